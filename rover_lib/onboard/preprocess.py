@@ -1,0 +1,48 @@
+"""From a camera's frame to the policy's input: one function for training, calibration, comparison and the Pi."""
+
+import cv2
+import numpy as np
+
+from rover_lib.onboard.errors import FrameError
+
+# torchvision's ImageNet statistics, RGB, for pixels in [0, 1]: what LeRobot's ACT was trained with.
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+def prepare_frame(frame_bgr: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Resize and reorder one camera frame.
+
+    frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it.
+    Returns (height, width, 3) uint8 RGB, contiguous. Normalisation is not done here: it is inside the
+    artifact's graph (see `normalise`), so that a Pi moves bytes, not floats.
+    A frame that has the size already is only reordered; a larger one is averaged over areas (no aliasing), a
+    smaller one interpolated. The aspect ratio is not kept, as in the trainer.
+    Raises FrameError for anything that is not such a picture.
+    """
+    if not isinstance(frame_bgr, np.ndarray) or frame_bgr.ndim != 3 or frame_bgr.shape[2] != 3:
+        found = getattr(frame_bgr, "shape", type(frame_bgr).__name__)
+        raise FrameError(f"a frame must be (height, width, 3) BGR, found {found}: is the camera delivering colour?")
+    if frame_bgr.dtype != np.uint8:
+        raise FrameError(f"a frame must be uint8, found {frame_bgr.dtype}: pass the picture as OpenCV reads it")
+    h, w = frame_bgr.shape[:2]
+    if h == 0 or w == 0:
+        raise FrameError(f"a frame of {w}x{h} pixels has no picture in it: check the camera")
+    if (h, w) != (height, width):
+        shrinks = height < h or width < w
+        frame_bgr = cv2.resize(
+            frame_bgr, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        )
+    return cv2.cvtColor(frame_bgr, cv2.COLOR_BGR2RGB)
+
+
+def normalise(
+    frame_rgb: np.ndarray, mean: tuple[float, ...] = IMAGENET_MEAN, std: tuple[float, ...] = IMAGENET_STD
+) -> np.ndarray:
+    """What LeRobot's forward expects of a frame from `prepare_frame`.
+
+    frame_rgb: (..., height, width, 3) uint8 RGB. Returns (..., 3, height, width) float32, (pixel / 255 - mean) / std.
+    """
+    x = frame_rgb.astype(np.float32) / np.float32(255)
+    x = (x - np.asarray(mean, np.float32)) / np.asarray(std, np.float32)
+    return np.ascontiguousarray(np.moveaxis(x, -1, -3))

@@ -1,0 +1,131 @@
+"""The one contract between the stages: a JSON file per stage in a run's folder.
+
+{"schema": 1, "stage": ..., "params": {...}, "metrics": {...}, "inputs": {file: sha256}, "env": {...}}
+Metric keys end in their unit (_ms _mb _us _pct _hz _c _g). Papermill, pytest, Ansible and the plots read these.
+"""
+
+import hashlib
+import json
+import math
+import os
+import platform
+import socket
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from rover_lib.onboard.errors import RoverError
+
+SCHEMA = 1
+
+
+@contextmanager
+def atomic_path(path: Path | str) -> Iterator[Path]:
+    """A temporary path beside `path`; renamed onto it when the block ends well, removed when it does not."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fd, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
+    os.close(fd)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with temporary.open("rb") as f:
+            os.fsync(f.fileno())  # a power cut after the rename must not leave an empty file
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)  # mkstemp's 0600 would hide the file from the service's user
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def sha256_of(path: Path | str) -> str:
+    """Hex SHA-256 of a file's bytes."""
+    with Path(path).open("rb") as f:
+        return hashlib.file_digest(f, "sha256").hexdigest()
+
+
+def environment() -> dict[str, Any]:
+    """Where a figure comes from: host, machine, processor, torch, engine, commit (None outside a checkout)."""
+    try:
+        found = subprocess.run(
+            ["git", "rev-parse", "--short", "HEAD"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            timeout=5,
+        )
+        commit = found.stdout.strip() or None
+    except (OSError, subprocess.SubprocessError):
+        commit = None
+    return {
+        "host": socket.gethostname(),
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "engine": torch.backends.quantized.engine,
+        "commit": commit,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """JSON's types from numpy's, torch's and pathlib's; a float that JSON cannot hold becomes None."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (np.ndarray, torch.Tensor)):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_stage(
+    path: Path | str,
+    stage: str,
+    *,
+    params: dict[str, Any],
+    metrics: dict[str, Any],
+    inputs: dict[str, str] | None = None,
+) -> dict[str, Any]:
+    """Write one stage's result atomically and return it as it was written."""
+    content = _plain(
+        {
+            "schema": SCHEMA,
+            "stage": stage,
+            "params": params,
+            "metrics": metrics,
+            "inputs": inputs or {},
+            "env": environment(),
+        }
+    )
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n")
+    return content
+
+
+def read_stage(path: Path | str, stage: str) -> dict[str, Any]:
+    """Read what `write_stage` wrote. Raises RoverError if the file is missing, damaged or of another stage."""
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise RoverError(f"{path}: not found; run the notebook of stage '{stage}' first") from None
+    except (ValueError, OSError) as e:
+        raise RoverError(f"{path}: not readable as JSON ({e}); delete it and run its stage again") from None
+    found = (content.get("schema"), content.get("stage")) if isinstance(content, dict) else type(content).__name__
+    if found != (SCHEMA, stage):
+        raise RoverError(f"{path}: expected schema {SCHEMA} of stage '{stage}', found {found}; run the stage again")
+    return content
