@@ -1,0 +1,124 @@
+"""Run an artifact: a frame and a state in, a chunk of actions out. torch, numpy and cv2 only."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from rover_lib.onboard.artifact import check_integrity, read_manifest, read_parity
+from rover_lib.onboard.errors import ArtifactError, PolicyError
+from rover_lib.onboard.preprocess import prepare_frame
+
+# What a pulse can express (facts of the car: steering both ways, throttle forward only). Others pass unclipped.
+ACTION_LIMITS = {"steering": (-1.0, 1.0), "throttle": (0.0, 1.0)}
+
+
+class Policy:
+    """A loaded artifact. Use `load_policy`."""
+
+    def __init__(self, path: Path, module: torch.jit.ScriptModule, manifest: dict[str, Any]):
+        self.path = path
+        self.manifest = manifest
+        self.action_names: tuple[str, ...] = tuple(manifest["action_names"])
+        self.state_names: tuple[str, ...] = tuple(manifest["state_names"])
+        self.cameras: tuple[str, ...] = tuple(c["name"] for c in manifest["cameras"])
+        self.chunk: int = manifest["chunk"]
+        self.rate_hz = float(manifest["rate_hz"])
+        self.image_size: tuple[int, int] = (manifest["cameras"][0]["height"], manifest["cameras"][0]["width"])
+        self._module = module
+        limits = [ACTION_LIMITS.get(name, (-np.inf, np.inf)) for name in self.action_names]
+        self._low, self._high = np.array(limits, np.float32).T
+
+    def predict_chunk(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
+        """Next actions for one observation.
+
+        frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it; a mapping by camera name if there are several.
+        state: (S,) float, for this car [steering, throttle] as last commanded.
+        Returns (chunk, A) float32; steering in [-1, 1], throttle in [0, 1], other actions as predicted.
+        Raises FrameError for a frame that is no picture, PolicyError for a state that is not finite or of another
+        shape, and for a prediction that is not finite: nobody gets a number that must not drive a car.
+        """
+        frames = self._frames(frame_bgr)
+        state = np.asarray(state, np.float32)
+        if state.shape != (len(self.state_names),):
+            raise PolicyError(f"the state must have shape ({len(self.state_names)},), found {state.shape}")
+        if not np.isfinite(state).all():
+            raise PolicyError(f"the state is not finite: {state.tolist()}; send what was last commanded")
+        chunk = self.run(state, [prepare_frame(f, c["height"], c["width"]) for f, c in frames])
+        if not np.isfinite(chunk).all():
+            raise PolicyError(f"{self.path}: the policy predicted NaN or Inf; stop the car and quantize again")
+        return np.clip(chunk, self._low, self._high)
+
+    def _frames(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray]) -> list[tuple[np.ndarray, dict[str, Any]]]:
+        cameras = self.manifest["cameras"]
+        if not isinstance(frame_bgr, Mapping):
+            frame_bgr = {self.cameras[0]: frame_bgr}
+        if set(frame_bgr) != set(self.cameras):
+            raise PolicyError(f"the policy looks through {list(self.cameras)}, found frames of {sorted(frame_bgr)}")
+        return [(frame_bgr[c["name"]], c) for c in cameras]
+
+    def run(self, state: np.ndarray, frames_rgb: list[np.ndarray]) -> np.ndarray:
+        """The bare graph: (S,) float32 and prepared frames in, (chunk, A) float32 out, neither checked nor clipped."""
+        # TorchScript re-optimises in its second call (0.37 G instructions on a Cortex-A76); the switch is thread-local.
+        with torch.inference_mode(), torch.jit.optimized_execution(False):
+            y = self._module(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames_rgb))
+        return y[0].numpy().copy()
+
+
+def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
+    """Load an artifact and prove that it computes here what it computed where it was made.
+
+    threads: for torch's kernels in this process; None leaves them as they are.
+    Checks the file's checksums, the manifest's schema, the torch version, the quantization engine and the parity
+    vectors (which also warm the kernels). Raises ArtifactError, in one sentence, if any of these fails.
+    """
+    path = Path(path)
+    check_integrity(path)
+    manifest = read_manifest(path)
+    made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
+    if made_with.split(".")[:2] != here.split(".")[:2]:
+        raise ArtifactError(f"{path}: made with torch {made_with}, here is {here}; install torch {made_with.split('+')[0]}")
+    engine = manifest["engine"]
+    if engine not in torch.backends.quantized.supported_engines:
+        raise ArtifactError(
+            f"{path}: needs the quantization engine '{engine}', this torch has "
+            f"{list(torch.backends.quantized.supported_engines)}; install PyPI's build of torch"
+        )
+    torch.backends.quantized.engine = engine
+    if threads:
+        torch.set_num_threads(threads)
+    try:
+        module = torch.jit.load(str(path), map_location="cpu").eval()
+    except RuntimeError as e:
+        raise ArtifactError(f"{path}: TorchScript cannot load it ({str(e).splitlines()[0][:200]}); quantize again") from None
+    policy = Policy(path, module, manifest)
+    check_parity(policy)
+    return policy
+
+
+def check_parity(policy: Policy) -> dict[str, float]:
+    """Run the artifact's parity vectors. Returns the largest difference per action; raises ArtifactError beyond tolerance.
+
+    FP32 differs between processors by the order of sums only. INT8 differs more, because its float parts (exp,
+    LayerNorm) round differently and each flipped rounding grows over the layers: the manifest's tolerance says how much.
+    """
+    vectors = read_parity(policy.path)
+    try:
+        frames = [vectors[f"frame_{c}"] for c in policy.cameras]
+        found = [policy.run(s, [f[i] for f in frames]) for i, s in enumerate(vectors["state"])]
+    except (KeyError, IndexError, RuntimeError) as e:
+        raise ArtifactError(f"{policy.path}: its parity vectors do not run ({str(e)[:200]}); quantize again") from None
+    if vectors["chunk"].shape != (len(found), policy.chunk, len(policy.action_names)):
+        raise ArtifactError(f"{policy.path}: its parity vectors have another shape than its manifest says; quantize again")
+    difference = np.abs(np.stack(found) - vectors["chunk"]).max((0, 1))
+    tolerance = policy.manifest["parity"]["tolerance"]
+    result = {name: float(d) for name, d in zip(policy.action_names, difference, strict=True)}
+    for name, d in result.items():
+        if not d <= tolerance[name]:  # NaN is not within
+            raise ArtifactError(
+                f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}, "
+                f"at most {tolerance[name]:.3g} is rounding; do not drive with it"
+            )
+    return result

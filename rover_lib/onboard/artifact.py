@@ -1,0 +1,150 @@
+"""The artifact: one TorchScript file with its manifest and parity vectors inside. No pickled objects, no lerobot.
+
+Inside the zip, beside TorchScript's own records: `extra/manifest.json` (what it is, see MANIFEST_KEYS) and
+`extra/parity.npz` (inputs, and the chunks that they must give).
+"""
+
+import hashlib
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.stage import atomic_path
+
+SCHEMA = 1
+MANIFEST_KEYS = {
+    "schema": int,
+    "mode": str,  # fp32, dynamic, static, mixed
+    "scheme": str,  # float, symmetric, affine
+    "engine": str,  # of torch.backends.quantized
+    "cameras": list,  # [{name, height, width}], in the graph's order
+    "state_names": list,
+    "action_names": list,
+    "chunk": int,  # actions per inference
+    "rate_hz": (int, float),  # of those actions
+    "normalisation": str,  # where it happens
+    "checkpoint": dict,  # {sha256, format}
+    "calibration": (dict, type(None)),  # {samples, observer, ...}
+    "weights_mb": (int, float),
+    "gmac": (int, float),  # multiply-accumulates of one inference, in 1e9
+    "parity": dict,  # {tolerance: {action: largest difference}, reason}
+    "versions": dict,  # {torch, rover_lib}
+}
+
+
+def save_artifact(
+    path: Path | str, module: torch.jit.ScriptModule, manifest: dict[str, Any], parity: dict[str, np.ndarray]
+) -> str:
+    """Write the artifact atomically; return its content hash.
+
+    parity: `state` (n, S) float32, `frame_<camera>` (n, height, width, 3) uint8 RGB, `chunk` (n, C, A) float32.
+    Raises ArtifactError if the manifest lacks something.
+    """
+    check_manifest(manifest, str(path))
+    vectors = io.BytesIO()
+    np.savez_compressed(vectors, **parity)
+    extra = {"manifest.json": json.dumps(manifest, sort_keys=True, indent=1), "parity.npz": vectors.getvalue()}
+    # Through a buffer, because torch.jit.save names the zip's folder after the file: same inputs, same bytes.
+    buffer = io.BytesIO()
+    torch.jit.save(module, buffer, _extra_files=extra)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
+    return content_hash(path)
+
+
+def content_hash(path: Path | str) -> str:
+    """Hex SHA-256 over everything in the artifact that acts: all records but TorchScript's debug tables.
+
+    Those hold source positions, so that they change with an edit that changes nothing.
+    """
+    digest = hashlib.sha256()
+    with _open(path) as z:
+        for name in sorted(z.namelist()):
+            if name.endswith(".debug_pkl"):
+                continue
+            digest.update(name.encode() + b"\0")
+            digest.update(hashlib.sha256(z.read(name)).digest())
+    return digest.hexdigest()
+
+
+def read_manifest(path: Path | str) -> dict[str, Any]:
+    """The manifest of an artifact, without running or even loading the policy. Raises ArtifactError."""
+    with _open(path) as z:
+        return _manifest_in(z, path)
+
+
+def read_parity(path: Path | str) -> dict[str, np.ndarray]:
+    """The parity vectors of an artifact. Raises ArtifactError."""
+    with _open(path) as z:
+        try:
+            content = np.load(io.BytesIO(z.read(_record(z, "parity.npz", path))), allow_pickle=False)
+            vectors = {k: content[k] for k in content.files}
+        except (ValueError, OSError, zipfile.BadZipFile) as e:
+            raise ArtifactError(f"{path}: its parity vectors are not readable ({e}); quantize again") from None
+    if "state" not in vectors or "chunk" not in vectors or len(vectors["chunk"]) == 0:
+        raise ArtifactError(f"{path}: it has no parity vectors (found {sorted(vectors)}); quantize again")
+    return vectors
+
+
+def check_integrity(path: Path | str) -> None:
+    """Raise ArtifactError if any byte changed since the artifact was written (TorchScript itself does not look)."""
+    with _open(path) as z:
+        try:
+            damaged = z.testzip()
+        except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError) as e:
+            raise ArtifactError(f"{path}: damaged ({e}); copy the file again") from None
+    if damaged:
+        raise ArtifactError(f"{path}: damaged, the checksum of '{damaged}' does not match; copy the file again")
+
+
+def check_manifest(manifest: Any, where: str) -> None:
+    """Raise ArtifactError, naming the key, for a manifest of another schema or with a value of another type."""
+    if not isinstance(manifest, dict):
+        raise ArtifactError(f"{where}: its manifest is no JSON object but {type(manifest).__name__}; quantize again")
+    if manifest.get("schema") != SCHEMA:
+        raise ArtifactError(
+            f"{where}: manifest schema {manifest.get('schema')!r}, this rover_lib reads {SCHEMA}; "
+            "use the rover_lib that wrote it, or quantize again"
+        )
+    for key, kind in MANIFEST_KEYS.items():
+        if not isinstance(manifest.get(key), kind):
+            found = repr(manifest[key])[:60] if key in manifest else "nothing"
+            raise ArtifactError(f"{where}: manifest key '{key}' is {found}, not what it should be; quantize again")
+    for camera in manifest["cameras"]:
+        if not isinstance(camera, dict) or not {"name", "height", "width"} <= camera.keys():
+            raise ArtifactError(f"{where}: manifest camera {camera!r} lacks name, height or width; quantize again")
+    tolerance = manifest["parity"].get("tolerance")
+    if not isinstance(tolerance, dict) or set(tolerance) != set(manifest["action_names"]):
+        raise ArtifactError(f"{where}: manifest parity tolerance {tolerance!r} does not cover its actions; quantize again")
+
+
+def _open(path: Path | str) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(path)
+    except FileNotFoundError:
+        raise ArtifactError(f"{path}: not found; 'rover run' writes artifacts to runs/<name>/") from None
+    except (zipfile.BadZipFile, OSError) as e:
+        raise ArtifactError(f"{path}: not an artifact, or cut short ({e}); copy the file again") from None
+
+
+def _record(z: zipfile.ZipFile, name: str, path: Path | str) -> str:
+    found = [n for n in z.namelist() if n.endswith(f"/extra/{name}")]
+    if len(found) != 1:
+        raise ArtifactError(f"{path}: no {name} in it; is it an artifact of this project? ('rover inspect' says what)")
+    return found[0]
+
+
+def _manifest_in(z: zipfile.ZipFile, path: Path | str) -> dict[str, Any]:
+    record = _record(z, "manifest.json", path)
+    try:
+        manifest = json.loads(z.read(record))
+    except (ValueError, zipfile.BadZipFile) as e:
+        raise ArtifactError(f"{path}: its manifest is not readable ({e}); copy the file again") from None
+    check_manifest(manifest, str(path))
+    return manifest

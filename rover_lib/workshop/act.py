@@ -1,0 +1,450 @@
+"""ACT for inference only: LeRobot's Action Chunking Transformer with everything left out that only training needs.
+
+The same function as `lerobot.policies.act` in eval mode (tests compare the two), arranged so that INT8 has little to do:
+batch norm is folded into the convolutions; the VAE encoder is gone (its latent is zero when driving, so its projection is
+a constant); positions enter attention behind the projections, W(x + pos) = Wx + W pos, as constants; and the first
+decoder layer's self-attention, which acts on zeros, is a constant too.
+
+Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions, C chunk, h and w of the feature map.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD
+
+# (block, convolutions per block, blocks per stage, channels out of layer4), from torchvision.models.resnet
+BACKBONES = {
+    "resnet18": ("basic", (2, 2, 2, 2), 512),
+    "resnet34": ("basic", (3, 4, 6, 3), 512),
+    "resnet50": ("bottleneck", (3, 4, 6, 3), 2048),
+}
+ACTIVATIONS = {"relu": nn.ReLU, "gelu": nn.GELU}
+EMBEDDINGS = {
+    "encoder_1d_feature_pos_embed": "folded into each encoder layer's and cross-attention's key (and query) constants",
+    "decoder_pos_embed": "folded into each decoder layer's query and key constants, and into the first layer's start",
+}
+
+
+@dataclass(frozen=True)
+class Affine:
+    """x * scale + shift, per channel: all of LeRobot's normalisation modes are of this form."""
+
+    scale: tuple[float, ...]
+    shift: tuple[float, ...]
+
+
+def _imagenet() -> Affine:
+    return Affine(
+        tuple(1 / s for s in IMAGENET_STD), tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True))
+    )
+
+
+@dataclass(frozen=True)
+class ActConfig:
+    """The shape of one policy. Made by `checkpoint`, which has checked it against the weights."""
+
+    cameras: tuple[str, ...] = ("cam_front",)
+    image_sizes: tuple[tuple[int, int], ...] = ((360, 640),)  # (height, width), one per camera
+    state_names: tuple[str, ...] = ("steering", "throttle")
+    action_names: tuple[str, ...] = ("steering", "throttle")
+    chunk: int = 32
+    dim: int = 512
+    heads: int = 8
+    feedforward: int = 3200
+    encoder_layers: int = 4
+    decoder_layers: int = 7
+    latent: int = 32
+    vae_layers: int = 4  # 0: trained without a VAE
+    backbone: str = "resnet18"
+    dilation: bool = False
+    pre_norm: bool = False
+    activation: str = "relu"
+    rate_hz: float = 30.0
+    image_norm: tuple[Affine, ...] = field(default_factory=lambda: (_imagenet(),))  # of pixels in [0, 1]
+    state_norm: Affine | None = None
+    action_unnorm: Affine | None = None
+
+    @property
+    def stride(self) -> int:
+        return 16 if self.dilation else 32
+
+
+def positions_2d(dim: int, h: int, w: int) -> Tensor:
+    """LeRobot's 2-d sinusoidal positions of an (h, w) feature map: (h * w, dim)."""
+    half = dim // 2
+    frequency = 10000 ** (2 * (torch.arange(half, dtype=torch.float32) // 2) / half)
+
+    def axis(n: int) -> Tensor:  # (n, half)
+        # In LeRobot's order of float operations, so that the constants are the same to the last bit.
+        p = torch.arange(1, n + 1, dtype=torch.float32)
+        p = (p / (p[-1:] + 1e-6) * (2 * math.pi))[:, None] / frequency
+        return torch.stack((p[:, 0::2].sin(), p[:, 1::2].cos()), -1).flatten(1)
+
+    y = axis(h)[:, None].expand(h, w, half)
+    x = axis(w)[None].expand(h, w, half)
+    return torch.cat((y, x), -1).reshape(h * w, dim)
+
+
+class Weights:
+    """A view into a checkpoint's tensors below one prefix."""
+
+    def __init__(self, tensors: dict[str, Tensor], prefix: str = ""):
+        self.tensors, self.prefix = tensors, prefix
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self.tensors[self.prefix + name].detach().float()
+
+    def __contains__(self, name: str) -> bool:
+        return any(k.startswith(self.prefix + name) for k in self.tensors)
+
+    def at(self, name: str) -> "Weights":
+        return Weights(self.tensors, f"{self.prefix}{name}.")
+
+
+def _load(module: nn.Module, weight: Tensor, bias: Tensor) -> nn.Module:
+    module.weight = nn.Parameter(weight.clone(), requires_grad=False)
+    module.bias = nn.Parameter(bias.clone(), requires_grad=False)
+    return module
+
+
+def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
+    out_features, in_features = weight.shape
+    return _load(nn.Linear(in_features, out_features, device="meta"), weight, bias)
+
+
+def layer_norm(w: Weights) -> nn.LayerNorm:
+    return _load(nn.LayerNorm(w["weight"].shape[0], device="meta"), w["weight"], w["bias"])
+
+
+def folded_conv(w: Weights, bn: Weights, stride: int, padding: int, dilation: int = 1) -> nn.Conv2d:
+    """A convolution without bias and the frozen batch norm behind it, as one convolution."""
+    weight = w["weight"]
+    out_channels, in_channels, size, _ = weight.shape
+    gain = bn["weight"] * (bn["running_var"] + 1e-5).rsqrt()  # eps of torchvision's FrozenBatchNorm2d
+    conv = nn.Conv2d(in_channels, out_channels, size, stride, padding, dilation, device="meta")
+    return _load(conv, weight * gain[:, None, None, None], bn["bias"] - bn["running_mean"] * gain)
+
+
+class Residual(nn.Module):
+    """One ResNet block: two (basic) or three (bottleneck) convolutions beside a shortcut."""
+
+    def __init__(self, w: Weights, kind: str, stride: int, dilation: int):
+        super().__init__()
+        if kind == "basic":
+            plan = [("1", stride, 1, 1), ("2", 1, 1, 1)]
+        else:
+            plan = [("1", 1, 0, 1), ("2", stride, dilation, dilation), ("3", 1, 0, 1)]
+        layers: list[nn.Module] = []
+        for n, s, padding, d in plan:
+            layers += [folded_conv(w.at(f"conv{n}"), w.at(f"bn{n}"), s, padding, d), nn.ReLU()]
+        self.body = nn.Sequential(*layers[:-1])
+        has_shortcut = "downsample" in w
+        self.shortcut = (
+            folded_conv(w.at("downsample.0"), w.at("downsample.1"), stride, 0) if has_shortcut else nn.Identity()
+        )
+        self.relu = nn.ReLU()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.relu(self.body(x) + self.shortcut(x))
+
+
+class Backbone(nn.Module):
+    """ResNet up to its last feature map: (1, 3, height, width) normalised -> (1, channels, h, w)."""
+
+    def __init__(self, w: Weights, config: ActConfig):
+        super().__init__()
+        kind, depths, _ = BACKBONES[config.backbone]
+        self.stem = nn.Sequential(folded_conv(w.at("conv1"), w.at("bn1"), 2, 3), nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+        dilation = 1
+        for i, depth in enumerate(depths):
+            stride = 1 if i == 0 else 2
+            first = dilation
+            if i == 3 and config.dilation:  # torchvision's replace_stride_with_dilation: only later blocks dilate
+                stride, dilation = 1, dilation * 2
+            blocks = [
+                Residual(w.at(f"layer{i + 1}.{j}"), kind, stride if j == 0 else 1, first if j == 0 else dilation)
+                for j in range(depth)
+            ]
+            setattr(self, f"layer{i + 1}", nn.Sequential(*blocks))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layer4(self.layer3(self.layer2(self.layer1(self.stem(x)))))
+
+
+class Pointwise(nn.Module):
+    """Where token projections live: as linears over (1, T, D), or as 1x1 convolutions over (1, D, 1, T).
+
+    In channels-last the two are the same memory and XNNPACK runs the same GEMM, but only a convolution may have one
+    weight scale per output channel with qint8 activations (a per-channel linear raises there).
+    """
+
+    def __init__(self, as_conv: bool):
+        super().__init__()
+        self.as_conv = as_conv
+
+    def project(self, weight: Tensor, bias: Tensor) -> nn.Module:
+        if not self.as_conv:
+            return linear(weight, bias)
+        out_features, in_features = weight.shape
+        return _load(nn.Conv2d(in_features, out_features, 1, device="meta"), weight[:, :, None, None], bias)
+
+    def enter(self, x: Tensor) -> Tensor:
+        return x.transpose(1, 2).unsqueeze(2) if self.as_conv else x
+
+    def leave(self, x: Tensor) -> Tensor:
+        return x.squeeze(2).transpose(1, 2) if self.as_conv else x
+
+
+class Attention(Pointwise):
+    """Multi-head attention added to the residual stream, with the positions of queries and keys as constants.
+
+    Channel scales (buffers, all None until `quantize` sets them) make the INT8 tensors inside even, and cancel exactly:
+    q_in and kv_in multiply the inputs, q_out, v_out and o_out the outputs; the keys' scale is merged into q_out (the
+    scores only see products), the output projection's input scale into v_out.
+    """
+
+    def __init__(
+        self, w: Weights, config: ActConfig, q_pos: Tensor, k_pos: Tensor, as_conv: bool, q_input: Tensor | None = None
+    ):
+        super().__init__(as_conv)
+        d = config.dim
+        self.heads = config.heads
+        weight, bias = w["in_proj_weight"], w["in_proj_bias"]
+        wq, wk, wv = weight.split(d)
+        bq, bk, bv = bias.split(d)
+        self.constant_q = q_input is not None  # nothing that the query is made of depends on the observation
+        self.register_buffer("q_pos", F.linear(q_input, wq, bq) + q_pos @ wq.T if self.constant_q else q_pos @ wq.T)
+        self.register_buffer("k_pos", k_pos @ wk.T)
+        if not self.constant_q:
+            self.q = self.project(wq, bq)
+        self.k = self.project(wk, bk)
+        self.v = self.project(wv, bv)
+        self.o = self.project(w["out_proj.weight"], w["out_proj.bias"])
+        for name in ("q_in", "kv_in", "q_out", "v_out", "o_out"):
+            self.register_buffer(name, None)
+
+    def forward(self, residual: Tensor, x: Tensor, memory: Tensor) -> Tensor:
+        """residual, x: (1, T, D); memory: (1, M, D). Returns residual + attention(x over memory)."""
+        m = self.enter(_times(memory, self.kv_in))
+        if self.constant_q:
+            q = self.q_pos
+        else:
+            # Self-attention has one source, hence one scale and one quantized input for Q, K and V.
+            xq = m if x is memory else self.enter(_times(x, self.q_in))
+            q = _plus_scaled(self.q_pos, self.leave(self.q(xq)), self.q_out)
+        k = self.leave(self.k(m)) + self.k_pos
+        v = _times(self.leave(self.v(m)), self.v_out)
+        q, k, v = (t.unflatten(2, (self.heads, -1)).transpose(1, 2) for t in (q, k, v))  # (1, H, T, D / H)
+        y = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
+        return _plus_scaled(residual, self.leave(self.o(self.enter(y))), self.o_out)
+
+
+class FeedForward(Pointwise):
+    """Two projections with an activation between, added to the residual stream. Scales as in Attention."""
+
+    def __init__(self, w: Weights, config: ActConfig, as_conv: bool):
+        super().__init__(as_conv)
+        self.up = self.project(w["linear1.weight"], w["linear1.bias"])
+        self.act = ACTIVATIONS[config.activation]()
+        self.down = self.project(w["linear2.weight"], w["linear2.bias"])
+        for name in ("up_in", "down_in", "down_out"):
+            self.register_buffer(name, None)
+
+    def forward(self, residual: Tensor, x: Tensor) -> Tensor:
+        h = self.act(self.up(self.enter(_times(x, self.up_in))))
+        if self.down_in is not None:  # only for activations that a scale does not pass through (not ReLU)
+            h = self.enter(self.leave(h) * self.down_in)
+        return _plus_scaled(residual, self.leave(self.down(h)), self.down_out)
+
+
+def _times(x: Tensor, scale: Tensor | None) -> Tensor:
+    return x if scale is None else x * scale
+
+
+def _plus_scaled(x: Tensor, y: Tensor, scale: Tensor | None) -> Tensor:
+    return x + y if scale is None else torch.addcmul(x, y, scale)
+
+
+class EncoderLayer(nn.Module):
+    def __init__(self, w: Weights, config: ActConfig, pos: Tensor, as_conv: bool):
+        super().__init__()
+        self.pre_norm = config.pre_norm
+        self.attention = Attention(w.at("self_attn"), config, pos, pos, as_conv)
+        self.feed_forward = FeedForward(w, config, as_conv)
+        self.norm1, self.norm2 = (layer_norm(w.at(f"norm{i}")) for i in (1, 2))
+
+    def forward(self, x: Tensor) -> Tensor:  # (1, T, D)
+        if self.pre_norm:
+            y = self.norm1(x)
+            x = self.attention(x, y, y)
+            return self.feed_forward(x, self.norm2(x))
+        x = self.norm1(self.attention(x, x, x))
+        return self.norm2(self.feed_forward(x, x))
+
+
+class DecoderLayer(nn.Module):
+    """`start`: None, or this first layer's input (zeros), whose self-attention is then computed here, once."""
+
+    def __init__(
+        self, w: Weights, config: ActConfig, q_pos: Tensor, k_pos: Tensor, as_conv: bool, start: Tensor | None = None
+    ):
+        super().__init__()
+        self.pre_norm, self.first = config.pre_norm, start is not None
+        attention = Attention(w.at("self_attn"), config, q_pos, q_pos, as_conv)
+        norm1, self.norm2, self.norm3 = (layer_norm(w.at(f"norm{i}")) for i in (1, 2, 3))
+        q_input = None
+        if self.first:
+            with torch.no_grad():
+                y = norm1(start) if self.pre_norm else start
+                x = attention(start, y, y)
+                x = x if self.pre_norm else norm1(x)
+                q_input = self.norm2(x) if self.pre_norm else x
+            self.register_buffer("start", x)
+        else:
+            self.attention, self.norm1 = attention, norm1
+        self.cross_attention = Attention(w.at("multihead_attn"), config, q_pos, k_pos, as_conv, q_input)
+        self.feed_forward = FeedForward(w, config, as_conv)
+
+    def forward(self, x: Tensor | None, memory: Tensor) -> Tensor:  # (1, C, D), (1, T, D)
+        if self.first:
+            x = self.start
+        elif self.pre_norm:
+            y = self.norm1(x)
+            x = self.attention(x, y, y)
+        else:
+            x = self.norm1(self.attention(x, x, x))
+        if self.pre_norm:
+            x = self.cross_attention(x, self.norm2(x), memory)
+            return self.feed_forward(x, self.norm3(x))
+        x = self.norm2(self.cross_attention(x, x, memory))
+        return self.norm3(self.feed_forward(x, x))
+
+
+class Normalise(nn.Module):
+    """x * scale + shift with constants in the graph; the identity when there is nothing to do."""
+
+    def __init__(self, affine: Affine | None, shape: tuple[int, ...]):
+        super().__init__()
+        self.acts = affine is not None
+        if affine is not None:
+            self.register_buffer("scale", torch.tensor(affine.scale, dtype=torch.float32).reshape(shape))
+            self.register_buffer("shift", torch.tensor(affine.shift, dtype=torch.float32).reshape(shape))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x * self.scale + self.shift if self.acts else x
+
+
+class ACT(nn.Module):
+    """The policy, for one observation at a time.
+
+    weights: LeRobot's names without the leading `model.`; config: checked against them (see `checkpoint`).
+    as_conv: token projections as 1x1 convolutions (what static INT8 wants) instead of linears.
+    forward(state (1, S) float32, *frames (height, width, 3) uint8 RGB, one per camera) -> (1, C, A) float32:
+    raw state in, raw actions out, all normalisation inside.
+    """
+
+    def __init__(self, config: ActConfig, weights: dict[str, Tensor], *, as_conv: bool = False):
+        super().__init__()
+        self.config = config
+        w = Weights(weights)
+        self.image_norm = nn.ModuleList(  # pixels are 0..255 here: the division by 255 is in the scale
+            Normalise(Affine(tuple(s / 255 for s in n.scale), n.shift), (1, 3, 1, 1)) for n in config.image_norm
+        )
+        self.state_norm = Normalise(config.state_norm, (1, -1))
+        self.action_unnorm = Normalise(config.action_unnorm, (1, 1, -1))
+        self.backbone = Backbone(w.at("backbone"), config)
+        project = w.at("encoder_img_feat_input_proj")
+        weight = project["weight"]
+        self.image_project = _load(nn.Conv2d(*weight.shape[1::-1], 1, device="meta"), weight, project["bias"])
+        state = w.at("encoder_robot_state_input_proj")
+        self.state_project = linear(state["weight"], state["bias"])
+        # The latent is zero when driving, so what its projection gives is its bias.
+        self.register_buffer("latent", w["encoder_latent_input_proj.bias"][None, None])
+        pos = [w["encoder_1d_feature_pos_embed.weight"]]
+        pos += [positions_2d(config.dim, -(-h // config.stride), -(-v // config.stride)) for h, v in config.image_sizes]
+        k_pos = torch.cat(pos)[None]  # (1, T, D)
+        q_pos = w["decoder_pos_embed.weight"][None]  # (1, C, D)
+        self.encoder = nn.ModuleList(
+            EncoderLayer(w.at(f"encoder.layers.{i}"), config, k_pos, as_conv) for i in range(config.encoder_layers)
+        )
+        self.encoder_norm = layer_norm(w.at("encoder.norm")) if config.pre_norm else nn.Identity()
+        zeros = torch.zeros_like(q_pos)
+        self.decoder = nn.ModuleList(
+            DecoderLayer(w.at(f"decoder.layers.{i}"), config, q_pos, k_pos, as_conv, None if i else zeros)
+            for i in range(config.decoder_layers)
+        )
+        self.norm = layer_norm(w.at("decoder.norm"))
+        self.head = linear(w["action_head.weight"], w["action_head.bias"])
+        self.eval().requires_grad_(False)
+
+    def forward(self, state: Tensor, *frames: Tensor) -> Tensor:
+        tokens = [self.latent, self.state_project(self.state_norm(state))[:, None]]
+        for norm, frame in zip(self.image_norm, frames, strict=True):
+            x = norm(frame.permute(2, 0, 1)[None].float())  # (1, 3, height, width), channels-last in memory
+            x = self.image_project(self.backbone(x))  # (1, D, h, w)
+            tokens.append(x.flatten(2).transpose(1, 2))  # (1, h * w, D)
+        x = torch.cat(tokens, 1)
+        for layer in self.encoder:
+            x = layer(x)
+        memory = self.encoder_norm(x)
+        y = None
+        for layer in self.decoder:
+            y = layer(y, memory)
+        return self.action_unnorm(self.head(self.norm(y)))
+
+
+def blocks(config: ActConfig) -> list[str]:
+    """Names of the parts that can be INT8 or float as one, in the order of the data."""
+    names = ["backbone.stem", *(f"backbone.layer{i}" for i in (1, 2, 3, 4)), "image_project"]
+    for i in range(config.encoder_layers):
+        names += [f"encoder.{i}.attention", f"encoder.{i}.feed_forward"]
+    for i in range(config.decoder_layers):
+        names += [f"decoder.{i}.{part}" for part in ("attention", "cross_attention", "feed_forward")[i == 0 :]]
+    return names
+
+
+def block_of(module_name: str) -> str:
+    """The block that a module belongs to; its own name for those that stay float (head, state_project)."""
+    parts = module_name.split(".")
+    return ".".join(parts[: {"backbone": 2, "encoder": 3, "decoder": 3}.get(parts[0], 1)])
+
+
+def multiply_accumulates(model: ACT) -> dict[str, int]:
+    """Multiply-accumulates of one inference, by block, attention's two products counted with their block."""
+    counts: dict[str, int] = {}
+    hooks = []
+
+    def add(name: str, n: int) -> None:
+        counts[block_of(name)] = counts.get(block_of(name), 0) + n
+
+    def watch(name: str):
+        def hook(module: nn.Module, args: tuple, out: Tensor) -> None:
+            if isinstance(module, Attention):
+                residual, _, memory = args
+                add(name, 2 * residual.shape[1] * memory.shape[1] * residual.shape[2])
+            elif isinstance(module, nn.Conv2d):
+                add(name, out.numel() * module.weight[0].numel())
+            else:
+                add(name, out.numel() * module.in_features)
+
+        return hook
+
+    for name, module in model.named_modules():
+        if isinstance(module, (nn.Conv2d, nn.Linear, Attention)):
+            hooks.append(module.register_forward_hook(watch(name)))
+    with torch.inference_mode():
+        model(*example_inputs(model.config))
+    for h in hooks:
+        h.remove()
+    return counts
+
+
+def example_inputs(config: ActConfig) -> tuple[Tensor, ...]:
+    """A neutral observation of the right shapes: zero state, grey frames."""
+    frames = (torch.full((h, w, 3), 128, dtype=torch.uint8) for h, w in config.image_sizes)
+    return torch.zeros(1, len(config.state_names)), *frames
