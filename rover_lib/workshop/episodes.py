@@ -1,0 +1,779 @@
+"""Recorded drives as training and calibration samples: the user's episode folders, with all their faults.
+
+    recordings = load_recordings("episodes")
+    parts = split(recordings)
+    samples, note = choose_calibration(parts.calibration, 200, seed=0)
+
+How a recording becomes samples:
+- A control is a measurement, per channel, only if the firmware saw a pulse (`pwm.Channel.measured`). Where
+  it did not, the file says 0 by the firmware's rule; such a value is missing here, never 0. Throttle and
+  steering of a frame are each the nearest *measured* control within `sync_s`: one lost reading between two
+  good ones costs nothing (controls come every 33 ms), a longer hole leaves its frames without an action.
+- Controls that waited in the serial buffer arrive in one burst, with system times that say nothing. They are
+  put where the Arduino's clock says, counted back from the first control that arrived live after them
+  (backwards and from close by, because that clock drifts). Those that the clock cannot place are dropped.
+- A frame's action is its control; its state is the previous frame's action; its chunk is its own action and
+  the following frames' (LeRobot's delta indices range(chunk)), padded at the end with the last one and
+  masked.
+- A picture that is missing or damaged costs its own sample only: time and action of that frame are known, so
+  its neighbours keep their state and chunk. A frame without an action, or a hole in time, ends the chunks
+  before it, and the frame after it is no sample: its state would be invented. Only the episode's first frame
+  starts neutral.
+"""
+
+import csv
+import json
+import math
+import os
+import stat
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.pwm import NEUTRAL, PwmCalibration
+from rover_lib.onboard.recording import CONTROL_FIELDS, FRAME_FIELDS
+from rover_lib.onboard.stage import sha256_of
+
+ACTION_NAMES = ("steering", "throttle")
+DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
+BURST_SHARE = 0.3  # arriving within this share of the usual interval means: both were waiting in a buffer
+BURST_MIN = 3  # fewer than this is jitter of the USB line, less than `sync_s`, and left alone
+HOLE_INTERVALS = 2.5  # one dropped frame is bridged, two in a row are a hole in time
+JPEG_TAIL = 64  # some recorders pad the end marker with zeros
+DISAGREES = 1e-3  # recorded action against the one computed from its pulse; the recordings hold 5e-5
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something wrong in a recording: `count` times `kind` in `file` (relative to the root), with the first
+    in words.
+    """
+
+    file: str
+    kind: str
+    count: int
+    note: str
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One training or calibration pair.
+
+    time_s: seconds since the episode's first frame. state: (2,) float32, the previous frame's [steering,
+    throttle]. chunk: (chunk, 2) float32, this frame's action and the following ones. is_pad: (chunk,) bool,
+    True past the end.
+    """
+
+    episode: str
+    frame_path: Path
+    time_s: float
+    state: np.ndarray
+    chunk: np.ndarray
+    is_pad: np.ndarray
+
+    def frame_bgr(self) -> np.ndarray:
+        """The picture, (h, w, 3) uint8 BGR. Raises EpisodeError if it is gone, cut short or no JPEG."""
+        try:
+            data = self.frame_path.read_bytes()
+        except OSError as e:
+            raise EpisodeError(
+                f"{self.frame_path}: cannot be read ({e.strerror}): restore it or load again"
+            ) from None
+        if problem := _jpeg_problem(data[:2], data[-JPEG_TAIL:]):
+            raise EpisodeError(
+                f"{self.frame_path}: {problem}: delete the picture or record the episode again"
+            )
+        try:
+            frame = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        except cv2.error:
+            frame = None
+        if frame is None:
+            raise EpisodeError(
+                f"{self.frame_path}: does not decode as a JPEG: delete it or record the episode again"
+            )
+        return frame
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One drive. frames and controls: how many were listed; duration_s: first to last frame."""
+
+    id: str
+    path: Path
+    label: str
+    duration_s: float
+    frames: int
+    controls: int
+    samples: tuple[Sample, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """All usable episodes below `root`, and what was wrong with the rest."""
+
+    root: Path
+    episodes: tuple[Episode, ...]
+    faults: tuple[Fault, ...]
+
+    @property
+    def samples(self) -> tuple[Sample, ...]:
+        """Every episode's samples, in order."""
+        return tuple(s for e in self.episodes for s in e.samples)
+
+    def action_range(self) -> dict[str, tuple[float, float]]:
+        """Smallest and largest recorded value of each action: what errors are given as a share of."""
+        actions = np.concatenate(
+            [s.chunk for s in self.samples]
+        )  # padding repeats values that are in it anyway
+        return {
+            n: (float(actions[:, i].min()), float(actions[:, i].max())) for i, n in enumerate(ACTION_NAMES)
+        }
+
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of every file that the samples came from, by its path relative to `root`."""
+        found = {}
+        for episode in self.episodes:
+            used = [p for name in DATA_FILES if (p := episode.path / name).is_file()]
+            for path in used + [s.frame_path for s in episode.samples]:
+                try:
+                    found[_relative(path, self.root)] = sha256_of(path)
+                except OSError as e:
+                    raise EpisodeError(
+                        f"{path}: cannot be read any more ({e.strerror}): load again"
+                    ) from None
+        return found
+
+    def summary(self) -> dict[str, Any]:
+        """Counts, ranges and faults as plain JSON types, for load.json."""
+        return {
+            "episodes": len(self.episodes),
+            "frames": sum(e.frames for e in self.episodes),
+            "controls": sum(e.controls for e in self.episodes),
+            "samples": len(self.samples),
+            "duration_s": sum(e.duration_s for e in self.episodes),
+            "labels": sorted({e.label for e in self.episodes}),
+            "action_range": {name: list(ends) for name, ends in self.action_range().items()},
+            "faults": [
+                {"file": f.file, "kind": f.kind, "count": f.count, "note": f.note} for f in self.faults
+            ],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Three parts that share no episode, or, where `note` says so, no moment in time.
+
+    calibration: for the observers. choosing: picks observers and mixed blocks. held_out: judges; nothing
+    else may look at it. episodes: part -> episode ids.
+    """
+
+    calibration: tuple[Sample, ...]
+    choosing: tuple[Sample, ...]
+    held_out: tuple[Sample, ...]
+    note: str | None
+    episodes: dict[str, list[str]]
+
+
+@dataclass
+class _Faults:
+    """Counts faults by file and kind, and keeps the first one's words."""
+
+    root: Path
+    found: dict[tuple[str, str], list] = field(default_factory=dict)
+
+    def add(self, path: Path, kind: str, note: str, count: int = 1) -> None:
+        if count:
+            entry = self.found.setdefault((_relative(path, self.root), kind), [0, note])
+            entry[0] += count
+
+    def listed(self) -> tuple[Fault, ...]:
+        return tuple(
+            Fault(file, kind, count, note) for (file, kind), (count, note) in sorted(self.found.items())
+        )
+
+
+@dataclass(frozen=True)
+class _Control:
+    """One reading. arduino_s is NaN where that clock was no number; an action is None where nothing was
+    measured.
+    """
+
+    system_s: float
+    arduino_s: float
+    actions: tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class _Frame:
+    number: int
+    time_s: float
+    path: Path
+    usable: bool
+
+
+def load_recordings(
+    root: Path | str,
+    chunk: int = 32,
+    sync_s: float = 0.05,
+    progress: Callable[..., Iterable] | None = None,
+    pwm: PwmCalibration | None = None,
+) -> Recordings:
+    """Read every episode folder below `root` (or `root` itself, if it is one).
+
+    chunk: actions per sample. sync_s: how far a control may be from its frame. progress: called like
+    tqdm.tqdm(iterable, desc=, total=), or None. Faults are counted and skipped; pictures are only checked
+    for their ends here and decoded in `Sample.frame_bgr`. Raises EpisodeError when nothing usable is left,
+    with the most frequent reasons.
+    """
+    root = Path(root)
+    root = root if root.name else root.resolve()  # "." has no name to give an episode
+    if chunk < 1 or not sync_s > 0:
+        raise EpisodeError(f"chunk must be at least 1 and sync_s above 0, found {chunk} and {sync_s}")
+    pwm = pwm or PwmCalibration()
+    try:
+        if any((root / name).exists() for name in DATA_FILES):
+            root, folders = root.parent, [root]  # faults and hashes then still name the episode
+        else:
+            folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and p.is_dir())
+    except OSError as e:
+        raise EpisodeError(
+            f"{root}: no folder of episodes ({e.strerror}): give the folder with episode_* in it"
+        ) from None
+    if not folders:
+        raise EpisodeError(
+            f"{root}: no episode folders in it: give the folder that holds episode_YYYYMMDD_HHMMSS"
+        )
+    faults = _Faults(root)
+    watched = progress(folders, desc="reading episodes", total=len(folders)) if progress else folders
+    episodes = tuple(e for folder in watched if (e := _load_episode(folder, chunk, sync_s, pwm, faults)))
+    if not episodes:
+        kinds: dict[str, int] = {}
+        for fault in faults.listed():
+            kinds[fault.kind] = kinds.get(fault.kind, 0) + fault.count
+        worst = ", ".join(
+            f"{kind} {n} times" for kind, n in sorted(kinds.items(), key=lambda k: (-k[1], k[0]))[:6]
+        )
+        raise EpisodeError(
+            f"{root}: no usable sample in {len(folders)} episode folder(s) ({worst or 'they are empty'}): "
+            "record again, or copy the whole folders, frames included"
+        )
+    return Recordings(root, episodes, faults.listed())
+
+
+def _relative(path: Path, root: Path) -> str:
+    try:
+        return path.relative_to(root).as_posix()
+    except ValueError:
+        return path.name
+
+
+def _shown(value: object) -> str:
+    """A value from a file for a sentence: short, and on one line."""
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _load_episode(
+    folder: Path, chunk: int, sync_s: float, pwm: PwmCalibration, faults: _Faults
+) -> Episode | None:
+    """One folder's episode, or None with a fault that says why."""
+    if folder.is_symlink() and not _inside(folder, folder.parent):
+        faults.add(folder, "path_leaves_folder", "the episode is a link to somewhere else")
+        return None
+    try:
+        present = any((folder / name).exists() for name in DATA_FILES)
+    except OSError as e:
+        faults.add(folder, "unreadable", e.strerror or type(e).__name__)
+        return None
+    if not present:
+        faults.add(folder, "no_data", f"none of {', '.join(DATA_FILES)} is there")
+        return None
+    label, tables = _read_tables(folder, faults)
+    controls = _read_controls(*tables["control_samples"], pwm, faults)
+    frames = _read_frames(folder, *tables["frame_samples"], faults)
+    if not controls or not frames:
+        faults.add(
+            folder,
+            "nothing_usable",
+            f"{len(controls)} usable controls and {len(frames)} usable frame entries",
+        )
+        return None
+    source = tables["control_samples"][0]
+    controls = _place_bursts(controls, source, faults)
+    samples = _make_samples(folder, frames, controls, chunk, sync_s, faults)
+    if not samples:
+        faults.add(folder, "nothing_usable", "no frame with a picture, an action and a known state")
+        return None
+    return Episode(
+        id=folder.name,
+        path=folder,
+        label=label,
+        duration_s=frames[-1].time_s - frames[0].time_s,
+        frames=len(tables["frame_samples"][1]),
+        controls=len(tables["control_samples"][1]),
+        samples=samples,
+    )
+
+
+def _read_tables(folder: Path, faults: _Faults) -> tuple[str, dict[str, tuple[Path, list]]]:
+    """The label, and for controls and frames the file that they came from and its rows: JSON if it has
+    them, else CSV.
+    """
+    content = _read_json(folder / "episode_data.json", faults)
+    label = content.get("action_label", "")
+    tables = {}
+    for key, name, fields in (
+        ("control_samples", "control_data.csv", CONTROL_FIELDS),
+        ("frame_samples", "frame_data.csv", FRAME_FIELDS),
+    ):
+        rows = content.get(key, [])
+        if not isinstance(rows, list):
+            faults.add(
+                folder / "episode_data.json", "wrong_type", f"{key} is a {type(rows).__name__}, not a list"
+            )
+            rows = []
+        if rows:
+            tables[key] = folder / "episode_data.json", rows
+        else:
+            tables[key] = folder / name, _read_csv(folder / name, fields, faults)
+    return label if isinstance(label, str) else "", tables
+
+
+def _read_bytes(path: Path, faults: _Faults) -> bytes | None:
+    """A data file's bytes; None, counted, if it is absent, empty, unreadable, or a link that leaves its
+    folder.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            faults.add(path, "unreadable", "not a file")
+            return None
+        if not _inside(path, path.parent):
+            faults.add(path, "path_leaves_folder", "a link to somewhere else")
+            return None
+        data = path.read_bytes()
+    except FileNotFoundError:
+        faults.add(path, "absent", "not there")
+        return None
+    except OSError as e:
+        faults.add(path, "unreadable", e.strerror or type(e).__name__)
+        return None
+    if not data.strip():
+        faults.add(path, "empty", "nothing in it")
+        return None
+    return data
+
+
+def _read_json(path: Path, faults: _Faults) -> dict[str, Any]:
+    data = _read_bytes(path, faults)
+    if data is None:
+        return {}
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError) as e:  # bad syntax or encoding, or brackets nested without end
+        faults.add(path, "broken_json", _shown(str(e)))
+        return {}
+    if not isinstance(content, dict):
+        faults.add(path, "wrong_type", f"holds a {type(content).__name__}, not an object")
+        return {}
+    return content
+
+
+def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict[str, Any]]:
+    data = _read_bytes(path, faults)
+    if data is None:
+        return []
+    table = csv.DictReader(data.decode("utf-8-sig", errors="replace").splitlines())
+    rows = []
+    try:
+        if missing := [name for name in fields if name not in (table.fieldnames or ())]:
+            faults.add(path, "wrong_header", f"no column {missing[0]}")
+            return []
+        rows.extend(table)
+    except csv.Error as e:
+        faults.add(path, "broken_csv", _shown(str(e)))
+    return rows
+
+
+def _number(value: object) -> float | None:
+    """A finite number from JSON or from a CSV's text; NaN for one that is not finite, None for another
+    type.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        return None
+    try:
+        found = float(value)
+    except OverflowError:
+        return math.nan
+    except ValueError:
+        return None
+    return found if math.isfinite(found) else math.nan
+
+
+def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults) -> list[_Control]:
+    """Usable readings, ordered by system time."""
+    controls = []
+    for i, row in enumerate(rows):
+        if not isinstance(row, dict):
+            faults.add(path, "wrong_type", f"control {i} is a {type(row).__name__}, not an object")
+            continue
+        values = {name: _number(row.get(name)) for name in CONTROL_FIELDS}
+        bad = [name for name, value in values.items() if value is None]
+        nan = [name for name, value in values.items() if value is not None and math.isnan(value)]
+        if bad:
+            faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {_shown(row.get(bad[0]))}")
+        if nan:
+            faults.add(path, "not_finite", f"control {i}: {nan[0]} is {_shown(row.get(nan[0]))}")
+        if "system_timestamp" in bad + nan:
+            continue  # without a time it can be no frame's action
+        actions = tuple(_read_action(name, values, i, path, pwm, faults) for name in ACTION_NAMES)
+        arduino_ms = values["arduino_timestamp"]
+        controls.append(
+            _Control(
+                values["system_timestamp"],
+                math.nan if arduino_ms is None else arduino_ms / 1000,
+                actions,
+            )
+        )
+    return _sorted_by_time(controls, [c.system_s for c in controls], path, "control", faults)
+
+
+def _read_action(
+    name: str, values: dict[str, float | None], i: int, path: Path, pwm: PwmCalibration, faults: _Faults
+) -> float | None:
+    """The recorded action of one channel, or None (counted) where it is no measurement."""
+    action, pulse_us, period_us = (values[f"{name}_{part}"] for part in ("normalized", "raw_us", "period_us"))
+    if any(v is None or math.isnan(v) for v in (action, pulse_us, period_us)):
+        return None  # counted by the caller, with the field's name
+    channel = pwm.channel(name)
+    expected = channel.action(pulse_us, period_us)
+    if expected is None:
+        kind = "zero_period" if period_us == 0 or pulse_us == 0 else "odd_period"
+        note = f"control {i}: pulse {pulse_us:g} us of {period_us:g} us; such values are missing, not 0"
+        faults.add(path, f"{name}_{kind}", note)
+        return None
+    if not channel.low <= action <= channel.high:
+        faults.add(path, f"{name}_out_of_range", f"control {i}: {action:g}")
+        return None
+    if abs(action - expected) > DISAGREES:
+        note = f"control {i}: {action:g} recorded, its pulse says {expected:.4f}; taken as recorded"
+        faults.add(path, f"{name}_disagrees_with_pulse", note)
+    return action
+
+
+def _sorted_by_time(items: list, times_s: list[float], path: Path, what: str, faults: _Faults) -> list:
+    """The items by time, stable; the steps back are counted."""
+    back = sum(b < a for a, b in pairwise(times_s))
+    faults.add(path, f"unsorted_{what}_times", f"{what}s were put in order of time", back)
+    return [items[i] for i in sorted(range(len(items)), key=times_s.__getitem__)]
+
+
+def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list[_Control]:
+    """Give the controls of a serial burst the times at which they were measured, or drop them."""
+    arduino_steps = [
+        b.arduino_s - a.arduino_s for a, b in pairwise(controls) if 0 < b.arduino_s - a.arduino_s < 1
+    ]
+    usual_s = float(np.median(arduino_steps)) if arduino_steps else 0.033
+    late = [b.system_s - a.system_s < BURST_SHARE * usual_s for a, b in pairwise(controls)] + [False]
+    placed: list[_Control] = []
+    moved = dropped = 0
+    farthest_s = 0.0
+    end = len(controls)
+    while end:
+        # one burst and the live control that ends it: late[start..end-2] and not late[end-1]
+        start = end - 1
+        while start and late[start - 1]:
+            start -= 1
+        run, end = controls[start:end], start
+        placed.append(run[-1])
+        if len(run) - 1 < BURST_MIN:
+            placed.extend(reversed(run[:-1]))
+            continue
+        for k in range(len(run) - 2, -1, -1):
+            control, after = run[k], run[k + 1]
+            step_s = after.arduino_s - control.arduino_s
+            if (
+                not step_s > 0
+            ):  # a restart, readings that were sent twice, or no number: before that the clock says nothing
+                dropped += k + 1
+                break
+            time_s = placed[-1].system_s - step_s
+            farthest_s = max(farthest_s, control.system_s - time_s)
+            placed.append(_Control(time_s, control.arduino_s, control.actions))
+            moved += 1
+    faults.add(
+        path,
+        "serial_burst",
+        f"placed by the Arduino's clock, up to {farthest_s:.2f} s before they arrived",
+        moved,
+    )
+    faults.add(
+        path, "serial_burst_dropped", "the Arduino's clock is missing, or steps back after them", dropped
+    )
+    return sorted(placed, key=lambda c: c.system_s)
+
+
+def _inside(path: Path, folder: Path) -> bool:
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+
+
+def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[_Frame]:
+    """The listed frames with a time, ordered by it; `usable` says whether there is a whole picture."""
+    frames: list[_Frame] = []
+    numbers: set[int] = set()
+    for i, row in enumerate(rows):
+        if not isinstance(row, dict):
+            faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
+            continue
+        number, time_s, name = (
+            _number(row.get("frame_id")),
+            _number(row.get("timestamp")),
+            row.get("image_path"),
+        )
+        if number is None or time_s is None or not isinstance(name, str) or not name:
+            faults.add(path, "wrong_type", f"frame {i}: {_shown({k: row.get(k) for k in FRAME_FIELDS})}")
+            continue
+        if math.isnan(number) or math.isnan(time_s):
+            faults.add(path, "not_finite", f"frame {i}: {_shown(row.get('timestamp'))}")
+            continue
+        if number in numbers:
+            faults.add(
+                path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts"
+            )
+            continue
+        numbers.add(number)
+        picture = folder / name.replace("\\", "/")
+        usable = _check_picture(folder, picture, name, path, faults)
+        frames.append(_Frame(int(number), time_s, picture, usable))
+    frames = _sorted_by_time(frames, [f.time_s for f in frames], path, "frame", faults)
+    kept = frames[:1]
+    for frame in frames[1:]:
+        if frame.time_s > kept[-1].time_s:
+            kept.append(frame)
+        else:
+            faults.add(
+                path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {kept[-1].number}"
+            )
+    return kept
+
+
+def _check_picture(folder: Path, picture: Path, name: str, path: Path, faults: _Faults) -> bool:
+    """Whether a listed picture is there, within the episode, and whole. Cheap: reads its two ends only."""
+    try:
+        if Path(name).is_absolute() or not _inside(picture, folder):
+            faults.add(path, "path_leaves_folder", f"{_shown(name)} is outside of the episode")
+            return False
+        if not stat.S_ISREG(picture.stat().st_mode):  # opening a pipe would wait for ever
+            faults.add(path, "frame_missing", f"{_shown(name)} is no file")
+            return False
+        with picture.open("rb") as f:
+            head = f.read(2)
+            f.seek(max(f.seek(0, os.SEEK_END) - JPEG_TAIL, 0))
+            problem = _jpeg_problem(head, f.read())
+    except (OSError, ValueError):  # not there, unreadable, a name too long, or with a zero byte in it
+        faults.add(path, "frame_missing", f"{_shown(name)} is listed but cannot be read")
+        return False
+    if problem:
+        faults.add(picture, "broken_jpeg", problem)
+        return False
+    return True
+
+
+def _jpeg_problem(head: bytes, tail: bytes) -> str | None:
+    """What is wrong with a JPEG's ends; cv2 gives a picture for a file that was cut short, and only warns."""
+    if head != b"\xff\xd8":
+        return "no JPEG: its start marker is missing"
+    if not tail.rstrip(b"\0").endswith(b"\xff\xd9"):
+        return "cut short: its end marker is missing"
+    return None
+
+
+def _actions_of(
+    frames: list[_Frame], controls: list[_Control], sync_s: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Each frame's action, (n, 2) float32; whether it has one, (n,); whether any control is near, (n,)."""
+    times_s = np.array([f.time_s for f in frames])
+    actions = np.zeros((len(frames), len(ACTION_NAMES)), np.float32)
+    known = np.ones(len(frames), bool)
+    for i in range(len(ACTION_NAMES)):
+        near, index = _nearest(
+            times_s, np.array([c.system_s for c in controls if c.actions[i] is not None]), sync_s
+        )
+        values = np.array([c.actions[i] for c in controls if c.actions[i] is not None], np.float32)
+        known &= near
+        if len(values):
+            actions[:, i] = np.where(near, values[index], 0)
+    near, _ = _nearest(times_s, np.array([c.system_s for c in controls]), sync_s)
+    return actions, known, near
+
+
+def _nearest(times_s: np.ndarray, sorted_s: np.ndarray, within_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """For each time the index of the nearest in `sorted_s`, and whether it is near enough."""
+    if not len(sorted_s):
+        return np.zeros(len(times_s), bool), np.zeros(len(times_s), int)
+    after = np.searchsorted(sorted_s, times_s).clip(1, max(len(sorted_s) - 1, 1)).clip(0, len(sorted_s) - 1)
+    before = (after - 1).clip(0)
+    index = np.where(np.abs(sorted_s[before] - times_s) <= np.abs(sorted_s[after] - times_s), before, after)
+    return np.abs(sorted_s[index] - times_s) <= within_s, index
+
+
+def _make_samples(
+    folder: Path, frames: list[_Frame], controls: list[_Control], chunk: int, sync_s: float, faults: _Faults
+) -> tuple[Sample, ...]:
+    actions, known, near = _actions_of(frames, controls, sync_s)
+    if not near.any():
+        gap_s = min(
+            abs(frames[0].time_s - controls[-1].system_s), abs(controls[0].system_s - frames[-1].time_s)
+        )
+        faults.add(folder, "no_overlap", f"frames and controls are {gap_s:.1f} s apart")
+        return ()
+    faults.add(folder, "frame_without_control", f"no control within {sync_s * 1000:g} ms", int((~near).sum()))
+    note = f"controls near, but without a measured pulse within {sync_s * 1000:g} ms"
+    faults.add(folder, "frame_without_measurement", note, int((near & ~known).sum()))
+
+    times_s = np.array([f.time_s for f in frames])
+    steps_s = np.diff(times_s)
+    holes = (
+        np.flatnonzero(steps_s > HOLE_INTERVALS * np.median(steps_s)) + 1
+        if len(steps_s)
+        else np.array([], int)
+    )
+    note = f"more than {HOLE_INTERVALS:g} times the usual interval between two frames"
+    faults.add(folder, "hole_in_time", note, len(holes))
+
+    samples: list[Sample] = []
+    unknown_state = 0
+    for segment in _segments(known, set(holes.tolist())):
+        n = len(segment)
+        index = np.arange(n)[:, None] + np.arange(chunk)
+        chunks, pads = actions[segment][np.minimum(index, n - 1)], index >= n
+        for k, i in enumerate(segment):
+            if not frames[i].usable:
+                continue
+            if k == 0 and i > 0:
+                unknown_state += 1
+                continue
+            state = actions[i - 1] if k else np.asarray(NEUTRAL, np.float32)
+            samples.append(
+                Sample(
+                    episode=folder.name,
+                    frame_path=frames[i].path,
+                    time_s=float(times_s[i] - times_s[0]),
+                    state=state.copy(),
+                    chunk=chunks[k].copy(),
+                    is_pad=pads[k].copy(),
+                )
+            )
+    faults.add(folder, "frame_without_state", "the previous frame's action is not known", unknown_state)
+    return tuple(samples)
+
+
+def _segments(known: np.ndarray, holes: set[int]) -> list[list[int]]:
+    """Runs of frames with actions and without a hole in time, as lists of indices."""
+    runs: list[list[int]] = []
+    for i in np.flatnonzero(known).tolist():
+        if runs and runs[-1][-1] == i - 1 and i not in holes:
+            runs[-1].append(i)
+        else:
+            runs.append([i])
+    return runs
+
+
+def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -> Split:
+    """Part the samples by whole episodes, at random by `seed`; half of the held-out share chooses, half
+    judges.
+
+    With fewer than three episodes, each is parted along its time instead (calibration first), with a gap of
+    one chunk between the parts, so that no action is in two of them; `note` says so. Raises EpisodeError for
+    a share outside (0, 1) or recordings too short to be parted.
+    """
+    if not 0 < held_out_share < 1:
+        raise EpisodeError(f"held_out_share must be between 0 and 1, found {held_out_share}")
+    episodes = recordings.episodes
+    if len(episodes) < 3:
+        return _split_by_time(episodes, held_out_share)
+    count = min(max(round(len(episodes) * held_out_share), 2), len(episodes) - 1)
+    order = np.random.default_rng(seed).permutation(len(episodes)).tolist()
+    parts = {
+        "calibration": sorted(order[count:]),
+        "choosing": sorted(order[: count // 2]),
+        "held_out": sorted(order[count // 2 : count]),
+    }
+    note = None
+    if abs(count / len(episodes) - held_out_share) > 0.1:
+        note = f"only {len(episodes)} episodes: {count} of them are held out, not {held_out_share:.0%}"
+    return Split(
+        **{part: tuple(s for i in indices for s in episodes[i].samples) for part, indices in parts.items()},
+        note=note,
+        episodes={part: [episodes[i].id for i in indices] for part, indices in parts.items()},
+    )
+
+
+def _split_by_time(episodes: tuple[Episode, ...], held_out_share: float) -> Split:
+    parts: dict[str, list[Sample]] = {"calibration": [], "choosing": [], "held_out": []}
+    for episode in episodes:
+        samples = episode.samples
+        gap = len(samples[0].chunk)
+        left = len(samples) - 2 * gap
+        if left < 3:
+            continue  # too short to give anything away between the parts
+        held = min(max(round(left * held_out_share), 2), left - 1)
+        first, second = left - held, held // 2
+        parts["calibration"] += samples[:first]
+        parts["choosing"] += samples[first + gap : first + gap + second]
+        parts["held_out"] += samples[first + gap + second + gap :]
+    if not parts["held_out"]:
+        lengths = ", ".join(f"{e.id}: {len(e.samples)}" for e in episodes)
+        raise EpisodeError(
+            f"{len(episodes)} episode(s) are too short to be parted (samples: {lengths}): "
+            "record at least three episodes, or a longer one"
+        )
+    return Split(
+        **{part: tuple(samples) for part, samples in parts.items()},
+        note=f"only {len(episodes)} episode(s): parted along time, with a gap of one chunk between",
+        episodes={part: sorted({s.episode for s in samples}) for part, samples in parts.items()},
+    )
+
+
+def choose_calibration(
+    samples: tuple[Sample, ...], count: int = 200, seed: int = 0
+) -> tuple[tuple[Sample, ...], str | None]:
+    """At most `count` samples that cover the recorded actions, in the order given; the same ones for the
+    same seed.
+
+    Half are farthest points of (state, actions along the chunk), each action divided by its own spread: an
+    observer must see the extremes, and throttle's are a tenth of steering's. The other half is drawn at
+    random from the rest: it must also see what is usual. The note says when there were fewer than asked.
+    Raises EpisodeError for no samples or a count below 1.
+    """
+    if not samples or count < 1:
+        raise EpisodeError(
+            f"cannot choose {count} of {len(samples)} samples for calibration: record more episodes"
+        )
+    if len(samples) <= count:
+        fewer = len(samples) < count
+        note = (
+            f"asked for {count} calibration samples, found only {len(samples)}: all are used"
+            if fewer
+            else None
+        )
+        return tuple(samples), note
+    rng = np.random.default_rng(seed)
+    steps = np.unique(np.linspace(0, len(samples[0].chunk) - 1, 4).round().astype(int))
+    points = np.stack([np.concatenate([s.state[None], s.chunk[steps]]) for s in samples]).astype(np.float64)
+    spread = points.reshape(-1, points.shape[-1]).std(axis=0)
+    points = (points / np.where(spread > 0, spread, 1)).reshape(len(samples), -1)
+    chosen = [int(rng.integers(len(samples)))]
+    distance = np.full(len(samples), np.inf)
+    while len(chosen) < (count + 1) // 2:
+        distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+        distance[chosen] = -1  # equal points must not be taken twice
+        chosen.append(int(distance.argmax()))
+    rest = np.setdiff1d(np.arange(len(samples)), chosen)
+    chosen += rng.choice(rest, count - len(chosen), replace=False).tolist()
+    return tuple(samples[i] for i in sorted(chosen)), None
