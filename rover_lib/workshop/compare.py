@@ -1,0 +1,345 @@
+"""What quantization changed: the same frames through every artifact, differences in units that the car feels.
+
+    report = fidelity(fp32, {"static": static}, split.held_out, recordings.action_range())
+    found = metrics(report, policies, trials, driven)
+    gates(found, params()["gates"])
+
+Errors are absolute differences to the FP32 artifact, never to the recorded action: how well the policy
+imitates is another question, whose answer (`recorded_error`) is given beside it as a yardstick.
+Padding: a sample near its episode's end has fewer recorded actions than a chunk is long. Both policies plan
+the whole chunk all the same and the car would drive it, so every step counts in `mae`; `mae_recorded_steps`
+counts only the steps that were recorded, and the error against the recording knows no others.
+"""
+
+import math
+import operator
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.errors import PolicyError, PwmError
+from rover_lib.onboard.policy import Policy, load_policy
+from rover_lib.onboard.pwm import PwmCalibration
+
+MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
+ARTIFACTS = ("fp32", *MODES, "static_affine")
+GATED = "static"  # the mode that a Pi is meant to run, and that the gates judge
+
+RELATIONS = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
+
+Progress = Callable[..., Iterable] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What a policy saw somewhere else than in a recording, say in a driven world. state: (S,) float32."""
+
+    frame: np.ndarray  # (h, w, 3) uint8 BGR
+    state: np.ndarray
+
+    def frame_bgr(self) -> np.ndarray:
+        return self.frame
+
+
+@dataclass(frozen=True, eq=False)
+class WorstFrame:
+    """A frame on which a mode differs most from FP32. Chunks (C, A) float32; error_pct: mean of its steps."""
+
+    mode: str
+    action: str
+    index: int
+    error_pct: float
+    sample: Any
+    reference: np.ndarray
+    other: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Fidelity:
+    """Chunks of every artifact on the same n frames.
+
+    reference: (n, C, A) float32 of FP32; chunks: the same by mode; recorded: (n, C, A), or None where nobody
+    drove; is_pad: (n, C) bool, steps after the end of the recording; action_range: name -> (least, most).
+    """
+
+    action_names: tuple[str, ...]
+    action_range: dict[str, tuple[float, float]]
+    samples: tuple[Any, ...]
+    reference: np.ndarray
+    chunks: dict[str, np.ndarray]
+    recorded: np.ndarray | None
+    is_pad: np.ndarray
+
+    def errors(self, mode: str) -> np.ndarray:
+        """(n, C, A) float64 absolute difference to FP32, in units of the action."""
+        return np.abs(self.chunks[mode].astype(np.float64) - self.reference)
+
+    def pct(self, action: str) -> float:
+        """One unit of an action in percent of its recorded range; NaN if the recording never moved it."""
+        low, high = self.action_range[action]
+        return 100 / (high - low) if high > low else math.nan
+
+    def us(self, action: str) -> float:
+        """What one unit of an action is in microseconds of pulse; NaN for an action that is no servo's."""
+        return us_per_unit(action)
+
+    def per_step_pct(self, mode: str) -> np.ndarray:
+        """(C, A) mean error of each step of the chunk, in percent of the recorded range."""
+        return self.errors(mode).mean(0) * [self.pct(a) for a in self.action_names]
+
+    def summary(self, mode: str) -> dict[str, Any]:
+        """Everything about one mode, keys by action name and unit."""
+        found: dict[str, Any] = {}
+        errors = self.errors(mode)
+        for i, action in enumerate(self.action_names):
+            e, pct, us = errors[..., i], self.pct(action), self.us(action)
+            found[f"{action}_mae_pct"] = e.mean() * pct
+            found[f"{action}_p95_pct"] = np.quantile(e, 0.95) * pct
+            found[f"{action}_max_pct"] = e.max() * pct
+            found[f"{action}_mae_recorded_steps_pct"] = e[~self.is_pad].mean() * pct
+            found[f"{action}_mae_per_step_pct"] = e.mean(0) * pct
+            if math.isfinite(us):
+                found[f"{action}_mae_us"] = e.mean() * us
+                found[f"{action}_p95_us"] = np.quantile(e, 0.95) * us
+                found[f"{action}_max_us"] = e.max() * us
+        return found | self.recorded_error(self.chunks[mode])
+
+    def recorded_error(self, chunks: np.ndarray) -> dict[str, float]:
+        """How far plans (n, C, A) are from what the driver did, mean over the recorded steps."""
+        if self.recorded is None:
+            return {}
+        e = np.abs(chunks.astype(np.float64) - self.recorded)[~self.is_pad].mean(0)
+        return {f"{a}_vs_recorded_pct": e[i] * self.pct(a) for i, a in enumerate(self.action_names)}
+
+    def worst(self, mode: str, count: int = 3) -> list[WorstFrame]:
+        """The `count` frames with the largest mean error over the plan, in whichever action, worst first."""
+        pct = [self.pct(a) for a in self.action_names]
+        per_frame = np.nan_to_num(self.errors(mode).mean(1) * pct)  # (n, A)
+        order = np.argsort(-per_frame.max(1), kind="stable")[:count]
+        return [
+            WorstFrame(
+                mode,
+                self.action_names[int(per_frame[i].argmax())],
+                int(i),
+                float(per_frame[i].max()),
+                self.samples[i],
+                self.reference[i],
+                self.chunks[mode][i],
+            )
+            for i in order
+        ]
+
+
+def us_per_unit(action: str) -> float:
+    """Microseconds of pulse per unit of an action; NaN for an action that is no servo's."""
+    try:
+        return PwmCalibration().us_per_unit(action)
+    except PwmError:
+        return math.nan
+
+
+def artifacts(run_dir: Path | str) -> dict[str, Path]:
+    """The artifacts of a run by mode, in the order of ARTIFACTS; those that are not there are left out."""
+    found = {mode: Path(run_dir) / f"policy_{mode}.pt" for mode in ARTIFACTS}
+    return {mode: path for mode, path in found.items() if path.is_file()}
+
+
+def load_policies(run_dir: Path | str, threads: int | None = None) -> dict[str, Policy]:
+    """Every artifact of a run, loaded and checked as on the Pi. ArtifactError for one that does not pass."""
+    found = {mode: load_policy(path, threads=threads) for mode, path in artifacts(run_dir).items()}
+    if "fp32" not in found:
+        raise PolicyError(f"{run_dir}: no policy_fp32.pt in it (found {sorted(found)}); run notebook 03")
+    return found
+
+
+def hashes(run_dir: Path | str) -> dict[str, str]:
+    """Content hash of every artifact of a run, by file name: what a comparison or benchmark was made of."""
+    return {path.name: content_hash(path) for path in artifacts(run_dir).values()}
+
+
+def thinned(samples: Sequence[Any], at_most: int) -> tuple[Any, ...]:
+    """At most that many of the samples, evenly spaced, first and last among them."""
+    if len(samples) <= at_most:
+        return tuple(samples)
+    return tuple(samples[i] for i in np.linspace(0, len(samples) - 1, at_most).round().astype(int))
+
+
+def driven(trials: Mapping[str, Any], at_most: int = 200) -> tuple[Observation, ...]:
+    """Observations from the (frame_bgr, state) that trial reports kept: places no recording went to."""
+    frames = [frame for trial in trials.values() for frame in trial.frames]
+    return tuple(
+        Observation(frame, np.asarray(state, np.float32)) for frame, state in thinned(frames, at_most)
+    )
+
+
+def fidelity(
+    reference: Any,
+    others: Mapping[str, Any],
+    samples: Sequence[Any],
+    action_range: Mapping[str, tuple[float, float]],
+    progress: Progress = None,
+) -> Fidelity:
+    """Run every policy on every sample.
+
+    reference, others: policies with predict_chunk(frame_bgr, state) -> (C, A), chunk and action_names.
+    samples: with frame_bgr() and state; chunk (C, A) and is_pad (C,) where there is a recording.
+    action_range: name -> (least, most). progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
+    Raises PolicyError for no samples, policies of other actions or chunks, or an action without a range.
+    """
+    names = tuple(reference.action_names)
+    if not samples:
+        raise PolicyError("there are no frames to compare on; record more, or hold out a larger share")
+    for mode, policy in others.items():
+        if (tuple(policy.action_names), policy.chunk) != (names, reference.chunk):
+            raise PolicyError(
+                f"{mode} plans {policy.chunk} steps of {list(policy.action_names)}, FP32 {reference.chunk} "
+                f"of {list(names)}; compare artifacts of one checkpoint"
+            )
+    if missing := [n for n in names if n not in action_range]:
+        raise PolicyError(
+            f"no recorded range of action {missing} (found {sorted(action_range)}); use other recordings"
+        )
+    expected, found = [], {mode: [] for mode in others}
+    for sample in progress(samples, desc="comparing", total=len(samples)) if progress else samples:
+        frame = sample.frame_bgr()
+        expected.append(reference.predict_chunk(frame, sample.state))
+        for mode, policy in others.items():
+            found[mode].append(policy.predict_chunk(frame, sample.state))
+    recorded = all(getattr(s, "chunk", None) is not None for s in samples)
+    pads = [s.is_pad for s in samples] if recorded else np.zeros((len(samples), reference.chunk), bool)
+    return Fidelity(
+        action_names=names,
+        action_range={n: (float(action_range[n][0]), float(action_range[n][1])) for n in names},
+        samples=tuple(samples),
+        reference=np.stack(expected),
+        chunks={mode: np.stack(chunks) for mode, chunks in found.items()},
+        recorded=np.stack([s.chunk for s in samples]) if recorded else None,
+        is_pad=np.asarray(pads, bool),
+    )
+
+
+def metrics(
+    report: Fidelity,
+    policies: Mapping[str, Any],
+    trials: Mapping[str, Any] | None = None,
+    on_drives: Fidelity | None = None,
+) -> dict[str, Any]:
+    """The metrics of compare.json: fp32, modes and what they were measured on.
+
+    policies: "fp32" and the modes, with .path and .manifest. trials: reports by mode (hits, trials,
+    wilson); modes that were not driven have None, not 0. on_drives: fidelity on the frames of those drives.
+    Sizes are artifact files on both sides, weights with weights: no optimizer state, no training-only part.
+    """
+    trials = trials or {}
+
+    def common(mode: str) -> dict[str, Any]:
+        trial = trials.get(mode)
+        low, high = trial.wilson if trial else (None, None)
+        return {
+            "hits": trial.hits if trial else None,
+            "trials": trial.trials if trial else None,
+            "hits_wilson_low": low,
+            "hits_wilson_high": high,
+            "size_mb": policies[mode].path.stat().st_size / 1e6,
+            "weights_mb": policies[mode].manifest["weights_mb"],
+        }
+
+    modes = {}
+    for mode in report.chunks:
+        modes[mode] = common(mode) | report.summary(mode)
+        modes[mode]["size_ratio"] = common("fp32")["size_mb"] / modes[mode]["size_mb"]
+        if on_drives is not None:
+            modes[mode]["driven"] = on_drives.summary(mode)
+    return {
+        "fp32": common("fp32") | report.recorded_error(report.reference),
+        "modes": modes,
+        "action_range": report.action_range,
+        "frames": len(report.samples),
+        "padded_steps_pct": 100 * report.is_pad.mean(),
+        "driven_frames": len(on_drives.samples) if on_drives else 0,
+        "worst": [_plain_worst(w) for mode in report.chunks for w in report.worst(mode)],
+    }
+
+
+def _plain_worst(worst: WorstFrame) -> dict[str, Any]:
+    path = getattr(worst.sample, "frame_path", None)
+    return {
+        "mode": worst.mode,
+        "action": worst.action,
+        "error_pct": worst.error_pct,
+        "episode": getattr(worst.sample, "episode", None),
+        "frame": path.name if path else None,
+        "fp32": worst.reference,
+        "int8": worst.other,
+    }
+
+
+def gate(name: str, found: float | None, relation: str, limit: Any, promised_by: str) -> dict[str, Any]:
+    """One row of the gates' table. passed is None where nothing was measured: no pass, no failure."""
+    if found is None or (isinstance(found, float) and math.isnan(found)):
+        found = passed = None
+    else:
+        passed = bool(RELATIONS[relation](found, limit))
+    return {
+        "gate": name,
+        "relation": relation,
+        "limit": limit,
+        "found": found,
+        "passed": passed,
+        "promised_by": promised_by,
+    }
+
+
+def gates(found: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GATED) -> list[dict[str, Any]]:
+    """The gates of params.yml that a comparison can judge. found: `metrics`; limits: params.yml's `gates`.
+
+    The error gates are for every action that the policy has and params.yml names, as `<action>_mae_pct`.
+    """
+    fp32, judged = found["fp32"], found["modes"][mode]
+    rows = [
+        gate(f"{mode} {key}", judged[key], "<=", limits[key], "this project")
+        for key in judged
+        if key.endswith("_mae_pct") and key in limits
+    ]
+    lost = None if fp32["hits"] is None or judged["hits"] is None else fp32["hits"] - judged["hits"]
+    rows += [
+        gate("fp32 hits", fp32["hits"], ">=", limits["fp32_hits"], "this project"),
+        gate(f"{mode} hits lost", lost, "<=", limits["hits_lost"], "this project"),
+        gate(f"{mode} size_mb", judged["size_mb"], "<=", limits["size_full_mb"], "this project"),
+    ]
+    original = limits["original"]
+    losses = [v for k, v in judged.items() if k.endswith("_mae_pct") and not math.isnan(v)]
+    loss = max(losses, default=None)
+    rows += [
+        gate(f"{mode} model_size_mb", judged["size_mb"], "<=", original["model_size_mb"], "the original"),
+        gate(f"{mode} accuracy_loss_pct", loss, "<=", original["accuracy_loss_pct"], "the original"),
+    ]
+    return rows
+
+
+def speed_gates(found: Mapping[str, Any], limits: Mapping[str, Any], where: str = "") -> list[dict[str, Any]]:
+    """The gates of the original's table that a benchmark can judge.
+
+    found: one artifact's metrics of benchmark-<host>.json. limits: params.yml's `gates`. where: a host.
+    Of the promised ranges the bound that hurts is the gate: a latency below 20 ms would not fail anybody.
+    """
+    o = limits["original"]
+    rows = [
+        ("latency_mean_ms", "<=", o["latency_mean_ms"][1]),
+        ("latency_p95_ms", "<=", o["latency_p95_ms"][1]),
+        ("throughput_fps", ">=", o["throughput_fps"][0]),
+        ("control_rate_hz", ">=", o["control_rate_hz"][0]),
+        ("peak_memory_mb", "<=", o["memory_mb"]),
+        ("cpu_pct", "<=", o["cpu_pct"]),
+        ("temperature_c", "<=", o["temperature_c"]),
+        ("throttled", "==", o["throttled"]),
+    ]
+    prefix = f"{where} " if where else ""
+    return [
+        gate(f"{prefix}{key}", found.get(key), relation, limit, "the original")
+        for key, relation, limit in rows
+    ]

@@ -1,0 +1,256 @@
+"""The comparison against values computed by hand."""
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rover_lib.onboard.errors import PolicyError
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.workshop import compare
+
+CHUNK = 3
+RANGE = {"steering": (-0.2, 0.6), "throttle": (0.0, 0.1)}
+LIMITS = {
+    "steering_mae_pct": 1.0,
+    "throttle_mae_pct": 1.0,
+    "hits_lost": 2,
+    "fp32_hits": 36,
+    "size_full_mb": 70,
+    "original": {
+        "latency_mean_ms": [20, 40],
+        "latency_p95_ms": [30, 50],
+        "throughput_fps": [25, 50],
+        "control_rate_hz": [22, 35],
+        "model_size_mb": 100,
+        "memory_mb": 500,
+        "cpu_pct": 80,
+        "accuracy_loss_pct": 5,
+        "temperature_c": 80,
+        "throttled": "0x0",
+    },
+}
+
+
+class Fixed:
+    """A policy that plans base, plus `off` once per frame that it has seen before."""
+
+    chunk = CHUNK
+
+    def __init__(self, base, off=None, names=("steering", "throttle")):
+        self.base, self.off, self.action_names = np.float32(base), off, names
+        self.calls = 0
+
+    def predict_chunk(self, frame_bgr, state):
+        off = 0 if self.off is None else self.off[self.calls]
+        self.calls += 1
+        return self.base + np.float32(off)
+
+
+def sample(pads=0, recorded=((0, 0),) * CHUNK):
+    is_pad = np.arange(CHUNK) >= CHUNK - pads
+    frame = np.zeros((4, 6, 3), np.uint8)
+    return SimpleNamespace(
+        frame_bgr=lambda: frame,
+        state=np.zeros(2, np.float32),
+        chunk=np.float32(recorded),
+        is_pad=is_pad,
+        frame_path=Path("episode/frames/frame_000001.jpg"),
+        episode="episode",
+    )
+
+
+@pytest.fixture
+def report():
+    """Steering is 0.008 off (1 % of its range) in the first step of frame 2, throttle 0.001 everywhere."""
+    base = [[0.1, 0.05], [0.2, 0.05], [0.3, 0.05]]
+    off = [np.full((3, 2), [0, 0.001]), np.float64([[0.008, 0.001], [0, 0.001], [0, 0.001]])]
+    return compare.fidelity(Fixed(base), {"static": Fixed(base, off)}, [sample(), sample(pads=2)], RANGE)
+
+
+def test_errors_by_hand(report):
+    found = report.summary("static")
+    assert found["steering_mae_pct"] == pytest.approx(0.008 / 6 / 0.8 * 100, rel=1e-4)
+    assert found["throttle_mae_pct"] == pytest.approx(1.0, rel=1e-4)
+    assert found["steering_max_pct"] == pytest.approx(1.0, rel=1e-4)
+    assert found["steering_mae_per_step_pct"] == pytest.approx([0.5, 0, 0], abs=1e-4)
+    # 0.001 of throttle is 0.058 % of a 1016 us period
+    assert found["throttle_mae_us"] == pytest.approx(0.001 * 0.5819 * 1016, rel=1e-4)
+    assert found["steering_mae_us"] == pytest.approx(0.008 / 6 * 0.02607 * 21316, rel=1e-4)
+
+
+def test_padded_steps_count_in_the_plan_but_not_against_the_recording(report):
+    found = report.summary("static")
+    assert report.is_pad.sum() == 2
+    assert found["steering_mae_recorded_steps_pct"] == pytest.approx(0.008 / 4 / 0.8 * 100, rel=1e-4)
+    # FP32 against a recorded (0, 0): steps 0.1, 0.2, 0.3 of frame 1 and 0.1 of frame 2
+    assert report.recorded_error(report.reference)["steering_vs_recorded_pct"] == pytest.approx(
+        0.7 / 4 / 0.8 * 100, rel=1e-4
+    )
+
+
+def test_worst_frame_comes_first_and_keeps_both_plans(report):
+    first, second = report.worst("static", 5)
+    assert (first.index, second.index) == (0, 1)  # equal throttle errors: the order is the recording's
+    assert first.action == "throttle" and first.error_pct == pytest.approx(1.0, rel=1e-4)
+    assert np.abs(first.other - first.reference)[:, 1] == pytest.approx([0.001] * 3, rel=1e-3)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.lists(st.floats(-1, 1, width=32), min_size=6, max_size=6), st.integers(1, 4), st.integers(0, 2))
+def test_a_policy_does_not_differ_from_itself(values, frames, pads):
+    base = np.reshape(values, (3, 2))
+    found = compare.fidelity(Fixed(base), {"static": Fixed(base)}, [sample(pads)] * frames, RANGE).summary(
+        "static"
+    )
+    numbers = {k: np.max(v) for k, v in found.items() if "vs_recorded" not in k}
+    assert numbers and all(v == 0 for v in numbers.values())
+
+
+def test_an_action_that_never_moved_has_no_share_of_its_range():
+    base = np.zeros((3, 2))
+    found = compare.fidelity(Fixed(base), {"static": Fixed(base)}, [sample()], RANGE | {"throttle": (0, 0)})
+    assert math.isnan(found.summary("static")["throttle_mae_pct"])
+    assert found.summary("static")["throttle_mae_us"] == 0
+    assert len(found.worst("static")) == 1
+
+
+def test_other_actions_are_keyed_by_name_and_have_no_pulses():
+    names = ("action_0", "action_1")
+    policy, other = Fixed(np.zeros((3, 2)), names=names), Fixed(np.zeros((3, 2)), names=names)
+    found = compare.fidelity(policy, {"static": other}, [sample()], dict.fromkeys(names, (0, 1))).summary(
+        "static"
+    )
+    assert found["action_0_mae_pct"] == 0
+    assert not [k for k in found if k.endswith("_us")]
+
+
+@pytest.mark.parametrize(
+    ("samples", "other", "ranges", "words"),
+    [
+        ([], Fixed(np.zeros((3, 2))), RANGE, "no frames"),
+        ([sample()], Fixed(np.zeros((3, 2)), names=("a", "b")), RANGE, "one checkpoint"),
+        ([sample()], Fixed(np.zeros((3, 2))), {"steering": (0, 1)}, "throttle"),
+    ],
+)
+def test_refusals_are_sentences(samples, other, ranges, words):
+    with pytest.raises(PolicyError, match=words):
+        compare.fidelity(Fixed(np.zeros((3, 2))), {"static": other}, samples, ranges)
+
+
+def test_thinned_keeps_first_and_last():
+    assert compare.thinned(range(100), 4) == (0, 33, 66, 99)
+    assert compare.thinned(range(3), 4) == (0, 1, 2)
+
+
+def test_frames_of_drives_become_observations():
+    frame = np.zeros((4, 6, 3), np.uint8)
+    trial = SimpleNamespace(frames=[(frame, np.array([0.1, 0.2]))] * 3)
+    seen = compare.driven({"fp32": trial, "static": trial}, at_most=4)
+    assert len(seen) == 4 and seen[0].frame_bgr() is frame and seen[0].state.dtype == np.float32
+    base = np.zeros((3, 2))
+    on_drives = compare.fidelity(Fixed(base), {"static": Fixed(base)}, seen, RANGE)
+    assert on_drives.recorded is None and not on_drives.is_pad.any()
+
+
+@pytest.fixture
+def policies(tmp_path):
+    made = {}
+    for mode, size in (("fp32", 4_000_000), ("static", 1_000_000)):
+        path = tmp_path / f"policy_{mode}.pt"
+        path.write_bytes(bytes(size))
+        made[mode] = SimpleNamespace(path=path, manifest={"weights_mb": size / 1e6})
+    return made
+
+
+def test_metrics_have_the_promised_keys(report, policies):
+    trials = {
+        m: SimpleNamespace(hits=h, trials=40, wilson=(0.8, 1.0)) for m, h in (("fp32", 40), ("static", 39))
+    }
+    found = compare.metrics(report, policies, trials, on_drives=report)
+    assert {"hits", "trials", "size_mb"} <= found["fp32"].keys()
+    static = found["modes"]["static"]
+    wanted = {"hits", "trials", "size_mb"}
+    wanted |= {f"{a}_mae_{unit}" for a in ("steering", "throttle") for unit in ("pct", "us")}
+    assert wanted <= static.keys()
+    assert (static["hits"], static["trials"], static["size_mb"], static["size_ratio"]) == (39, 40, 1.0, 4.0)
+    assert static["driven"]["throttle_mae_pct"] == static["throttle_mae_pct"]
+    assert found["padded_steps_pct"] == pytest.approx(100 / 3)
+
+
+def test_what_was_not_driven_is_none_not_zero(report, policies):
+    found = compare.metrics(report, policies)
+    assert found["fp32"]["hits"] is None and found["modes"]["static"]["hits"] is None
+    rows = {r["gate"]: r for r in compare.gates(found, LIMITS)}
+    assert rows["fp32 hits"]["passed"] is None and rows["static hits lost"]["passed"] is None
+
+
+def metrics_of(**changed):
+    static = {"steering_mae_pct": 0.3, "throttle_mae_pct": 0.7, "hits": 38, "size_mb": 66.4} | changed
+    return {"fp32": {"hits": 40}, "modes": {"static": static}}
+
+
+def test_gates_pass():
+    rows = compare.gates(metrics_of(), LIMITS)
+    assert len(rows) == 7 and all(r["passed"] is True for r in rows)
+
+
+@pytest.mark.parametrize(
+    ("changed", "failing"),
+    [
+        ({"throttle_mae_pct": 1.01}, {"static throttle_mae_pct"}),
+        ({"steering_mae_pct": 5.5}, {"static steering_mae_pct", "static accuracy_loss_pct"}),
+        ({"hits": 37}, {"static hits lost"}),
+        ({"size_mb": 266.0}, {"static size_mb", "static model_size_mb"}),
+    ],
+)
+def test_gates_fail(changed, failing):
+    assert {r["gate"] for r in compare.gates(metrics_of(**changed), LIMITS) if not r["passed"]} == failing
+
+
+def test_gates_are_exact_at_the_limit_and_blind_to_nan():
+    rows = {
+        r["gate"]: r
+        for r in compare.gates(metrics_of(throttle_mae_pct=1.0, steering_mae_pct=math.nan), LIMITS)
+    }
+    assert rows["static throttle_mae_pct"]["passed"] is True
+    assert rows["static steering_mae_pct"]["passed"] is None
+    assert rows["static accuracy_loss_pct"]["found"] == 1.0
+
+
+def test_speed_gates_take_the_bound_that_hurts():
+    found = {
+        "latency_mean_ms": 12.0,  # faster than the promised 20 to 40: passes
+        "latency_p95_ms": 51.0,
+        "throughput_fps": 25.0,
+        "control_rate_hz": 21.9,
+        "peak_memory_mb": 400.0,
+        "cpu_pct": 80.0,
+        "temperature_c": None,  # no sensor here
+        "throttled": "0x50000",
+    }
+    passed = {r["gate"]: r["passed"] for r in compare.speed_gates(found, LIMITS)}
+    assert passed == {
+        "latency_mean_ms": True,
+        "latency_p95_ms": False,
+        "throughput_fps": True,
+        "control_rate_hz": False,
+        "peak_memory_mb": True,
+        "cpu_pct": True,
+        "temperature_c": None,
+        "throttled": False,
+    }
+
+
+def test_us_per_unit_is_the_calibrations():
+    assert compare.us_per_unit("throttle") == PwmCalibration().us_per_unit("throttle")
+    assert math.isnan(compare.us_per_unit("gripper"))
+
+
+def test_a_run_without_fp32_is_refused(tmp_path):
+    with pytest.raises(PolicyError, match="notebook 03"):
+        compare.load_policies(tmp_path)
