@@ -46,6 +46,7 @@ BURST_SHARE = 0.3  # arriving within this share of the usual interval means: bot
 BURST_MIN = 3  # fewer than this is jitter of the USB line, less than `sync_s`, and left alone
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged, two in a row are a hole in time
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
+LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
 DISAGREES = 1e-3  # recorded action against the one computed from its pulse; the recordings hold 5e-5
 
 
@@ -401,7 +402,7 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict
 
 
 def _number(value: object) -> float | None:
-    """A finite number from JSON or from a CSV's text; NaN for one that is not finite, None for another
+    """A finite number from JSON or from a CSV's text; NaN for one that is none or absurd, None for another
     type.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
@@ -412,7 +413,7 @@ def _number(value: object) -> float | None:
         return math.nan
     except ValueError:
         return None
-    return found if math.isfinite(found) else math.nan
+    return found if abs(found) < LARGEST else math.nan
 
 
 def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults) -> list[_Control]:
@@ -427,28 +428,22 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
         nan = [name for name, value in values.items() if value is not None and math.isnan(value)]
         if bad:
             faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {_shown(row.get(bad[0]))}")
+            continue  # such a row was not written by the recorder: nothing in it can be trusted
         if nan:
             faults.add(path, "not_finite", f"control {i}: {nan[0]} is {_shown(row.get(nan[0]))}")
-        if "system_timestamp" in bad + nan:
+        if "system_timestamp" in nan:
             continue  # without a time it can be no frame's action
         actions = tuple(_read_action(name, values, i, path, pwm, faults) for name in ACTION_NAMES)
-        arduino_ms = values["arduino_timestamp"]
-        controls.append(
-            _Control(
-                values["system_timestamp"],
-                math.nan if arduino_ms is None else arduino_ms / 1000,
-                actions,
-            )
-        )
+        controls.append(_Control(values["system_timestamp"], values["arduino_timestamp"] / 1000, actions))
     return _sorted_by_time(controls, [c.system_s for c in controls], path, "control", faults)
 
 
 def _read_action(
-    name: str, values: dict[str, float | None], i: int, path: Path, pwm: PwmCalibration, faults: _Faults
+    name: str, values: dict[str, float], i: int, path: Path, pwm: PwmCalibration, faults: _Faults
 ) -> float | None:
     """The recorded action of one channel, or None (counted) where it is no measurement."""
     action, pulse_us, period_us = (values[f"{name}_{part}"] for part in ("normalized", "raw_us", "period_us"))
-    if any(v is None or math.isnan(v) for v in (action, pulse_us, period_us)):
+    if any(math.isnan(v) for v in (action, pulse_us, period_us)):
         return None  # counted by the caller, with the field's name
     channel = pwm.channel(name)
     expected = channel.action(pulse_us, period_us)

@@ -1,0 +1,714 @@
+"""Recordings with every fault that was seen, and some that were not: counted and skipped, never an action."""
+
+import json
+import math
+import os
+import shutil
+import time
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.recording import CONTROL_FIELDS, FRAME_FIELDS, EpisodeWriter
+from rover_lib.workshop.episodes import choose_calibration, load_recordings, split
+
+CHUNK = 8
+PWM = PwmCalibration()
+FRAME = np.full((18, 32, 3), (30, 90, 200), np.uint8)
+
+
+def steering_at(t_s):
+    return 0.6 * math.sin(1.5 * t_s)
+
+
+def throttle_at(t_s):
+    return 0.04 + 0.03 * math.cos(2 * t_s)
+
+
+def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0):
+    """A faultless drive: controls every 33 ms from 0.1 s before the frames to 0.1 s after them."""
+    folder = root / name
+    with EpisodeWriter(folder, label="hit red balloon", resolution=(32, 18)) as writer:
+        for i in range(round((frames / 30 + 0.2) / 0.033)):
+            t_s = i * 0.033
+            pulses = PWM.pulses(steering_at(t_s), throttle_at(t_s))
+            writer.control(start_s + t_s, 500 + 33 * i, pulses.steering_us, pulses.throttle_us, 21316, 1016)
+        for i in range(frames):
+            writer.frame(start_s + 0.1 + i / 30, FRAME)
+    return folder
+
+
+def edit(folder, change):
+    """Rewrite a recording's JSON; the CSVs go, so that nothing can be taken from them."""
+    path = folder / "episode_data.json"
+    content = json.loads(path.read_text())
+    changed = change(content)
+    path.write_text(json.dumps(content if changed is None else changed))
+    for name in ("control_data.csv", "frame_data.csv"):
+        (folder / name).unlink(missing_ok=True)
+    return folder
+
+
+def kinds(recordings):
+    found = {}
+    for fault in recordings.faults:
+        found[fault.kind] = found.get(fault.kind, 0) + fault.count
+    return found
+
+
+def load(root, **options):
+    return load_recordings(root, **{"chunk": CHUNK, **options})
+
+
+# ---- a faultless recording -------------------------------------------------------------------------------
+
+
+def test_pairs_of_a_faultless_recording(tmp_path):
+    record(tmp_path)
+    recordings = load(tmp_path)
+    assert recordings.faults == ()
+    (episode,) = recordings.episodes
+    assert (episode.id, episode.label, episode.frames) == ("episode_20260101_120000", "hit red balloon", 40)
+    assert episode.duration_s == pytest.approx(39 / 30)
+    samples = recordings.samples
+    assert len(samples) == 40
+    assert samples[0].state.tolist() == [0, 0]  # neutral at the start
+    for k, sample in enumerate(samples):
+        assert sample.state.dtype == sample.chunk.dtype == np.float32
+        assert sample.chunk.shape == (CHUNK, 2)
+        assert sample.time_s == pytest.approx(k / 30, abs=1e-6)
+        # the chunk is this frame's action and the next ones: within half a control interval of the drive
+        for step in range(CHUNK):
+            t_s = 0.1 + min(k + step, 39) / 30
+            assert sample.chunk[step, 0] == pytest.approx(steering_at(t_s), abs=0.9 * 0.017 + 0.001)
+            assert sample.chunk[step, 1] == pytest.approx(throttle_at(t_s), abs=0.06 * 0.017 + 0.001)
+        assert sample.is_pad.tolist() == [k + step >= 40 for step in range(CHUNK)]
+    for before, after in pairwise(samples):
+        assert after.state.tolist() == before.chunk[0].tolist()
+        assert after.chunk[0].tolist() == before.chunk[1].tolist()
+    assert (samples[-1].chunk == samples[-1].chunk[0]).all()
+    assert len({tuple(c) for c in samples[5].chunk.tolist()}) > CHUNK // 2  # a chunk changes over time
+
+
+def test_actions_are_the_nearest_controls(tmp_path):
+    folder = record(tmp_path)
+    content = json.loads((folder / "episode_data.json").read_text())
+    for sample, frame in zip(load(tmp_path).samples, content["frame_samples"], strict=True):
+        nearest = min(
+            content["control_samples"], key=lambda c: abs(c["system_timestamp"] - frame["timestamp"])
+        )
+        expected = [nearest["steering_normalized"], nearest["throttle_normalized"]]
+        assert sample.chunk[0].tolist() == np.float32(expected).tolist()
+
+
+def test_summary_range_and_hashes(tmp_path):
+    record(tmp_path)
+    recordings = load(tmp_path)
+    ends = recordings.action_range()
+    assert ends["throttle"][0] == pytest.approx(0.01, abs=0.004)
+    assert ends["throttle"][1] == pytest.approx(0.07, abs=0.004)
+    assert ends["steering"][1] == pytest.approx(0.6, abs=0.01)
+    summary = recordings.summary()
+    assert json.loads(json.dumps(summary)) == summary
+    assert (summary["episodes"], summary["frames"], summary["samples"], summary["faults"]) == (1, 40, 40, [])
+    hashes = recordings.hashes()
+    assert len(hashes) == 43
+    assert "episode_20260101_120000/frames/frame_000001.jpg" in hashes
+    assert hashes == load(tmp_path).hashes()
+
+
+def test_one_episode_folder_may_be_given_itself(tmp_path):
+    folder = record(tmp_path)
+    assert [s.chunk.tolist() for s in load(folder).samples] == [
+        s.chunk.tolist() for s in load(tmp_path).samples
+    ]
+    assert load(folder).hashes() == load(tmp_path).hashes()
+
+
+def test_pictures(tmp_path):
+    folder = record(tmp_path, frames=3)
+    samples = load(tmp_path).samples
+    assert samples[0].frame_bgr().shape == (18, 32, 3)
+    assert np.abs(samples[0].frame_bgr().astype(int) - FRAME).max() <= 3
+    picture = folder / "frames/frame_000001.jpg"
+    whole = picture.read_bytes()
+    for damaged in (whole[:-30], b"", b"\xff\xd8\xff\xd9", b"\xff\xd8" + bytes(300) + b"\xff\xd9"):
+        picture.write_bytes(damaged)
+        with pytest.raises(EpisodeError, match="frame_000001"):
+            samples[0].frame_bgr()
+    picture.unlink()
+    with pytest.raises(EpisodeError, match="cannot be read"):
+        samples[0].frame_bgr()
+
+
+def test_progress_is_called_like_tqdm(tmp_path):
+    record(tmp_path)
+    seen = []
+
+    def progress(iterable, desc=None, total=None):
+        seen.append((desc, total))
+        yield from iterable
+
+    assert len(load(tmp_path, progress=progress).episodes) == 1
+    assert seen == [("reading episodes", 1)]
+
+
+# ---- the faults ------------------------------------------------------------------------------------------
+
+
+def test_missing_and_truncated_pictures_cost_their_own_sample_only(tmp_path):
+    folder = record(tmp_path)
+    whole = load(tmp_path).samples
+    (folder / "frames/frame_000010.jpg").unlink()
+    cut = folder / "frames/frame_000020.jpg"
+    cut.write_bytes(cut.read_bytes()[:-40])
+    (folder / "frames/frame_000030.jpg").write_bytes(b"")
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"frame_missing": 1, "broken_jpeg": 2}
+    assert {f.file for f in recordings.faults} == {
+        "episode_20260101_120000/episode_data.json",
+        "episode_20260101_120000/frames/frame_000020.jpg",
+        "episode_20260101_120000/frames/frame_000030.jpg",
+    }
+    left = [s for k, s in enumerate(whole) if k not in (9, 19, 29)]
+    assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in left]
+    assert [s.state.tolist() for s in recordings.samples] == [s.state.tolist() for s in left]
+
+
+def test_padding_after_the_end_marker_is_no_damage(tmp_path):
+    folder = record(tmp_path, frames=3)
+    picture = folder / "frames/frame_000001.jpg"
+    picture.write_bytes(picture.read_bytes() + bytes(20))
+    assert load(tmp_path).faults == ()
+
+
+@pytest.mark.parametrize("period", [0, 2032])
+def test_throttle_without_a_measured_pulse_is_missing_not_zero(tmp_path, period):
+    def change(content):
+        for control in content["control_samples"][20:30]:
+            control.update(throttle_raw_us=0, throttle_period_us=period, throttle_normalized=0.0)
+
+    edit(record(tmp_path), change)
+    recordings = load(tmp_path)
+    found = kinds(recordings)
+    assert found["throttle_zero_period"] == 10
+    assert found["frame_without_measurement"] > 5
+    assert found["frame_without_state"] == 1
+    assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009  # the drive's least throttle, no 0
+    before = [s for s in recordings.samples if s.time_s < 0.7]
+    assert before[-1].is_pad.tolist() == [False] + [True] * (CHUNK - 1)  # the hole ends the chunks before it
+
+
+def test_two_periods_at_once_are_odd(tmp_path):
+    def change(content):
+        content["control_samples"][20].update(steering_period_us=42632, steering_normalized=0.0)
+
+    edit(record(tmp_path), change)
+    assert kinds(load(tmp_path)) == {"steering_odd_period": 1}
+
+
+def test_single_lost_readings_cost_no_frame(tmp_path):
+    def change(content):
+        for control in content["control_samples"][5:35:3]:
+            control.update(throttle_raw_us=0, throttle_period_us=0, throttle_normalized=0.0)
+
+    edit(record(tmp_path), change)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"throttle_zero_period": 10}
+    assert len(recordings.samples) == 40
+    assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009
+
+
+def test_serial_burst_is_placed_by_the_arduinos_clock(tmp_path):
+    folder = record(tmp_path)
+    whole = load(tmp_path).samples
+
+    def change(content):
+        # the first 0.7 s waited in the buffer: they arrive together, 0.3 ms apart, before the 21st
+        controls = content["control_samples"]
+        for k, control in enumerate(controls[:20]):
+            control["system_timestamp"] = controls[20]["system_timestamp"] - 0.0003 * (20 - k)
+
+    edit(folder, change)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"serial_burst": 20}
+    assert "0.65 s" in recordings.faults[0].note
+    assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
+
+
+def test_serial_burst_that_the_clock_cannot_place_is_dropped(tmp_path):
+    def change(content):
+        controls = content["control_samples"]
+        for k, control in enumerate(controls[:20]):
+            control["system_timestamp"] = controls[20]["system_timestamp"] - 0.0003 * (20 - k)
+        controls[15]["arduino_timestamp"] = 10**6
+
+    edit(record(tmp_path), change)
+    assert kinds(load(tmp_path)) == {
+        "serial_burst": 4,
+        "serial_burst_dropped": 16,
+        "frame_without_control": 12,
+        "frame_without_state": 1,
+    }
+
+
+def test_real_recording(sample_episode, tmp_path):
+    copy = tmp_path / sample_episode.name
+    copy.mkdir()
+    shutil.copyfile(sample_episode / "episode_data.json", copy / "episode_data.json")
+    (copy / "frames").mkdir()
+    with pytest.raises(EpisodeError, match="frame_missing 176 times"):
+        load_recordings(tmp_path)
+    pictures = sorted((sample_episode / "frames").glob("*.jpg"))
+    for k in range(1, 177):  # what is not there gets the picture that is
+        shutil.copyfile(pictures[0], copy / f"frames/frame_{k:06d}.jpg")
+    recordings = load_recordings(tmp_path)
+    found = kinds(recordings)
+    assert found["throttle_zero_period"] == 138
+    assert found["serial_burst"] + found["serial_burst_dropped"] == 111
+    assert found["frame_without_measurement"] == 25  # the first 0.9 s: no throttle pulse yet
+    assert len(recordings.samples) == 150
+    assert recordings.action_range()["throttle"][1] == pytest.approx(0.0348)
+    assert recordings.samples[0].frame_bgr().shape == (480, 640, 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"), [(None, "absent"), ("", "empty"), ("{", "broken_json"), ("[]", "wrong_type")]
+)
+def test_without_json_the_csvs_serve(tmp_path, text, kind):
+    folder = record(tmp_path)
+    whole = load(tmp_path).samples
+    if text is None:
+        (folder / "episode_data.json").unlink()
+    else:
+        (folder / "episode_data.json").write_text(text)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {kind: 1}
+    assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
+    assert [s.state.tolist() for s in recordings.samples] == [s.state.tolist() for s in whole]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[" * 100_000, '{"control_samples": {}, "frame_samples": 1}', "\udcff"]
+)
+def test_without_json_and_csvs_the_folder_is_skipped(tmp_path, text):
+    record(tmp_path, "episode_20260101_000000")
+    folder = record(tmp_path, "episode_20260102_000000")
+    (folder / "episode_data.json").write_bytes(text.encode(errors="surrogateescape"))
+    (folder / "control_data.csv").unlink()
+    (folder / "frame_data.csv").unlink()
+    recordings = load(tmp_path)
+    assert [e.id for e in recordings.episodes] == ["episode_20260101_000000"]
+    assert kinds(recordings)["nothing_usable"] == 1
+    shutil.rmtree(tmp_path / "episode_20260101_000000")
+    with pytest.raises(EpisodeError, match="no usable sample in 1 episode folder"):
+        load(tmp_path)
+
+
+def test_csv_faults(tmp_path):
+    folder = record(tmp_path)
+    (folder / "episode_data.json").unlink()
+    lines = (folder / "control_data.csv").read_text().splitlines()
+    lines[3] = "1,2"
+    lines[6] = lines[6].replace("1000.", "nan1000.")
+    lines[9] = "99," + "nan," + ",".join(lines[9].split(",")[2:])
+    (folder / "control_data.csv").write_text("\n".join(lines))
+    found = kinds(load(tmp_path))
+    assert found == {"absent": 1, "wrong_type": 2, "not_finite": 1}
+    (folder / "control_data.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(EpisodeError, match="wrong_header 1 times"):
+        load(tmp_path)
+
+
+def test_not_finite_and_wrong_types_are_counted_and_skipped(tmp_path):
+    def change(content):
+        controls, frames = content["control_samples"], content["frame_samples"]
+        controls[20]["system_timestamp"] = math.nan
+        controls[23]["steering_normalized"] = math.inf
+        controls[26]["throttle_raw_us"] = None
+        controls[29]["throttle_normalized"] = 7.0
+        controls.append("control")
+        frames[10]["timestamp"] = math.nan
+        frames[15]["image_path"] = 15
+        frames[20]["frame_id"] = "x"
+        frames[25]["timestamp"] = 10**400
+        frames += [None, {}]
+
+    edit(record(tmp_path), change)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"not_finite": 4, "wrong_type": 6, "throttle_out_of_range": 1}
+    assert len(recordings.samples) == 36
+    assert all(np.isfinite(s.chunk).all() and np.isfinite(s.state).all() for s in recordings.samples)
+
+
+def test_a_value_that_its_pulse_denies_is_counted(tmp_path):
+    def change(content):
+        content["control_samples"][20]["steering_normalized"] = 0.99
+
+    edit(record(tmp_path), change)
+    assert kinds(load(tmp_path)) == {"steering_disagrees_with_pulse": 1}
+
+
+def test_unsorted_times(tmp_path):
+    folder = record(tmp_path)
+    whole = load(tmp_path).samples
+
+    def change(content):
+        for rows in (content["control_samples"], content["frame_samples"]):
+            rows[5], rows[12] = rows[12], rows[5]
+
+    edit(folder, change)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"unsorted_control_times": 2, "unsorted_frame_times": 2}
+    assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
+
+
+def test_no_overlap(tmp_path):
+    def change(content):
+        for frame in content["frame_samples"]:
+            frame["timestamp"] += 3600
+
+    record(tmp_path, "episode_20260101_000000")
+    edit(record(tmp_path, "episode_20260102_000000"), change)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"no_overlap": 1, "nothing_usable": 1}
+    assert "3598.6 s apart" in recordings.faults[0].note
+    assert recordings.faults[0].file == "episode_20260102_000000"
+
+
+def test_sync_window(tmp_path):
+    def change(content):
+        del content["control_samples"][
+            20:24
+        ]  # a hole of 165 ms: two frames are further than 50 ms from both ends
+
+    edit(record(tmp_path), change)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"frame_without_control": 2, "frame_without_state": 1}
+    assert len(recordings.samples) == 37
+    assert len(load(tmp_path, sync_s=0.1).samples) == 40
+
+
+def test_a_hole_in_time_ends_chunks_and_states(tmp_path):
+    def change(content):
+        del content["frame_samples"][20:30]
+
+    edit(record(tmp_path), change)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"hole_in_time": 1, "frame_without_state": 1}
+    assert len(recordings.samples) == 29
+    assert recordings.samples[19].is_pad.sum() == CHUNK - 1
+
+
+def test_duplicates(tmp_path):
+    def change(content):
+        frames = content["frame_samples"]
+        frames[10]["frame_id"] = frames[9]["frame_id"]
+        frames[20]["timestamp"] = frames[19]["timestamp"]
+
+    edit(record(tmp_path), change)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"duplicate_frame_id": 1, "duplicate_frame_time": 1}
+    assert len(recordings.samples) == 38
+
+
+def test_frame_ids_need_not_start_at_1(tmp_path):
+    def change(content):
+        for frame in content["frame_samples"]:
+            frame["frame_id"] += 816
+
+    edit(record(tmp_path), change)
+    assert load(tmp_path).faults == ()
+
+
+def test_paths_that_leave_the_folder(tmp_path):
+    outside = record(tmp_path / "other", "episode_20260101_000000") / "frames/frame_000001.jpg"
+    folder = record(tmp_path / "mine")
+    (folder / "frames/link.jpg").symlink_to(outside)
+    (folder / "away").symlink_to(outside.parent)
+    os.mkfifo(folder / "frames/pipe.jpg")
+    leaving = [
+        "../../other/episode_20260101_000000/frames/frame_000001.jpg",
+        "frames/../../../other/episode_20260101_000000/frames/frame_000001.jpg",
+        "..\\..\\other\\episode_20260101_000000\\frames\\frame_000001.jpg",
+        str(outside),
+        "frames/link.jpg",
+        "away/frame_000001.jpg",
+    ]
+    other = ["frames/pipe.jpg", "frames", "frames/a\0b.jpg", "x" * 5000]
+
+    def change(content):
+        for frame, path in zip(content["frame_samples"][5:], leaving + other, strict=False):
+            frame["image_path"] = path
+
+    edit(folder, change)
+    recordings = load(tmp_path / "mine")
+    assert kinds(recordings) == {"path_leaves_folder": len(leaving), "frame_missing": len(other)}
+    assert all(s.frame_path.resolve().is_relative_to(folder) for s in recordings.samples)
+
+
+def test_links_instead_of_data(tmp_path):
+    record(tmp_path / "mine", "episode_20260101_000000")
+    other = record(tmp_path / "other", "episode_20260102_000000")
+    (tmp_path / "mine/episode_20260103_000000").symlink_to(other)
+    (tmp_path / "mine/episode_20260104_000000").mkdir()
+    (tmp_path / "mine/episode_20260104_000000/episode_data.json").symlink_to(other / "episode_data.json")
+    (tmp_path / "mine/episode_20260105_000000").mkdir()
+    (tmp_path / "mine/.episode_20260106_000000.tmp").mkdir()  # a recorder at work
+    (tmp_path / "mine/notes.txt").write_text("x")
+    recordings = load(tmp_path / "mine")
+    assert [e.id for e in recordings.episodes] == ["episode_20260101_000000"]
+    assert kinds(recordings) == {"path_leaves_folder": 2, "absent": 2, "nothing_usable": 1, "no_data": 1}
+
+
+@pytest.mark.parametrize("make", ["nothing", "file", "empty", "strangers"])
+def test_no_recordings_is_one_sentence(tmp_path, make):
+    root = tmp_path / "episodes"
+    if make == "file":
+        root.write_text("x")
+    elif make != "nothing":
+        root.mkdir()
+    if make == "strangers":
+        (root / "photos").mkdir()
+    with pytest.raises(EpisodeError, match="episodes") as e:
+        load(root)
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize("options", [{"chunk": 0}, {"sync_s": 0}, {"sync_s": math.nan}])
+def test_options_that_make_no_sense(tmp_path, options):
+    record(tmp_path)
+    with pytest.raises(EpisodeError, match="sync_s"):
+        load(tmp_path, **options)
+
+
+# ---- wild input ------------------------------------------------------------------------------------------
+
+ODD = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=8),
+    st.sampled_from(
+        ["frames/frame_000001.jpg", "frames/frame_000002.jpg", "../x.jpg", "nan", "1e999", "/", "."]
+    ),
+    st.lists(st.integers(), max_size=2),
+    st.dictionaries(st.text(max_size=3), st.integers(), max_size=2),
+)
+GOOD = {
+    "arduino_timestamp": st.integers(0, 3000),
+    "system_timestamp": st.floats(0, 3),
+    "steering_normalized": st.floats(-1, 1),
+    "throttle_normalized": st.floats(0, 1),
+    "steering_raw_us": st.sampled_from([0, 1000, 1456, 1900]),
+    "throttle_raw_us": st.sampled_from([0, 120, 136, 700]),
+    "steering_period_us": st.sampled_from([0, 21316, 42632]),
+    "throttle_period_us": st.sampled_from([0, 1012, 1016, 2032]),
+    "frame_id": st.integers(0, 60),
+    "timestamp": st.floats(0, 3),
+    "image_path": st.sampled_from(["frames/frame_000001.jpg", "frames/frame_000002.jpg"]),
+}
+
+
+def rows_of(fields):
+    good = st.fixed_dictionaries({f: GOOD[f] for f in fields})
+    mixed = st.fixed_dictionaries({f: st.one_of(GOOD[f], GOOD[f], GOOD[f], ODD) for f in fields})
+    return st.lists(st.one_of(good, good, mixed, ODD), max_size=30)
+
+
+WILD = st.one_of(
+    ODD,
+    st.fixed_dictionaries(
+        {
+            "action_label": st.one_of(st.just("x"), ODD),
+            "control_samples": st.one_of(rows_of(CONTROL_FIELDS), rows_of(CONTROL_FIELDS), ODD),
+            "frame_samples": st.one_of(rows_of(FRAME_FIELDS), rows_of(FRAME_FIELDS), ODD),
+        }
+    ),
+)
+QUICK = settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+
+
+def check_sane(root):
+    """Loads or refuses; whatever is loaded can be trained on."""
+    try:
+        recordings = load(root)
+    except EpisodeError as e:
+        assert "\n" not in str(e)
+        return
+    assert recordings.samples
+    json.dumps(recordings.summary(), allow_nan=False)
+    for sample in recordings.samples:
+        assert np.isfinite(sample.chunk).all()
+        assert np.isfinite(sample.state).all()
+        assert math.isfinite(sample.time_s)
+        assert (np.abs(sample.chunk) <= 1).all()
+        assert (sample.chunk[:, 1] >= 0).all()
+        assert not sample.is_pad[0]
+        assert sample.frame_bgr().shape == (18, 32, 3)
+
+
+@pytest.fixture(scope="module")
+def wild_folder(tmp_path_factory):
+    folder = record(tmp_path_factory.mktemp("wild"), frames=2)
+    for name in ("control_data.csv", "frame_data.csv"):
+        (folder / name).unlink()
+    return folder
+
+
+@QUICK
+@given(content=WILD)
+def test_wild_json(wild_folder, content):
+    (wild_folder / "episode_data.json").write_text(json.dumps(content))
+    check_sane(wild_folder.parent)
+
+
+@QUICK
+@given(data=st.binary(max_size=200))
+def test_wild_bytes_as_json(wild_folder, data):
+    (wild_folder / "episode_data.json").write_bytes(data)
+    check_sane(wild_folder.parent)
+
+
+@QUICK
+@given(
+    controls=st.lists(st.lists(st.one_of(st.text(max_size=6), st.floats().map(str), st.integers().map(str)))),
+    frames=st.lists(st.lists(st.one_of(st.text(max_size=6), st.floats().map(str), GOOD["image_path"]))),
+    tail=st.binary(max_size=20),
+)
+def test_wild_csv(tmp_path_factory, controls, frames, tail):
+    folder = record(tmp_path_factory.mktemp("csv"), frames=2)
+    (folder / "episode_data.json").unlink()
+    for name, rows in (("control_data.csv", controls), ("frame_data.csv", frames)):
+        text = "\n".join(",".join(row) for row in rows)
+        with (folder / name).open("ab") as f:
+            f.write(text.encode(errors="replace") + tail)
+    check_sane(folder.parent)
+
+
+# ---- splitting and choosing ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory):
+    root = tmp_path_factory.mktemp("many")
+    for k in range(16):
+        record(root, f"episode_20260101_{k:06d}", frames=12)
+    return load(root)
+
+
+def test_split_by_whole_episodes(many):
+    parts = split(many, 0.25, seed=0)
+    assert {p: len(ids) for p, ids in parts.episodes.items()} == {
+        "calibration": 12,
+        "choosing": 2,
+        "held_out": 2,
+    }
+    assert parts.note is None
+    ids = [i for part in parts.episodes.values() for i in part]
+    assert sorted(ids) == [e.id for e in many.episodes]
+    for name, part in parts.episodes.items():
+        assert {s.episode for s in getattr(parts, name)} == set(part)
+    total = len(parts.calibration) + len(parts.choosing) + len(parts.held_out)
+    assert total == len(many.samples)
+    assert split(many, 0.25, seed=0).episodes == parts.episodes
+    assert any(split(many, 0.25, seed=k).episodes != parts.episodes for k in range(1, 5))
+
+
+def test_three_episodes_give_one_to_each_part(tmp_path):
+    for k in range(3):
+        record(tmp_path, f"episode_20260101_{k:06d}", frames=12)
+    parts = split(load(tmp_path))
+    assert [len(ids) for ids in parts.episodes.values()] == [1, 1, 1]
+    assert "only 3 episodes" in parts.note
+
+
+@pytest.mark.parametrize("episodes", [1, 2])
+def test_few_episodes_are_parted_along_time_with_a_gap(tmp_path, episodes):
+    for k in range(episodes):
+        record(tmp_path, f"episode_20260101_{k:06d}", frames=60)
+    parts = split(load(tmp_path))
+    assert "along time" in parts.note
+    for k in range(episodes):
+        times = [
+            [s.time_s for s in part if s.episode.endswith(str(k))]
+            for part in (parts.calibration, parts.choosing, parts.held_out)
+        ]
+        assert all(times)
+        for before, after in pairwise(times):
+            # a chunk's last action lies (CHUNK - 1) frames after its frame: none is shared
+            assert min(after) - max(before) > (CHUNK - 0.5) / 30
+    assert len(parts.calibration) > len(parts.choosing) + len(parts.held_out)
+
+
+def test_too_short_to_split(tmp_path):
+    record(tmp_path, frames=2 * CHUNK)
+    with pytest.raises(EpisodeError, match="too short to be parted"):
+        split(load(tmp_path))
+
+
+@pytest.mark.parametrize("share", [0, 1, -1, math.nan])
+def test_split_shares_that_make_no_sense(many, share):
+    with pytest.raises(EpisodeError, match="held_out_share"):
+        split(many, share)
+
+
+@given(share=st.floats(0.01, 0.99), seed=st.integers(0, 10**6))
+@settings(deadline=None, suppress_health_check=list(HealthCheck))
+def test_split_never_shares_an_episode(many, share, seed):
+    parts = split(many, share, seed)
+    ids = [i for part in parts.episodes.values() for i in part]
+    assert len(ids) == len(set(ids)) == 16
+    assert all(parts.episodes.values())
+
+
+def test_calibration_covers_the_recorded_actions(many):
+    chosen, note = choose_calibration(many.samples, 20, seed=0)
+    assert note is None
+    assert len({id(s) for s in chosen}) == 20
+    assert [id(s) for s in choose_calibration(many.samples, 20, seed=0)[0]] == [id(s) for s in chosen]
+    assert [id(s) for s in choose_calibration(many.samples, 20, seed=1)[0]] != [id(s) for s in chosen]
+    recorded = np.concatenate([s.chunk for s in many.samples])
+    covered = np.concatenate([s.chunk for s in chosen])
+    np.testing.assert_allclose(np.ptp(covered, axis=0), np.ptp(recorded, axis=0), rtol=0.02)
+    order = {id(s): k for k, s in enumerate(many.samples)}
+    places = [order[id(s)] for s in chosen]
+    assert places == sorted(places)
+
+
+def test_fewer_than_asked_is_said(many):
+    chosen, note = choose_calibration(many.samples[:7], 200)
+    assert len(chosen) == 7
+    assert note == "asked for 200 calibration samples, found only 7: all are used"
+    assert choose_calibration(many.samples[:7], 7)[1] is None
+
+
+def test_equal_samples_are_not_taken_twice(many):
+    same = tuple(replace(many.samples[0]) for _ in range(30))
+    chosen, _ = choose_calibration(same, 10)
+    assert len({id(s) for s in chosen}) == 10
+
+
+def test_nothing_to_choose(many):
+    with pytest.raises(EpisodeError, match="cannot choose"):
+        choose_calibration((), 10)
+    with pytest.raises(EpisodeError, match="cannot choose"):
+        choose_calibration(many.samples, 0)
+
+
+def test_sixty_episodes_load_in_seconds(tmp_path):
+    first = record(tmp_path, "episode_20260101_000000", frames=120)
+    for k in range(1, 60):
+        shutil.copytree(first, tmp_path / f"episode_20260101_{k:06d}")
+    start_s = time.perf_counter()
+    recordings = load_recordings(tmp_path)
+    elapsed_s = time.perf_counter() - start_s
+    assert len(recordings.samples) == 60 * 120
+    assert elapsed_s < 10  # 0.7 s on an idle core
