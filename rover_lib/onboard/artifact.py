@@ -7,6 +7,7 @@ Inside the zip, beside TorchScript's own records: `extra/manifest.json` (what it
 import hashlib
 import io
 import json
+import re
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.stage import atomic_path
 
 SCHEMA = 1
+MANGLED = re.compile(rb"___torch_mangle_\d+")
 MANIFEST_KEYS = {
     "schema": int,
     "mode": str,  # fp32, dynamic, static, mixed
@@ -49,7 +51,10 @@ def save_artifact(
     check_manifest(manifest, str(path))
     vectors = io.BytesIO()
     np.savez_compressed(vectors, **parity)
-    extra = {"manifest.json": json.dumps(manifest, sort_keys=True, indent=1), "parity.npz": vectors.getvalue()}
+    extra = {
+        "manifest.json": json.dumps(manifest, sort_keys=True, indent=1),
+        "parity.npz": vectors.getvalue(),
+    }
     # Through a buffer, because torch.jit.save names the zip's folder after the file: same inputs, same bytes.
     buffer = io.BytesIO()
     torch.jit.save(module, buffer, _extra_files=extra)
@@ -59,17 +64,21 @@ def save_artifact(
 
 
 def content_hash(path: Path | str) -> str:
-    """Hex SHA-256 over everything in the artifact that acts: all records but TorchScript's debug tables.
+    """Hex SHA-256 over everything in the artifact that acts: the same inputs give the same hash.
 
-    Those hold source positions, so that they change with an edit that changes nothing.
+    The bytes of the file may differ: TorchScript writes debug tables (source positions), a serial number, and class
+    names with a counter of all classes that the process ever made.
     """
     digest = hashlib.sha256()
     with _open(path) as z:
         for name in sorted(z.namelist()):
-            if name.endswith(".debug_pkl"):
+            if name.endswith((".debug_pkl", "/.data/serialization_id")):
                 continue
-            digest.update(name.encode() + b"\0")
-            digest.update(hashlib.sha256(z.read(name)).digest())
+            record = z.read(name)
+            if not name.startswith("archive/constants/"):
+                record = MANGLED.sub(b"", record)
+            digest.update(MANGLED.sub(b"", name.encode()) + b"\0")
+            digest.update(hashlib.sha256(record).digest())
     return digest.hexdigest()
 
 
@@ -121,7 +130,9 @@ def check_manifest(manifest: Any, where: str) -> None:
             raise ArtifactError(f"{where}: manifest camera {camera!r} lacks name, height or width; quantize again")
     tolerance = manifest["parity"].get("tolerance")
     if not isinstance(tolerance, dict) or set(tolerance) != set(manifest["action_names"]):
-        raise ArtifactError(f"{where}: manifest parity tolerance {tolerance!r} does not cover its actions; quantize again")
+        raise ArtifactError(
+            f"{where}: manifest parity tolerance {tolerance!r} does not cover its actions; quantize again"
+        )
 
 
 def _open(path: Path | str) -> zipfile.ZipFile:

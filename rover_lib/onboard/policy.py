@@ -79,7 +79,9 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
     manifest = read_manifest(path)
     made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
     if made_with.split(".")[:2] != here.split(".")[:2]:
-        raise ArtifactError(f"{path}: made with torch {made_with}, here is {here}; install torch {made_with.split('+')[0]}")
+        raise ArtifactError(
+            f"{path}: made with torch {made_with}, here is {here}; install torch {made_with.split('+')[0]}"
+        )
     engine = manifest["engine"]
     if engine not in torch.backends.quantized.supported_engines:
         raise ArtifactError(
@@ -92,7 +94,9 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
     try:
         module = torch.jit.load(str(path), map_location="cpu").eval()
     except RuntimeError as e:
-        raise ArtifactError(f"{path}: TorchScript cannot load it ({str(e).splitlines()[0][:200]}); quantize again") from None
+        raise ArtifactError(
+            f"{path}: TorchScript cannot load it ({str(e).splitlines()[0][:200]}); quantize again"
+        ) from None
     policy = Policy(path, module, manifest)
     check_parity(policy)
     return policy
@@ -111,7 +115,9 @@ def check_parity(policy: Policy) -> dict[str, float]:
     except (KeyError, IndexError, RuntimeError) as e:
         raise ArtifactError(f"{policy.path}: its parity vectors do not run ({str(e)[:200]}); quantize again") from None
     if vectors["chunk"].shape != (len(found), policy.chunk, len(policy.action_names)):
-        raise ArtifactError(f"{policy.path}: its parity vectors have another shape than its manifest says; quantize again")
+        raise ArtifactError(
+            f"{policy.path}: its parity vectors have another shape than its manifest says; quantize again"
+        )
     difference = np.abs(np.stack(found) - vectors["chunk"]).max((0, 1))
     tolerance = policy.manifest["parity"]["tolerance"]
     result = {name: float(d) for name, d in zip(policy.action_names, difference, strict=True)}

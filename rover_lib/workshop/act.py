@@ -40,7 +40,8 @@ class Affine:
 
 def _imagenet() -> Affine:
     return Affine(
-        tuple(1 / s for s in IMAGENET_STD), tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True))
+        tuple(1 / s for s in IMAGENET_STD),
+        tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True)),
     )
 
 
@@ -209,7 +210,13 @@ class Attention(Pointwise):
     """
 
     def __init__(
-        self, w: Weights, config: ActConfig, q_pos: Tensor, k_pos: Tensor, as_conv: bool, q_input: Tensor | None = None
+        self,
+        w: Weights,
+        config: ActConfig,
+        q_pos: Tensor,
+        k_pos: Tensor,
+        as_conv: bool,
+        q_input: Tensor | None = None,
     ):
         super().__init__(as_conv)
         d = config.dim
@@ -291,7 +298,13 @@ class DecoderLayer(nn.Module):
     """`start`: None, or this first layer's input (zeros), whose self-attention is then computed here, once."""
 
     def __init__(
-        self, w: Weights, config: ActConfig, q_pos: Tensor, k_pos: Tensor, as_conv: bool, start: Tensor | None = None
+        self,
+        w: Weights,
+        config: ActConfig,
+        q_pos: Tensor,
+        k_pos: Tensor,
+        as_conv: bool,
+        start: Tensor | None = None,
     ):
         super().__init__()
         self.pre_norm, self.first = config.pre_norm, start is not None
@@ -384,8 +397,8 @@ class ACT(nn.Module):
 
     def forward(self, state: Tensor, *frames: Tensor) -> Tensor:
         tokens = [self.latent, self.state_project(self.state_norm(state))[:, None]]
-        for norm, frame in zip(self.image_norm, frames, strict=True):
-            x = norm(frame.permute(2, 0, 1)[None].float())  # (1, 3, height, width), channels-last in memory
+        for i, norm in enumerate(self.image_norm):  # by index: FX cannot iterate over frames while it traces
+            x = norm(frames[i].permute(2, 0, 1)[None].float())  # (1, 3, height, width), channels-last in memory
             x = self.image_project(self.backbone(x))  # (1, D, h, w)
             tokens.append(x.flatten(2).transpose(1, 2))  # (1, h * w, D)
         x = torch.cat(tokens, 1)

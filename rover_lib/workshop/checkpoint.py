@@ -71,7 +71,9 @@ def _load_trainer(path: Path) -> Checkpoint:
     if missing := sorted(TRAINER_KEYS - set(raw)):
         raise CheckpointError(f"{path}: the config lacks {missing}; it cannot be read off the weights, add them")
     if raw.get("n_obs_steps", 1) != 1:
-        raise CheckpointError(f"{path}: n_obs_steps is {raw['n_obs_steps']!r}; ACT acts on one observation, train with 1")
+        raise CheckpointError(
+            f"{path}: n_obs_steps is {raw['n_obs_steps']!r}; ACT acts on one observation, train with 1"
+        )
     height, width = (_positive(path, raw, k) for k in ("image_height", "image_width"))
     config = _config_from(
         path,
@@ -156,7 +158,9 @@ def _load_lerobot(folder: Path) -> Checkpoint:
         kind, shape = _feature(folder, name, feature)
         if kind == "VISUAL":
             if len(shape) != 3 or shape[0] != 3:
-                raise CheckpointError(f"{folder}: camera '{name}' has shape {shape}; only (3, height, width) works here")
+                raise CheckpointError(
+                    f"{folder}: camera '{name}' has shape {shape}; only (3, height, width) works here"
+                )
             cameras.append(name)
             sizes.append((shape[1], shape[2]))
         elif kind == "ENV":
@@ -218,7 +222,9 @@ class Normaliser:
         steps = _read_json(self.where).get("steps", [])
         renames = [s for s in steps if (s.get("config") or {}).get("rename_map")]
         if renames:
-            raise CheckpointError(f"{self.where}: renames observations ({renames[0]['config']}); rename the inputs instead")
+            raise CheckpointError(
+                f"{self.where}: renames observations ({renames[0]['config']}); rename the inputs instead"
+            )
         known = {"rename_observations_processor", "to_batch_processor", "device_processor", step_name}
         if unknown := [str(s.get("registry_name")) for s in steps if s.get("registry_name") not in known]:
             raise CheckpointError(f"{self.where}: has processor steps that are not known here: {unknown}")
@@ -234,14 +240,18 @@ class Normaliser:
     def affine(self, key: str, kind: str, size: int, inverse: bool = False) -> Affine | None:
         """LeRobot's _apply_transform as scale and shift; None where it leaves the feature alone."""
         mode = self.modes.get(kind, "IDENTITY")
-        stats = {k.removeprefix(f"{key}."): v.double().flatten() for k, v in self.stats.items() if k.startswith(f"{key}.")}
+        stats = {
+            k.removeprefix(f"{key}."): v.double().flatten() for k, v in self.stats.items() if k.startswith(f"{key}.")
+        }
         if mode == "IDENTITY" or not stats:
             return None
         pairs = {"MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}  # fmt: skip
         if mode not in pairs:
             raise CheckpointError(f"{self.where}: normalisation mode '{mode}' of '{key}' is not known here")
         if missing := [p for p in pairs[mode] if p not in stats]:
-            raise CheckpointError(f"{self.where}: mode '{mode}' of '{key}' needs {missing}, the file has {sorted(stats)}")
+            raise CheckpointError(
+                f"{self.where}: mode '{mode}' of '{key}' needs {missing}, the file has {sorted(stats)}"
+            )
         a, b = (stats[p] for p in pairs[mode])
         if len(a) != size or len(b) != size:
             raise CheckpointError(f"{self.where}: statistics of '{key}' have {len(a)} values, the feature has {size}")
@@ -302,13 +312,17 @@ def _names(count: int, stem: str) -> tuple[str, ...]:
 def _config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActConfig:
     """Add to what the config says what only the weights' shapes say, and refuse what cannot be run."""
     if known["backbone"] not in BACKBONES:
-        raise CheckpointError(f"{path}: backbone {known['backbone']!r} is not known here; known are {sorted(BACKBONES)}")
+        raise CheckpointError(
+            f"{path}: backbone {known['backbone']!r} is not known here; known are {sorted(BACKBONES)}"
+        )
     if known.get("activation", "relu") not in ACTIVATIONS:
         raise CheckpointError(
             f"{path}: activation {known['activation']!r} is not known here; known are {sorted(ACTIVATIONS)}"
         )
     if known.get("dilation") and BACKBONES[known["backbone"]][0] == "basic":
-        raise CheckpointError(f"{path}: {known['backbone']} cannot be dilated (torchvision refuses it too); use resnet50")
+        raise CheckpointError(
+            f"{path}: {known['backbone']} cannot be dilated (torchvision refuses it too); use resnet50"
+        )
     if known["dim"] % known["heads"]:
         raise CheckpointError(f"{path}: {known['heads']} heads do not divide a width of {known['dim']}")
     if known["dim"] % 4:
@@ -355,7 +369,9 @@ def expected_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
                 norm(f"{at}.norm{n + 1}")
 
     with torch.device("meta"):
-        resnet = getattr(torchvision.models, c.backbone)(norm_layer=torchvision.ops.misc.FrozenBatchNorm2d, weights=None)
+        resnet = getattr(torchvision.models, c.backbone)(
+            norm_layer=torchvision.ops.misc.FrozenBatchNorm2d, weights=None
+        )
     shapes |= {f"backbone.{k}": tuple(v.shape) for k, v in resnet.state_dict().items() if not k.startswith("fc.")}
     lin("encoder_img_feat_input_proj", d, BACKBONES[c.backbone][2], 1, 1)
     lin("encoder_robot_state_input_proj", d, states)
@@ -385,7 +401,13 @@ def _listed(names: list[str]) -> str:
 
 
 def _checked(
-    path: Path, kind: str, config: ActConfig, weights: dict[str, Tensor], sha256: str, size: int, extra: dict[str, Any]
+    path: Path,
+    kind: str,
+    config: ActConfig,
+    weights: dict[str, Tensor],
+    sha256: str,
+    size: int,
+    extra: dict[str, Any],
 ) -> Checkpoint:
     expected = expected_shapes(config)
     found = {k: tuple(v.shape) for k, v in weights.items()}
