@@ -1,0 +1,396 @@
+"""A balloon world: what a small car with a front camera sees and does, deterministic by seed.
+
+A car stands on a floor, a red balloon floats some metres ahead, and the task is to drive into it. Floor,
+wall, light and the objects that are not red balloons differ from seed to seed. Lengths are metres, angles
+radians (positive to the left), actions the policy's: steering in [-1, 1] (positive to the left), throttle in
+[0, 1].
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from rover_lib.onboard.errors import WorldError
+
+RATE_HZ = 30.0
+FRAME_HEIGHT, FRAME_WIDTH = 360, 640
+TIMEOUT_S = 8.0
+
+# Car. Full steering turns the wheels by 34 degrees, a throttle of 0.09 (a drive's most in real recordings) is
+# 1.1 m/s.
+WHEELBASE_M = 0.26
+WHEEL_ANGLE_RAD = 0.6
+STEERING_LAG_S = 0.12
+SPEED_PER_THROTTLE_MPS = 12.0
+SPEED_LAG_S = 0.2
+
+# Expert.
+STEERING_MOST = 0.65
+THROTTLE_MOST = 0.09
+THROTTLE_RISE_PER_S = 0.20  # from a stand to full in half a second
+THROTTLE_FALL_PER_S = 0.30
+
+# Camera, a pinhole above the front bumper that looks straight ahead, with the horizon above the middle.
+FOCAL_PX = 400.0
+HORIZON_ROW = 125
+CENTRE_COLUMN = FRAME_WIDTH / 2
+CAMERA_HEIGHT_M = 0.20
+
+BALLOON_RADIUS_M = 0.16
+BALLOON_HEIGHT_M = 0.24  # its centre
+HIT_DISTANCE_M = 0.30  # camera to the balloon's centre: the bumper touches it
+ARENA_RADIUS_M = 7.0
+
+FLOOR_PX_PER_M = 160
+FLOOR_TILE_PX = 640
+FAR_ROWS = 24  # below the horizon, drawn from a blurred floor: a sharp one would flicker
+
+_DISTRACTOR_BGR = (
+    (190, 90, 30),
+    (70, 150, 40),
+    (40, 190, 215),
+    (150, 60, 120),
+    (205, 200, 195),
+    (45, 45, 45),
+    (170, 170, 40),
+    (90, 115, 140),
+)
+
+
+@dataclass(frozen=True)
+class CarState:
+    """Where the car is and what it does. `steering` lags behind `steering_command`, in the same unit."""
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    heading_rad: float = 0.0
+    speed_mps: float = 0.0
+    steering: float = 0.0
+    steering_command: float = 0.0
+    throttle_command: float = 0.0
+    time_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Thing:
+    """Something on the floor: kind is 'balloon', 'box' or 'cone'; its colour is BGR."""
+
+    kind: str
+    x_m: float
+    y_m: float
+    radius_m: float
+    height_m: float
+    colour: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Shove:
+    """A push from outside: the car is turned and moved sideways while it lasts."""
+
+    start_s: float
+    end_s: float
+    yaw_rps: float
+    sideways_mps: float
+
+
+class World:
+    """One drive to one balloon.
+
+    seed: everything that is random follows from it. shoves: how many pushes the car gets on its way.
+    Frames and motion depend on nothing but the seed, the shoves and the actions given.
+    """
+
+    def __init__(self, seed: int, shoves: int = 0):
+        if seed < 0 or shoves < 0:
+            raise WorldError(f"a world's seed and shoves must not be negative, found {seed} and {shoves}")
+        self.seed = seed
+        rng = np.random.default_rng([seed, 20_251])
+        self.state = CarState()
+        distance, bearing = rng.uniform(1.8, 4.0), rng.uniform(-0.5, 0.5)
+        red = (int(rng.integers(20, 50)), int(rng.integers(15, 45)), int(rng.integers(190, 240)))
+        self.balloon = Thing(
+            "balloon",
+            distance * math.cos(bearing),
+            distance * math.sin(bearing),
+            BALLOON_RADIUS_M,
+            BALLOON_HEIGHT_M,
+            red,
+        )
+        self.distractors = tuple(_distractors(rng, self.balloon))
+        self.trajectory = [self.state]
+        self.outcome: str | None = None  # 'hit', 'left' (past it or out of the arena), 'timeout'
+        self._shoves = tuple(_shoves(np.random.default_rng([seed, 20_252]), shoves))
+        self._floor, self._far_floor = _floor(rng)
+        self._wall = _wall(rng)
+        self._light = _light(rng)
+        self._gain = rng.uniform(0.75, 1.15)
+        self._flicker = rng.uniform(0.0, 0.12), rng.uniform(0.5, 2.0), rng.uniform(0, 2 * math.pi)
+
+    @property
+    def hit(self) -> bool:
+        return self.outcome == "hit"
+
+    @property
+    def done(self) -> bool:
+        return self.outcome is not None
+
+    def step(self, steering: float, throttle: float, dt: float = 1 / RATE_HZ) -> None:
+        """Drive for dt seconds. Raises WorldError for an action outside its range, or after the end."""
+        if not (-1 <= steering <= 1 and 0 <= throttle <= 1):
+            raise WorldError(f"steering must be in [-1, 1] and throttle in [0, 1], found ({steering}, {throttle})")
+        if self.done:
+            raise WorldError(f"world {self.seed} has ended ({self.outcome}): make a new one")
+        s = self.state
+        wheels = s.steering + (steering - s.steering) * (1 - math.exp(-dt / STEERING_LAG_S))
+        wanted = throttle * SPEED_PER_THROTTLE_MPS
+        speed = s.speed_mps + (wanted - s.speed_mps) * (1 - math.exp(-dt / SPEED_LAG_S))
+        yaw_rps = speed / WHEELBASE_M * math.tan(wheels * WHEEL_ANGLE_RAD)
+        sideways_mps = 0.0
+        for shove in self._shoves:
+            if shove.start_s <= s.time_s < shove.end_s:
+                yaw_rps += shove.yaw_rps
+                sideways_mps += shove.sideways_mps
+        middle = s.heading_rad + yaw_rps * dt / 2
+        self.state = replace(
+            s,
+            x_m=s.x_m + (speed * math.cos(middle) - sideways_mps * math.sin(middle)) * dt,
+            y_m=s.y_m + (speed * math.sin(middle) + sideways_mps * math.cos(middle)) * dt,
+            heading_rad=s.heading_rad + yaw_rps * dt,
+            speed_mps=speed,
+            steering=wheels,
+            steering_command=steering,
+            throttle_command=throttle,
+            time_s=s.time_s + dt,
+        )
+        self.trajectory.append(self.state)
+        distance, bearing = self.balloon_seen()
+        if distance < HIT_DISTANCE_M:
+            self.outcome = "hit"
+        elif (distance < 1.5 and abs(bearing) > 1.4) or math.hypot(self.state.x_m, self.state.y_m) > ARENA_RADIUS_M:
+            self.outcome = "left"
+        elif self.state.time_s >= TIMEOUT_S:
+            self.outcome = "timeout"
+
+    def balloon_seen(self) -> tuple[float, float]:
+        """Distance in metres and bearing in radians (positive to the left) of the balloon from the camera."""
+        ahead, left = self._local(self.balloon.x_m, self.balloon.y_m)
+        return math.hypot(ahead, left), math.atan2(left, ahead)
+
+    def _local(self, x_m: float, y_m: float) -> tuple[float, float]:
+        dx, dy = x_m - self.state.x_m, y_m - self.state.y_m
+        cos, sin = math.cos(self.state.heading_rad), math.sin(self.state.heading_rad)
+        return cos * dx + sin * dy, cos * dy - sin * dx
+
+    def render(self) -> np.ndarray:
+        """What the front camera sees now: (360, 640, 3) uint8 BGR."""
+        frame = np.empty((FRAME_HEIGHT, FRAME_WIDTH, 3), np.uint8)
+        self._draw_wall(frame)
+        self._draw_floor(frame)
+        seen = []
+        for thing in (*self.distractors, self.balloon):
+            ahead, left = self._local(thing.x_m, thing.y_m)
+            if ahead > 0.12 and abs(left) < 1.2 * ahead + 0.5:
+                seen.append((ahead, left, thing))
+        for ahead, left, thing in sorted(seen, key=lambda s: -s[0]):  # the far ones first: the near ones hide them
+            _draw_thing(frame, ahead, left, thing)
+        depth, rate, phase = self._flicker
+        gain = self._gain * (1 + depth * math.sin(rate * self.state.time_s + phase))
+        return cv2.multiply(frame, self._light, scale=gain / 128)
+
+    def _draw_wall(self, frame: np.ndarray) -> None:
+        width = self._wall.shape[1] - FRAME_WIDTH
+        first = round(-self.state.heading_rad * FOCAL_PX) % width
+        frame[:HORIZON_ROW] = self._wall[:, first : first + FRAME_WIDTH]
+
+    def _draw_floor(self, frame: np.ndarray) -> None:
+        s = self.state
+        cos, sin = math.cos(s.heading_rad), math.sin(s.heading_rad)
+        # Below the horizon a pixel (u, v) is the floor at ahead = f h / (v - v0), left = (u0 - u) h / (v - v0).
+        to_local = np.array(
+            [
+                [0, 0, FOCAL_PX * CAMERA_HEIGHT_M],
+                [-CAMERA_HEIGHT_M, 0, CENTRE_COLUMN * CAMERA_HEIGHT_M],
+                [0, 1, -HORIZON_ROW],
+            ]
+        )
+        to_floor = np.array([[cos, -sin, s.x_m], [sin, cos, s.y_m], [0, 0, 1]])
+        for texture, first, last in (
+            (self._far_floor, HORIZON_ROW, HORIZON_ROW + FAR_ROWS),
+            (self._floor, HORIZON_ROW + FAR_ROWS, FRAME_HEIGHT),
+        ):
+            px_per_m = FLOOR_PX_PER_M * texture.shape[0] / FLOOR_TILE_PX
+            from_crop = np.array([[1, 0, 0], [0, 1, first + 0.5], [0, 0, 1.0]])
+            matrix = np.diag([px_per_m, px_per_m, 1]) @ to_floor @ to_local @ from_crop
+            cv2.warpPerspective(
+                texture,
+                matrix,
+                (FRAME_WIDTH, last - first),
+                dst=frame[first:last],
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_WRAP,
+            )
+
+
+def expert(world: World) -> tuple[float, float]:
+    """What a good driver does now: (steering, throttle).
+
+    Steers towards the balloon; drives off gently, slows in a turn and before the balloon.
+    """
+    distance, bearing = world.balloon_seen()
+    steering = float(np.clip(1.1 * bearing, -STEERING_MOST, STEERING_MOST))
+    in_turn = 1 - 0.55 * min(1.0, abs(bearing) / 0.5)
+    near = float(np.clip(0.35 + 0.65 * (distance - 0.5) / 1.2, 0.35, 1.0))
+    wanted = THROTTLE_MOST * in_turn * near
+    before = world.state.throttle_command
+    throttle = min(max(wanted, before - THROTTLE_FALL_PER_S / RATE_HZ), before + THROTTLE_RISE_PER_S / RATE_HZ)
+    return steering, throttle
+
+
+def _distractors(rng: np.random.Generator, balloon: Thing) -> Iterator[Thing]:
+    for _ in range(int(rng.integers(2, 7))):
+        kind = str(rng.choice(["balloon", "box", "cone"]))
+        base = _DISTRACTOR_BGR[int(rng.integers(len(_DISTRACTOR_BGR)))]
+        colour = tuple(int(c) for c in np.clip(np.array(base) * rng.uniform(0.75, 1.2), 0, 255))
+        distance, bearing = rng.uniform(1.2, 6.0), rng.uniform(-0.9, 0.9)
+        x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+        radius = rng.uniform(0.10, 0.18)
+        height = rng.uniform(0.2, 0.4) if kind == "balloon" else rng.uniform(0.15, 0.45)
+        to_balloon = math.hypot(balloon.x_m, balloon.y_m)
+        along = (x * balloon.x_m + y * balloon.y_m) / to_balloon
+        aside = abs(x * balloon.y_m - y * balloon.x_m) / to_balloon
+        if aside < 0.45 and along < to_balloon + 0.3:
+            continue  # it would hide the balloon from a car that drives straight to it
+        yield Thing(kind, x, y, radius, height, colour)
+
+
+def _shoves(rng: np.random.Generator, count: int) -> Iterator[Shove]:
+    for i in range(count):
+        start = 0.3 + 1.1 * i + rng.uniform(0.0, 0.8)
+        length = rng.uniform(0.10, 0.20)
+        turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.12, 0.45)
+        yield Shove(start, start + length, turn / length, rng.uniform(-0.12, 0.12) / length)
+
+
+def _noise(rng: np.random.Generator, size: int, cells: int) -> np.ndarray:
+    """(size, size) float32 in about [-1, 1], smooth over size / cells pixels, without a seam."""
+    grid = rng.uniform(-1, 1, (cells, cells)).astype(np.float32)
+    wrapped = np.pad(grid, 2, mode="wrap")
+    cell = size // cells
+    big = cv2.resize(wrapped, None, fx=cell, fy=cell, interpolation=cv2.INTER_CUBIC)
+    return big[2 * cell : 2 * cell + size, 2 * cell : 2 * cell + size]
+
+
+def _floor(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A floor that repeats every four metres, (640, 640, 3) uint8, and the same blurred and smaller."""
+    size = FLOOR_TILE_PX
+    base = rng.uniform(70, 170) + rng.uniform(-22, 22, 3)
+    shade = _noise(rng, size, 10) * rng.uniform(4, 16) + _noise(rng, size, 80) * rng.uniform(2, 10)
+    shade += rng.normal(0, rng.uniform(1, 6), (size, size)).astype(np.float32)
+    pattern = str(rng.choice(["plain", "tiles", "planks", "carpet"]))
+    if pattern == "tiles":
+        pitch = int(rng.choice([40, 64, 80]))
+        step = np.arange(size) // pitch
+        shade += ((step[:, None] + step[None]) % 2) * rng.uniform(-25, 25)
+        joints = (np.arange(size) % pitch) < 2
+        shade -= (joints[:, None] | joints[None]) * rng.uniform(10, 40)
+    elif pattern == "planks":
+        rows = np.repeat(rng.uniform(-16, 16, size // 32), 32)
+        shade += rows[:, None] + ((np.arange(size) % 32) < 2)[:, None] * -25
+    elif pattern == "carpet":
+        stripes = np.sin(np.arange(size) * 2 * np.pi * int(rng.integers(4, 16)) / size)
+        shade += stripes[None] * rng.uniform(6, 22)
+    floor = np.clip(base[None, None] + shade[..., None], 0, 255).astype(np.uint8)
+    far = cv2.GaussianBlur(cv2.resize(floor, (80, 80), interpolation=cv2.INTER_AREA), (0, 0), 2.0)
+    return floor, far
+
+
+def _wall(rng: np.random.Generator) -> np.ndarray:
+    """A panorama above the horizon, (125, 2513 + 640, 3) uint8: its start is repeated at its end."""
+    width = round(2 * math.pi * FOCAL_PX)
+    top, bottom = (rng.uniform(90, 220) + rng.uniform(-25, 25, 3) for _ in range(2))
+    ramp = np.linspace(0, 1, HORIZON_ROW)[:, None, None]
+    wall = np.broadcast_to(top * (1 - ramp) + bottom * ramp, (HORIZON_ROW, width, 3)).astype(np.float32)
+    wall = np.ascontiguousarray(np.clip(wall, 0, 255).astype(np.uint8))
+    for _ in range(int(rng.integers(4, 18))):
+        x, y = int(rng.integers(0, width - 160)), int(rng.integers(0, 100))
+        w, h = int(rng.integers(20, 160)), int(rng.integers(15, 110))
+        grey = rng.uniform(40, 210)
+        colour = np.clip(grey + rng.uniform(-35, 35, 3), 0, 255)
+        cv2.rectangle(wall, (x, y), (x + w, min(y + h, HORIZON_ROW - 4)), colour.tolist(), cv2.FILLED)
+    skirting = rng.uniform(40, 200)
+    wall[HORIZON_ROW - int(rng.integers(2, 7)) :] = np.uint8(skirting)
+    return np.ascontiguousarray(np.concatenate([wall, wall[:, :FRAME_WIDTH]], axis=1))
+
+
+def _light(rng: np.random.Generator) -> np.ndarray:
+    """How each pixel is lit, (360, 640, 3) uint8, 128 is as it is: a slope, a tint, dark corners."""
+    x = np.linspace(-1, 1, FRAME_WIDTH)[None]
+    y = np.linspace(-1, 1, FRAME_HEIGHT)[:, None]
+    slope = 1 + rng.uniform(-0.2, 0.2) * x + rng.uniform(-0.15, 0.15) * y - rng.uniform(0, 0.12) * (x**2 + y**2)
+    tint = 1 + rng.uniform(-0.07, 0.07, 3)
+    return np.clip(128 * slope[..., None] * tint, 0, 255).astype(np.uint8)
+
+
+_SHIFT = 3  # drawn in eighths of a pixel, so that a thing moves smoothly
+_ONE = 1 << _SHIFT
+
+
+def _draw_thing(frame: np.ndarray, ahead: float, left: float, thing: Thing) -> None:
+    scale = FOCAL_PX / ahead
+    column = CENTRE_COLUMN - left * scale
+    foot = HORIZON_ROW + CAMERA_HEIGHT_M * scale
+    _draw_shadow(frame, column, foot, thing.radius_m, ahead)
+    if thing.kind == "balloon":
+        middle = HORIZON_ROW + (CAMERA_HEIGHT_M - thing.height_m) * scale
+        string = (int(column), int(middle)), (int(column + 0.01 * scale), int(min(foot, 2 * FRAME_HEIGHT)))
+        cv2.line(frame, *string, (215, 215, 215), max(1, round(0.004 * scale)), cv2.LINE_AA)
+        _draw_sphere(frame, column, middle, thing.radius_m * scale, thing.colour)
+        return
+    top = HORIZON_ROW + (CAMERA_HEIGHT_M - thing.height_m) * scale
+    half = thing.radius_m * scale
+    upper = half if thing.kind == "box" else 0.1 * half
+    corners = np.array([[column - upper, top], [column + upper, top], [column + half, foot], [column - half, foot]])
+    cv2.fillConvexPoly(frame, np.int32(corners * _ONE), thing.colour, cv2.LINE_AA, _SHIFT)
+    lit = [min(255, c * 1.25 + 12) for c in thing.colour]
+    corners[[1, 2], 0] = column + 0.15 * np.array([-upper, -half])
+    cv2.fillConvexPoly(frame, np.int32(corners * _ONE), lit, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_shadow(frame: np.ndarray, column: float, foot: float, radius_m: float, ahead: float) -> None:
+    half_width = FOCAL_PX * radius_m * 0.9 / ahead
+    half_height = half_width * CAMERA_HEIGHT_M / ahead
+    x0, x1 = max(0, int(column - half_width)), min(FRAME_WIDTH, int(column + half_width) + 1)
+    y0, y1 = max(0, int(foot - half_height)), min(FRAME_HEIGHT, int(foot + half_height) + 1)
+    if x0 >= x1 or y0 >= y1:
+        return
+    x = (np.arange(x0, x1, dtype=np.float32) - column) / max(half_width, 1)
+    y = (np.arange(y0, y1, dtype=np.float32) - foot) / max(half_height, 1)
+    keep = np.clip(0.5 + 0.6 * (x[None] ** 2 + y[:, None] ** 2), 0, 1)
+    part = frame[y0:y1, x0:x1]
+    part[:] = part * keep[..., None]
+
+
+def _draw_sphere(frame: np.ndarray, column: float, row: float, radius: float, colour: tuple[int, int, int]) -> None:
+    """A balloon: a little taller than wide, dark at its rim, with a highlight towards the upper left."""
+    rings = int(np.clip(radius / 8, 3, 14))  # enough that a near balloon shows no steps
+    for i in range(rings):
+        share = i / (rings - 1)
+        size = radius * (1 - 0.85 * share)
+        shade = 0.62 + 0.50 * share
+        lift = 70 * max(0.0, share - 0.7) / 0.3
+        centre = ((column - 0.28 * radius * share) * _ONE, (row - 0.33 * radius * share) * _ONE)
+        cv2.ellipse(
+            frame,
+            (round(centre[0]), round(centre[1])),
+            (max(1, round(size * _ONE)), max(1, round(1.12 * size * _ONE))),
+            0,
+            0,
+            360,
+            [min(255.0, c * shade + lift) for c in colour],
+            cv2.FILLED,
+            cv2.LINE_AA,
+            _SHIFT,
+        )
