@@ -17,9 +17,7 @@ NEUTRAL = (0.0, 0.0)  # (steering, throttle): straight and stopped
 def _finite(value: object, what: str) -> float:
     """`value` as a float. Raises PwmError for None, strings, booleans, NaN and infinities."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise PwmError(
-            f"{what} must be a number, found {type(value).__name__} {value!r}: send neutral instead"
-        )
+        raise PwmError(f"{what} must be a number, found {type(value).__name__} {value!r}: send neutral instead")
     try:
         found = float(value)
     except OverflowError:
@@ -47,21 +45,14 @@ class Channel:
     def __post_init__(self):
         for key in ("period_us", "neutral_pct", "span_pct", "low", "high"):
             _finite(getattr(self, key), f"{self.name} {key}")
-        if (
-            self.period_us <= 0
-            or self.span_pct <= 0
-            or not self.low <= 0 <= self.high
-            or self.low == self.high
-        ):
+        if self.period_us <= 0 or self.span_pct <= 0 or not self.low <= 0 <= self.high or self.low == self.high:
             raise PwmError(
                 f"{self.name}: period {self.period_us} us, span {self.span_pct} %, range "
                 f"{self.low} to {self.high} is no servo channel: period and span must be above 0"
             )
         ends = self.neutral_pct + self.span_pct * self.low, self.neutral_pct + self.span_pct * self.high
         if ends[0] <= 0 or ends[1] >= 100:
-            raise PwmError(
-                f"{self.name}: its ends are {ends[0]:.2f} % and {ends[1]:.2f} % of a period: must be inside"
-            )
+            raise PwmError(f"{self.name}: its ends are {ends[0]:.2f} % and {ends[1]:.2f} % of a period: must be inside")
 
     @property
     def us_per_unit(self) -> float:
@@ -137,9 +128,7 @@ class PwmCalibration:
     def channel(self, action_name: str) -> Channel:
         """The channel of "steering" or "throttle". Raises PwmError for other names."""
         if action_name not in ("steering", "throttle"):
-            raise PwmError(
-                f"no servo channel for action {action_name!r}: this rover has steering and throttle"
-            )
+            raise PwmError(f"no servo channel for action {action_name!r}: this rover has steering and throttle")
         return getattr(self, action_name)
 
     def pulses(self, steering: float, throttle: float) -> Pulses:

@@ -103,13 +103,9 @@ class EpisodeWriter:
         }
         for name, value in whole.items():
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-                raise EpisodeError(
-                    f"{self.folder.name}: {name} must be a whole number from 0, found {value!r}"
-                )
+                raise EpisodeError(f"{self.folder.name}: {name} must be a whole number from 0, found {value!r}")
             whole[name] = int(value)
-        actions = self.pwm.actions_from_pulses(
-            steering_us, throttle_us, steering_period_us, throttle_period_us
-        )
+        actions = self.pwm.actions_from_pulses(steering_us, throttle_us, steering_period_us, throttle_period_us)
         row = {
             "system_timestamp": self._time(t_system_s),
             "steering_normalized": round(actions.steering or 0.0, 4) + 0.0,  # + 0.0: no "-0.0" in the file
@@ -124,27 +120,19 @@ class EpisodeWriter:
         t_s = self._time(t_s)
         shape = (self.resolution[1], self.resolution[0], 3)
         if not isinstance(frame_bgr, np.ndarray) or frame_bgr.shape != shape or frame_bgr.dtype != np.uint8:
-            found = (
-                f"{getattr(frame_bgr, 'dtype', type(frame_bgr).__name__)} {getattr(frame_bgr, 'shape', '')}"
-            )
-            raise EpisodeError(
-                f"{self.folder.name}: frames must be uint8 {shape}, found {found}: check the camera"
-            )
+            found = f"{getattr(frame_bgr, 'dtype', type(frame_bgr).__name__)} {getattr(frame_bgr, 'shape', '')}"
+            raise EpisodeError(f"{self.folder.name}: frames must be uint8 {shape}, found {found}: check the camera")
         number = len(self._frames) + 1
         relative = f"frames/frame_{number:06d}.jpg"
         ok, jpeg = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         if not ok:
-            raise EpisodeError(
-                f"{self.folder.name}: frame {number} could not be written as JPEG: check the camera"
-            )
+            raise EpisodeError(f"{self.folder.name}: frame {number} could not be written as JPEG: check the camera")
         (self._temporary / relative).write_bytes(jpeg.tobytes())
         self._frames.append({"frame_id": number, "timestamp": t_s, "image_path": relative})
 
     def _must_be_open(self) -> None:
         if self._temporary is None:
-            raise EpisodeError(
-                f"{self.folder.name}: not open: use it as `with EpisodeWriter(...) as writer:`"
-            )
+            raise EpisodeError(f"{self.folder.name}: not open: use it as `with EpisodeWriter(...) as writer:`")
 
     def _time(self, t_s: float) -> float:
         try:
@@ -152,16 +140,12 @@ class EpisodeWriter:
         except (TypeError, ValueError, OverflowError):
             found = math.nan
         if not math.isfinite(found):
-            raise EpisodeError(
-                f"{self.folder.name}: a time must be finite seconds, found {t_s!r}: check the clock"
-            )
+            raise EpisodeError(f"{self.folder.name}: a time must be finite seconds, found {t_s!r}: check the clock")
         return found
 
     def _refuse_existing(self) -> None:
         if os.path.lexists(self.folder):
-            raise EpisodeError(
-                f"{self.folder}: exists already: name another folder, or move this one away first"
-            )
+            raise EpisodeError(f"{self.folder}: exists already: name another folder, or move this one away first")
 
     def _finish(self) -> None:
         if not self._controls or not self._frames:

@@ -45,6 +45,7 @@ DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
 BURST_SHARE = 0.3  # arriving within this share of the usual interval means: both were waiting in a buffer
 BURST_MIN = 3  # fewer than this is jitter of the USB line, less than `sync_s`, and left alone
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged, two in a row are a hole in time
+HOLE_S = 0.5  # and so is this, whatever is usual: no camera of a moving car is that slow
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
 DISAGREES = 1e-3  # recorded action against the one computed from its pulse; the recordings hold 5e-5
@@ -83,21 +84,15 @@ class Sample:
         try:
             data = self.frame_path.read_bytes()
         except OSError as e:
-            raise EpisodeError(
-                f"{self.frame_path}: cannot be read ({e.strerror}): restore it or load again"
-            ) from None
+            raise EpisodeError(f"{self.frame_path}: cannot be read ({e.strerror}): restore it or load again") from None
         if problem := _jpeg_problem(data[:2], data[-JPEG_TAIL:]):
-            raise EpisodeError(
-                f"{self.frame_path}: {problem}: delete the picture or record the episode again"
-            )
+            raise EpisodeError(f"{self.frame_path}: {problem}: delete the picture or record the episode again")
         try:
             frame = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         except cv2.error:
             frame = None
         if frame is None:
-            raise EpisodeError(
-                f"{self.frame_path}: does not decode as a JPEG: delete it or record the episode again"
-            )
+            raise EpisodeError(f"{self.frame_path}: does not decode as a JPEG: delete it or record the episode again")
         return frame
 
 
@@ -129,12 +124,8 @@ class Recordings:
 
     def action_range(self) -> dict[str, tuple[float, float]]:
         """Smallest and largest recorded value of each action: what errors are given as a share of."""
-        actions = np.concatenate(
-            [s.chunk for s in self.samples]
-        )  # padding repeats values that are in it anyway
-        return {
-            n: (float(actions[:, i].min()), float(actions[:, i].max())) for i, n in enumerate(ACTION_NAMES)
-        }
+        actions = np.concatenate([s.chunk for s in self.samples])  # padding repeats values that are in it anyway
+        return {n: (float(actions[:, i].min()), float(actions[:, i].max())) for i, n in enumerate(ACTION_NAMES)}
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file that the samples came from, by its path relative to `root`."""
@@ -145,9 +136,7 @@ class Recordings:
                 try:
                     found[_relative(path, self.root)] = sha256_of(path)
                 except OSError as e:
-                    raise EpisodeError(
-                        f"{path}: cannot be read any more ({e.strerror}): load again"
-                    ) from None
+                    raise EpisodeError(f"{path}: cannot be read any more ({e.strerror}): load again") from None
         return found
 
     def summary(self) -> dict[str, Any]:
@@ -160,9 +149,7 @@ class Recordings:
             "duration_s": sum(e.duration_s for e in self.episodes),
             "labels": sorted({e.label for e in self.episodes}),
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
-            "faults": [
-                {"file": f.file, "kind": f.kind, "count": f.count, "note": f.note} for f in self.faults
-            ],
+            "faults": [{"file": f.file, "kind": f.kind, "count": f.count, "note": f.note} for f in self.faults],
         }
 
 
@@ -194,9 +181,7 @@ class _Faults:
             entry[0] += count
 
     def listed(self) -> tuple[Fault, ...]:
-        return tuple(
-            Fault(file, kind, count, note) for (file, kind), (count, note) in sorted(self.found.items())
-        )
+        return tuple(Fault(file, kind, count, note) for (file, kind), (count, note) in sorted(self.found.items()))
 
 
 @dataclass(frozen=True)
@@ -247,9 +232,7 @@ def load_recordings(
             f"{root}: no folder of episodes ({e.strerror}): give the folder with episode_* in it"
         ) from None
     if not folders:
-        raise EpisodeError(
-            f"{root}: no episode folders in it: give the folder that holds episode_YYYYMMDD_HHMMSS"
-        )
+        raise EpisodeError(f"{root}: no episode folders in it: give the folder that holds episode_YYYYMMDD_HHMMSS")
     faults = _Faults(root)
     watched = progress(folders, desc="reading episodes", total=len(folders)) if progress else folders
     episodes = tuple(e for folder in watched if (e := _load_episode(folder, chunk, sync_s, pwm, faults)))
@@ -257,9 +240,7 @@ def load_recordings(
         kinds: dict[str, int] = {}
         for fault in faults.listed():
             kinds[fault.kind] = kinds.get(fault.kind, 0) + fault.count
-        worst = ", ".join(
-            f"{kind} {n} times" for kind, n in sorted(kinds.items(), key=lambda k: (-k[1], k[0]))[:6]
-        )
+        worst = ", ".join(f"{kind} {n} times" for kind, n in sorted(kinds.items(), key=lambda k: (-k[1], k[0]))[:6])
         raise EpisodeError(
             f"{root}: no usable sample in {len(folders)} episode folder(s) ({worst or 'they are empty'}): "
             "record again, or copy the whole folders, frames included"
@@ -280,9 +261,7 @@ def _shown(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _load_episode(
-    folder: Path, chunk: int, sync_s: float, pwm: PwmCalibration, faults: _Faults
-) -> Episode | None:
+def _load_episode(folder: Path, chunk: int, sync_s: float, pwm: PwmCalibration, faults: _Faults) -> Episode | None:
     """One folder's episode, or None with a fault that says why."""
     if folder.is_symlink() and not _inside(folder, folder.parent):
         faults.add(folder, "path_leaves_folder", "the episode is a link to somewhere else")
@@ -335,9 +314,7 @@ def _read_tables(folder: Path, faults: _Faults) -> tuple[str, dict[str, tuple[Pa
     ):
         rows = content.get(key, [])
         if not isinstance(rows, list):
-            faults.add(
-                folder / "episode_data.json", "wrong_type", f"{key} is a {type(rows).__name__}, not a list"
-            )
+            faults.add(folder / "episode_data.json", "wrong_type", f"{key} is a {type(rows).__name__}, not a list")
             rows = []
         if rows:
             tables[key] = folder / "episode_data.json", rows
@@ -470,9 +447,7 @@ def _sorted_by_time(items: list, times_s: list[float], path: Path, what: str, fa
 
 def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list[_Control]:
     """Give the controls of a serial burst the times at which they were measured, or drop them."""
-    arduino_steps = [
-        b.arduino_s - a.arduino_s for a, b in pairwise(controls) if 0 < b.arduino_s - a.arduino_s < 1
-    ]
+    arduino_steps = [b.arduino_s - a.arduino_s for a, b in pairwise(controls) if 0 < b.arduino_s - a.arduino_s < 1]
     usual_s = float(np.median(arduino_steps)) if arduino_steps else 0.033
     late = [b.system_s - a.system_s < BURST_SHARE * usual_s for a, b in pairwise(controls)] + [False]
     placed: list[_Control] = []
@@ -507,9 +482,7 @@ def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list
         f"placed by the Arduino's clock, up to {farthest_s:.2f} s before they arrived",
         moved,
     )
-    faults.add(
-        path, "serial_burst_dropped", "the Arduino's clock is missing, or steps back after them", dropped
-    )
+    faults.add(path, "serial_burst_dropped", "the Arduino's clock is missing, or steps back after them", dropped)
     return sorted(placed, key=lambda c: c.system_s)
 
 
@@ -537,9 +510,7 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
             faults.add(path, "not_finite", f"frame {i}: {_shown(row.get('timestamp'))}")
             continue
         if number in numbers:
-            faults.add(
-                path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts"
-            )
+            faults.add(path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts")
             continue
         numbers.add(number)
         picture = folder / name.replace("\\", "/")
@@ -551,9 +522,7 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
         if frame.time_s > kept[-1].time_s:
             kept.append(frame)
         else:
-            faults.add(
-                path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {kept[-1].number}"
-            )
+            faults.add(path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {kept[-1].number}")
     return kept
 
 
@@ -596,9 +565,7 @@ def _actions_of(
     actions = np.zeros((len(frames), len(ACTION_NAMES)), np.float32)
     known = np.ones(len(frames), bool)
     for i in range(len(ACTION_NAMES)):
-        near, index = _nearest(
-            times_s, np.array([c.system_s for c in controls if c.actions[i] is not None]), sync_s
-        )
+        near, index = _nearest(times_s, np.array([c.system_s for c in controls if c.actions[i] is not None]), sync_s)
         values = np.array([c.actions[i] for c in controls if c.actions[i] is not None], np.float32)
         known &= near
         if len(values):
@@ -622,9 +589,7 @@ def _make_samples(
 ) -> tuple[Sample, ...]:
     actions, known, near = _actions_of(frames, controls, sync_s)
     if not near.any():
-        gap_s = min(
-            abs(frames[0].time_s - controls[-1].system_s), abs(controls[0].system_s - frames[-1].time_s)
-        )
+        gap_s = min(abs(frames[0].time_s - controls[-1].system_s), abs(controls[0].system_s - frames[-1].time_s))
         faults.add(folder, "no_overlap", f"frames and controls are {gap_s:.1f} s apart")
         return ()
     faults.add(folder, "frame_without_control", f"no control within {sync_s * 1000:g} ms", int((~near).sum()))
@@ -633,12 +598,9 @@ def _make_samples(
 
     times_s = np.array([f.time_s for f in frames])
     steps_s = np.diff(times_s)
-    holes = (
-        np.flatnonzero(steps_s > HOLE_INTERVALS * np.median(steps_s)) + 1
-        if len(steps_s)
-        else np.array([], int)
-    )
-    note = f"more than {HOLE_INTERVALS:g} times the usual interval between two frames"
+    longest_s = min(HOLE_INTERVALS * float(np.median(steps_s)), HOLE_S) if len(steps_s) else HOLE_S
+    holes = np.flatnonzero(steps_s > longest_s) + 1
+    note = f"more than {longest_s:.3f} s between two frames"
     faults.add(folder, "hole_in_time", note, len(holes))
 
     samples: list[Sample] = []
@@ -747,16 +709,10 @@ def choose_calibration(
     Raises EpisodeError for no samples or a count below 1.
     """
     if not samples or count < 1:
-        raise EpisodeError(
-            f"cannot choose {count} of {len(samples)} samples for calibration: record more episodes"
-        )
+        raise EpisodeError(f"cannot choose {count} of {len(samples)} samples for calibration: record more episodes")
     if len(samples) <= count:
         fewer = len(samples) < count
-        note = (
-            f"asked for {count} calibration samples, found only {len(samples)}: all are used"
-            if fewer
-            else None
-        )
+        note = f"asked for {count} calibration samples, found only {len(samples)}: all are used" if fewer else None
         return tuple(samples), note
     rng = np.random.default_rng(seed)
     steps = np.unique(np.linspace(0, len(samples[0].chunk) - 1, 4).round().astype(int))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from recorded import real_episode
 
 from rover_lib.onboard.errors import PwmError
 from rover_lib.onboard.pwm import ARDUINO_STEP_US, NEUTRAL, Channel, Pulses, PwmCalibration
@@ -34,7 +35,8 @@ def test_ends(pwm):
     assert pwm.pulses(1, 1) == Pulses(2012, 711)
 
 
-def test_recorded_pulses_come_back_within_a_timer_step(pwm, sample_episode):
+def test_recorded_pulses_come_back_within_a_timer_step(pwm):
+    sample_episode = real_episode()
     controls = json.loads((sample_episode / "episode_data.json").read_text())["control_samples"]
     checked = clipped = 0
     for control in controls:
