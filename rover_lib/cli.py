@@ -1,0 +1,283 @@
+"""The command line, thin: it parses, calls the library and prints. On the Pi only the onboard commands work."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rover_lib.onboard.errors import RoverError
+
+FILE = click.Path(path_type=Path)
+
+
+class Rover(click.Group):
+    """A bad input ends in one sentence and exit code 1; --debug adds the traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except RoverError as e:
+            if ctx.params.get("debug"):
+                raise
+            click.echo(f"rover: {e}", err=True)
+        except ModuleNotFoundError as e:
+            if ctx.params.get("debug") or (e.name or "").startswith("rover_lib"):
+                raise
+            click.echo(
+                f"rover: this command needs {e.name}, which only a workstation has: make demo sets one up", err=True
+            )
+        except (OSError, MemoryError) as e:
+            if ctx.params.get("debug"):
+                raise
+            click.echo(f"rover: {type(e).__name__}: {e}", err=True)
+        ctx.exit(1)
+
+
+def progress() -> Callable[..., Any]:
+    """A progress bar where someone watches; plain silence in a log."""
+    from functools import partial
+
+    from tqdm import tqdm
+
+    return partial(tqdm, disable=not sys.stderr.isatty(), leave=False)
+
+
+def show(value: Any, as_json: bool) -> None:
+    """Print a nested dict for people, or as JSON."""
+    if as_json:
+        click.echo(json.dumps(value, indent=2, default=str))
+        return
+
+    def lines(v: Any, indent: str) -> None:
+        for key, inner in v.items() if isinstance(v, dict) else enumerate(v):
+            if isinstance(inner, (dict, list)) and inner:
+                click.echo(f"{indent}{key}")
+                lines(inner, indent + "  ")
+            else:
+                text = f"{inner:.4g}" if isinstance(inner, float) else inner
+                click.echo(f"{indent}{key:<28} {text}")
+
+    lines(value, "")
+
+
+@click.group(cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
+@click.version_option(package_name="rover-policy")
+def main(debug: bool) -> None:
+    """Put a learned driving policy on a small computer.
+
+    A checkpoint (LeRobot ACT) and recordings go in; an INT8 artifact that a Raspberry Pi can run, an honest comparison
+    with the original and a benchmark come out. Start with `make demo`, or with `rover run` on your own files.
+    """
+
+
+@main.command()
+@click.argument("checkpoint", type=FILE)
+@click.argument("episodes", type=FILE)
+@click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
+@click.option("--runs-dir", type=FILE, default="runs", show_default=True)
+@click.option("--samples", type=click.IntRange(min=1), help="Calibration samples [default: params.yml].")
+@click.option("--worlds", type=click.IntRange(min=0), default=0, show_default=True, help="Balloon worlds to drive in.")
+@click.option("--iterations", type=click.IntRange(min=1), help="Timed inferences per mode [default: params.yml].")
+def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
+    """Load, calibrate, quantize, compare and benchmark CHECKPOINT with the recordings in EPISODES.
+
+    Executes the five notebooks; reports, artifacts, figures and the executed notebooks are left in the run's folder.
+    """
+    from rover_lib.workshop.run import run as run_notebooks
+
+    chosen = {k: v for k, v in options.items() if v is not None}
+    folder = run_notebooks(checkpoint, episodes, progress=progress(), **chosen)
+    click.echo(f"done: {folder}")
+
+
+@main.command()
+@click.argument("file", type=FILE)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def inspect(file: Path, as_json: bool) -> None:
+    """Say what FILE is: an artifact, a checkpoint, or a folder of recordings."""
+    import zipfile
+
+    from rover_lib.onboard.artifact import check_integrity, content_hash, read_manifest
+
+    if file.is_file() and zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as z:
+            scripted = any("/code/" in name for name in z.namelist())
+        if scripted:
+            check_integrity(file)
+            return show({"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}, as_json)
+    if file.is_dir() and not (file / "config.json").exists():
+        from rover_lib.workshop.episodes import load_recordings
+
+        return show({"recordings": load_recordings(file, progress=progress()).summary()}, as_json)
+    from rover_lib.workshop.checkpoint import load_checkpoint
+
+    checkpoint = load_checkpoint(file)
+    return show({"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}, as_json)
+
+
+@main.command()
+@click.argument("checkpoint", type=FILE)
+@click.argument("episodes", type=FILE)
+@click.option("-o", "--output", type=FILE, required=True, help="The artifact to write.")
+@click.option("--mode", type=click.Choice(["fp32", "dynamic", "static"]), default="static", show_default=True)
+@click.option("--kind", type=click.Choice(["symmetric", "affine"]), default="symmetric", show_default=True)
+@click.option(
+    "--observer", type=click.Choice(["histogram", "minmax", "percentile"]), default="histogram", show_default=True
+)
+@click.option("--float-block", "float_blocks", multiple=True, help="A block to leave in float; makes static mixed.")
+@click.option("--samples", type=click.IntRange(min=1), help="Calibration samples [default: params.yml].")
+def quantize(checkpoint: Path, episodes: Path, output: Path, mode: str, samples: int | None, **how: Any) -> None:
+    """Quantize CHECKPOINT, calibrated on the recordings in EPISODES, to one artifact.
+
+    `rover run` does this for all modes, chooses the observer and the blocks by measurement, and compares.
+    """
+    from rover_lib.workshop import quantize as q
+    from rover_lib.workshop.act import ACT
+    from rover_lib.workshop.checkpoint import load_checkpoint
+    from rover_lib.workshop.episodes import choose_calibration, load_recordings, split
+    from rover_lib.workshop.params import params
+
+    p = params()
+    how_many, seed = samples or p["calibration"]["samples"], p["calibration"]["seed"]
+    ck = load_checkpoint(checkpoint)
+    recordings = load_recordings(episodes, ck.config.chunk, p["calibration"]["sync_s"], progress())
+    parts = split(recordings, p["calibration"]["held_out_share"], seed)
+    chosen, note = choose_calibration(parts.calibration, how_many, seed)
+    if note:
+        click.echo(f"rover: note: {note}", err=True)
+    vectors = parts.choosing[:: max(1, len(parts.choosing) // 16)] or chosen[:16]
+    options = {"samples": vectors, "tolerance": p["parity"]["fp32"], "int8_errors": p["parity"]["int8_errors"]}
+    if mode == "fp32":
+        digest = q.export(ACT(ck.config, ck.weights), ck, output, **options)
+    else:
+        mode = "mixed" if mode == "static" and how["float_blocks"] else mode
+        smooth = p["quantization"]["smooth"]
+        scheme = q.Scheme(mode, smooth=smooth, percentile=p["quantization"]["percentile"], **how)
+        calibration = q.calibrate(ck, chosen, smooth=smooth, progress=progress())
+        quantized = q.quantize(ck, scheme, calibration)
+        for warning in quantized.report["warnings"]:
+            click.echo(f"rover: warning: {warning}", err=True)
+        digest = q.export(quantized, ck, output, calibration=calibration, **options)
+    click.echo(f"{output}: {mode}, {output.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
+
+
+@main.command()
+@click.argument("reference", type=FILE)
+@click.argument("artifacts", type=FILE, nargs=-1, required=True)
+@click.option("--episodes", type=FILE, required=True, help="Recordings; their held-out part judges.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_json: bool) -> None:
+    """Compare ARTIFACTS with REFERENCE (the FP32 artifact) on recorded frames.
+
+    Errors are shares of the recorded range and microseconds of servo pulse.
+    """
+    from rover_lib.onboard.policy import load_policy
+    from rover_lib.workshop import compare as c
+    from rover_lib.workshop.episodes import load_recordings, split
+    from rover_lib.workshop.params import params
+
+    p = params()["calibration"]
+    fp32 = load_policy(reference)
+    recordings = load_recordings(episodes, fp32.chunk, p["sync_s"], progress())
+    held_out = split(recordings, p["held_out_share"], p["seed"]).held_out
+    others = {a.stem.removeprefix("policy_"): load_policy(a) for a in artifacts}
+    report = c.fidelity(fp32, others, held_out, recordings.action_range(), progress())
+    show({name: report.summary(name) for name in others}, as_json)
+
+
+@main.command()
+@click.argument("artifacts", type=FILE, nargs=-1, required=True)
+@click.option("--warmup", type=click.IntRange(min=0), default=10, show_default=True)
+@click.option("--iterations", type=click.IntRange(min=1), default=100, show_default=True)
+@click.option("--threads", type=click.IntRange(min=0), default=0, show_default=True, help="0: all cores.")
+@click.option("--duration", type=float, help="Soak for so many seconds instead, with a time series.")
+@click.option("--output", type=FILE, help="Write benchmark JSON there, for notebook 05.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def benchmark(
+    artifacts: tuple[Path, ...],
+    warmup: int,
+    iterations: int,
+    threads: int,
+    duration: float | None,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors.
+
+    The first artifact's figures stand at the top level. Needs nothing but the artifact: this is what runs on the Pi.
+    """
+    from rover_lib.onboard.artifact import read_parity
+    from rover_lib.onboard.benchmark import benchmark as measure
+    from rover_lib.onboard.policy import load_policy
+    from rover_lib.onboard.stage import sha256_of, write_stage
+
+    policies = {a.stem: load_policy(a) for a in artifacts}
+    vectors = read_parity(artifacts[0])
+    first = policies[artifacts[0].stem]
+    frames = [
+        {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
+    ]  # stored as RGB; a camera gives BGR
+    options = {"warmup": warmup, "iterations": iterations, "threads": threads, "duration_s": duration}
+    metrics = measure(policies, frames, vectors["state"][0], **options)
+    if output:
+        write_stage(
+            output, "benchmark", params=options, metrics=metrics, inputs={a.name: sha256_of(a) for a in artifacts}
+        )
+    show(metrics, as_json)
+
+
+@main.group()
+def world() -> None:
+    """The balloon world: record an expert, train a policy, drive it."""
+
+
+@world.command()
+@click.argument("out_dir", type=FILE)
+@click.option("--count", type=click.IntRange(min=1), default=60, show_default=True, help="Episodes.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def record(out_dir: Path, count: int, seed: int) -> None:
+    """Record COUNT drives of the expert to OUT_DIR, in the format of the real car's recorder."""
+    from rover_lib.playground.record import record_episodes
+
+    click.echo(f"recorded: {record_episodes(out_dir, count, seed, progress())}")
+
+
+@world.command()
+@click.argument("episodes", type=FILE)
+@click.argument("output", type=FILE)
+@click.option("--size", type=click.Choice(["small", "full"]), default="small", show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps [default: the recipe's].")
+@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
+def train(episodes: Path, output: Path, **options: Any) -> None:
+    """Train LeRobot's ACT on EPISODES and write the checkpoint OUTPUT, in the format of the user's trainer.
+
+    `full` is the policy of the real car; on a CPU give it a few --steps, which do not make it drive.
+    """
+    from rover_lib.playground.train import train as train_policy
+
+    click.echo(f"trained: {train_policy(episodes, output, progress=progress(), **options)}")
+
+
+@world.command()
+@click.argument("artifact", type=FILE)
+@click.option("--worlds", type=click.IntRange(min=1), default=40, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def trial(artifact: Path, worlds: int, seed: int, as_json: bool) -> None:
+    """Drive ARTIFACT through worlds that it has never seen, and count the balloons it hits."""
+    from rover_lib.onboard.policy import load_policy
+    from rover_lib.playground.trial import run_trials
+
+    report = run_trials(load_policy(artifact), worlds, seed, progress=progress())
+    low, high = report.wilson
+    result = {"hits": report.hits, "trials": report.trials, "wilson_low": low, "wilson_high": high}
+    show(result, as_json)
+
+
+if __name__ == "__main__":
+    main()

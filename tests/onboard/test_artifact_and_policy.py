@@ -1,0 +1,217 @@
+"""The artifact alone: what it holds, what it refuses, and that it drives without the workshop."""
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import memory_samples
+
+import rover_lib
+from rover_lib.onboard import artifact, load_policy
+from rover_lib.onboard.errors import ArtifactError, FrameError, PolicyError
+from rover_lib.onboard.policy import check_parity
+
+FRAME = memory_samples(1)[0].picture
+STATE = np.zeros(2, np.float32)
+
+
+def rewritten(source: Path, target: Path, change: dict[str, object]) -> Path:
+    """A copy of an artifact with records replaced, by the end of their names; checksums stay right."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for item in old.infolist():
+            content = old.read(item)
+            for name, edit in change.items():
+                if item.filename.endswith(name):
+                    content = edit(content)
+            if content is not None:
+                new.writestr(item, content)
+    return target
+
+
+def manifest_with(**values):
+    return lambda raw: json.dumps({k: v for k, v in (json.loads(raw) | values).items() if v is not ...}).encode()
+
+
+@pytest.mark.parametrize("mode", ["fp32", "dynamic", "static", "mixed"])
+def test_drives(artifacts, mode):
+    policy = load_policy(artifacts[mode])
+    assert policy.manifest["mode"] == mode and policy.action_names == ("steering", "throttle")
+    assert policy.rate_hz == 30 and policy.image_size == (72, 128)
+    chunk = policy.predict_chunk(FRAME, STATE)
+    assert chunk.shape == (policy.chunk, 2) and chunk.dtype == np.float32
+    assert (np.abs(chunk[:, 0]) <= 1).all() and (chunk[:, 1] >= 0).all() and (chunk[:, 1] <= 1).all()
+    assert np.array_equal(chunk, policy.predict_chunk(FRAME, STATE))  # no state is kept
+    assert not np.array_equal(chunk, policy.predict_chunk(255 - FRAME, STATE))  # it looks
+    big = np.repeat(np.repeat(FRAME, 5, 0), 5, 1)
+    assert np.allclose(policy.predict_chunk(big, STATE), chunk, atol=1e-5)  # any size of camera
+
+
+def test_equals_the_policy_it_was_made_of(tiny, artifacts):
+    from rover_lib.workshop.act import ACT
+    from rover_lib.workshop.quantize import inputs_of
+
+    sample = memory_samples(1, seed=9)[0]
+    policy = load_policy(artifacts["fp32"])
+    with torch.inference_mode():
+        expected = ACT(tiny.config, tiny.weights)(*inputs_of(sample, tiny.config))[0].numpy()
+    found = policy.run(sample.state, [inputs_of(sample, tiny.config)[1].numpy()])
+    assert np.abs(found - expected).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("frame", "state", "error"),
+    [
+        (None, STATE, FrameError),
+        (FRAME[:, :, 0], STATE, FrameError),
+        (FRAME.astype(np.float32), STATE, FrameError),
+        (FRAME[:0], STATE, FrameError),
+        (FRAME, np.zeros(3), PolicyError),
+        (FRAME, np.array([np.nan, 0]), PolicyError),
+        (FRAME, np.array([0, np.inf]), PolicyError),
+        ({"other": FRAME}, STATE, PolicyError),
+    ],
+)
+def test_refuses_what_is_no_observation(artifacts, frame, state, error):
+    with pytest.raises(error):
+        load_policy(artifacts["fp32"]).predict_chunk(frame, state)
+
+
+def test_a_prediction_that_is_not_finite_never_comes_out(artifacts, monkeypatch):
+    policy = load_policy(artifacts["fp32"])
+    monkeypatch.setattr(policy, "_module", lambda *x: torch.full((1, 32, 2), torch.nan))
+    with pytest.raises(PolicyError, match="NaN"):
+        policy.predict_chunk(FRAME, STATE)
+
+
+def refused(path) -> str:
+    with pytest.raises(ArtifactError) as e:
+        load_policy(path)
+    assert str(path) in str(e.value) and "\n" not in str(e.value)
+    return str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"schema": 99}, "schema 99"),
+        ({"versions": {"torch": "2.7.1"}}, "torch 2.7.1"),
+        ({"engine": "x86tpu"}, "x86tpu"),
+        ({"chunk": ...}, "'chunk'"),
+        ({"chunk": "32"}, "'chunk'"),
+        ({"chunk": 16}, "another shape"),
+        ({"cameras": [{"name": "cam_front"}]}, "lacks name, height or width"),
+        ({"action_names": ["steering"]}, "tolerance"),
+        ({"parity": {"tolerance": {"steering": 0.0, "throttle": -1.0}}}, "do not drive"),
+    ],
+)
+def test_refuses_manifests_that_do_not_fit(artifacts, tmp_path, values, says):
+    path = rewritten(artifacts["static"], tmp_path / "x.pt", {"manifest.json": manifest_with(**values)})
+    assert says in refused(path)
+
+
+def other_answers(raw: bytes) -> bytes:
+    vectors = dict(np.load(io.BytesIO(raw)))
+    vectors["chunk"] = vectors["chunk"] + 0.5
+    out = io.BytesIO()
+    np.savez_compressed(out, **vectors)
+    return out.getvalue()
+
+
+def test_refuses_a_policy_that_computes_something_else(artifacts, tmp_path):
+    path = rewritten(artifacts["static"], tmp_path / "x.pt", {"parity.npz": other_answers})
+    assert "differs by" in refused(path)
+
+
+def test_refuses_damaged_files(artifacts, tmp_path):
+    whole = artifacts["static"].read_bytes()
+    path = tmp_path / "x.pt"
+    assert "not found" in refused(path)
+    for content in (b"", b"text", whole[: len(whole) // 2]):
+        path.write_bytes(content)
+        refused(path)
+    for at in range(0, len(whole), len(whole) // 25):  # a flipped byte anywhere, in weights too
+        flipped = bytearray(whole)
+        flipped[at] ^= 0x10
+        path.write_bytes(flipped)
+        try:
+            same = np.array_equal(load_policy(path).predict_chunk(FRAME, STATE), reference(artifacts))
+        except ArtifactError:
+            continue
+        assert same  # only bytes that mean nothing (padding between records) may pass
+
+
+def reference(artifacts):
+    return load_policy(artifacts["static"]).predict_chunk(FRAME, STATE)
+
+
+def test_refuses_files_without_manifest_or_vectors(artifacts, tmp_path):
+    gone = lambda raw: None  # noqa: E731
+    assert "manifest.json" in refused(rewritten(artifacts["fp32"], tmp_path / "a.pt", {"manifest.json": gone}))
+    assert "parity.npz" in refused(rewritten(artifacts["fp32"], tmp_path / "b.pt", {"parity.npz": gone}))
+    junk = rewritten(artifacts["fp32"], tmp_path / "c.pt", {"parity.npz": lambda raw: b"junk"})
+    assert "parity vectors" in refused(junk)
+    pickled = io.BytesIO()
+    np.savez(pickled, state=np.array([{}], object), chunk=np.zeros(1))
+    evil = rewritten(artifacts["fp32"], tmp_path / "d.pt", {"parity.npz": lambda raw: pickled.getvalue()})
+    assert "parity vectors" in refused(evil)  # no pickled objects, ever
+
+
+def test_nothing_is_left_when_writing_fails(artifacts, tmp_path, monkeypatch):
+    module = torch.jit.load(str(artifacts["fp32"]))
+    manifest, parity = artifact.read_manifest(artifacts["fp32"]), artifact.read_parity(artifacts["fp32"])
+    path = tmp_path / "x.pt"
+    with pytest.raises(ArtifactError, match="'gmac'"):
+        artifact.save_artifact(path, module, {k: v for k, v in manifest.items() if k != "gmac"}, parity)
+
+    def full(self, data):
+        raise OSError(28, "No space left on device")
+
+    path.write_text("old")
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space"):
+        artifact.save_artifact(path, module, manifest, parity)
+    assert [p.name for p in tmp_path.iterdir()] == ["x.pt"] and path.read_text() == "old"
+
+
+def test_parity_difference_is_reported(artifacts):
+    found = check_parity(load_policy(artifacts["fp32"]))
+    assert set(found) == {"steering", "throttle"} and max(found.values()) <= 1e-4
+
+
+def test_drives_in_a_clean_environment(artifacts, tmp_path):
+    """torch, numpy and opencv only, as on the Pi: no lerobot, no torchvision, no workshop."""
+    versions = {n: __import__(m).__version__ for n, m in {"torch": "torch", "numpy": "numpy"}.items()}
+    from importlib.metadata import version
+
+    wanted = [f"{n}=={v.split('+')[0]}" for n, v in versions.items()]
+    wanted.append(f"opencv-python-headless=={version('opencv-python-headless')}")
+    venv = tmp_path / "venv"
+    uv = [sys.executable, "-m", "uv"]
+    subprocess.run([*uv, "venv", "--quiet", "--python", sys.executable, venv], check=True)
+    python = venv / "bin" / "python"
+    subprocess.run([*uv, "pip", "install", "--quiet", "--python", python, *wanted], check=True)
+    package = Path(rover_lib.__file__).parent
+    copy = tmp_path / "code" / "rover_lib"
+    shutil.copytree(package / "onboard", copy / "onboard")
+    shutil.copy(package / "__init__.py", copy)
+    program = f"""
+import importlib.util, sys
+sys.path.insert(0, {str(copy.parent)!r})
+import numpy as np
+from rover_lib.onboard import load_policy
+for absent in ("lerobot", "torchvision", "rover_lib.workshop", "yaml", "click"):
+    assert importlib.util.find_spec(absent) is None, absent
+for path in {[str(artifacts[m]) for m in ("fp32", "dynamic", "static", "mixed")]!r}:
+    chunk = load_policy(path, threads=1).predict_chunk(np.full((360, 640, 3), 99, np.uint8), np.zeros(2))
+    assert chunk.shape == (32, 2) and np.isfinite(chunk).all()
+print("drove")
+"""
+    done = subprocess.run([python, "-I", "-c", program], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0 and done.stdout.strip() == "drove", done.stderr

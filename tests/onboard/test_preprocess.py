@@ -1,0 +1,62 @@
+"""Frames: equal to LeRobot's path (RGB, resize, ImageNet normalisation)."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import smooth_frame
+from hypothesis import given
+from hypothesis import strategies as st
+from torchvision.transforms.v2 import functional as tv
+
+from rover_lib.onboard.errors import FrameError
+from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise, prepare_frame
+
+
+def lerobots(frame_bgr, height, width):
+    """RGB, to float, torchvision's resize, torchvision's normalisation."""
+    x = torch.from_numpy(cv2.cvtColor(frame_bgr, cv2.COLOR_BGR2RGB)).permute(2, 0, 1).float() / 255
+    x = tv.resize(x, [height, width], antialias=True)
+    return tv.normalize(x, IMAGENET_MEAN, IMAGENET_STD).numpy()
+
+
+def test_same_size_is_exact():
+    frame = np.random.default_rng(0).integers(0, 256, (360, 640, 3), dtype=np.uint8)
+    rgb = prepare_frame(frame, 360, 640)
+    assert np.array_equal(rgb, frame[:, :, ::-1]) and rgb.flags.c_contiguous
+    assert np.abs(normalise(rgb) - lerobots(frame, 360, 640)).max() < 1e-5
+
+
+@pytest.mark.parametrize(("h", "w"), [(480, 640), (720, 1280), (180, 320), (361, 641)])
+def test_resized_is_lerobots_to_a_step_of_the_picture(h, w):
+    """OpenCV averages bytes, torchvision floats: on a camera-like picture they differ by rounding of a byte or two."""
+    frame = smooth_frame(np.random.default_rng(1), h, w)
+    difference = np.abs(normalise(prepare_frame(frame, 360, 640)) - lerobots(frame, 360, 640))
+    step = 1 / 255 / min(IMAGENET_STD)
+    assert difference.mean() < 0.75 * step
+    assert difference.max() < 4 * step
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 40), st.integers(1, 40), st.integers(0, 255))
+def test_any_size_keeps_a_flat_colour(h, w, height, width, value):
+    frame = np.full((h, w, 3), (value, 255 - value, 7), np.uint8)
+    out = prepare_frame(frame, height, width)
+    assert out.shape == (height, width, 3) and out.dtype == np.uint8
+    assert np.array_equal(out, np.broadcast_to(np.array([7, 255 - value, value], np.uint8), out.shape))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        None,
+        "frame",
+        np.zeros((4, 4), np.uint8),
+        np.zeros((4, 4, 4), np.uint8),
+        np.zeros((4, 4, 3)),
+        np.zeros((0, 4, 3), np.uint8),
+    ],
+    ids=lambda b: str(getattr(b, "shape", b)),
+)
+def test_refuses_what_is_no_picture(bad):
+    with pytest.raises(FrameError):
+        prepare_frame(bad, 360, 640)

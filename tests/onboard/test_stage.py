@@ -1,0 +1,42 @@
+"""Stage files: whole or absent, and plain JSON."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+
+
+def test_writes_plain_json(tmp_path):
+    path = tmp_path / "runs" / "x" / "load.json"
+    metrics = {"a_ms": np.float32(1.5), "b": np.arange(2), "c": torch.tensor(3), "nan": float("nan"), "p": path}
+    written = write_stage(path, "load", params={}, metrics=metrics, inputs={"f": "0"})
+    assert read_stage(path, "load") == written == json.loads(path.read_text())
+    assert written["metrics"] == {"a_ms": 1.5, "b": [0, 1], "c": 3, "nan": None, "p": str(path)}
+    assert set(written) == {"schema", "stage", "params", "metrics", "inputs", "env"}
+    assert {"host", "machine", "torch", "commit"} <= set(written["env"])
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(None, "not found"), ("{", "JSON"), ("[]", "found list"), ('{"schema": 2, "stage": "load"}', "schema 1")],
+)
+def test_refuses_what_is_no_stage(tmp_path, content, says):
+    path = tmp_path / "load.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(RoverError, match=says):
+        read_stage(path, "load")
+
+
+def test_an_exception_leaves_the_old_file(tmp_path):
+    path = tmp_path / "x"
+    path.write_text("old")
+    before = sha256_of(path)
+    with pytest.raises(ZeroDivisionError), atomic_path(path) as temporary:
+        temporary.write_text("half")
+        1 / 0  # noqa: B018
+    assert sha256_of(path) == before and list(tmp_path.iterdir()) == [path]

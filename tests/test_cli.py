@@ -1,0 +1,91 @@
+"""The command line: help that helps, one sentence for bad input, nothing half-written."""
+
+import json
+
+import pytest
+import torch
+from click.testing import CliRunner
+
+from rover_lib.cli import main
+
+
+def rover(*args):
+    return CliRunner().invoke(main, [str(a) for a in args])
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        [],
+        ["run"],
+        ["inspect"],
+        ["quantize"],
+        ["compare"],
+        ["benchmark"],
+        ["world"],
+        ["world", "record"],
+        ["world", "train"],
+        ["world", "trial"],
+    ],
+    ids=" ".join,
+)
+def test_help(command):
+    result = rover(*command, "--help")
+    assert result.exit_code == 0 and "Usage" in result.output and len(result.output) > 150
+
+
+def test_inspects_each_kind_of_file(artifacts, tiny_file):
+    found = json.loads(rover("inspect", artifacts["static"], "--json").output)
+    assert found["artifact"]["mode"] == "static" and len(found["artifact"]["content_hash"]) == 64
+    found = json.loads(rover("inspect", tiny_file, "--json").output)
+    assert found["checkpoint"]["format"] == "trainer"
+    assert "parameters_acting" in rover("inspect", tiny_file).output
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["inspect", "nothing.pt"],
+        ["benchmark", "nothing.pt"],
+        ["compare", "nothing.pt", "other.pt", "--episodes", "none"],
+        ["quantize", "nothing.pth", "none", "-o", "out.pt"],
+        ["run", "nothing.pth", "none"],
+        ["world", "train", "none", "out.pth"],
+        ["world", "trial", "nothing.pt"],
+    ],
+    ids=" ".join,
+)
+def test_bad_input_is_one_sentence(args, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = rover(*args)
+    assert result.exit_code == 1
+    lines = [line for line in result.output.splitlines() if line]
+    assert len(lines) == 1 and lines[0].startswith("rover: "), result.output
+    assert [p for p in tmp_path.rglob("*") if p.is_file()] == []  # nothing half-written
+
+
+def test_debug_shows_the_traceback(tmp_path):
+    result = rover("--debug", "inspect", tmp_path / "nothing.pt")
+    assert result.exit_code == 1 and result.exception is not None
+
+
+def test_benchmark_writes_its_stage(artifacts, tmp_path):
+    out = tmp_path / "benchmark-here.json"
+    result = rover(
+        "benchmark", artifacts["static"], artifacts["fp32"], "--iterations", 3, "--warmup", 1, "--threads", 1,
+        "--output", out, "--json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    metrics = json.loads(out.read_text())["metrics"]
+    keys = "latency_p50_ms latency_p95_ms latency_p99_ms latency_mean_ms latency_max_ms throughput_fps "
+    keys += "control_rate_hz peak_memory_mb cpu_pct floor_ms"
+    assert set(keys.split()) <= set(metrics) and set(metrics["artifacts"]) == {"policy_static", "policy_fp32"}
+
+
+def test_a_damaged_checkpoint_leaves_no_artifact(tiny_file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    content = torch.load(tiny_file, weights_only=False)
+    content["model_state_dict"]["model.action_head.bias"][0] = torch.nan
+    torch.save(content, tmp_path / "nan.pth")
+    result = rover("quantize", tmp_path / "nan.pth", "episodes", "-o", tmp_path / "out.pt")
+    assert result.exit_code == 1 and "NaN" in result.output and not (tmp_path / "out.pt").exists()

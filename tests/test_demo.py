@@ -1,0 +1,41 @@
+"""The demo's run, made by `make demo`, held to the gates of params.yml."""
+
+import pytest
+from conftest import stage_of
+
+from rover_lib.onboard import load_policy
+from rover_lib.workshop.params import params
+
+STAGES = ("load", "calibrate", "quantize", "compare")
+
+
+def test_left_everything_that_a_run_leaves(demo_run):
+    for stage in STAGES:
+        content = stage_of(demo_run, stage)
+        assert content["schema"] == 1 and content["stage"] == stage and content["inputs"]
+    for mode in ("fp32", "dynamic", "static", "mixed"):
+        assert load_policy(demo_run / f"policy_{mode}.pt").manifest["mode"] == mode
+    assert len(list(demo_run.glob("0[1-5]_*.ipynb"))) == 5
+    assert len(list((demo_run / "figures").glob("*.png"))) >= 5
+    assert list(demo_run.glob("benchmark-*.json"))
+
+
+def test_the_policy_drives_and_int8_drives_like_it(demo_run):
+    gates, metrics = params()["gates"], stage_of(demo_run, "compare")["metrics"]
+    fp32, static = metrics["fp32"], metrics["modes"]["static"]
+    assert fp32["trials"] == static["trials"] == 40
+    assert fp32["hits"] >= gates["fp32_hits"]
+    assert static["hits"] >= fp32["hits"] - gates["hits_lost"]
+
+
+@pytest.mark.parametrize("mode", ["static", "mixed"])
+def test_int8_is_faithful(demo_run, mode):
+    gates, found = params()["gates"], stage_of(demo_run, "compare")["metrics"]["modes"][mode]
+    for action in ("steering", "throttle"):
+        assert 0 < found[f"{action}_mae_pct"] <= gates[f"{action}_mae_pct"]
+        assert found[f"{action}_mae_us"] > 0
+
+
+def test_sizes_are_weights_with_weights(demo_run):
+    metrics = stage_of(demo_run, "compare")["metrics"]
+    assert 0.2 < metrics["modes"]["static"]["size_mb"] / metrics["fp32"]["size_mb"] < 0.35

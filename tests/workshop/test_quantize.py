@@ -1,0 +1,285 @@
+"""Quantization: exact where it claims to be, acting where it claims to act, loud where it cannot."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from conftest import TINY, lerobot_policy, memory_samples, trainer_content
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rover_lib.onboard.errors import QuantizeError
+from rover_lib.workshop import act
+from rover_lib.workshop import quantize as q
+from rover_lib.workshop.act import ACT
+from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.quantize import Bench, Calibration, RangeObserver, Scheme, calibrate, quantize
+
+RANGE = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.5)}
+
+
+def inputs(checkpoint, count=4, seed=3):
+    return [q.inputs_of(s, checkpoint.config) for s in memory_samples(count, *checkpoint.config.image_sizes[0], seed)]
+
+
+@pytest.mark.parametrize("as_conv", [False, True])
+@pytest.mark.parametrize(
+    "variant", [{}, {"pre_norm": True, "n_encoder_layers": 2}, {"feedforward_activation": "gelu"}], ids=str
+)
+@pytest.mark.parametrize("smooth", [0.0, 0.5, 1.0])
+def test_channel_scales_are_exact_in_float(variant, smooth, as_conv, tmp_path):
+    from test_act import saved
+
+    saved(lerobot_policy(**(TINY | variant)), tmp_path)
+    checkpoint = load_checkpoint(tmp_path)
+    model = ACT(checkpoint.config, checkpoint.weights, as_conv=as_conv)
+    seen = inputs(checkpoint, 3)
+    before = q.predictions(model, seen)
+    maxima = q.channel_maxima(model, seen)
+    q.apply_channel_scales(model, maxima, smooth)
+    assert any(b is not None for n, b in model.named_buffers() if n.endswith("kv_in"))
+    assert (q.predictions(model, seen) - before).abs().max() < 1e-5
+
+
+def test_channel_scales_even_out_an_outlier_channel(tiny):
+    """One channel of the last feed-forward's output fifty times the rest: what cost the throttle 2.8 %."""
+    weights = {k: v.clone() for k, v in tiny.weights.items()}
+    weights["decoder.layers.1.linear2.weight"][5] *= 50
+    loud = replace(tiny, weights=weights, sha256="loud")
+    name = "decoder.1.feed_forward.down"
+    seen = calibrate(loud, memory_samples(8)).channels[name]
+
+    def spread(x):
+        return (x.max() / x.median()).item()
+
+    assert spread(seen["out_max"]) > 10
+    assert spread(seen["out_max_scaled"]) < 3
+
+
+@pytest.mark.parametrize("kind", ["symmetric", "affine"])
+@pytest.mark.parametrize("mode", ["dynamic", "static", "mixed"])
+def test_acts_on_every_layer_and_stays_close(tiny, calibration, mode, kind):
+    scheme = Scheme(mode, kind, float_blocks=("backbone.stem",) if mode == "mixed" else ())
+    quantized = quantize(tiny, scheme, calibration)
+    convs = [n for n, m in ACT(tiny.config, tiny.weights).named_modules() if isinstance(m, torch.nn.Conv2d)]
+    projections = q._projections(ACT(tiny.config, tiny.weights))
+    expected = {"dynamic": len(projections), "static": len(projections) + len(convs)}
+    expected["mixed"] = expected["static"] - 1
+    assert quantized.report["int8_modules"] == expected[mode]
+    assert set(quantized.report["embeddings"]) == {"encoder_1d_feature_pos_embed", "decoder_pos_embed"}
+    x = inputs(tiny)
+    reference = q.predictions(ACT(tiny.config, tiny.weights), x)
+    error = (q.predictions(quantized.module, x) - reference).abs()
+    assert 0 < error.mean() < 0.1 * reference.std()
+
+
+def test_symmetric_means_what_the_fast_kernels_want(tiny, calibration):
+    """qint8 activations, weights per channel and symmetric in [-127, 127]: what dispatches to XNNPACK."""
+    module = quantize(tiny, Scheme("static"), calibration).module
+    for name, m in module.named_modules():
+        if isinstance(m, q.INT8_MODULES):
+            w = m.weight()
+            assert w.qscheme() == torch.per_channel_affine and (w.q_per_channel_zero_points() == 0).all(), name
+            assert w.int_repr().min() >= -127, name
+            assert w.q_per_channel_scales().min() >= q.SMALLEST_SCALE and m.scale >= q.SMALLEST_SCALE, name
+    dtypes = {n.args[3] for n in module.graph.nodes if n.target is torch.quantize_per_tensor}
+    assert dtypes == {torch.qint8}
+    affine = quantize(tiny, Scheme("static", "affine"), calibration).module
+    assert {n.args[3] for n in affine.graph.nodes if n.target is torch.quantize_per_tensor} == {torch.quint8}
+
+
+def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration):
+    """The first layer's INT8 output against quantize -> float convolution -> quantize, to one step."""
+    quantized = quantize(tiny, Scheme("static"), calibration)
+    prepared = q._prepared(tiny, Scheme("static"), calibration)
+    seen = {}
+    conv = quantized.module.get_submodule("backbone.stem.0")
+    conv.register_forward_hook(lambda m, args, out: seen.update(x=args[0], y=out))
+    quantized.module(*inputs(tiny, 1)[0])
+    x, y = seen["x"], seen["y"]
+    plain = prepared.get_submodule("backbone.stem.0")
+    float_conv = plain[0] if isinstance(plain, torch.nn.Sequential) else plain
+    w = conv.weight().dequantize()
+    z = torch.relu(
+        torch.nn.functional.conv2d(x.dequantize(), w, float_conv.bias, float_conv.stride, float_conv.padding)
+    )
+    z = torch.fake_quantize_per_tensor_affine(z, y.q_scale(), y.q_zero_point(), -128, 127)
+    assert (y.dequantize() - z).abs().max() <= 1.01 * y.q_scale()
+
+
+def test_a_mode_that_changed_nothing_is_an_error(tiny, calibration, monkeypatch):
+    monkeypatch.setattr(q, "_pattern", lambda block, relu: "no such module")
+    with pytest.raises(QuantizeError):
+        quantize(tiny, Scheme("static"), calibration)
+    with pytest.raises(QuantizeError, match="nothing was quantized"):
+        q.check_acted({}, ["a"])
+    with pytest.raises(QuantizeError, match="1 of 2 layers stayed float: b"):
+        q.check_acted({"a": torch.nn.Identity()}, ["a", "b"])
+
+
+def test_embedding_tables_would_be_weight_only(tiny):
+    mapping = q._mapping(tiny.config, Scheme())
+    assert mapping.object_type_qconfigs[torch.nn.Embedding] is torch.ao.quantization.float_qparams_weight_only_qconfig
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"mode": "int4"}, {"kind": "odd"}, {"observer": "guess"}, {"smooth": 1.5}, {"percentile": 0.0}],
+    ids=str,
+)
+def test_a_scheme_that_exists_is_valid(bad):
+    with pytest.raises(QuantizeError, match=next(iter(bad))):
+        Scheme(**bad)
+
+
+def test_refusals(tiny, calibration, tmp_path):
+    with pytest.raises(QuantizeError, match="no_block"):
+        quantize(tiny, Scheme("mixed", float_blocks=("no_block",)), calibration)
+    with pytest.raises(QuantizeError, match="smooth"):
+        quantize(tiny, Scheme(smooth=None), calibration)
+    with pytest.raises(QuantizeError, match="another checkpoint"):
+        quantize(replace(tiny, sha256="other"), Scheme(), calibration)
+    with pytest.raises(QuantizeError, match="needs samples"):
+        calibrate(tiny, [])
+    with pytest.raises(QuantizeError, match="choosing needs samples"):
+        Bench(tiny, calibration, [], RANGE)
+    with pytest.raises(QuantizeError, match="02_calibrate"):
+        Calibration.load(tmp_path / "none.pt")
+    (tmp_path / "bad.pt").write_bytes(b"x")
+    with pytest.raises(QuantizeError, match="not a calibration"):
+        Calibration.load(tmp_path / "bad.pt")
+
+
+def test_refuses_policies_that_recordings_do_not_fit(tmp_path):
+    from test_act import saved
+
+    saved(lerobot_policy(**TINY, states=6, actions=6), tmp_path)
+    with pytest.raises(QuantizeError, match="6 actions"):
+        calibrate(load_checkpoint(tmp_path), memory_samples(1))
+
+
+def test_non_finite_activations_are_an_error(tiny):
+    weights = {k: v.clone() for k, v in tiny.weights.items()}
+    weights["backbone.conv1.weight"] *= 1e38
+    with pytest.raises(QuantizeError, match="NaN or Inf"):
+        calibrate(replace(tiny, weights=weights), memory_samples(1))
+
+
+def test_a_calibration_survives_its_file(tiny, calibration, tmp_path):
+    calibration.save(tmp_path / "c.pt")
+    again = Calibration.load(tmp_path / "c.pt")
+    x = inputs(tiny)
+    a, b = (q.predictions(quantize(tiny, Scheme(), c).module, x) for c in (calibration, again))
+    assert torch.equal(a, b)
+
+
+def test_inspect_layers_sees_clipping(tiny, calibration):
+    quantized = quantize(tiny, Scheme(observer="minmax"), calibration)
+    rows = {r["name"]: r for r in q.inspect_layers(quantized, tiny, calibration, memory_samples(12))}
+    assert len(rows) == quantized.report["int8_modules"]
+    # The calibration's own samples, min-max: nothing is clipped, and every layer carries a signal.
+    assert max(r["clipped_pct"] for r in rows.values()) < 0.5
+    assert min(r["snr_db"] for r in rows.values()) > 5
+    assert not q.clipped_warnings(list(rows.values()), 1.0)
+    conv = quantized.module.get_submodule("backbone.layer1.0.body.0")
+    conv.scale = float(conv.scale) / 4
+    rows = q.inspect_layers(quantized, tiny, calibration, memory_samples(2))
+    row = next(r for r in rows if r["name"] == "backbone.layer1.0.body.0")
+    assert row["clipped_pct"] > 1
+    assert any("layer1.0.body.0" in w for w in q.clipped_warnings(rows, 1.0))
+
+
+def test_bench_chooses_by_error(tiny, calibration):
+    bench = Bench(tiny, calibration, memory_samples(3, seed=8), RANGE)
+    scheme, table = bench.choose_observer(Scheme())
+    assert set(table) == set(q.OBSERVERS)
+    assert max(table[scheme.observer].values()) == min(max(row.values()) for row in table.values())
+    sensitivity = bench.sensitivity(scheme)
+    assert list(sensitivity) == act.blocks(tiny.config)
+    assert all(max(e.values()) > 0 for e in sensitivity.values())  # each block alone does something
+    mixed, steps = bench.choose_mixed(scheme, sensitivity, budget_pct=1e-6, max_blocks=2)
+    assert [len(s["float_blocks"]) for s in steps] == [0, 1, 2] and mixed.mode == "mixed"
+    worst = max(sensitivity, key=lambda b: max(sensitivity[b].values()))
+    assert steps[1]["float_blocks"] == [worst]
+    plain, steps = bench.choose_mixed(scheme, sensitivity, budget_pct=100, max_blocks=2)
+    assert plain.float_blocks == () and len(steps) == 1
+
+
+finite = st.floats(-1e4, 1e4, allow_nan=False, width=32)
+
+
+def observer(choice="minmax"):
+    return RangeObserver(dtype=torch.qint8, quant_min=-128, quant_max=127, choice=choice, percentile=99.0)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.lists(finite, min_size=1, max_size=50), min_size=1, max_size=5), st.sampled_from(q.OBSERVERS))
+def test_an_observers_range_is_within_what_it_saw(batches, choice):
+    o = observer(choice)
+    for b in batches:
+        o(torch.tensor(b))
+    values = np.concatenate([np.asarray(b, np.float32) for b in batches])
+    low, high = o.range()
+    assert min(values.min(), 0) - 1e-3 <= low <= 0 <= high <= max(values.max(), 0) + 1e-3
+    assert o.histogram.sum() == len(values)  # no value falls off when the limit doubles
+    scale, zero = o.calculate_qparams()
+    assert scale >= q.SMALLEST_SCALE and -128 <= zero <= 127
+
+
+def test_growing_the_histogram_keeps_it_exact():
+    one, two = observer(), observer()
+    small, large = torch.linspace(-1, 1, 1001), torch.linspace(-4, 4, 1001)
+    one(small), one(large)
+    two(large)  # its limit is 4 from the start
+    two(small)
+    assert one.limit == two.limit == 4
+    # A value on the border of two bins may fall on either side, nothing moves further.
+    assert (one.histogram.cumsum(0) - two.histogram.cumsum(0)).abs().max() <= 2
+
+
+def test_percentile_and_histogram_drop_a_lone_outlier():
+    x = torch.cat([torch.linspace(-1, 1, 100_000), torch.tensor([50.0])])
+    ranges = {}
+    for choice in q.OBSERVERS:
+        o = observer(choice)
+        o(x)
+        ranges[choice] = o.range()[1]
+    assert ranges["minmax"] == 50
+    assert ranges["percentile"] < 1.1
+    assert ranges["histogram"] < 50
+
+
+def test_an_observer_that_saw_nothing_says_so():
+    with pytest.raises(QuantizeError, match="saw nothing"):
+        observer().calculate_qparams()
+
+
+def test_same_inputs_same_content(tiny, calibration, tmp_path):
+    from rover_lib.onboard.artifact import content_hash
+
+    hashes = {
+        q.export(
+            quantize(tiny, Scheme(), calibration),
+            tiny,
+            tmp_path / n,
+            samples=memory_samples(2),
+            calibration=calibration,
+        )
+        for n in ("a.pt", "b.pt")
+    }
+    assert hashes == {content_hash(tmp_path / "a.pt")}
+    other = q.export(ACT(tiny.config, tiny.weights), tiny, tmp_path / "c.pt", samples=memory_samples(2))
+    assert other not in hashes
+
+
+def test_calibration_is_weights_only(calibration, tmp_path):
+    calibration.save(tmp_path / "c.pt")
+    torch.load(tmp_path / "c.pt", weights_only=True)  # no pickled objects
+
+
+def test_the_optimizer_is_not_in_the_artifact(tiny_policy, artifacts):
+    assert "optimizer_state_dict" in trainer_content(tiny_policy)
+    acting = 4 * sum(v.numel() for k, v in tiny_policy.state_dict().items() if "vae" not in k) / 1e6
+    assert artifacts["fp32"].stat().st_size / 1e6 < 1.05 * acting + 0.3
+    assert artifacts["static"].stat().st_size < 0.3 * artifacts["fp32"].stat().st_size
