@@ -6,6 +6,7 @@ features, computed once; then all together at a tenth of the rate.
 """
 
 import inspect
+import math
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -401,14 +402,11 @@ def _optimiser(
 ) -> tuple[torch.optim.AdamW, torch.optim.lr_scheduler.LRScheduler]:
     optimizer = torch.optim.AdamW(parameters, lr=rate, betas=BETAS, weight_decay=WEIGHT_DECAY)
     warmup = max(1, steps // 20)
-    scheduler = torch.optim.lr_scheduler.SequentialLR(
-        optimizer,
-        [
-            torch.optim.lr_scheduler.LinearLR(optimizer, 0.1, total_iters=warmup),
-            torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, steps - warmup), eta_min=rate * 0.01),
-        ],
-        [warmup],
-    )
+
+    def share(step: int) -> float:
+        return min(1.0, (step + 1) / warmup) * (0.01 + 0.99 * (1 + math.cos(math.pi * min(1, step / steps))) / 2)
+
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, share)
     return optimizer, scheduler
 
 
