@@ -19,17 +19,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import PolicyError, PwmError
-from rover_lib.onboard.policy import Policy, load_policy
+from rover_lib.onboard.policy import ACTION_LIMITS, Policy, load_policy
+from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.workshop.act import Affine
+from rover_lib.workshop.checkpoint import Checkpoint
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
 ARTIFACTS = ("fp32", *MODES, "static_affine")
 GATED = "static"  # the mode that a Pi is meant to run, and that the gates judge
 
-RELATIONS = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
+RELATIONS = {"<=": operator.le, ">=": operator.ge}
 
 Progress = Callable[..., Iterable] | None
 
@@ -134,6 +138,73 @@ class Fidelity:
         ]
 
 
+class LerobotEager:
+    """LeRobot's own ACTPolicy in eager FP32, behind an artifact's interface: where a policy comes from, and the
+    yardstick of its speed. Downloads nothing.
+    """
+
+    def __init__(self, checkpoint: Checkpoint):
+        # seconds to import, and only the benchmark's notebook wants it
+        from lerobot.configs.types import FeatureType, PolicyFeature
+        from lerobot.policies.act.configuration_act import ACTConfig
+        from lerobot.policies.act.modeling_act import ACTPolicy
+
+        c = checkpoint.config
+        self.config, self.chunk = c, c.chunk
+        self.action_names, self.state_names = c.action_names, c.state_names
+        inputs = {
+            f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, *size))
+            for name, size in zip(c.cameras, c.image_sizes, strict=True)
+        }
+        config = ACTConfig(
+            input_features={
+                **inputs,
+                "observation.state": PolicyFeature(FeatureType.STATE, (len(c.state_names),)),
+            },
+            output_features={"action": PolicyFeature(FeatureType.ACTION, (len(c.action_names),))},
+            device="cpu",
+            chunk_size=c.chunk,
+            n_action_steps=c.chunk,
+            vision_backbone=c.backbone,
+            pretrained_backbone_weights=None,
+            replace_final_stride_with_dilation=c.dilation,
+            pre_norm=c.pre_norm,
+            dim_model=c.dim,
+            n_heads=c.heads,
+            dim_feedforward=c.feedforward,
+            feedforward_activation=c.activation,
+            n_encoder_layers=c.encoder_layers,
+            n_decoder_layers=c.decoder_layers,
+            use_vae=c.vae_layers > 0,
+            latent_dim=c.latent,
+            n_vae_encoder_layers=max(c.vae_layers, 1),
+        )
+        self._policy = ACTPolicy(config)
+        self._policy.model.load_state_dict(checkpoint.weights)
+        self._policy.eval()
+        limits = [ACTION_LIMITS.get(name, (-np.inf, np.inf)) for name in c.action_names]
+        self._low, self._high = np.array(limits, np.float32).T
+
+    def predict_chunk(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
+        """As `Policy.predict_chunk`: (C, A) float32, clipped to what a pulse can express."""
+        c = self.config
+        frames = frame_bgr if isinstance(frame_bgr, Mapping) else {c.cameras[0]: frame_bgr}
+        batch = {"observation.state": _affine(np.asarray(state, np.float32), c.state_norm)[None]}
+        for name, size, norm in zip(c.cameras, c.image_sizes, c.image_norm, strict=True):
+            pixels = prepare_frame(frames[name], *size).astype(np.float32) / 255
+            batch[f"observation.images.{name}"] = _affine(pixels, norm).permute(2, 0, 1)[None].contiguous()
+        with torch.inference_mode():
+            chunk = self._policy.predict_action_chunk(batch)[0]
+        return np.clip(_affine(chunk.numpy(), c.action_unnorm).numpy(), self._low, self._high)
+
+
+def _affine(x: np.ndarray, affine: Affine | None) -> torch.Tensor:
+    """x * scale + shift over the last axis."""
+    if affine is None:
+        return torch.from_numpy(x)
+    return torch.from_numpy(x * np.float32(affine.scale) + np.float32(affine.shift))
+
+
 def us_per_unit(action: str) -> float:
     """Microseconds of pulse per unit of an action; NaN for an action that is no servo's."""
     try:
@@ -171,9 +242,7 @@ def thinned(samples: Sequence[Any], at_most: int) -> tuple[Any, ...]:
 def driven(trials: Mapping[str, Any], at_most: int = 200) -> tuple[Observation, ...]:
     """Observations from the (frame_bgr, state) that trial reports kept: places no recording went to."""
     frames = [frame for trial in trials.values() for frame in trial.frames]
-    return tuple(
-        Observation(frame, np.asarray(state, np.float32)) for frame, state in thinned(frames, at_most)
-    )
+    return tuple(Observation(frame, np.asarray(state, np.float32)) for frame, state in thinned(frames, at_most))
 
 
 def fidelity(
@@ -200,9 +269,7 @@ def fidelity(
                 f"of {list(names)}; compare artifacts of one checkpoint"
             )
     if missing := [n for n in names if n not in action_range]:
-        raise PolicyError(
-            f"no recorded range of action {missing} (found {sorted(action_range)}); use other recordings"
-        )
+        raise PolicyError(f"no recorded range of action {missing} (found {sorted(action_range)}); use other recordings")
     expected, found = [], {mode: [] for mode in others}
     for sample in progress(samples, desc="comparing", total=len(samples)) if progress else samples:
         frame = sample.frame_bgr()
@@ -278,7 +345,7 @@ def _plain_worst(worst: WorstFrame) -> dict[str, Any]:
     }
 
 
-def gate(name: str, found: float | None, relation: str, limit: Any, promised_by: str) -> dict[str, Any]:
+def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str, Any]:
     """One row of the gates' table. passed is None where nothing was measured: no pass, no failure."""
     if found is None or (isinstance(found, float) and math.isnan(found)):
         found = passed = None
@@ -290,56 +357,32 @@ def gate(name: str, found: float | None, relation: str, limit: Any, promised_by:
         "limit": limit,
         "found": found,
         "passed": passed,
-        "promised_by": promised_by,
     }
 
 
 def gates(found: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GATED) -> list[dict[str, Any]]:
     """The gates of params.yml that a comparison can judge. found: `metrics`; limits: params.yml's `gates`.
 
-    The error gates are for every action that the policy has and params.yml names, as `<action>_mae_pct`.
+    The error gates are for every action that the policy has and params.yml names, as `<action>_mae_pct`. Those of
+    speed are `onboard.benchmark.check_gates`.
     """
     fp32, judged = found["fp32"], found["modes"][mode]
     rows = [
-        gate(f"{mode} {key}", judged[key], "<=", limits[key], "this project")
+        gate(f"{mode} {key}", judged[key], "<=", limits[key])
         for key in judged
         if key.endswith("_mae_pct") and key in limits
     ]
     lost = None if fp32["hits"] is None or judged["hits"] is None else fp32["hits"] - judged["hits"]
     rows += [
-        gate("fp32 hits", fp32["hits"], ">=", limits["fp32_hits"], "this project"),
-        gate(f"{mode} hits lost", lost, "<=", limits["hits_lost"], "this project"),
-        gate(f"{mode} size_mb", judged["size_mb"], "<=", limits["size_full_mb"], "this project"),
+        gate("fp32 hits", fp32["hits"], ">=", limits["fp32_hits"]),
+        gate(f"{mode} hits lost", lost, "<=", limits["hits_lost"]),
+        gate(f"{mode} size_mb", judged["size_mb"], "<=", limits["size_full_mb"]),
     ]
     original = limits["original"]
     losses = [v for k, v in judged.items() if k.endswith("_mae_pct") and not math.isnan(v)]
     loss = max(losses, default=None)
     rows += [
-        gate(f"{mode} model_size_mb", judged["size_mb"], "<=", original["model_size_mb"], "the original"),
-        gate(f"{mode} accuracy_loss_pct", loss, "<=", original["accuracy_loss_pct"], "the original"),
+        gate(f"{mode} model_size_mb", judged["size_mb"], "<=", original["model_size_mb"]),
+        gate(f"{mode} accuracy_loss_pct", loss, "<=", original["accuracy_loss_pct"]),
     ]
     return rows
-
-
-def speed_gates(found: Mapping[str, Any], limits: Mapping[str, Any], where: str = "") -> list[dict[str, Any]]:
-    """The gates of the original's table that a benchmark can judge.
-
-    found: one artifact's metrics of benchmark-<host>.json. limits: params.yml's `gates`. where: a host.
-    Of the promised ranges the bound that hurts is the gate: a latency below 20 ms would not fail anybody.
-    """
-    o = limits["original"]
-    rows = [
-        ("latency_mean_ms", "<=", o["latency_mean_ms"][1]),
-        ("latency_p95_ms", "<=", o["latency_p95_ms"][1]),
-        ("throughput_fps", ">=", o["throughput_fps"][0]),
-        ("control_rate_hz", ">=", o["control_rate_hz"][0]),
-        ("peak_memory_mb", "<=", o["memory_mb"]),
-        ("cpu_pct", "<=", o["cpu_pct"]),
-        ("temperature_c", "<=", o["temperature_c"]),
-        ("throttled", "==", o["throttled"]),
-    ]
-    prefix = f"{where} " if where else ""
-    return [
-        gate(f"{prefix}{key}", found.get(key), relation, limit, "the original")
-        for key, relation, limit in rows
-    ]

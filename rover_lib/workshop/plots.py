@@ -1,0 +1,679 @@
+"""One function per figure; each returns a matplotlib Figure and touches nothing else.
+
+    plots.save(plots.action_error(report), run_dir, "04_action_error")
+
+Colours are Okabe and Ito's, which colour-blind people can tell apart; a mode has the same one in every figure.
+Figures are drawn for a notebook's width at 100 dots per inch.
+"""
+
+import socket
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.workshop.act import ACT, block_of
+from rover_lib.workshop.compare import Fidelity
+from rover_lib.workshop.episodes import Episode, Recordings, Sample
+from rover_lib.workshop.quantize import OBSERVERS, Calibration, RangeObserver
+
+WIDTH_IN, DPI = 9.0, 100
+BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE = (
+    "#333333",
+    "#E69F00",
+    "#56B4E9",
+    "#009E73",
+    "#0072B2",
+    "#D55E00",
+    "#CC79A7",
+)
+GREY = "#B0B0B0"
+COLOURS = {
+    "fp32": BLACK,
+    "dynamic": ORANGE,
+    "static": BLUE,
+    "mixed": GREEN,
+    "static_affine": RED,
+    "lerobot": PURPLE,
+    "steering": BLUE,
+    "throttle": ORANGE,
+}
+NAMES = {
+    "fp32": "FP32",
+    "dynamic": "dynamic",
+    "static": "static",
+    "mixed": "mixed",
+    "static_affine": "static, affine",
+    "lerobot": "LeRobot, eager FP32",
+}
+
+# Instructions of one inference of the full policy (15.02 GMAC, 360x640), in 1e9: label, all, SIMD among them.
+# Counted on an emulated Cortex-A76 (qemu-aarch64 with a counting plugin, one thread, third inference on).
+COUNTED = (
+    ("FP32, TorchScript", 6.10, 3.80),
+    ("INT8 affine (quint8): QNNPACK's kernels", 5.35, 4.40),
+    ("INT8 symmetric (qint8): XNNPACK, all that FX can", 1.66, 1.12),
+    ("the same, attention and residuals in float", 1.49, 1.08),
+    ("the same, projections as 1x1 convolutions (ours)", 1.43, 1.08),
+    ("dot-product instructions alone", 0.94, 0.94),
+)
+
+
+def _axes(rows: int, columns: int = 1, height_in: float = 3.2, **options: Any) -> tuple[Figure, np.ndarray]:
+    """A figure and its (rows, columns) axes, closed for pyplot: who shows the figure is the caller's affair."""
+    fig, axes = plt.subplots(
+        rows, columns, figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained", squeeze=False, **options
+    )
+    plt.close(fig)
+    for ax in axes.flat:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(labelsize=9)
+    return fig, axes
+
+
+def _legend(ax: Axes, **options: Any) -> None:
+    ax.legend(frameon=False, fontsize=9, **options)
+
+
+def _legend_below(fig: Figure, ax: Axes, columns: int) -> None:
+    """One legend for all of a figure's axes."""
+    handles, labels = ax.get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+
+
+def _values(ax: Axes, y: Sequence[float], x: Sequence[float], form: str) -> None:
+    """The numbers behind horizontal bars, with room for them."""
+    for at, value in zip(y, x, strict=True):
+        ax.annotate(form.format(value), (value, at), (4, 0), textcoords="offset points", va="center", fontsize=9)
+    ax.margins(x=0.16)
+
+
+def save(figure: Figure, run_dir: Path | str, name: str) -> Figure:
+    """Write run_dir/figures/<name>.png and return the figure, so that a cell that ends with this also shows it."""
+    path = Path(run_dir) / "figures" / f"{name}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=DPI)
+    return figure
+
+
+# --- 01: the checkpoint and the recordings --------------------------------------------------------
+
+
+def checkpoint_size(report: Mapping[str, Any]) -> Figure:
+    """Where a checkpoint's megabytes are, and what remains of them. report: `Checkpoint.report`."""
+    acting_mb = 4 * report["parameters_acting"] / 1e6
+    training_mb = 4 * report["parameters"] / 1e6 - acting_mb
+    other_mb = max(report["file_mb"] - report["optimizer_mb"] - acting_mb - training_mb, 0)
+    parts = {
+        "weights that act": (acting_mb, BLUE),
+        "weights of training only (VAE)": (training_mb, SKY),
+        "optimizer state": (report["optimizer_mb"], ORANGE),
+        "everything else": (other_mb, GREY),
+    }
+    rows = ["checkpoint file", "FP32, only what acts", "INT8, a byte per weight"]
+    fig, axes = _axes(1, height_in=2.8)
+    ax, left = axes[0, 0], 0.0
+    for name, (size_mb, colour) in parts.items():
+        if size_mb > 0.005 * report["file_mb"]:
+            ax.barh(0, size_mb, left=left, color=colour, label=name)
+            left += size_mb
+    ax.barh([1, 2], [acting_mb, report["int8_floor_mb"]], color=BLUE)
+    _values(ax, range(3), [report["file_mb"], acting_mb, report["int8_floor_mb"]], "{:.1f} MB")
+    ax.set_yticks(range(3), rows)
+    ax.invert_yaxis()
+    ax.set_xlabel("size (MB, 10^6 bytes)")
+    ax.set_title(
+        f"{report['file_mb'] / report['int8_floor_mb']:.1f}x in all: {report['file_mb'] / acting_mb:.1f}x left out, "
+        f"{acting_mb / report['int8_floor_mb']:.1f}x by INT8",
+        fontsize=11,
+    )
+    _legend(ax, loc="lower right")
+    return fig
+
+
+def parameters_by_block(model: ACT) -> dict[str, int]:
+    """Weights and biases per block, blocks named as in `act.multiply_accumulates`."""
+    counts: dict[str, int] = {}
+    for name, tensor in model.named_parameters():
+        block = block_of(name)
+        counts[block] = counts.get(block, 0) + tensor.numel()
+    return counts
+
+
+def work_per_block(parameters: Mapping[str, int], macs: Mapping[str, int]) -> Figure:
+    """Parameters and multiply-accumulates of every block, in the order of the data."""
+    blocks = [b for b in macs if macs[b] or parameters.get(b)]
+    fig, axes = _axes(1, 2, height_in=1.2 + 0.21 * len(blocks), sharey=True)
+    left, right = axes[0]
+    y = np.arange(len(blocks))
+    colours = [{"backbone": SKY, "encoder": GREEN, "decoder": ORANGE}.get(b.split(".")[0], GREY) for b in blocks]
+    left.barh(y, [parameters.get(b, 0) / 1e6 for b in blocks], color=colours)
+    right.barh(y, [macs[b] / 1e6 for b in blocks], color=colours)
+    left.set_yticks(y, blocks)
+    left.invert_yaxis()
+    left.set_xlabel(f"parameters (10^6), {sum(parameters.values()) / 1e6:.2f} in all")
+    right.set_xlabel(f"multiply-accumulates (10^6), {sum(macs.values()) / 1e6:.0f} in all")
+    left.set_title("what must be stored", fontsize=11)
+    right.set_title("what must be computed", fontsize=11)
+    for part, colour in (("backbone", SKY), ("encoder", GREEN), ("decoder", ORANGE)):
+        right.barh(0, 0, color=colour, label=part)
+    _legend(right, loc="lower right")
+    return fig
+
+
+def episode_overview(episode: Episode, pictures: int = 5) -> Figure:
+    """One drive: what the camera saw, what the driver did, and the pulses that the servos got."""
+    samples = episode.samples
+    shown = [samples[i] for i in np.linspace(0, len(samples) - 1, pictures).round().astype(int)]
+    fig = plt.figure(figsize=(WIDTH_IN, 6.2), dpi=DPI, layout="constrained")
+    plt.close(fig)
+    grid = fig.add_gridspec(3, pictures, height_ratios=(1.1, 1.3, 1.3))
+    for i, sample in enumerate(shown):
+        ax = fig.add_subplot(grid[0, i])
+        ax.imshow(sample.frame_bgr()[..., ::-1])
+        ax.set_title(f"{sample.time_s:.1f} s", fontsize=9)
+        ax.axis("off")
+    times_s = [s.time_s for s in samples]
+    actions = np.stack([s.chunk[0] for s in samples])
+    pulses = [PwmCalibration().pulses(*(float(v) for v in a)) for a in actions]
+    upper, lower = fig.add_subplot(grid[1, :]), fig.add_subplot(grid[2, :])
+    rows = (
+        (upper, actions[:, 0], actions[:, 1], "{} (share of full)"),
+        (lower, [p.steering_us for p in pulses], [p.throttle_us for p in pulses], "{} pulse (us)"),
+    )
+    for ax, steering, throttle, unit in rows:
+        other = ax.twinx()
+        ax.plot(times_s, steering, color=BLUE, lw=1.5)
+        other.plot(times_s, throttle, color=ORANGE, lw=1.5, ls="--")
+        ax.set_ylabel(unit.format("steering"), color=BLUE)
+        other.set_ylabel(unit.format("throttle"), color="#8A5F00")  # the same orange, dark enough to read
+        ax.spines["top"].set_visible(False)
+        other.spines["top"].set_visible(False)
+    lower.set_xlabel("time in the episode (s)")
+    fig.suptitle(
+        f"{episode.id}: {episode.label or 'no label'}, {len(samples)} samples of {episode.frames} frames",
+        fontsize=11,
+    )
+    return fig
+
+
+def faults(recordings: Recordings) -> Figure:
+    """What was wrong in the recordings, by kind; every count was skipped, none became an action."""
+    counts: dict[str, int] = {}
+    for fault in recordings.faults:
+        counts[fault.kind] = counts.get(fault.kind, 0) + fault.count
+    kinds = sorted(counts, key=lambda k: -counts[k])
+    fig, axes = _axes(1, height_in=1.3 + 0.28 * max(len(kinds), 1))
+    ax = axes[0, 0]
+    used = len(recordings.samples)
+    if kinds:
+        ax.barh(range(len(kinds)), [counts[k] for k in kinds], color=RED)
+        _values(ax, range(len(kinds)), [counts[k] for k in kinds], "{:d}")
+        ax.set_yticks(range(len(kinds)), [k.replace("_", " ") for k in kinds])
+        ax.invert_yaxis()
+        ax.set_xlabel("times")
+    else:
+        ax.text(0.5, 0.5, "no faults found", ha="center", va="center", transform=ax.transAxes, fontsize=11)
+        ax.set_axis_off()
+    ax.set_title(f"{len(recordings.episodes)} episodes give {used} samples; faults that were skipped:", fontsize=11)
+    return fig
+
+
+# --- 02: calibration ------------------------------------------------------------------------------
+
+
+def calibration_coverage(
+    pool: Sequence[Sample],
+    chosen: Sequence[Sample],
+    held_out: Sequence[Sample],
+    names=("steering", "throttle"),
+) -> Figure:
+    """Which recorded actions the calibration samples cover, beside those that judge later."""
+    fig, axes = _axes(1, 3, height_in=3.4)
+    sets = (
+        ("could calibrate", pool, GREY, "o", 8),
+        ("held out", held_out, ORANGE, "x", 14),
+        ("calibrate", chosen, BLUE, "o", 10),
+    )
+    for label, samples, colour, marker, size in sets:
+        first = np.stack([s.chunk[0] for s in samples])
+        axes[0, 0].scatter(
+            *first.T[:2],
+            s=size,
+            c=colour,
+            marker=marker,
+            lw=0.8,
+            alpha=0.8,
+            label=f"{label} ({len(samples)})",
+        )
+    axes[0, 0].set(xlabel=f"{names[0]} (share of full)", ylabel=f"{names[1]} (share of full)")
+    axes[0, 0].set_title("one point per frame", fontsize=11)
+    for i in range(2):
+        ax = axes[0, i + 1]
+        every = np.concatenate([s.chunk[:, i] for s in pool])
+        bins = np.linspace(every.min(), every.max(), 25) if every.max() > every.min() else 25
+        for samples, colour, style in ((pool, GREY, "stepfilled"), (chosen, BLUE, "step")):
+            values = np.concatenate([s.chunk[:, i] for s in samples])
+            ax.hist(
+                values,
+                bins,
+                weights=np.full(len(values), 100 / len(values)),
+                color=colour,
+                histtype=style,
+                lw=1.5,
+            )
+        ax.set(xlabel=f"{names[i]} (share of full)", ylabel="actions (%)")
+        ax.set_title(f"{names[i]} over whole plans", fontsize=11)
+    _legend_below(fig, axes[0, 0], 3)
+    return fig
+
+
+def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
+    """What calibration saw in a few layers, and the range that each observer would give INT8's 256 steps to.
+
+    Of each part of the policy the layer where the observers disagree most.
+    """
+    found = []
+    for layer, observers in _observers(calibration).items():
+        ranges = {name: observers[name].range() for name in OBSERVERS}
+        widths = [high - low for low, high in ranges.values()]
+        found.append((max(widths) / max(min(widths), 1e-12), layer, observers["minmax"], ranges))
+    found.sort(key=lambda row: -row[0])
+    best = {}
+    for row in found:
+        best.setdefault(row[1].split(".")[0], row)
+    found = list(best.values())[:count]
+    fig, axes = _axes(1, len(found), height_in=3.6)
+    styles = {"minmax": (BLACK, ":"), "percentile": (ORANGE, "--"), "histogram": (BLUE, "-")}
+    for ax, (_, layer, seen, ranges) in zip(axes[0], found, strict=False):
+        share = 100 * seen.histogram / seen.histogram.sum()
+        limit = seen.limit.item()
+        edges = np.linspace(-limit, limit, 129)
+        ax.bar(edges[:-1], share.view(128, -1).sum(1), np.diff(edges), align="edge", color=GREY)
+        for name, (colour, style) in styles.items():
+            for i, x in enumerate(ranges[name]):
+                ax.axvline(x, color=colour, ls=style, lw=1.6, label=name if i == 0 else None)
+        low, high = ranges["minmax"]
+        ax.set_xlim(low - 0.06 * (high - low), high + 0.06 * (high - low))
+        ax.set_yscale("log")
+        ax.set_title(layer, fontsize=10)
+        ax.set_xlabel("activation (no unit)")
+    axes[0, 0].set_ylabel("values seen (%, logarithmic)")
+    _legend_below(fig, axes[0, 0], 3)
+    return fig
+
+
+def _observers(calibration: Calibration) -> dict[str, dict[str, Any]]:
+    """For each layer with a recorded range: an observer of each choice with what calibration saw there."""
+    states: dict[str, dict[str, torch.Tensor]] = {}
+    for key, tensor in calibration.observers.items():
+        name, _, buffer = key.rpartition(".")
+        states.setdefault(name, {})[buffer] = tensor
+    by_range = {(s["min_val"].item(), s["max_val"].item()): s for s in states.values() if "histogram" in s}
+    found = {}
+    for layer, ends in calibration.ranges.items():
+        state = by_range.get((ends["min"], ends["max"]))
+        if state is None:
+            continue
+        found[layer] = {}
+        for choice in OBSERVERS:
+            o = RangeObserver(dtype=torch.qint8, quant_min=-128, quant_max=127, choice=choice, percentile=99.99)
+            for buffer in ("min_val", "max_val", "limit", "histogram"):
+                getattr(o, buffer).copy_(state[buffer])
+            found[layer][choice] = o
+    return found
+
+
+# --- 03: quantization -----------------------------------------------------------------------------
+
+
+def outlier_channels(calibration: Calibration) -> Figure:
+    """The largest activation per channel, before and after channel scales.
+
+    Left: every projection's largest channel over its median one. Right: the projection where that was worst.
+    """
+    layers = {n: c for n, c in calibration.channels.items() if "in_max_scaled" in c}
+
+    def peak(x: torch.Tensor) -> float:
+        """How much larger the largest channel is than the middle one, of those that are not dead."""
+        x = x[x > 1e-6 * x.max()]
+        return float(x.max() / x.median()) if len(x) else 1.0
+
+    # Behind `up` INT8 sees the other side of the activation function, which is the input of `down`.
+    sides = {n: ("in",) if n.endswith(".up") else ("in", "out") for n in layers}
+    pairs = [(n, s) for n in layers for s in sides[n]]
+    worst, side = max(pairs, key=lambda row: peak(layers[row[0]][f"{row[1]}_max"]))
+    fig, axes = _axes(1, 2, height_in=max(3.4, 1.0 + 0.12 * len(layers)))
+    left, right = axes[0]
+    y = {name: i for i, name in enumerate(layers)}
+    for at, where, marker in (("in", "input", "o"), ("out", "output", "s")):
+        shown = [n for n in layers if at in sides[n]]
+        for key, colour, label in ((f"{at}_max", RED, "before"), (f"{at}_max_scaled", BLUE, "after")):
+            peaks = [peak(layers[n][key]) for n in shown]
+            face = "none" if label == "before" else colour
+            left.scatter(
+                peaks, [y[n] for n in shown], color=colour, marker=marker, s=16, fc=face, label=f"{where}, {label}"
+            )
+    left.set_yticks(list(y.values()), list(layers), fontsize=min(8, 260 / len(layers)))
+    left.invert_yaxis()
+    left.set(xscale="log", xlabel="largest channel / median channel")
+    left.set_title("all projections of the transformer", fontsize=11)
+    for key, colour, label in (
+        (f"{side}_max", RED, "before"),
+        (f"{side}_max_scaled", BLUE, "after channel scales"),
+    ):
+        x = np.sort(np.asarray(layers[worst][key]))[::-1]
+        right.plot(np.arange(1, len(x) + 1), 100 * x / x[0], color=colour, lw=1.8, label=label)
+    right.set(xlabel="channel, largest first", ylabel="activation (% of the largest)", ylim=(0, 105))
+    right.set_title(f"{worst}, {'input' if side == 'in' else 'output'}", fontsize=11)
+    _legend(right)
+    _legend_below(fig, left, 4)
+    return fig
+
+
+def instruction_counts() -> Figure:
+    """Why symmetric: instructions of one inference of the full policy, by what ran. Not measured in this run."""
+    fig, axes = _axes(1, height_in=3.0)
+    ax, y = axes[0, 0], np.arange(len(COUNTED))
+    total, simd = (np.array([row[i] for row in COUNTED]) for i in (1, 2))
+    ax.barh(y, simd, color=BLUE, label="SIMD (vector) instructions")
+    ax.barh(y, total - simd, left=simd, color=SKY, label="all others")
+    _values(ax, y, total, "{:.2f}")
+    ax.set_yticks(y, [row[0] for row in COUNTED])
+    ax.invert_yaxis()
+    ax.set_xlabel("instructions of one inference (10^9)")
+    ax.set_title("counted on an emulated Cortex-A76: full policy, 360x640, 15 GMAC", fontsize=11)
+    _legend(ax, loc="lower right")
+    return fig
+
+
+def errors_by_choice(table: Mapping[str, Mapping[str, float]], title: str, budget_pct: float | None = None) -> Figure:
+    """Error of each action for each choice, say of observers. table: {choice: {<action>_mae_pct}}."""
+    choices, keys = list(table), [k for k in next(iter(table.values())) if k.endswith("_mae_pct")]
+    fig, axes = _axes(1, height_in=1.3 + 0.42 * len(choices))
+    ax, height = axes[0, 0], 0.8 / len(keys)
+    for i, key in enumerate(keys):
+        y = np.arange(len(choices)) + (i - (len(keys) - 1) / 2) * height
+        values = [table[c][key] for c in choices]
+        ax.barh(y, values, height, color=_action_colour(key, i), label=key.removesuffix("_mae_pct"))
+        _values(ax, y, values, "{:.2f}")
+    if budget_pct is not None:
+        ax.axvline(budget_pct, color=BLACK, ls="--", lw=1, label=f"limit, {budget_pct:g} %")
+    ax.set_yticks(range(len(choices)), choices)
+    ax.invert_yaxis()
+    ax.set_xlabel("mean error against FP32 (% of the recorded range)")
+    ax.set_title(title, fontsize=11)
+    _legend(ax, loc="upper left", bbox_to_anchor=(1, 1))
+    return fig
+
+
+def _action_colour(key: str, index: int) -> str:
+    return COLOURS.get(key.split("_")[0], (BLUE, ORANGE, GREEN, RED, PURPLE, SKY)[index % 6])
+
+
+def sensitivity(
+    table: Mapping[str, Mapping[str, float]], steps: Sequence[Mapping[str, Any]], budget_pct: float
+) -> Figure:
+    """Left: each block quantized alone. Right: what leaving the worst ones in float buys.
+
+    table: {block: {<action>_mae_pct}}; steps: of `choose_mixed`, {float_blocks, <action>_mae_pct}.
+    """
+    blocks, keys = list(table), [k for k in next(iter(table.values())) if k.endswith("_mae_pct")]
+    fig, axes = _axes(1, 2, height_in=max(3.6, 1.2 + 0.26 * len(blocks)), width_ratios=(1.5, 1))
+    left, right = axes[0]
+    height = 0.8 / len(keys)
+    for i, key in enumerate(keys):
+        name, colour = key.removesuffix("_mae_pct"), _action_colour(key, i)
+        y = np.arange(len(blocks)) + (i - (len(keys) - 1) / 2) * height
+        left.barh(y, [table[b][key] for b in blocks], height, color=colour, label=name)
+        right.plot(range(len(steps)), [s[key] for s in steps], "o-", color=colour, label=name)
+    left.set_yticks(range(len(blocks)), blocks)
+    left.invert_yaxis()
+    left.set_xlabel("mean error (% of the recorded range)")
+    left.set_title("this block alone in INT8", fontsize=11)
+    right.axhline(budget_pct, color=BLACK, ls="--", lw=1, label=f"budget, {budget_pct:g} %")
+    right.set_xticks(range(len(steps)))
+    right.set(xlabel="blocks left in float", ylabel="mean error (% of the recorded range)", ylim=(0, None))
+    right.margins(x=0.15)
+    right.set_title("all others in INT8", fontsize=11)
+    _legend(right)
+    return fig
+
+
+def layers(rows: Sequence[Mapping[str, Any]], clipped_warn_pct: float) -> Figure:
+    """Signal to noise and clipped share of every INT8 layer, in the order of the data. rows: `inspect_layers`."""
+    fig, axes = _axes(2, 1, height_in=4.6, sharex=True)
+    upper, lower = axes[:, 0]
+    x = np.arange(len(rows))
+    parts = [r["block"].split(".")[0] for r in rows]
+    colours = [{"backbone": SKY, "encoder": GREEN, "decoder": ORANGE}.get(p, GREY) for p in parts]
+    upper.bar(x, [r["snr_db"] for r in rows], color=colours)
+    upper.set_ylabel("signal to noise (dB)")
+    upper.set_title("higher is better; errors from earlier layers are included", fontsize=11)
+    lower.bar(x, [r["clipped_pct"] for r in rows], color=colours)
+    lower.axhline(clipped_warn_pct, color=RED, ls="--", lw=1.2)
+    lower.text(len(rows) - 0.5, clipped_warn_pct, "warning ", color=RED, ha="right", va="bottom", fontsize=9)
+    lower.set(ylabel="clipped (% of values)", xlabel="INT8 layer, in the order of the data")
+    lower.set_ylim(0, 1.25 * max(clipped_warn_pct, *(r["clipped_pct"] for r in rows)))
+    for part, colour in (("backbone", SKY), ("encoder", GREEN), ("decoder", ORANGE), ("image_project", GREY)):
+        if part in parts:
+            lower.bar(0, 0, color=colour, label=part)
+    _legend_below(fig, lower, 4)
+    return fig
+
+
+# --- 04: comparison -------------------------------------------------------------------------------
+
+
+def sizes(metrics: Mapping[str, Any]) -> Figure:
+    """Artifact files, weights with weights. metrics: of compare.json."""
+    found = {"fp32": metrics["fp32"]["size_mb"]} | {m: v["size_mb"] for m, v in metrics["modes"].items()}
+    fig, axes = _axes(1, height_in=1.0 + 0.34 * len(found))
+    ax, y = axes[0, 0], range(len(found))
+    ax.barh(y, list(found.values()), color=[COLOURS.get(m, GREY) for m in found])
+    for at, size_mb in enumerate(found.values()):
+        text = f"{size_mb:.1f} MB" + (f", {found['fp32'] / size_mb:.1f}x smaller" if at else "")
+        ax.annotate(text, (size_mb, at), (4, 0), textcoords="offset points", va="center", fontsize=9)
+    ax.margins(x=0.25)
+    ax.set_yticks(y, [NAMES.get(m, m) for m in found])
+    ax.invert_yaxis()
+    ax.set_xlabel("artifact file (MB, 10^6 bytes)")
+    return fig
+
+
+def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure:
+    """Mean error of every mode against FP32 at each step of the plan: percent of the recorded range, and pulse."""
+    actions, steps = report.action_names, report.reference.shape[1]
+    fig, axes = _axes(1, len(actions), height_in=3.6)
+    times_s = np.arange(steps) / rate_hz
+    for i, action in enumerate(actions):
+        ax = axes[0, i]
+        for mode in report.chunks:
+            error = report.per_step_pct(mode)[:, i]
+            ax.plot(times_s, error, color=COLOURS.get(mode, GREY), lw=1.8, label=NAMES.get(mode, mode))
+        ax.set(xlabel="step of the plan (s ahead)", ylabel="mean error (% of the recorded range)", ylim=(0, None))
+        us = report.us(action) / report.pct(action)
+        if np.isfinite(us):
+            other = ax.secondary_yaxis("right", functions=(lambda p, u=us: p * u, lambda e, u=us: e / u))
+            other.set_ylabel("the same as pulse (us)")
+            other.tick_params(labelsize=9)
+        ax.set_title(action, fontsize=11)
+    _legend_below(fig, axes[0, 0], 5)
+    return fig
+
+
+def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0) -> Figure:
+    """The frames on which a mode differs most from FP32: the picture and both plans, with the recording's own."""
+    found = report.worst(mode, count)
+    names = report.action_names
+    fig, axes = _axes(len(found), 1 + len(names), height_in=0.9 + 1.9 * len(found))
+    times_s = np.arange(report.reference.shape[1]) / rate_hz
+    for row, worst in zip(axes, found, strict=True):
+        row[0].imshow(worst.sample.frame_bgr()[..., ::-1])
+        row[0].axis("off")
+        row[0].set_title(f"{worst.action} {worst.error_pct:.2f} % off", fontsize=10)
+        recorded = getattr(worst.sample, "chunk", None)
+        for i, name in enumerate(names):
+            ax = row[1 + i]
+            if recorded is not None:
+                known = ~worst.sample.is_pad
+                ax.plot(times_s[known], recorded[known, i], color=GREY, lw=3, label="driver")
+            ax.plot(times_s, worst.reference[:, i], color=BLACK, lw=1.8, label="FP32")
+            ax.plot(
+                times_s,
+                worst.other[:, i],
+                color=COLOURS.get(mode, BLUE),
+                lw=1.8,
+                ls="--",
+                label=f"{mode} INT8",
+            )
+            ax.set_ylabel(f"{name}", fontsize=9)
+            low, high = report.action_range[name]
+            ax.set_ylim(low - 0.05 * (high - low + 1e-6), high + 0.05 * (high - low + 1e-6))
+    for ax in axes[-1, 1:]:
+        ax.set_xlabel("step of the plan (s ahead)")
+    _legend_below(fig, axes[0, 1], 3)
+    return fig
+
+
+def hits(metrics: Mapping[str, Any]) -> Figure:
+    """Balloons hit in unseen worlds, with Wilson's 95 % interval: how little so few drives say. metrics: of compare."""
+    rows = {"fp32": metrics["fp32"]} | dict(metrics["modes"])
+    rows = {m: v for m, v in rows.items() if v["trials"]}
+    fig, axes = _axes(1, height_in=1.2 + 0.36 * max(len(rows), 1))
+    ax = axes[0, 0]
+    for y, (mode, v) in enumerate(rows.items()):
+        colour = COLOURS.get(mode, GREY)
+        ax.plot([100 * v["hits_wilson_low"], 100 * v["hits_wilson_high"]], [y, y], color=colour, lw=3, alpha=0.5)
+        ax.plot(100 * v["hits"] / v["trials"], y, "o", color=colour, ms=8)
+        ax.annotate(
+            f"{v['hits']} of {v['trials']}",
+            (1.01, y),
+            xycoords=("axes fraction", "data"),
+            va="center",
+            fontsize=10,
+        )
+    ax.set_yticks(range(len(rows)), [NAMES.get(m, m) for m in rows])
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    lows = [100 * v["hits_wilson_low"] for v in rows.values()]
+    ax.set_xlim(max(0, min(lows, default=0) - 5), 101)
+    ax.set_xlabel("worlds in which the balloon was hit (%), with the 95 % interval")
+    return fig
+
+
+def drives_from_above(trials: Mapping[str, Any], count: int = 4) -> Figure:
+    """The worlds in which the modes' drives part most. trials: closed-loop reports by mode, FP32 among them."""
+
+    def apart(index: int) -> float:
+        base, gap = trials["fp32"].per_world[index].trajectory, 0.0
+        for trial in trials.values():
+            other = trial.per_world[index].trajectory
+            n = min(len(base.x_m), len(other.x_m))
+            gap = max(gap, np.hypot(base.x_m[:n] - other.x_m[:n], base.y_m[:n] - other.y_m[:n]).max())
+        return gap
+
+    worlds = sorted(range(len(trials["fp32"].per_world)), key=lambda i: -apart(i))[:count]
+    fig, axes = _axes(1, count, height_in=3.8)
+    for ax, i in zip(axes[0], worlds, strict=False):
+        for mode, trial in trials.items():
+            path = trial.per_world[i].trajectory
+            style = "-" if mode == "fp32" else "--"
+            # forward is up; positive y is to the left of the car
+            ax.plot(-path.y_m, path.x_m, style, color=COLOURS.get(mode, GREY), lw=1.8, label=NAMES.get(mode, mode))
+        x, y = trials["fp32"].per_world[i].trajectory.balloon_xy_m
+        ax.add_patch(Circle((-y, x), 0.16, color=RED))
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_xlabel("to the right (m)")
+        missed = [NAMES.get(m, m) for m, t in trials.items() if not t.per_world[i].hit]
+        ax.set_title(
+            f"{100 * apart(i):.0f} cm apart\n" + (f"missed: {', '.join(missed)}" if missed else "all hit"),
+            fontsize=9,
+        )
+    axes[0, 0].set_ylabel("ahead of the start (m)")
+    _legend_below(fig, axes[0, 0], 5)
+    return fig
+
+
+def gates(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """The gates as a table: what was promised, what was found."""
+    verdict = {True: ("pass", "#DCF0E8"), False: ("FAIL", "#F9DDCB"), None: ("not measured", "#EFEFEF")}
+
+    def shown(value: Any) -> str:
+        return "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+
+    cells = [[r["gate"], _limit(r), shown(r["found"]), verdict[r["passed"]][0]] for r in rows]
+    fig, axes = _axes(1, height_in=0.5 + 0.27 * (len(rows) + 1))
+    axes[0, 0].axis("off")
+    table = axes[0, 0].table(
+        cells,
+        colLabels=["gate", "promised", "found", "verdict"],
+        colWidths=(0.46, 0.2, 0.16, 0.18),
+        cellLoc="left",
+        colLoc="left",
+        bbox=(0, 0, 1, 1),
+    )
+    table.auto_set_font_size(False)
+    table.set_fontsize(10)
+    for (row, column), cell in table.get_celld().items():
+        cell.set_edgecolor("#DDDDDD")
+        if row == 0:
+            cell.set_text_props(weight="bold")
+        elif column == 3:
+            cell.set_facecolor(verdict[rows[row - 1]["passed"]][1])
+    return fig
+
+
+def _limit(row: Mapping[str, Any]) -> str:
+    """A gate's limit in words; a promised range as it was promised."""
+    limit = row["limit"]
+    if isinstance(limit, (list, tuple)):
+        return f"{limit[0]:g} to {limit[1]:g}"
+    words = {"<=": "at most ", ">=": "at least "}.get(row.get("relation", ""), "")
+    return words + (f"{limit:g}" if isinstance(limit, (int, float)) else str(limit))
+
+
+# --- 05: benchmark ----------------------------------------------------------------------------------------
+
+
+def latency(benchmarks: Sequence[Mapping[str, Any]]) -> Figure:
+    """How long one inference takes, by host and artifact: p50, p95, p99, and the floor of a Pi 5 by arithmetic.
+
+    benchmarks: contents of benchmark-<host>.json, one panel each.
+    """
+    counts = [len(b["metrics"]["artifacts"]) for b in benchmarks]
+    fig, axes = _axes(len(benchmarks), height_in=0.9 + sum(0.7 + 0.36 * n for n in counts), height_ratios=counts)
+    for ax, stage in zip(axes[:, 0], benchmarks, strict=True):
+        found = {name.removeprefix("policy_"): v for name, v in stage["metrics"]["artifacts"].items()}
+        for y, (name, v) in enumerate(found.items()):
+            p50, p95, p99 = (v[f"latency_{p}_ms"] for p in ("p50", "p95", "p99"))
+            once = {"label": None} if y else {}
+            ax.barh(y, p50, 0.62, color=COLOURS.get(name, GREY), alpha=0.85)
+            ax.plot([p50, p99], [y, y], color=BLACK, lw=1)
+            ax.plot(p95, y, "|", color=BLACK, ms=14, mew=2, **({"label": "p95"} | once))
+            ax.plot(p99, y, "|", color=BLACK, ms=7, mew=1.5, **({"label": "p99"} | once))
+            if v.get("floor_ms") is not None:
+                ax.plot(v["floor_ms"], y, "D", color=RED, mec="white", ms=6, **({"label": "floor of a Pi 5"} | once))
+            text = f"{p50:.1f} / {p95:.1f} / {p99:.1f} ms"
+            ax.annotate(text, (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=9)
+        ax.set_yticks(range(len(found)), [NAMES.get(n, n) for n in found])
+        ax.invert_yaxis()
+        ax.set_xlim(0, None)
+        env = stage["env"]
+        n = next(iter(found.values()))["n"]
+        ax.set_title(f"{host_name(env)} ({env['machine']}, {env['cores']} cores), n = {n}, bar: p50", fontsize=11)
+    axes[-1, 0].set_xlabel("latency of one inference, one plan of actions (ms)")
+    axes[0, 0].text(1.01, 1.02, "p50 / p95 / p99", transform=axes[0, 0].transAxes, fontsize=9)
+    _legend_below(fig, axes[0, 0], 3)
+    return fig
+
+
+def host_name(env: Mapping[str, Any]) -> str:
+    """ "this machine" for the one that draws: a committed figure need not name it."""
+    return "this machine" if env["host"] == socket.gethostname() else str(env["host"])

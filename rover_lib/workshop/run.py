@@ -1,0 +1,281 @@
+"""Execute the five notebooks on a checkpoint and recordings, and put what they showed back into the repository.
+
+    folder = run("best_model.pth", "episodes", "mine")
+
+A run is a folder: load.json, calibrate.json, quantize.json, compare.json, benchmark-<host>.json, calibration.pt,
+policy_<mode>.pt, figures/*.png and the executed notebooks. The notebooks know each other only through these files.
+"""
+
+import io
+import logging
+import os
+import re
+import shutil
+import socket
+import sys
+import tempfile
+from base64 import b64decode, b64encode
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import papermill
+from jupyter_client.kernelspec import KernelSpec
+from jupyter_client.manager import AsyncKernelManager
+from nbclient.exceptions import DeadKernelError
+from papermill.exceptions import PapermillExecutionError
+from PIL import Image
+
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.stage import atomic_path, read_stage
+from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
+from rover_lib.workshop.episodes import Recordings, Split, load_recordings, split
+from rover_lib.workshop.params import params
+
+NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
+NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
+TTY_VARIABLE = "ROVER_PROGRESS_TTY"  # the terminal of who started a run: the notebooks' bars are drawn there
+IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
+NOTEBOOK_LIMIT = 1_000_000  # bytes, of a committed notebook
+
+Progress = Callable[..., Iterable]
+
+
+class NotebookError(RoverError):
+    """A notebook that did not run to its end, or whose output must not be committed."""
+
+
+# --- what the notebooks call ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Opened:
+    """What notebook 01 loaded: the checkpoint, the recordings, and who of them calibrates, chooses and judges."""
+
+    checkpoint: Checkpoint
+    recordings: Recordings
+    parts: Split
+
+
+def load(checkpoint: Path | str, episodes: Path | str) -> Opened:
+    """Read a checkpoint and its recordings, and part them as params.yml says. Raises CheckpointError, EpisodeError."""
+    p = params()["calibration"]
+    found = load_checkpoint(checkpoint)
+    recordings = load_recordings(episodes, found.config.chunk, p["sync_s"], watched())
+    return Opened(found, recordings, split(recordings, p["held_out_share"], p["seed"]))
+
+
+def opened(run_dir: Path | str) -> Opened:
+    """What notebook 01 loaded, again. Raises RoverError if it did not run, or if the files have changed since."""
+    stage = read_stage(Path(run_dir) / "load.json", "load")
+    again = load(stage["params"]["checkpoint"], stage["params"]["episodes"])
+    if again.checkpoint.sha256 != stage["metrics"]["checkpoint"]["sha256"]:
+        raise NotebookError(f"{again.checkpoint.path}: is not what notebook 01 loaded any more; run it again")
+    if again.parts.episodes != stage["metrics"]["split"]:
+        raise NotebookError(f"{again.recordings.root}: has other episodes than notebook 01 found; run it again")
+    return again
+
+
+def watched() -> Progress | None:
+    """A progress bar where someone watches, else None: bars in a stored output are noise.
+
+    That is the terminal from which `run` was started, or a JupyterLab session.
+    """
+    from tqdm import tqdm
+
+    if terminal := os.environ.get(TTY_VARIABLE):
+        try:
+            stream = Path(terminal).open("w")  # noqa: SIM115, open as long as the kernel lives
+        except OSError:
+            return None
+        return lambda *a, **k: tqdm(*a, **k, file=stream, leave=False)
+    if "JPY_SESSION_NAME" in os.environ:
+        return lambda *a, **k: tqdm(*a, **k, leave=False)
+    return None
+
+
+# --- running them -----------------------------------------------------------------------------------------------------
+
+
+class ThisPython(AsyncKernelManager):
+    """A kernel of the interpreter that runs this, whatever kernels the user has registered under its name."""
+
+    @property
+    def kernel_spec(self) -> KernelSpec:
+        argv = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+        return KernelSpec(argv=argv, display_name="Python 3", language="python")
+
+
+def parameters_of(notebook: Path) -> set[str]:
+    """Names that the notebook's `parameters` cell sets."""
+    for cell in nbformat.read(notebook, as_version=4).cells:
+        if "parameters" in cell.metadata.get("tags", []):
+            return set(re.findall(r"^(\w+) *=", cell.source, re.M))
+    return set()
+
+
+def run(
+    checkpoint: Path | str,
+    episodes: Path | str,
+    name: str = "mine",
+    *,
+    runs_dir: Path | str = "runs",
+    progress: Progress | None = None,
+    notebooks: Path | str = NOTEBOOKS,
+    **overrides: Any,
+) -> Path:
+    """Execute the five notebooks in order; return the run's folder.
+
+    overrides: any of the notebooks' parameters, say worlds=40, samples=200, iterations=100. progress: called like
+    tqdm.tqdm(iterable, desc=, total=), or None.
+    What an earlier run of that name left is removed first, except for benchmarks of other hosts. Raises NotebookError,
+    in one sentence with the notebook, the cell and its error; what the stages before it made stays, nothing
+    half-written does.
+    """
+    if not re.fullmatch(r"\w[\w.-]*", name):
+        raise NotebookError(f"a run's name must be a plain folder name, found {name!r}; use letters, digits and _")
+    sources = [Path(notebooks) / f"{n}.ipynb" for n in NAMES]
+    if missing := [s.name for s in sources if not s.is_file()]:
+        raise NotebookError(f"{notebooks}: no {missing[0]} in it; run from a checkout of the project")
+    known = set().union(*(parameters_of(s) for s in sources))
+    if unknown := sorted(set(overrides) - known):
+        raise NotebookError(f"no notebook has a parameter {unknown}; known are {sorted(known)}")
+    folder = Path(runs_dir).resolve() / name
+    fresh = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    _clear(folder)
+    given = {
+        "run_dir": str(folder),
+        "checkpoint": str(Path(checkpoint).resolve()),
+        "episodes": str(Path(episodes).resolve()),
+        **overrides,
+    }
+    try:
+        for source in progress(sources, desc="notebooks", total=len(sources)) if progress else sources:
+            _execute(source, folder, {k: v for k, v in given.items() if k in parameters_of(source)}, bool(progress))
+    finally:
+        if fresh and not any(folder.iterdir()):
+            folder.rmdir()  # nothing came of it
+    return folder
+
+
+def _clear(folder: Path) -> None:
+    """Remove what an earlier run left, so that no file of it can be taken for this one's."""
+    stages = ("load", "calibrate", "quantize", "compare", f"benchmark-{socket.gethostname()}")
+    old = [folder / f"{s}.json" for s in stages] + [folder / "calibration.pt", *folder.glob("policy_*.pt")]
+    for path in [*old, *(folder / f"{n}.ipynb" for n in NAMES)]:
+        path.unlink(missing_ok=True)
+    shutil.rmtree(folder / "figures", ignore_errors=True)
+
+
+def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> None:
+    logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
+    terminal = os.ttyname(sys.stderr.fileno()) if bars and _is_terminal(sys.stderr) else ""
+    before = os.environ.get(TTY_VARIABLE)
+    os.environ[TTY_VARIABLE] = terminal
+    try:
+        with atomic_path(folder / source.name) as temporary:
+            try:
+                papermill.execute_notebook(
+                    str(source),
+                    str(temporary),
+                    parameters=given,
+                    cwd=str(folder),
+                    progress_bar=False,
+                    kernel_name="python3",
+                    kernel_manager_class=ThisPython,
+                )
+            except PapermillExecutionError as e:
+                raise NotebookError(f"{source.name}, cell {e.cell_index + 1}: {_sentence(e)}") from e
+            except DeadKernelError as e:
+                raise NotebookError(f"{source.name}: its kernel died; is there enough memory?") from e
+    finally:
+        os.environ.pop(TTY_VARIABLE)
+        if before is not None:
+            os.environ[TTY_VARIABLE] = before
+
+
+def _is_terminal(stream: Any) -> bool:
+    try:
+        return os.isatty(stream.fileno())
+    except (AttributeError, OSError, ValueError):
+        return False
+
+
+def _sentence(error: PapermillExecutionError) -> str:
+    """A RoverError's own words; for what the program did not foresee also the error's name and how to see more."""
+    text = " ".join(str(error.evalue).split())
+    ours = {c.__name__ for c in _subclasses(RoverError)} | {RoverError.__name__}
+    if error.ename in ours:
+        return text
+    return f"{error.ename}: {text}; 'rover --debug run' shows the traceback"
+
+
+def _subclasses(kind: type) -> set[type]:
+    return set(kind.__subclasses__()).union(*(_subclasses(c) for c in kind.__subclasses__()))
+
+
+# --- publishing what they showed --------------------------------------------------------------------------------------
+
+
+def publish(run_dir: Path | str, notebooks_dir: Path | str = NOTEBOOKS) -> list[Path]:
+    """Put a run's outputs into the repository's notebooks: no counts, no papermill metadata, no paths of this machine.
+
+    Cells are matched by id, and their sources must be the same. Large pictures get 256 colours. Raises NotebookError if
+    a notebook was not run, has changed since, still holds a path, or is larger than 1 MB; then nothing is written.
+    """
+    run_dir, notebooks_dir = Path(run_dir).resolve(), Path(notebooks_dir).resolve()
+    made = {}
+    for name in NAMES:
+        target, executed = notebooks_dir / f"{name}.ipynb", run_dir / f"{name}.ipynb"
+        if not executed.is_file():
+            raise NotebookError(f"{executed}: not there; execute the run first")
+        made[target] = _published(nbformat.read(target, as_version=4), nbformat.read(executed, as_version=4), name)
+        for folder in (run_dir, notebooks_dir.parent, Path.home(), Path(tempfile.gettempdir()), Path(sys.prefix)):
+            if len(str(folder)) > 1 and f"{folder}/" in made[target]:
+                raise NotebookError(f"{name}: an output shows a path below {folder}; print names, not paths")
+        if len(made[target]) > NOTEBOOK_LIMIT:
+            raise NotebookError(
+                f"{name}: {len(made[target]) / 1e6:.1f} MB with its outputs; draw less, 1 MB is the limit"
+            )
+    for target, text in made.items():
+        with atomic_path(target) as temporary:
+            temporary.write_text(text)
+    return list(made)
+
+
+def _published(source: Any, executed: Any, name: str) -> str:
+    outputs = {c.id: c for c in executed.cells if c.cell_type == "code"}
+    for cell in source.cells:
+        if cell.cell_type != "code":
+            continue
+        ran = outputs.get(cell.id)
+        if ran is None or ran.source != cell.source:
+            raise NotebookError(f"{name}: cell '{cell.id}' is not what was executed; execute the run again")
+        cell.outputs = [_plain_output(o) for o in ran.outputs]
+        cell.execution_count = None
+    return nbformat.writes(source) + "\n"
+
+
+def _plain_output(output: Any) -> Any:
+    output = nbformat.from_dict(dict(output))
+    if "execution_count" in output:
+        output.execution_count = None
+    output.pop("transient", None)
+    if picture := output.get("data", {}).get("image/png"):
+        output.data = {"image/png": _smaller(picture)}  # without "<Figure size ...>"
+    if "metadata" in output:
+        output.metadata = {}
+    return output
+
+
+def _smaller(picture: str) -> str:
+    """A base64 PNG, with 256 colours if it is large and they make it smaller."""
+    raw = b64decode(picture)
+    if len(raw) > IMAGE_LIMIT:
+        buffer = io.BytesIO()
+        Image.open(io.BytesIO(raw)).convert("RGB").quantize(256).save(buffer, "PNG", optimize=True)
+        raw = min(raw, buffer.getvalue(), key=len)
+    return b64encode(raw).decode()
