@@ -103,10 +103,12 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
 
 
 def check_parity(policy: Policy) -> dict[str, float]:
-    """Run the artifact's parity vectors. Returns the largest difference per action; raises ArtifactError beyond tolerance.
+    """Run the artifact's parity vectors.
+
+    Returns the largest difference per action. Raises ArtifactError beyond the manifest's tolerance.
 
     FP32 differs between processors by the order of sums only. INT8 differs more, because its float parts (exp,
-    LayerNorm) round differently and each flipped rounding grows over the layers: the manifest's tolerance says how much.
+    LayerNorm) round differently and each flipped rounding grows over the layers.
     """
     vectors = read_parity(policy.path)
     try:

@@ -1,9 +1,9 @@
 """ACT for inference only: LeRobot's Action Chunking Transformer with everything left out that only training needs.
 
-The same function as `lerobot.policies.act` in eval mode (tests compare the two), arranged so that INT8 has little to do:
-batch norm is folded into the convolutions; the VAE encoder is gone (its latent is zero when driving, so its projection is
-a constant); positions enter attention behind the projections, W(x + pos) = Wx + W pos, as constants; and the first
-decoder layer's self-attention, which acts on zeros, is a constant too.
+The same function as `lerobot.policies.act` in eval mode (tests compare the two), with all that does not depend on the
+observation computed once: batch norm is folded into the convolutions; the VAE encoder is gone (its latent is zero when
+driving, so its projection is its bias); positions are constants; and the first decoder layer's self-attention, which
+acts on zeros, is a constant too, with the query behind it.
 
 Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions, C chunk, h and w of the feature map.
 """
@@ -25,8 +25,8 @@ BACKBONES = {
 }
 ACTIVATIONS = {"relu": nn.ReLU, "gelu": nn.GELU}
 EMBEDDINGS = {
-    "encoder_1d_feature_pos_embed": "folded into each encoder layer's and cross-attention's key (and query) constants",
-    "decoder_pos_embed": "folded into each decoder layer's query and key constants, and into the first layer's start",
+    "encoder_1d_feature_pos_embed": "one constant with the image's sinusoidal positions; never looked up by index",
+    "decoder_pos_embed": "a constant; with the first decoder layer's self-attention and query computed from it once",
 }
 
 
@@ -202,50 +202,39 @@ class Pointwise(nn.Module):
 
 
 class Attention(Pointwise):
-    """Multi-head attention added to the residual stream, with the positions of queries and keys as constants.
+    """Multi-head attention added to the residual stream.
 
     Channel scales (buffers, all None until `quantize` sets them) make the INT8 tensors inside even, and cancel exactly:
-    q_in and kv_in multiply the inputs, q_out, v_out and o_out the outputs; the keys' scale is merged into q_out (the
-    scores only see products), the output projection's input scale into v_out.
+    q_in, k_in and v_in multiply the inputs, q_out, v_out and o_out the outputs; the keys' output scale is merged into
+    q_out (the scores only see products), the output projection's input scale into v_out.
     """
 
-    def __init__(
-        self,
-        w: Weights,
-        config: ActConfig,
-        q_pos: Tensor,
-        k_pos: Tensor,
-        as_conv: bool,
-        q_input: Tensor | None = None,
-    ):
+    def __init__(self, w: Weights, config: ActConfig, as_conv: bool, query: Tensor | None = None):
+        """query: (1, T, D) where it does not depend on the observation; its projection is then a constant."""
         super().__init__(as_conv)
-        d = config.dim
         self.heads = config.heads
-        weight, bias = w["in_proj_weight"], w["in_proj_bias"]
-        wq, wk, wv = weight.split(d)
-        bq, bk, bv = bias.split(d)
-        self.constant_q = q_input is not None  # nothing that the query is made of depends on the observation
-        self.register_buffer("q_pos", F.linear(q_input, wq, bq) + q_pos @ wq.T if self.constant_q else q_pos @ wq.T)
-        self.register_buffer("k_pos", k_pos @ wk.T)
-        if not self.constant_q:
+        wq, wk, wv = w["in_proj_weight"].split(config.dim)
+        bq, bk, bv = w["in_proj_bias"].split(config.dim)
+        self.register_buffer("constant_q", None if query is None else F.linear(query, wq, bq))
+        if query is None:
             self.q = self.project(wq, bq)
         self.k = self.project(wk, bk)
         self.v = self.project(wv, bv)
         self.o = self.project(w["out_proj.weight"], w["out_proj.bias"])
-        for name in ("q_in", "kv_in", "q_out", "v_out", "o_out"):
+        for name in ("q_in", "k_in", "v_in", "q_out", "v_out", "o_out"):
             self.register_buffer(name, None)
 
-    def forward(self, residual: Tensor, x: Tensor, memory: Tensor) -> Tensor:
-        """residual, x: (1, T, D); memory: (1, M, D). Returns residual + attention(x over memory)."""
-        m = self.enter(_times(memory, self.kv_in))
-        if self.constant_q:
-            q = self.q_pos
+    def forward(self, residual: Tensor, query: Tensor | None, key: Tensor, value: Tensor) -> Tensor:
+        """residual, query: (1, T, D); key, value: (1, M, D). Returns residual + attention."""
+        k = self.enter(_times(key, self.k_in))
+        if self.constant_q is not None:
+            q = self.constant_q
         else:
-            # Self-attention has one source, hence one scale and one quantized input for Q, K and V.
-            xq = m if x is memory else self.enter(_times(x, self.q_in))
-            q = _plus_scaled(self.q_pos, self.leave(self.q(xq)), self.q_out)
-        k = self.leave(self.k(m)) + self.k_pos
-        v = _times(self.leave(self.v(m)), self.v_out)
+            # Self-attention asks and answers with one tensor: one scale and one quantized input for Q and K.
+            q = k if query is key else self.enter(_times(query, self.q_in))
+            q = _times(self.leave(self.q(q)), self.q_out)
+        k = self.leave(self.k(k))
+        v = _times(self.leave(self.v(self.enter(_times(value, self.v_in)))), self.v_out)
         q, k, v = (t.unflatten(2, (self.heads, -1)).transpose(1, 2) for t in (q, k, v))  # (1, H, T, D / H)
         y = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
         return _plus_scaled(residual, self.leave(self.o(self.enter(y))), self.o_out)
@@ -278,63 +267,57 @@ def _plus_scaled(x: Tensor, y: Tensor, scale: Tensor | None) -> Tensor:
 
 
 class EncoderLayer(nn.Module):
-    def __init__(self, w: Weights, config: ActConfig, pos: Tensor, as_conv: bool):
+    def __init__(self, w: Weights, config: ActConfig, as_conv: bool):
         super().__init__()
         self.pre_norm = config.pre_norm
-        self.attention = Attention(w.at("self_attn"), config, pos, pos, as_conv)
+        self.attention = Attention(w.at("self_attn"), config, as_conv)
         self.feed_forward = FeedForward(w, config, as_conv)
         self.norm1, self.norm2 = (layer_norm(w.at(f"norm{i}")) for i in (1, 2))
 
-    def forward(self, x: Tensor) -> Tensor:  # (1, T, D)
+    def forward(self, x: Tensor, pos: Tensor) -> Tensor:  # (1, T, D) each
         if self.pre_norm:
             y = self.norm1(x)
-            x = self.attention(x, y, y)
+            y_pos = y + pos
+            x = self.attention(x, y_pos, y_pos, y)
             return self.feed_forward(x, self.norm2(x))
-        x = self.norm1(self.attention(x, x, x))
+        x_pos = x + pos
+        x = self.norm1(self.attention(x, x_pos, x_pos, x))
         return self.norm2(self.feed_forward(x, x))
 
 
 class DecoderLayer(nn.Module):
-    """`start`: None, or this first layer's input (zeros), whose self-attention is then computed here, once."""
+    """The first layer's input is zeros, so its self-attention, and the query behind it, are computed here, once."""
 
-    def __init__(
-        self,
-        w: Weights,
-        config: ActConfig,
-        q_pos: Tensor,
-        k_pos: Tensor,
-        as_conv: bool,
-        start: Tensor | None = None,
-    ):
+    def __init__(self, w: Weights, config: ActConfig, as_conv: bool, q_pos: Tensor, first: bool):
         super().__init__()
-        self.pre_norm, self.first = config.pre_norm, start is not None
-        attention = Attention(w.at("self_attn"), config, q_pos, q_pos, as_conv)
-        norm1, self.norm2, self.norm3 = (layer_norm(w.at(f"norm{i}")) for i in (1, 2, 3))
-        q_input = None
-        if self.first:
+        self.pre_norm, self.first = config.pre_norm, first
+        self.norm1, self.norm2, self.norm3 = (layer_norm(w.at(f"norm{i}")) for i in (1, 2, 3))
+        self.attention = Attention(w.at("self_attn"), config, as_conv)
+        self.register_buffer("start", None)
+        query = None
+        if first:
             with torch.no_grad():
-                y = norm1(start) if self.pre_norm else start
-                x = attention(start, y, y)
-                x = x if self.pre_norm else norm1(x)
-                q_input = self.norm2(x) if self.pre_norm else x
-            self.register_buffer("start", x)
-        else:
-            self.attention, self.norm1 = attention, norm1
-        self.cross_attention = Attention(w.at("multihead_attn"), config, q_pos, k_pos, as_conv, q_input)
+                start = self._self_attend(torch.zeros_like(q_pos), q_pos)
+                query = (self.norm2(start) if self.pre_norm else start) + q_pos
+            self.start = start
+            del self.attention, self.norm1
+        self.cross_attention = Attention(w.at("multihead_attn"), config, as_conv, query)
         self.feed_forward = FeedForward(w, config, as_conv)
 
-    def forward(self, x: Tensor | None, memory: Tensor) -> Tensor:  # (1, C, D), (1, T, D)
-        if self.first:
-            x = self.start
-        elif self.pre_norm:
-            y = self.norm1(x)
-            x = self.attention(x, y, y)
-        else:
-            x = self.norm1(self.attention(x, x, x))
+    def _self_attend(self, x: Tensor, q_pos: Tensor) -> Tensor:
+        y = self.norm1(x) if self.pre_norm else x
+        y_pos = y + q_pos
+        x = self.attention(x, y_pos, y_pos, y)
+        return x if self.pre_norm else self.norm1(x)
+
+    def forward(self, x: Tensor | None, q_pos: Tensor, memory: Tensor, memory_pos: Tensor) -> Tensor:
+        """x, q_pos: (1, C, D), x None for the first layer; memory, memory_pos (with positions added): (1, T, D)."""
+        x = self.start if self.first else self._self_attend(x, q_pos)
+        y = self.norm2(x) if self.pre_norm else x
+        x = self.cross_attention(x, None if self.first else y + q_pos, memory_pos, memory)
         if self.pre_norm:
-            x = self.cross_attention(x, self.norm2(x), memory)
             return self.feed_forward(x, self.norm3(x))
-        x = self.norm2(self.cross_attention(x, x, memory))
+        x = self.norm2(x)
         return self.norm3(self.feed_forward(x, x))
 
 
@@ -380,15 +363,14 @@ class ACT(nn.Module):
         self.register_buffer("latent", w["encoder_latent_input_proj.bias"][None, None])
         pos = [w["encoder_1d_feature_pos_embed.weight"]]
         pos += [positions_2d(config.dim, -(-h // config.stride), -(-v // config.stride)) for h, v in config.image_sizes]
-        k_pos = torch.cat(pos)[None]  # (1, T, D)
-        q_pos = w["decoder_pos_embed.weight"][None]  # (1, C, D)
+        self.register_buffer("pos", torch.cat(pos)[None])  # (1, T, D)
+        self.register_buffer("q_pos", w["decoder_pos_embed.weight"][None])  # (1, C, D)
         self.encoder = nn.ModuleList(
-            EncoderLayer(w.at(f"encoder.layers.{i}"), config, k_pos, as_conv) for i in range(config.encoder_layers)
+            EncoderLayer(w.at(f"encoder.layers.{i}"), config, as_conv) for i in range(config.encoder_layers)
         )
         self.encoder_norm = layer_norm(w.at("encoder.norm")) if config.pre_norm else nn.Identity()
-        zeros = torch.zeros_like(q_pos)
         self.decoder = nn.ModuleList(
-            DecoderLayer(w.at(f"decoder.layers.{i}"), config, q_pos, k_pos, as_conv, None if i else zeros)
+            DecoderLayer(w.at(f"decoder.layers.{i}"), config, as_conv, self.q_pos, first=i == 0)
             for i in range(config.decoder_layers)
         )
         self.norm = layer_norm(w.at("decoder.norm"))
@@ -403,11 +385,12 @@ class ACT(nn.Module):
             tokens.append(x.flatten(2).transpose(1, 2))  # (1, h * w, D)
         x = torch.cat(tokens, 1)
         for layer in self.encoder:
-            x = layer(x)
+            x = layer(x, self.pos)
         memory = self.encoder_norm(x)
+        memory_pos = memory + self.pos
         y = None
         for layer in self.decoder:
-            y = layer(y, memory)
+            y = layer(y, self.q_pos, memory, memory_pos)
         return self.action_unnorm(self.head(self.norm(y)))
 
 
@@ -438,8 +421,8 @@ def multiply_accumulates(model: ACT) -> dict[str, int]:
     def watch(name: str):
         def hook(module: nn.Module, args: tuple, out: Tensor) -> None:
             if isinstance(module, Attention):
-                residual, _, memory = args
-                add(name, 2 * residual.shape[1] * memory.shape[1] * residual.shape[2])
+                residual, _, key, _ = args
+                add(name, 2 * residual.shape[1] * key.shape[1] * residual.shape[2])
             elif isinstance(module, nn.Conv2d):
                 add(name, out.numel() * module.weight[0].numel())
             else:

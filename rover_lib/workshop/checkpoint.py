@@ -1,6 +1,6 @@
-"""Checkpoints in: the trainer's best_model.pth or LeRobot's pretrained_model/ folder, checked before anything uses them.
+"""Checkpoints in: the trainer's best_model.pth or LeRobot's pretrained_model/ folder, checked before they are used.
 
-Nothing in a file is ever executed: pickles are read with weights_only=True, and what that refuses is refused here by name.
+Nothing in a file is ever executed: pickles are read with weights_only=True, and what that refuses is refused by name.
 """
 
 import json
@@ -245,7 +245,12 @@ class Normaliser:
         }
         if mode == "IDENTITY" or not stats:
             return None
-        pairs = {"MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}  # fmt: skip
+        pairs = {
+            "MEAN_STD": ("mean", "std"),
+            "MIN_MAX": ("min", "max"),
+            "QUANTILES": ("q01", "q99"),
+            "QUANTILE10": ("q10", "q90"),
+        }
         if mode not in pairs:
             raise CheckpointError(f"{self.where}: normalisation mode '{mode}' of '{key}' is not known here")
         if missing := [p for p in pairs[mode] if p not in stats]:

@@ -1,12 +1,11 @@
-"""From a checkpoint and calibration samples to INT8. The only module that touches torch.ao.quantization (deprecated after 2.8).
+"""From a checkpoint and calibration samples to INT8. Only this module touches torch.ao.quantization (its last is 2.8).
 
     calibration = calibrate(checkpoint, samples)              # what flows through each layer
     quantized = quantize(checkpoint, Scheme("static"), calibration)
     export(quantized, checkpoint, path, ...)                  # the artifact
 
 Static INT8 covers convolutions, token projections and the backbone's adds. The residual stream, LayerNorm, the products
-of attention and the two-row head stay float: they are 2 % of the arithmetic, and quantizing them costs more instructions
-than it saves.
+of attention and the two-row head stay float: 2 % of the arithmetic, and quantizing them costs more than it saves.
 """
 
 import copy
@@ -217,7 +216,7 @@ def channel_maxima(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> dict[str
 
 
 def _output_scale(out_max: Tensor) -> Tensor:
-    """Per channel, with the largest at 1 so that magnitudes stay natural; a dead channel does not blow its weights up."""
+    """Per channel, the largest at 1 so that magnitudes stay natural; a dead channel does not blow its weights up."""
     return (out_max / out_max.max().clamp(min=1e-12)).clamp(min=1 / 64)
 
 
@@ -251,23 +250,19 @@ def apply_channel_scales(model: ACT, maxima: dict[str, dict[str, Tensor]], smoot
         if isinstance(part, Attention):
             seen = {p: maxima[f"{name}.{p}"] for p in "qkvo" if f"{name}.{p}" in maxima}
             out = {p: _output_scale(s["out_max"]) for p, s in seen.items()}
-            shared = ["k", "v"]
-            if not part.constant_q:
-                if name.endswith("cross_attention"):
-                    part.q_in = _input_scale(seen["q"]["in_max"], [matrix(part.q) / out["q"][:, None]], smooth)
-                else:
-                    shared = ["q", "k", "v"]
-            sources = [matrix(getattr(part, p)) / out[p][:, None] for p in shared]
-            part.kv_in = _input_scale(seen["k"]["in_max"], sources, smooth)
-            o_in = _input_scale(seen["o"]["in_max"], [matrix(part.o) / out["o"][:, None]], smooth)
-            if not part.constant_q:
-                q_in = part.q_in if part.q_in is not None else part.kv_in
-                rescale(part.q, 1 / out["q"], 1 / q_in)
+            even = {p: matrix(getattr(part, p)) / out[p][:, None] for p in seen}
+            shares = "q" in seen and not name.endswith("cross_attention")  # self-attention: one input for Q and K
+            part.k_in = _input_scale(seen["k"]["in_max"], [even["q"], even["k"]] if shares else [even["k"]], smooth)
+            part.v_in = _input_scale(seen["v"]["in_max"], [even["v"]], smooth)
+            o_in = _input_scale(seen["o"]["in_max"], [even["o"]], smooth)
+            if "q" not in seen:
+                part.constant_q = part.constant_q * out["k"]
+            else:
+                part.q_in = None if shares else _input_scale(seen["q"]["in_max"], [even["q"]], smooth)
+                rescale(part.q, 1 / out["q"], 1 / (part.k_in if shares else part.q_in))
                 part.q_out = out["q"] * out["k"]
-            rescale(part.k, 1 / out["k"], 1 / part.kv_in)
-            part.k_pos /= out["k"]
-            part.q_pos *= out["k"]
-            rescale(part.v, 1 / out["v"], 1 / part.kv_in)
+            rescale(part.k, 1 / out["k"], 1 / part.k_in)
+            rescale(part.v, 1 / out["v"], 1 / part.v_in)
             part.v_out = out["v"] * o_in
             rescale(part.o, 1 / out["o"], 1 / o_in)
             part.o_out = out["o"]
@@ -657,7 +652,7 @@ def inspect_layers(
     """Per static INT8 layer: scale, zero point, share of values clipped and signal-to-noise against float.
 
     Both run over the samples (which calibration should not have seen). clipped_pct: of the float values that lie
-    outside the INT8 range; snr_db: 10 log10 of signal over error power, with the errors that arrive from before included.
+    outside the INT8 range; snr_db: 10 log10 of signal over error power, errors that arrive from before included.
     """
     if quantized.scheme.mode == "dynamic":
         return []

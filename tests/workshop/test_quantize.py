@@ -38,7 +38,7 @@ def test_channel_scales_are_exact_in_float(variant, smooth, as_conv, tmp_path):
     before = q.predictions(model, seen)
     maxima = q.channel_maxima(model, seen)
     q.apply_channel_scales(model, maxima, smooth)
-    assert any(b is not None for n, b in model.named_buffers() if n.endswith("kv_in"))
+    assert any(b is not None for n, b in model.named_buffers() if n.endswith("v_in"))
     assert (q.predictions(model, seen) - before).abs().max() < 1e-5
 
 
