@@ -73,7 +73,7 @@ def cached_folder(kind: str, key: str, make: Callable[[Path], None]) -> Path:
 
 def record_episodes(
     out_dir: Path | str,
-    count: int = 60,
+    count: int = 80,
     seed: int = 0,
     progress: Callable[..., Iterable] | None = None,
 ) -> Path:

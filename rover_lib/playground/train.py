@@ -116,7 +116,7 @@ RECIPES = {
     ("small", "cpu"): Recipe(300, 900, 60, batch=16, transformer_batch=16, samples=4000),
     ("small", "cuda"): Recipe(300, 900, 60, batch=16, transformer_batch=16, samples=4000),
     # a processor can only show that it runs: minutes for these few steps
-    ("full", "cpu"): Recipe(2, 2, 2, batch=2, transformer_batch=2, samples=16, transformer_rate=1e-4),
+    ("full", "cpu"): Recipe(20, 30, 10, batch=2, transformer_batch=2, samples=100, transformer_rate=1e-4),
     ("full", "cuda"): Recipe(1500, 4000, 500, batch=16, transformer_batch=16, samples=4000, transformer_rate=1e-4),
 }
 
@@ -241,7 +241,7 @@ def make_checkpoint(
     size: str = "full",
     episodes_dir: Path | str | None = None,
     seed: int = 0,
-    steps: int = 3,
+    steps: int = 12,
     progress: Progress = None,
 ) -> Path:
     """A checkpoint of a few steps: real in format, size and ranges, but it cannot drive.
@@ -279,11 +279,16 @@ def _train(
     data = _load(parts.calibration, recipe.samples, size, "reading frames", progress)
     held_out = _load(parts.choosing, max(8, recipe.samples // 8), size, "reading held-out frames", progress)
     # errors count in units of what was recorded: throttle's whole range is a tenth of steering's
-    spread = data.chunks[~data.is_pad].std(axis=0)
-    loss_weights = torch.from_numpy(1 / np.maximum(spread, 1e-3)).to(device)
+    recorded = data.chunks[~data.is_pad]
+    spread = np.maximum(recorded.std(axis=0), 1e-3)
+    loss_weights = torch.from_numpy(1 / spread).to(device)
 
     with _seeded(seed):
-        policy = build_policy(size).to(device)
+        policy = build_policy(size)
+        with torch.no_grad():  # starts at the mean action, give or take: a fresh head plans wild ones
+            policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
+            policy.model.action_head.bias.copy_(torch.from_numpy(recorded.mean(axis=0)))
+        policy.to(device)
         _train_backbone(policy, data, recipe, loss_weights, rng, progress)
         _train_transformer(policy, data, recipe, loss_weights, rng, progress)
         optimizer, scheduler = _train_together(policy, data, recipe, loss_weights, rng, progress)

@@ -4,8 +4,9 @@ import torch
 
 from rover_lib.onboard.errors import RoverError, WorldError
 from rover_lib.playground import train as train_module
-from rover_lib.playground.train import RECIPES, SIZES, LerobotDriver, build_policy, train
+from rover_lib.playground.train import RECIPES, SIZES, LerobotDriver, build_policy, make_checkpoint, train
 from rover_lib.playground.trial import run_trials
+from rover_lib.playground.world import World
 from rover_lib.workshop.checkpoint import load_checkpoint
 
 # the keys of the user's best_model.pth
@@ -201,3 +202,12 @@ def test_a_loss_that_is_not_finite_ends_the_training(recorded, tmp_path, monkeyp
     with pytest.raises(WorldError, match="loss is nan"):
         train(recorded, tmp_path / "best_model.pth", seed=9, steps=3, device="cpu")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_checkpoint_for_trying_things_needs_no_recordings_and_plans_mild_actions(tmp_path):
+    out = make_checkpoint(tmp_path / "best_model.pth", size="small", steps=3)
+    policy = build_policy(SIZES["small"])
+    policy.load_state_dict(torch.load(out, weights_only=False)["model_state_dict"])
+    chunk = LerobotDriver(policy).predict_chunk(World(1).render(), np.zeros(2, np.float32))
+    assert abs(chunk[:, 0]).max() < 0.65
+    assert 0 < chunk[:, 1].mean() < 0.2
