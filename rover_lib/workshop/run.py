@@ -15,17 +15,16 @@ import socket
 import sys
 import tempfile
 from base64 import b64decode, b64encode
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import nbformat
-import papermill
+import torch
 from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
-from nbclient.exceptions import DeadKernelError
-from papermill.exceptions import PapermillExecutionError
 from PIL import Image
 
 from rover_lib.onboard.errors import RoverError
@@ -37,6 +36,14 @@ from rover_lib.workshop.params import params
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
 TTY_VARIABLE = "ROVER_PROGRESS_TTY"  # the terminal of who started a run: the notebooks' bars are drawn there
+KERNEL_ENVIRONMENT = {
+    # OpenMP's threads wait by spinning, in the way of XNNPACK's own: INT8 took 124 ms so on two busy cores, not 2.6 ms.
+    "OMP_WAIT_POLICY": "PASSIVE",
+    # Both are known, and noise in a stored output: QNNPACK ignores reduce_range, tqdm misses widgets.
+    "PYTHONWARNINGS": "ignore:Currently,ignore:IProgress not found",
+    "TORCH_CPP_LOG_LEVEL": "ERROR",
+}
+SMALL_GMAC = 1.0  # below this a second thread costs more, on a busy machine, than it brings
 IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
 NOTEBOOK_LIMIT = 1_000_000  # bytes, of a committed notebook
 
@@ -68,8 +75,13 @@ def load(checkpoint: Path | str, episodes: Path | str) -> Opened:
 
 
 def opened(run_dir: Path | str) -> Opened:
-    """What notebook 01 loaded, again. Raises RoverError if it did not run, or if the files have changed since."""
+    """What notebook 01 loaded, again. Raises RoverError if it did not run, or if the files have changed since.
+
+    For a policy of less than SMALL_GMAC, torch is set to one thread (a benchmark sets its own).
+    """
     stage = read_stage(Path(run_dir) / "load.json", "load")
+    if sum(stage["metrics"]["checkpoint"]["macs_by_block"].values()) < SMALL_GMAC * 1e9:
+        torch.set_num_threads(1)
     again = load(stage["params"]["checkpoint"], stage["params"]["episodes"])
     if again.checkpoint.sha256 != stage["metrics"]["checkpoint"]["sha256"]:
         raise NotebookError(f"{again.checkpoint.path}: is not what notebook 01 loaded any more; run it again")
@@ -104,7 +116,7 @@ class ThisPython(AsyncKernelManager):
 
     @property
     def kernel_spec(self) -> KernelSpec:
-        argv = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+        argv = [sys.executable, "-m", "ipykernel_launcher", "--log-level=40", "-f", "{connection_file}"]
         return KernelSpec(argv=argv, display_name="Python 3", language="python")
 
 
@@ -171,30 +183,42 @@ def _clear(folder: Path) -> None:
 
 
 def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> None:
+    # here, because it takes a second that the kernels, which import this module too, need not spend
+    import papermill
+    from nbclient.exceptions import DeadKernelError
+
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
     terminal = os.ttyname(sys.stderr.fileno()) if bars and _is_terminal(sys.stderr) else ""
-    before = os.environ.get(TTY_VARIABLE)
-    os.environ[TTY_VARIABLE] = terminal
+    with _environment({TTY_VARIABLE: terminal, **KERNEL_ENVIRONMENT}), atomic_path(folder / source.name) as temporary:
+        try:
+            papermill.execute_notebook(
+                str(source),
+                str(temporary),
+                parameters=given,
+                cwd=str(folder),
+                progress_bar=False,
+                kernel_name="python3",
+                kernel_manager_class=ThisPython,
+            )
+        except papermill.PapermillExecutionError as e:
+            raise NotebookError(f"{source.name}, cell {e.cell_index + 1}: {_sentence(e)}") from e
+        except DeadKernelError as e:
+            raise NotebookError(f"{source.name}: its kernel died; is there enough memory?") from e
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """os.environ with these values inside, as before outside: a kernel inherits it."""
+    before = {k: os.environ.get(k) for k in values}
+    os.environ.update(values)
     try:
-        with atomic_path(folder / source.name) as temporary:
-            try:
-                papermill.execute_notebook(
-                    str(source),
-                    str(temporary),
-                    parameters=given,
-                    cwd=str(folder),
-                    progress_bar=False,
-                    kernel_name="python3",
-                    kernel_manager_class=ThisPython,
-                )
-            except PapermillExecutionError as e:
-                raise NotebookError(f"{source.name}, cell {e.cell_index + 1}: {_sentence(e)}") from e
-            except DeadKernelError as e:
-                raise NotebookError(f"{source.name}: its kernel died; is there enough memory?") from e
+        yield
     finally:
-        os.environ.pop(TTY_VARIABLE)
-        if before is not None:
-            os.environ[TTY_VARIABLE] = before
+        for key, value in before.items():
+            if value is None:
+                os.environ.pop(key, None)
+            else:
+                os.environ[key] = value
 
 
 def _is_terminal(stream: Any) -> bool:
@@ -204,7 +228,7 @@ def _is_terminal(stream: Any) -> bool:
         return False
 
 
-def _sentence(error: PapermillExecutionError) -> str:
+def _sentence(error: Any) -> str:
     """A RoverError's own words; for what the program did not foresee also the error's name and how to see more."""
     text = " ".join(str(error.evalue).split())
     ours = {c.__name__ for c in _subclasses(RoverError)} | {RoverError.__name__}
@@ -254,7 +278,7 @@ def _published(source: Any, executed: Any, name: str) -> str:
         ran = outputs.get(cell.id)
         if ran is None or ran.source != cell.source:
             raise NotebookError(f"{name}: cell '{cell.id}' is not what was executed; execute the run again")
-        cell.outputs = [_plain_output(o) for o in ran.outputs]
+        cell.outputs = [_plain_output(o) for o in ran.outputs if o.get("name") != "stderr"]
         cell.execution_count = None
     return nbformat.writes(source) + "\n"
 
