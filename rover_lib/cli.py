@@ -237,7 +237,7 @@ def world() -> None:
 
 @world.command()
 @click.argument("out_dir", type=FILE)
-@click.option("--count", type=click.IntRange(min=1), default=60, show_default=True, help="Episodes.")
+@click.option("--count", type=click.IntRange(min=1), default=80, show_default=True, help="Episodes.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 def record(out_dir: Path, count: int, seed: int) -> None:
     """Record COUNT drives of the expert to OUT_DIR, in the format of the real car's recorder."""

@@ -283,3 +283,23 @@ def test_the_optimizer_is_not_in_the_artifact(tiny_policy, artifacts):
     acting = 4 * sum(v.numel() for k, v in tiny_policy.state_dict().items() if "vae" not in k) / 1e6
     assert artifacts["fp32"].stat().st_size / 1e6 < 1.05 * acting + 0.3
     assert artifacts["static"].stat().st_size < 0.3 * artifacts["fp32"].stat().st_size
+
+
+def test_the_users_full_size_static_artifact_is_at_most_70_mb(tmp_path):
+    """The floor is 66.4 MB, a byte per weight that acts; the optimizer and the VAE encoder are not in it."""
+    from rover_lib.onboard import load_policy
+
+    policy = lerobot_policy(
+        {"observation.images.cam_front": (360, 640)}, chunk_size=32, n_decoder_layers=7, n_vae_encoder_layers=4
+    )
+    torch.save(trainer_content(policy), tmp_path / "best_model.pth")
+    checkpoint = load_checkpoint(tmp_path / "best_model.pth")
+    samples = [
+        replace(s, picture=np.random.default_rng(i).integers(0, 256, (360, 640, 3), dtype=np.uint8))  # incompressible
+        for i, s in enumerate(memory_samples(3, 360, 640))
+    ]
+    calibration = calibrate(checkpoint, samples)
+    quantized = quantize(checkpoint, Scheme("static"), calibration)
+    q.export(quantized, checkpoint, tmp_path / "static.pt", samples=samples, calibration=calibration)
+    assert 60 < (tmp_path / "static.pt").stat().st_size / 1e6 <= 70
+    assert load_policy(tmp_path / "static.pt").manifest["gmac"] == pytest.approx(15.0, abs=0.1)
