@@ -592,10 +592,9 @@ def drives_from_above(trials: Mapping[str, Any], count: int = 4) -> Figure:
         ax.set_aspect("equal", adjustable="datalim")
         ax.set_xlabel("to the right (m)")
         missed = [NAMES.get(m, m) for m, t in trials.items() if not t.per_world[i].hit]
-        ax.set_title(
-            f"{100 * apart(i):.0f} cm apart\n" + (f"missed: {', '.join(missed)}" if missed else "all hit"),
-            fontsize=9,
-        )
+        outcome = "all hit" if not missed else "all missed" if len(missed) == len(trials) else ""
+        outcome = outcome or (f"{missed[0]} missed" if len(missed) == 1 else f"{len(missed)} of {len(trials)} missed")
+        ax.set_title(f"{100 * apart(i):.0f} cm apart, {outcome}", fontsize=9)
     axes[0, 0].set_ylabel("ahead of the start (m)")
     _legend_below(fig, axes[0, 0], 5)
     return fig

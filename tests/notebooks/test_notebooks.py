@@ -1,0 +1,181 @@
+"""The notebooks as files: they call, check and show; what a function could hold is not in them. nbval runs them."""
+
+import ast
+import re
+import sys
+
+import nbformat
+import pytest
+
+from rover_lib.workshop import run as runs
+from rover_lib.workshop.run import NAMES, NOTEBOOK_LIMIT, NOTEBOOKS, parameters_of
+
+PATHS = [NOTEBOOKS / f"{name}.ipynb" for name in NAMES]
+MOST_LINES = 12
+
+
+@pytest.fixture(params=PATHS, ids=NAMES)
+def path(request):
+    return request.param
+
+
+@pytest.fixture
+def notebook(path):
+    return nbformat.read(path, as_version=4)
+
+
+def code(notebook):
+    return [c for c in notebook.cells if c.cell_type == "code"]
+
+
+def test_is_valid_with_stable_ids(notebook):
+    nbformat.validate(notebook)
+    ids = [c.id for c in notebook.cells]
+    assert len(set(ids)) == len(ids) and all(re.fullmatch(r"[a-z-]+", i) for i in ids)
+
+
+def test_title_is_a_question(notebook):
+    title = notebook.cells[0].source.splitlines()[0]
+    assert notebook.cells[0].cell_type == "markdown" and re.fullmatch(r"# .+\?", title)
+
+
+def test_parameters_are_literals_with_a_reason(notebook):
+    cells = [c for c in code(notebook) if "parameters" in c.metadata.get("tags", [])]
+    assert len(cells) == 1
+    for line, statement in zip(cells[0].source.splitlines(), ast.parse(cells[0].source).body, strict=True):
+        ast.literal_eval(statement.value)
+        assert "  # " in line
+
+
+def test_cells_call_check_and_show(notebook):
+    for cell in code(notebook):
+        kinds = {type(n) for n in ast.walk(ast.parse(cell.source))}
+        assert not kinds & {ast.FunctionDef, ast.ClassDef, ast.Try, ast.While}, cell.id
+        imports = kinds & {ast.Import, ast.ImportFrom}
+        lines = [n for n in cell.source.splitlines() if n.strip()]
+        assert imports or len(lines) <= MOST_LINES, f"{cell.id} has {len(lines)} lines"
+
+
+def test_every_notebook_asserts_something_or_writes_a_figure(notebook):
+    text = "\n".join(c.source for c in code(notebook))
+    assert "plots.save(" in text and "write_stage(" in text
+
+
+def test_committed_outputs_are_clean(notebook, path):
+    text = path.read_text()
+    assert len(text) < NOTEBOOK_LIMIT
+    assert not re.search(r"(/home/|/root/|/tmp/|/Users/|/work/|[A-Z]:\\\\)", text)
+    assert "papermill" not in notebook.metadata and "Warning" not in text
+    for cell in code(notebook):
+        assert cell.execution_count is None
+        assert not [o for o in cell.outputs if o.get("name") == "stderr" or o.output_type == "error"]
+        assert all(o.get("execution_count") is None for o in cell.outputs)
+
+
+def test_all_know_the_run_folder():
+    assert all("run_dir" in parameters_of(p) for p in PATHS)
+    assert {"checkpoint", "episodes"} <= parameters_of(PATHS[0])
+
+
+# --- executing and publishing ---
+
+
+def written(folder, name, *cells):
+    """A small notebook: cells are (id, source) or (id, source, outputs)."""
+    made = nbformat.v4.new_notebook(metadata={"language_info": {"name": "python"}})
+    for cell_id, source, *outputs in cells:
+        cell = nbformat.v4.new_code_cell(source, outputs=outputs[0] if outputs else [], id=cell_id)
+        if cell_id == "parameters":
+            cell.metadata["tags"] = ["parameters"]
+        made.cells.append(cell)
+    folder.mkdir(exist_ok=True)
+    nbformat.write(made, folder / f"{name}.ipynb")
+
+
+@pytest.fixture
+def one_notebook(monkeypatch, tmp_path):
+    monkeypatch.setattr(runs, "NAMES", ("01_load",))
+    return tmp_path / "notebooks"
+
+
+def test_a_run_fills_parameters_and_leaves_the_executed_notebook(one_notebook, tmp_path):
+    written(
+        one_notebook,
+        "01_load",
+        ("parameters", 'run_dir = "."  # here\nworlds = 1  # so many'),
+        ("work", "import pathlib, sys\npathlib.Path(run_dir, 'made').write_text(f'{worlds} {sys.executable}')"),
+    )
+    folder = runs.run("ck", "episodes", "mine", runs_dir=tmp_path / "runs", notebooks=one_notebook, worlds=7)
+    assert (folder / "made").read_text() == f"7 {sys.executable}"
+    assert {p.name for p in folder.iterdir()} == {"made", "01_load.ipynb"}
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        (
+            "from rover_lib.onboard.errors import EpisodeError\nraise EpisodeError('x: empty; record again')",
+            r"^01_load.ipynb, cell \d: x: empty; record again$",
+        ),
+        ("1 / 0", r"^01_load.ipynb, cell \d: ZeroDivisionError: division by zero; .*--debug"),
+    ],
+)
+def test_a_failing_cell_is_one_sentence_and_no_file(one_notebook, tmp_path, source, words):
+    written(one_notebook, "01_load", ("parameters", 'run_dir = "."  # here'), ("work", source))
+    with pytest.raises(runs.NotebookError, match=words):
+        runs.run("ck", "episodes", "mine", runs_dir=tmp_path / "runs", notebooks=one_notebook)
+    assert not (tmp_path / "runs" / "mine").exists()
+
+
+def test_what_a_run_was_not_asked_to_know_is_refused(one_notebook, tmp_path):
+    written(one_notebook, "01_load", ("parameters", 'run_dir = "."  # here'))
+    with pytest.raises(runs.NotebookError, match=r"no notebook has a parameter \['wrlds'\]"):
+        runs.run("ck", "episodes", runs_dir=tmp_path, notebooks=one_notebook, wrlds=1)
+    with pytest.raises(runs.NotebookError, match="plain folder name"):
+        runs.run("ck", "episodes", "../up", runs_dir=tmp_path, notebooks=one_notebook)
+
+
+def test_an_old_run_is_cleared_but_for_other_hosts(tmp_path):
+    for name in ("load.json", "policy_static.pt", "benchmark-pi.json", "best_model.pth"):
+        (tmp_path / name).touch()
+    runs._clear(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == {"benchmark-pi.json", "best_model.pth"}
+
+
+def stream(text, name="stdout"):
+    return nbformat.v4.new_output("stream", name=name, text=text)
+
+
+def test_publishing_takes_outputs_without_counts_and_noise(one_notebook, tmp_path):
+    written(one_notebook, "01_load", ("parameters", "a = 1  # one"), ("work", "print(a)\na"))
+    shown = nbformat.v4.new_output("execute_result", data={"text/plain": "1"}, execution_count=3)
+    ran = ("work", "print(a)\na", [stream("1\n"), stream("noise", "stderr"), shown])
+    written(tmp_path / "run", "01_load", ("parameters", "a = 1  # one"), ("injected", "a = 2"), ran)
+    (path,) = runs.publish(tmp_path / "run", one_notebook)
+    parameters, work = nbformat.read(path, as_version=4).cells
+    assert parameters.source == "a = 1  # one"
+    assert [o.output_type for o in work.outputs] == ["stream", "execute_result"]
+    assert work.outputs[1].execution_count is None
+
+
+def test_publishing_refuses_paths_and_changed_cells(one_notebook, tmp_path):
+    written(one_notebook, "01_load", ("work", "print(1)"))
+    before = (one_notebook / "01_load.ipynb").read_text()
+    written(tmp_path / "run", "01_load", ("work", "print(1)", [stream(f"{tmp_path}/run/x")]))
+    with pytest.raises(runs.NotebookError, match="print names"):
+        runs.publish(tmp_path / "run", one_notebook)
+    written(tmp_path / "run", "01_load", ("work", "print(2)", [stream("2")]))
+    with pytest.raises(runs.NotebookError, match="not what was executed"):
+        runs.publish(tmp_path / "run", one_notebook)
+    assert (one_notebook / "01_load.ipynb").read_text() == before
+
+
+def test_what_was_opened_must_not_have_changed(tmp_path):
+    with pytest.raises(runs.RoverError, match="stage 'load'"):
+        runs.opened(tmp_path)
+
+
+def test_nobody_watches_a_test(monkeypatch):
+    monkeypatch.delenv("JPY_SESSION_NAME", raising=False)
+    monkeypatch.setenv(runs.TTY_VARIABLE, "")
+    assert runs.watched() is None
