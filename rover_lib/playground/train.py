@@ -5,6 +5,8 @@ the backbone alone with live batch norm, predicting the chunk; the transformer o
 features, computed once; then all together at a tenth of the rate.
 """
 
+from __future__ import annotations
+
 import inspect
 import math
 import shutil
@@ -13,14 +15,10 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import torchvision
-from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.policies.act.configuration_act import ACTConfig
-from lerobot.policies.act.modeling_act import ACTPolicy
 from torch import Tensor, nn
 
 from rover_lib.onboard import preprocess
@@ -31,6 +29,10 @@ from rover_lib.playground import record
 from rover_lib.playground.record import cached_folder, key_of
 from rover_lib.workshop import episodes as episodes_module
 from rover_lib.workshop.episodes import Sample, load_recordings, split
+from rover_lib.workshop.params import params
+
+if TYPE_CHECKING:
+    from lerobot.policies.act.modeling_act import ACTPolicy
 
 IMAGE, STATE, ACTION, IS_PAD = "observation.images.cam_front", "observation.state", "action", "action_is_pad"
 CHUNK = 32
@@ -75,7 +77,7 @@ class Recipe:
     backbone_rate: float = 1e-3
     transformer_rate: float = 5e-4
 
-    def of_steps(self, steps: int) -> "Recipe":
+    def of_steps(self, steps: int) -> Recipe:
         """The same recipe with so many steps in all, at least one in each phase."""
         planned = self.backbone_steps, self.transformer_steps, self.together_steps
         backbone, transformer, together = (max(1, round(steps * p / sum(planned))) for p in planned)
@@ -140,6 +142,11 @@ class Frames:
 
 def build_policy(size: Size) -> ACTPolicy:
     """LeRobot's ACTPolicy of that size with fresh weights; downloads nothing."""
+    # here, because it takes ten seconds that a checkpoint from the cache need not wait for
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
     config = ACTConfig(
         input_features={
             IMAGE: PolicyFeature(FeatureType.VISUAL, (3, size.image_height, size.image_width)),
@@ -198,7 +205,7 @@ def train(
     steps: optimiser steps of all three phases together; the recipe's when left out.
     device: 'cpu', 'cuda' or None for the best there is.
     progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
-    The calibration part of the default split is trained on, the choosing part gives best_val_loss, and the
+    The calibration part of params.yml's split is trained on, the choosing part gives best_val_loss, and the
     held-out part is left alone, so that it may judge later.
     Returns out_path, which appears complete or not at all. The same input gives the same weights on one
     machine; a checkpoint that was made before is taken from the cache.
@@ -215,16 +222,17 @@ def train(
     recipe = RECIPES[size, device]
     if steps is not None:
         recipe = recipe.of_steps(steps)
-    params = {
+    made_of = {
         "size": asdict(SIZES[size]),
         "recipe": asdict(recipe),
         "seed": seed,
         "device": device,
         "versions": [version(name) for name in ("torch", "lerobot", "torchvision", "numpy")],
         "episodes": {p.relative_to(episodes_dir).as_posix(): sha256_of(p) for p in _files(episodes_dir)},
+        "split": params()["calibration"],
         "names": [episodes_dir.name, out_path.parent.name],
     }
-    key = key_of(params, inspect.getmodule(train), preprocess, episodes_module)
+    key = key_of(made_of, inspect.getmodule(train), preprocess, episodes_module)
 
     def make(folder: Path) -> None:
         checkpoint = _train(episodes_dir, out_path, SIZES[size], recipe, seed, torch.device(device), progress)
@@ -273,8 +281,9 @@ def _train(
     device: torch.device,
     progress: Progress,
 ) -> dict[str, Any]:
-    recordings = load_recordings(episodes_dir, chunk=CHUNK, progress=progress)
-    parts = split(recordings)
+    p = params()["calibration"]
+    recordings = load_recordings(episodes_dir, CHUNK, p["sync_s"], progress)
+    parts = split(recordings, p["held_out_share"], p["seed"])
     rng = np.random.default_rng([seed, 77])
     data = _load(parts.calibration, recipe.samples, size, "reading frames", progress)
     held_out = _load(parts.choosing, max(8, recipe.samples // 8), size, "reading held-out frames", progress)
@@ -455,6 +464,8 @@ def _train_backbone(
     """Phase one: live batch norm; its statistics, measured on the data, become the frozen ones."""
     device = loss_weights.device
     height, width = data.images.shape[1:3]
+    import torchvision
+
     resnet = torchvision.models.resnet18(weights=None)
     live = torchvision.models._utils.IntermediateLayerGetter(resnet, {"layer4": "feature_map"})
     model = _ChunkFromFeatures(live, height, width).to(device).train()

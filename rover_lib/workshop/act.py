@@ -440,6 +440,15 @@ def multiply_accumulates(model: ACT) -> dict[str, int]:
     return counts
 
 
+def parameters_by_block(model: ACT) -> dict[str, int]:
+    """Weights and biases per block, blocks named as in `act.multiply_accumulates`."""
+    counts: dict[str, int] = {}
+    for name, tensor in model.named_parameters():
+        block = block_of(name)
+        counts[block] = counts.get(block, 0) + tensor.numel()
+    return counts
+
+
 def example_inputs(config: ActConfig) -> tuple[Tensor, ...]:
     """A neutral observation of the right shapes: zero state, grey frames."""
     frames = (torch.full((h, w, 3), 128, dtype=torch.uint8) for h, w in config.image_sizes)

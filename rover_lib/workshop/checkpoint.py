@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torchvision
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
@@ -373,11 +372,7 @@ def expected_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
             for n in range(len(attentions) + 1):
                 norm(f"{at}.norm{n + 1}")
 
-    with torch.device("meta"):
-        resnet = getattr(torchvision.models, c.backbone)(
-            norm_layer=torchvision.ops.misc.FrozenBatchNorm2d, weights=None
-        )
-    shapes |= {f"backbone.{k}": tuple(v.shape) for k, v in resnet.state_dict().items() if not k.startswith("fc.")}
+    shapes |= {f"backbone.{k}": v for k, v in _resnet_shapes(c.backbone).items()}
     lin("encoder_img_feat_input_proj", d, BACKBONES[c.backbone][2], 1, 1)
     lin("encoder_robot_state_input_proj", d, states)
     lin("encoder_latent_input_proj", d, c.latent)
@@ -398,6 +393,32 @@ def expected_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
         lin("vae_encoder_robot_state_input_proj", d, states)
         lin("vae_encoder_action_input_proj", d, actions)
         lin("vae_encoder_latent_output_proj", 2 * c.latent, d)
+    return shapes
+
+
+def _resnet_shapes(name: str) -> dict[str, tuple[int, ...]]:
+    """torchvision's ResNet without its classifier, with frozen batch norm (importing that takes three seconds)."""
+    kind, depths, _ = BACKBONES[name]
+    shapes: dict[str, tuple[int, ...]] = {}
+
+    def conv_bn(conv: str, bn: str, out: int, inp: int, size: int) -> None:
+        shapes[f"{conv}.weight"] = (out, inp, size, size)
+        shapes.update({f"{bn}.{k}": (out,) for k in ("weight", "bias", "running_mean", "running_var")})
+
+    conv_bn("conv1", "bn1", 64, 3, 7)
+    inp = 64
+    for stage, depth in enumerate(depths, 1):
+        width = 64 * 2 ** (stage - 1)
+        out = width if kind == "basic" else 4 * width
+        sizes = (3, 3) if kind == "basic" else (1, 3, 1)
+        for i in range(depth):
+            at = f"layer{stage}.{i}"
+            channels = [inp, *(width for _ in sizes[1:]), out]
+            for n, size in enumerate(sizes, 1):
+                conv_bn(f"{at}.conv{n}", f"{at}.bn{n}", channels[n], channels[n - 1], size)
+            if i == 0 and (stage > 1 or out != inp):
+                conv_bn(f"{at}.downsample.0", f"{at}.downsample.1", out, inp, 1)
+            inp = out
     return shapes
 
 

@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.workshop.act import ACT, block_of
 from rover_lib.workshop.compare import Fidelity
 from rover_lib.workshop.episodes import Episode, Recordings, Sample
 from rover_lib.workshop.quantize import OBSERVERS, Calibration, RangeObserver
@@ -136,15 +135,6 @@ def checkpoint_size(report: Mapping[str, Any]) -> Figure:
     )
     _legend(ax, loc="lower right")
     return fig
-
-
-def parameters_by_block(model: ACT) -> dict[str, int]:
-    """Weights and biases per block, blocks named as in `act.multiply_accumulates`."""
-    counts: dict[str, int] = {}
-    for name, tensor in model.named_parameters():
-        block = block_of(name)
-        counts[block] = counts.get(block, 0) + tensor.numel()
-    return counts
 
 
 def work_per_block(parameters: Mapping[str, int], macs: Mapping[str, int]) -> Figure:

@@ -17,33 +17,26 @@ import tempfile
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import nbformat
-import torch
 from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 from PIL import Image
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.stage import atomic_path, read_stage
-from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.episodes import Recordings, Split, load_recordings, split
-from rover_lib.workshop.params import params
+from rover_lib.onboard.stage import atomic_path
+from rover_lib.workshop.session import TTY_VARIABLE
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
-TTY_VARIABLE = "ROVER_PROGRESS_TTY"  # the terminal of who started a run: the notebooks' bars are drawn there
 KERNEL_ENVIRONMENT = {
-    # OpenMP's threads wait by spinning, in the way of XNNPACK's own: INT8 took 124 ms so on two busy cores, not 2.6 ms.
-    "OMP_WAIT_POLICY": "PASSIVE",
+    "OMP_WAIT_POLICY": "PASSIVE",  # rover_lib/__init__.py says why; a cell may import torch before it
     # Both are known, and noise in a stored output: QNNPACK ignores reduce_range, tqdm misses widgets.
     "PYTHONWARNINGS": "ignore:Currently,ignore:IProgress not found",
     "TORCH_CPP_LOG_LEVEL": "ERROR",
 }
-SMALL_GMAC = 1.0  # below this a second thread costs more, on a busy machine, than it brings
 IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
 NOTEBOOK_LIMIT = 1_000_000  # bytes, of a committed notebook
 
@@ -52,60 +45,6 @@ Progress = Callable[..., Iterable]
 
 class NotebookError(RoverError):
     """A notebook that did not run to its end, or whose output must not be committed."""
-
-
-# --- what the notebooks call ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Opened:
-    """What notebook 01 loaded: the checkpoint, the recordings, and who of them calibrates, chooses and judges."""
-
-    checkpoint: Checkpoint
-    recordings: Recordings
-    parts: Split
-
-
-def load(checkpoint: Path | str, episodes: Path | str) -> Opened:
-    """Read a checkpoint and its recordings, and part them as params.yml says. Raises CheckpointError, EpisodeError."""
-    p = params()["calibration"]
-    found = load_checkpoint(checkpoint)
-    recordings = load_recordings(episodes, found.config.chunk, p["sync_s"], watched())
-    return Opened(found, recordings, split(recordings, p["held_out_share"], p["seed"]))
-
-
-def opened(run_dir: Path | str) -> Opened:
-    """What notebook 01 loaded, again. Raises RoverError if it did not run, or if the files have changed since.
-
-    For a policy of less than SMALL_GMAC, torch is set to one thread (a benchmark sets its own).
-    """
-    stage = read_stage(Path(run_dir) / "load.json", "load")
-    if sum(stage["metrics"]["checkpoint"]["macs_by_block"].values()) < SMALL_GMAC * 1e9:
-        torch.set_num_threads(1)
-    again = load(stage["params"]["checkpoint"], stage["params"]["episodes"])
-    if again.checkpoint.sha256 != stage["metrics"]["checkpoint"]["sha256"]:
-        raise NotebookError(f"{again.checkpoint.path}: is not what notebook 01 loaded any more; run it again")
-    if again.parts.episodes != stage["metrics"]["split"]:
-        raise NotebookError(f"{again.recordings.root}: has other episodes than notebook 01 found; run it again")
-    return again
-
-
-def watched() -> Progress | None:
-    """A progress bar where someone watches, else None: bars in a stored output are noise.
-
-    That is the terminal from which `run` was started, or a JupyterLab session.
-    """
-    from tqdm import tqdm
-
-    if terminal := os.environ.get(TTY_VARIABLE):
-        try:
-            stream = Path(terminal).open("w")  # noqa: SIM115, open as long as the kernel lives
-        except OSError:
-            return None
-        return lambda *a, **k: tqdm(*a, **k, file=stream, leave=False)
-    if "JPY_SESSION_NAME" in os.environ:
-        return lambda *a, **k: tqdm(*a, **k, leave=False)
-    return None
 
 
 # --- running them -----------------------------------------------------------------------------------------------------

@@ -3,11 +3,14 @@
 import ast
 import re
 import sys
+from types import SimpleNamespace
 
 import nbformat
 import pytest
 
+from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import run as runs
+from rover_lib.workshop import session
 from rover_lib.workshop.run import NAMES, NOTEBOOK_LIMIT, NOTEBOOKS, parameters_of
 
 PATHS = [NOTEBOOKS / f"{name}.ipynb" for name in NAMES]
@@ -170,12 +173,25 @@ def test_publishing_refuses_paths_and_changed_cells(one_notebook, tmp_path):
     assert (one_notebook / "01_load.ipynb").read_text() == before
 
 
-def test_what_was_opened_must_not_have_changed(tmp_path):
+def test_what_was_opened_must_not_have_changed(tiny, tiny_file, tmp_path, monkeypatch):
     with pytest.raises(runs.RoverError, match="stage 'load'"):
-        runs.opened(tmp_path)
+        session.opened(tmp_path)
+    report = {"sha256": "another", "macs_by_block": {"head": 1}}
+    given = {"checkpoint": str(tiny_file), "episodes": "episodes"}
+    write_stage(tmp_path / "load.json", "load", params=given, metrics={"checkpoint": report, "split": {}}, inputs={})
+    parts = SimpleNamespace(episodes={})
+    monkeypatch.setattr(session, "load", lambda *paths: session.Opened(tiny, SimpleNamespace(root="episodes"), parts))
+    with pytest.raises(runs.RoverError, match="is not what notebook 01 loaded"):
+        session.opened(tmp_path)
+    report["sha256"] = tiny.sha256
+    write_stage(tmp_path / "load.json", "load", params=given, metrics={"checkpoint": report, "split": {}}, inputs={})
+    assert session.opened(tmp_path).checkpoint is tiny
+    parts.episodes["held_out"] = ["another"]
+    with pytest.raises(runs.RoverError, match="other episodes"):
+        session.opened(tmp_path)
 
 
 def test_nobody_watches_a_test(monkeypatch):
     monkeypatch.delenv("JPY_SESSION_NAME", raising=False)
     monkeypatch.setenv(runs.TTY_VARIABLE, "")
-    assert runs.watched() is None
+    assert session.watched() is None

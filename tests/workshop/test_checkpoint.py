@@ -4,6 +4,7 @@ import json
 import os
 import pickle
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,8 +61,11 @@ def test_reads_scalars_of_old_and_new_numpy(tiny_policy, tmp_path):
     assert load_checkpoint(old).report["best_val_loss"] == load_checkpoint(new).report["best_val_loss"]
 
 
-def test_expected_shapes_are_lerobots(tiny):
-    assert {k: tuple(v.shape) for k, v in tiny.weights.items()} == expected_shapes(tiny.config)
+@pytest.mark.parametrize("backbone", ["resnet18", "resnet34", "resnet50"])
+def test_expected_shapes_are_lerobots(tiny, backbone):
+    policy = lerobot_policy(**TINY, vision_backbone=backbone)
+    theirs = {k.removeprefix("model."): tuple(v.shape) for k, v in policy.state_dict().items()}
+    assert expected_shapes(replace(tiny.config, backbone=backbone)) == theirs
 
 
 class Evil:
