@@ -1,0 +1,140 @@
+/* Count what an emulated program executes between two marks, block by block. A QEMU TCG plugin.
+ *
+ * The guest marks with a system call that does nothing else: getppid(MARK, 1, section) starts a section,
+ * getppid(MARK, 0, section) ends it and writes <folder>/<section>.blocks: for every translated block that ran in
+ * between five uint64, in this order: its address in the guest, how often it was entered, and how many instructions,
+ * SIMD or floating-point instructions, and SDOT instructions it has.
+ * A section counts from the instruction after the call that starts it to the call that ends it, included.
+ *
+ * Exact for one running thread: counters are added to without locks, because that makes them cheap enough to be
+ * compiled into each block. Loads and stores of vectors are not SIMD here: Arm encodes them as loads and stores.
+ *
+ * Use: qemu-aarch64 -plugin count.so,folder=FOLDER program
+ * The declarations are our own because Debian 12 ships QEMU 7.2 without qemu-plugin.h. They are version 1 of the
+ * plugin interface, which QEMU refuses from 9.0 on.
+ */
+#include <pthread.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define EXPORT __attribute__((visibility("default")))
+
+typedef uint64_t qemu_plugin_id_t;
+typedef struct qemu_info_t qemu_info_t;
+struct qemu_plugin_tb;
+struct qemu_plugin_insn;
+enum qemu_plugin_op { QEMU_PLUGIN_INLINE_ADD_U64 };
+typedef void (*translated_cb)(qemu_plugin_id_t, struct qemu_plugin_tb *);
+typedef void (*syscall_cb)(qemu_plugin_id_t, unsigned cpu, int64_t number, uint64_t a1, uint64_t a2, uint64_t a3,
+                           uint64_t a4, uint64_t a5, uint64_t a6, uint64_t a7, uint64_t a8);
+extern void qemu_plugin_register_vcpu_tb_trans_cb(qemu_plugin_id_t, translated_cb);
+extern void qemu_plugin_register_vcpu_syscall_cb(qemu_plugin_id_t, syscall_cb);
+extern void qemu_plugin_register_vcpu_tb_exec_inline(struct qemu_plugin_tb *, enum qemu_plugin_op, void *, uint64_t);
+extern size_t qemu_plugin_tb_n_insns(const struct qemu_plugin_tb *);
+extern uint64_t qemu_plugin_tb_vaddr(const struct qemu_plugin_tb *);
+extern struct qemu_plugin_insn *qemu_plugin_tb_get_insn(const struct qemu_plugin_tb *, size_t);
+extern const void *qemu_plugin_insn_data(const struct qemu_plugin_insn *);
+
+EXPORT int qemu_plugin_version = 1;
+
+enum { GETPPID = 173, MARK = 0xC0FFEE, BLOCKS_PER_SLAB = 65536 };
+
+struct block {
+    uint64_t entered, entered_at_start; /* `entered` is written by translated code */
+    uint64_t address, instructions, simd, sdot;
+};
+
+/* Slabs never move: translated code holds pointers into them. A block that QEMU translates again gets a new entry. */
+struct slab {
+    struct slab *next;
+    size_t used;
+    struct block blocks[BLOCKS_PER_SLAB];
+};
+
+static struct slab *slabs;
+static const char *folder;
+static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
+
+static void fail(const char *what)
+{
+    perror(what);
+    _Exit(1);
+}
+
+static int is_simd(uint32_t word) /* Arm ARM C4.1: bits 28:25 are x111 */
+{
+    return (word >> 25 & 7) == 7;
+}
+
+static int is_sdot(uint32_t word) /* of 16 bytes: by vector, or by element */
+{
+    return (word & 0xFFE0FC00) == 0x4E809400 || (word & 0xFFC0F400) == 0x4F80E000;
+}
+
+static void on_translated(qemu_plugin_id_t id, struct qemu_plugin_tb *tb)
+{
+    pthread_mutex_lock(&lock);
+    if (!slabs || slabs->used == BLOCKS_PER_SLAB) {
+        struct slab *slab = calloc(1, sizeof *slab);
+        if (!slab)
+            fail("count: no memory");
+        slab->next = slabs;
+        slabs = slab;
+    }
+    struct block *block = &slabs->blocks[slabs->used++];
+    pthread_mutex_unlock(&lock);
+    block->address = qemu_plugin_tb_vaddr(tb);
+    block->instructions = qemu_plugin_tb_n_insns(tb);
+    for (size_t i = 0; i < block->instructions; i++) {
+        uint32_t word;
+        memcpy(&word, qemu_plugin_insn_data(qemu_plugin_tb_get_insn(tb, i)), sizeof word);
+        block->simd += is_simd(word);
+        block->sdot += is_sdot(word);
+    }
+    qemu_plugin_register_vcpu_tb_exec_inline(tb, QEMU_PLUGIN_INLINE_ADD_U64, &block->entered, 1);
+}
+
+static void on_syscall(qemu_plugin_id_t id, unsigned cpu, int64_t number, uint64_t mark, uint64_t starts,
+                       uint64_t section, uint64_t a4, uint64_t a5, uint64_t a6, uint64_t a7, uint64_t a8)
+{
+    if (number != GETPPID || mark != MARK)
+        return;
+    pthread_mutex_lock(&lock);
+    FILE *file = NULL;
+    if (!starts) {
+        char path[4096];
+        snprintf(path, sizeof path, "%s/%llu.blocks", folder, (unsigned long long)section);
+        file = fopen(path, "wb");
+        if (!file)
+            fail(path);
+    }
+    for (struct slab *slab = slabs; slab; slab = slab->next)
+        for (size_t i = 0; i < slab->used; i++) {
+            struct block *b = &slab->blocks[i];
+            uint64_t row[5] = {b->address, b->entered - b->entered_at_start, b->instructions, b->simd, b->sdot};
+            if (starts)
+                b->entered_at_start = b->entered;
+            else if (row[1] && fwrite(row, sizeof row, 1, file) != 1)
+                fail("count: cannot write");
+        }
+    if (file && fclose(file))
+        fail("count: cannot write");
+    pthread_mutex_unlock(&lock);
+}
+
+EXPORT int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int argc, char **argv)
+{
+    for (int i = 0; i < argc; i++)
+        if (!strncmp(argv[i], "folder=", 7))
+            folder = strdup(argv[i] + 7);
+    if (!folder) {
+        fprintf(stderr, "count: needs folder=FOLDER\n");
+        return -1;
+    }
+    qemu_plugin_register_vcpu_tb_trans_cb(id, on_translated);
+    qemu_plugin_register_vcpu_syscall_cb(id, on_syscall);
+    return 0;
+}

@@ -1,0 +1,64 @@
+"""Runs inside the emulated Pi: one artifact through rover_lib.onboard alone, as a Pi would run it.
+
+    guest.py ARTIFACT OBSERVATIONS FOLDER COUNTED
+
+OBSERVATIONS is an npz of `state` (n, S) float32 and `frame_0000`... (h, w, 3) uint8 BGR; they are predicted in that
+order, and again from the first if there are fewer than COUNTED. Loading is section 0 of the plugin's counts, the first
+COUNTED inferences are sections 1, 2, ...; a frame is read outside of them, and prepared inside. Leaves in FOLDER
+`chunks.npy` (n, chunk, A) float32, `maps` (where what is loaded) and `versions.json`. Each line on stdout says what
+begins.
+"""
+
+import ctypes
+import json
+import platform
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from rover_lib.onboard import load_policy
+from rover_lib.onboard.errors import RoverError
+
+GETPPID, MARK = 173, 0xC0FFEE  # as in count.c; without the plugin it is a system call that does nothing
+libc = ctypes.CDLL(None)
+
+
+def mark(starts: bool, section: int) -> None:
+    libc.syscall(GETPPID, ctypes.c_ulong(MARK), ctypes.c_ulong(starts), ctypes.c_ulong(section))
+
+
+def main(artifact: str, observations: str, folder: str, counted: str) -> None:
+    print("load", flush=True)
+    mark(True, 0)
+    policy = load_policy(artifact, threads=1)
+    mark(False, 0)
+    chunks = []
+    with np.load(observations) as seen:
+        states = seen["state"]
+        for i in range(max(len(states), int(counted))):
+            state, frame = states[i % len(states)], seen[f"frame_{i % len(states):04d}"]
+            print("predict", flush=True)
+            if i < int(counted):
+                mark(True, i + 1)
+                chunk = policy.predict_chunk(frame, state)
+                mark(False, i + 1)
+            else:
+                chunk = policy.predict_chunk(frame, state)
+            chunks.append(chunk)
+    out = Path(folder)
+    np.save(out / "chunks.npy", np.stack(chunks[: len(states)]))
+    versions = {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__}
+    versions |= {"cv2": cv2.__version__, "machine": platform.machine(), "libc": " ".join(platform.libc_ver())}
+    (out / "versions.json").write_text(json.dumps(versions | {"threads": torch.get_num_threads()}))
+    (out / "maps").write_text(Path("/proc/self/maps").read_text())
+    print("done", flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        main(*sys.argv[1:])
+    except RoverError as e:
+        sys.exit(f"error: {e}")
