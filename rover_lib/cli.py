@@ -222,7 +222,7 @@ def benchmark(
         {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
     ]  # stored as RGB; a camera gives BGR
     options = {"warmup": warmup, "iterations": iterations, "threads": threads, "duration_s": duration}
-    metrics = measure(policies, frames, vectors["state"][0], **options)
+    metrics = measure(policies, frames, vectors["state"][0], **options, memory_alone=True)
     if output:
         write_stage(
             output, "benchmark", params=options, metrics=metrics, inputs={a.name: sha256_of(a) for a in artifacts}

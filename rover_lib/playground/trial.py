@@ -1,9 +1,11 @@
 """Drive a policy through balloon worlds that it has not seen, and count."""
 
 import math
-from collections.abc import Callable, Iterable
+import os
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -104,6 +106,13 @@ def run_trials(
                 stride *= 2
     hits = sum(r.hit for r in results)
     return TrialReport(hits, worlds, wilson_interval(hits, worlds), results, seen)
+
+
+def run_trials_of(policies: Mapping[str, Drives], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
+    """`run_trials` for several policies at once, a thread for each core; the same worlds and results as one by one."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        running = {name: pool.submit(run_trials, policy, worlds, **options) for name, policy in policies.items()}
+        return {name: trial.result() for name, trial in running.items()}
 
 
 def _drive(policy: Drives, world: World, replan_every: int) -> tuple[WorldResult, list[tuple[np.ndarray, np.ndarray]]]:

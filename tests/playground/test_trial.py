@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from rover_lib.onboard.errors import WorldError
-from rover_lib.playground.trial import run_trials, wilson_interval
+from rover_lib.playground.trial import run_trials, run_trials_of, wilson_interval
 from rover_lib.playground.world import World
 
 
@@ -127,3 +127,12 @@ def test_progress_is_told():
 
     run_trials(Constant(0, 0.05), worlds=2, progress=progress)
     assert told == [("driving", 2)]
+
+
+def test_several_at_once_drive_as_one_by_one():
+    policies = {"left": Constant(-0.2, 0.05), "right": Constant(0.2, 0.05), "straight": Constant(0.0, 0.05)}
+    together = run_trials_of(policies, 3)
+    for name, policy in policies.items():
+        alone = run_trials(policy, 3)
+        assert [r.outcome for r in together[name].per_world] == [r.outcome for r in alone.per_world]
+        assert [r.nearest_m for r in together[name].per_world] == [r.nearest_m for r in alone.per_world]
