@@ -7,9 +7,9 @@ machine is an arm64 Debian's Python with the wheels that a Pi gets (requirements
 with a small plugin of ours (emulated/count.c); in it runs rover_lib.onboard alone, in one thread. Nothing of the host
 is changed: packages are fetched by a private apt, unpacked without being installed, and cached.
 
-Memory is what the host holds resident inside the address range that the guest lives in, which the emulator reserves at
-a fixed place; the emulator's own share (its translated code, the plugin's counters) lies outside and is reported
-beside it. It is sampled, and the guest is far slower than a Pi, so that little escapes. MB are 10**6 bytes.
+Memory is the most that the emulator's process held resident, as the kernel keeps it, less the emulator's own share: its
+translated code and the plugin's counters lie outside the address range that it reserves for the guest at a fixed place,
+grow slowly, and are read five times a second. They are reported beside it. MB are 10**6 bytes.
 """
 
 import hashlib
@@ -27,6 +27,7 @@ from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Lock
@@ -71,7 +72,7 @@ COUNTED = 10  # inferences after loading, each for itself
 STEADY = 3  # the first whose count is what all later ones cost
 FRAMES = 50
 KERNELS = 30  # named in the report, the rest summed up
-SAMPLE_S = 0.2  # an emulated inference takes a second at least; reading the mappings takes a hundredth
+SAMPLE_S = 0.2  # the emulator's own memory grows slowly
 SILENCE_S = 1200  # one emulated inference of the full policy in FP32 takes about a minute
 
 BLOCK = np.dtype([(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot")])  # as in count.c
@@ -304,8 +305,8 @@ def emulate(
                 ready = readable.select(SAMPLE_S)
                 if stop and stop.is_set():
                     raise ArmError("stopped, because another count failed")
-                guest_mb, outside_mb = _resident_mb(process.pid)
-                peak[step] = max(peak[step], guest_mb)
+                peak_mb, outside_mb = _memory_mb(process.pid)
+                peak[step] = max(peak[step], peak_mb - outside_mb)
                 emulator_mb = outside_mb or emulator_mb
                 if not ready:
                     if time.monotonic() - heard > SILENCE_S:
@@ -319,7 +320,9 @@ def emulate(
                     break
                 *lines, unread = (unread + content).split(b"\n")
                 for line in lines:
-                    step = line.decode(errors="replace")
+                    before, step = step, line.decode(errors="replace")
+                    if step != before:
+                        _forget_peak(process.pid)
                     if on_line:
                         on_line(step)
             code = process.wait()
@@ -358,21 +361,25 @@ def _site(root: Path) -> Path:
     return root / "opt" / "site"
 
 
-def _resident_mb(pid: int) -> tuple[float, float]:
-    """What a process holds resident inside the guest's address range, and outside of it. Zeros when it has ended."""
-    inside, outside, in_guest = 0, 0, False
+def _memory_mb(pid: int) -> tuple[float, float]:
+    """The most that a process held resident, and what it holds now outside the guest's addresses; zeros if it ended."""
+    outside_kb, in_guest = 0, False
     try:
-        content = Path(f"/proc/{pid}/smaps").read_text()
+        mappings = Path(f"/proc/{pid}/smaps").read_text()
+        peak = re.search(r"^VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text(), re.M)
     except OSError:
         return 0.0, 0.0
-    for line in content.splitlines():
+    for line in mappings.splitlines():
         if line.startswith("Rss:"):
-            kb = int(line.split()[1])
-            inside, outside = (inside + kb, outside) if in_guest else (inside, outside + kb)
+            outside_kb += 0 if in_guest else int(line.split()[1])
         elif not line[0].isupper():  # a mapping's addresses; the lines about it start in capitals
-            start = int(line.partition("-")[0], 16)
-            in_guest = GUEST_BASE <= start < GUEST_BASE + GUEST_SIZE
-    return inside * 1024 / 1e6, outside * 1024 / 1e6
+            in_guest = GUEST_BASE <= int(line.partition("-")[0], 16) < GUEST_BASE + GUEST_SIZE
+    return (int(peak[1]) * 1024 / 1e6, outside_kb * 1024 / 1e6) if peak else (0.0, 0.0)
+
+
+def _forget_peak(pid: int) -> None:
+    with suppress(OSError):  # ended, or a kernel without it: then a peak of before counts too, and none is missed
+        Path(f"/proc/{pid}/clear_refs").write_text("5")
 
 
 # --- naming -----------------------------------------------------------------------------------------------------------

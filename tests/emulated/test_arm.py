@@ -108,6 +108,13 @@ def test_kernels_are_summed_and_the_rest_is_other():
     assert found == {"bar": (100, 100, 0), "foo": (55, 20, 10), "other": (1, 0, 0)}
 
 
+def test_an_image_size_is_judged_by_fp32_of_its_own():
+    there = ("policy_fp32", "policy_fp32_180x320", "policy_static")
+    assert arm.reference_of("policy_static", there) == "policy_fp32"
+    assert arm.reference_of("policy_static_180x320", there) == "policy_fp32_180x320"
+    assert arm.reference_of("policy_static_240x432", there) == "policy_fp32"
+
+
 def test_packages_are_named_when_they_cannot_be_installed(monkeypatch):
     monkeypatch.setattr(arm, "missing_packages", lambda: ["qemu-user"])
     monkeypatch.setattr(arm.os, "geteuid", lambda: 1000)
