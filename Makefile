@@ -5,12 +5,13 @@ ROVER := $(VENV)/bin/rover
 READY := $(VENV)/.ready
 NAME ?= mine
 
-.PHONY: help demo run test lint lab notebooks clean
+.PHONY: help demo run test lint lab arm notebooks clean
 
 help:
 	@echo "make demo                                   record, train, quantize, compare and benchmark in the balloon world"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make test                                   lint, unit, parity, notebook tests and one whole run"
+	@echo "make arm NAME=demo                          count a run's instructions on an emulated Cortex-A76"
 	@echo "make lab                                    JupyterLab on the notebooks"
 	@echo "make notebooks                              put the demo's outputs into the committed notebooks"
 
@@ -38,6 +39,9 @@ lint: $(READY)
 # The demo is the tests' whole run; it is made once, and tests/test_demo.py holds it to the gates of params.yml.
 test: lint demo
 	$(VENV)/bin/pytest
+
+arm: $(READY)
+	$(ROVER) arm 'runs/$(NAME)'
 
 lab: $(READY)
 	$(VENV)/bin/jupyter lab notebooks

@@ -230,6 +230,24 @@ def benchmark(
     show(metrics, as_json)
 
 
+@main.command()
+@click.argument("run_dir", type=FILE)
+@click.option(
+    "--frames", type=click.IntRange(min=3), default=50, show_default=True, help="Held-out frames to judge with."
+)
+@click.option("--jobs", type=click.IntRange(min=1), help="Artifacts at a time [default: all cores].")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def arm(run_dir: Path, frames: int, jobs: int | None, as_json: bool) -> None:
+    """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
+
+    A count, never a time. Needs Debian 12 with qemu-user and gcc, which are installed when you are root.
+    """
+    from rover_lib.workshop.arm import count_run, table
+
+    content = count_run(run_dir, frames=frames, jobs=jobs, progress=progress())
+    click.echo(json.dumps(content, indent=2) if as_json else table(content))
+
+
 @main.group()
 def world() -> None:
     """The balloon world: record an expert, train a policy, drive it."""

@@ -1,6 +1,5 @@
 """Episodes of an expert in balloon worlds, in the user's format, and the cache of what was made."""
 
-import hashlib
 import inspect
 import json
 import os
@@ -10,8 +9,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +20,7 @@ from rover_lib.onboard.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.recording import EpisodeWriter
 from rover_lib.playground import world as world_module
 from rover_lib.playground.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World, expert
+from rover_lib.workshop.cache import cached_folder, key_of
 
 LABEL = "hit red balloon"
 JPEG_QUALITY = 85
@@ -33,42 +31,6 @@ FIRST_DRIVE = datetime(2025, 1, 1, 12, tzinfo=UTC)
 BETWEEN_DRIVES = timedelta(seconds=30)
 FIRST_WORLD = 1_000_000  # far from the worlds that trials drive in
 CONTROL_LATENCY_S = 0.004  # the serial line delivers a control a little after the frame that it belongs to
-
-
-def cache_root() -> Path:
-    """Where recordings and checkpoints are kept: $ROVER_CACHE, or rover/ in the user's cache."""
-    given = os.environ.get("ROVER_CACHE")
-    return Path(given) if given else Path.home() / ".cache" / "rover"
-
-
-def key_of(params: dict[str, Any], *modules: ModuleType) -> str:
-    """Hash, 16 hex digits, of what makes a thing: its parameters and the sources of the modules involved."""
-    digest = hashlib.sha256(json.dumps(params, sort_keys=True).encode())
-    for module in modules:
-        digest.update(Path(inspect.getfile(module)).read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def cached_folder(kind: str, key: str, make: Callable[[Path], None]) -> Path:
-    """The folder <cache>/<kind>-<key>, made by `make(temporary folder)` if it is not there yet.
-
-    It appears complete or not at all: made beside its place and renamed.
-    """
-    folder = cache_root() / f"{kind}-{key}"
-    if folder.is_dir():
-        return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    try:
-        make(temporary)
-        try:
-            temporary.rename(folder)
-        except OSError:
-            if not folder.is_dir():  # another process may have made the same one meanwhile
-                raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    return folder
 
 
 def record_episodes(

@@ -12,7 +12,6 @@ translated code and the plugin's counters lie outside the address range that it 
 grow slowly, and are read five times a second. They are reported beside it. MB are 10**6 bytes.
 """
 
-import hashlib
 import json
 import mmap
 import os
@@ -39,6 +38,7 @@ from rover_lib.onboard.artifact import read_manifest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.stage import sha256_of, write_stage
+from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.compare import Fidelity, thinned
 from rover_lib.workshop.params import params
 from rover_lib.workshop.session import SMALL_GMAC, opened
@@ -101,31 +101,6 @@ class Machine:
     plugin: Path
 
 
-def cache_root() -> Path:
-    """Where what is expensive to make is kept: $ROVER_CACHE, or rover/ in the user's cache."""
-    given = os.environ.get("ROVER_CACHE")
-    return Path(given) if given else Path.home() / ".cache" / "rover"
-
-
-def cached_folder(kind: str, key: str, make: Callable[[Path], None]) -> Path:
-    """The folder <cache>/<kind>-<key>, made by `make(temporary folder)` if not there yet: complete or not at all."""
-    folder = cache_root() / f"{kind}-{key}"
-    if folder.is_dir():
-        return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    try:
-        make(temporary)
-        try:
-            temporary.rename(folder)
-        except OSError:
-            if not folder.is_dir():  # another process may have made the same one meanwhile
-                raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    return folder
-
-
 def missing_packages() -> list[str]:
     """Debian packages that counting needs and this machine lacks."""
     commands = {package for command, package in NEEDS.items() if not shutil.which(command)}
@@ -174,25 +149,18 @@ def _end_of(text: str) -> str:
     return " ".join(text.split())[-400:] or "it said nothing"
 
 
-def _key(*parts: bytes | str) -> str:
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(hashlib.sha256(part if isinstance(part, bytes) else part.encode()).digest())
-    return digest.hexdigest()[:16]
-
-
 def _plugin() -> Path:
     def make(folder: Path) -> None:
         # What the emulator provides is resolved when it loads the plugin.
         command = ["gcc", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "count.so", PLUGIN]
         _call(command, f"{PLUGIN.name} does not compile")
 
-    return cached_folder("arm-plugin", _key(PLUGIN.read_bytes()), make) / "count.so"
+    return cached_folder("arm-plugin", key_of({}, PLUGIN), make) / "count.so"
 
 
 def _userland() -> Path:
-    recipe = json.dumps([GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, CORES, RECIPE])
-    return cached_folder("arm-userland", _key(REQUIREMENTS.read_bytes(), recipe), _make_userland)
+    recipe = {"made": [GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, CORES, RECIPE]}
+    return cached_folder("arm-userland", key_of(recipe, REQUIREMENTS), _make_userland)
 
 
 def _make_userland(root: Path) -> None:

@@ -114,7 +114,7 @@ def run(
 
 def _clear(folder: Path) -> None:
     """Remove what an earlier run left, so that no file of it can be taken for this one's."""
-    stages = ("load", "calibrate", "quantize", "compare", f"benchmark-{socket.gethostname()}")
+    stages = ("load", "calibrate", "quantize", "compare", "arm", f"benchmark-{socket.gethostname()}")
     old = [folder / f"{s}.json" for s in stages] + [folder / "calibration.pt", *folder.glob("policy_*.pt")]
     for path in [*old, *(folder / f"{n}.ipynb" for n in NAMES)]:
         path.unlink(missing_ok=True)

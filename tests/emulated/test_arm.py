@@ -19,7 +19,10 @@ from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.params import params
 
 MISSING = arm.missing_packages()
-pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"needs the Debian packages {' '.join(MISSING)}")
+pytestmark = [
+    pytest.mark.emulated,
+    pytest.mark.skipif(bool(MISSING), reason=f"needs the Debian packages {' '.join(MISSING)}"),
+]
 
 SVC = 0xD4000001
 START, ROUNDS, SECTION = 0x400000, 1000, 7

@@ -6,7 +6,7 @@ import pytest
 
 from rover_lib.onboard.errors import WorldError
 from rover_lib.playground import record
-from rover_lib.playground.record import cache_root, cached_folder, key_of, record_episodes
+from rover_lib.playground.record import record_episodes
 from rover_lib.workshop.episodes import load_recordings
 
 # facts of the user's format, as found in a real recording
@@ -147,29 +147,3 @@ def test_progress_is_told(tmp_path, monkeypatch):
 
     record_episodes(tmp_path / "episodes", count=3, progress=progress)
     assert told == [("recording", 3)]
-
-
-def test_the_cache_is_where_the_user_says(monkeypatch, tmp_path):
-    monkeypatch.setenv("ROVER_CACHE", str(tmp_path))
-    assert cache_root() == tmp_path
-    monkeypatch.delenv("ROVER_CACHE")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache_root() == tmp_path / ".cache" / "rover"
-
-
-def test_a_cached_folder_is_made_once(monkeypatch, tmp_path):
-    monkeypatch.setenv("ROVER_CACHE", str(tmp_path))
-    made = []
-
-    def make(folder):
-        made.append(folder)
-        (folder / "file").write_text("x")
-
-    assert cached_folder("thing", "1", make) == cached_folder("thing", "1", make) == tmp_path / "thing-1"
-    assert len(made) == 1
-
-
-def test_keys_follow_parameters_and_sources():
-    assert key_of({"a": 1}, record) == key_of({"a": 1}, record)
-    assert key_of({"a": 1}, record) != key_of({"a": 2}, record)
-    assert key_of({"a": 1}, record) != key_of({"a": 1}, json)

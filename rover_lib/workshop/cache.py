@@ -1,0 +1,48 @@
+"""A cache outside the tree, by the hash of what made its content: recordings, checkpoints, the emulated Pi."""
+
+import hashlib
+import inspect
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+
+def cache_root() -> Path:
+    """Where what is expensive to make is kept: $ROVER_CACHE, or rover/ in the user's cache."""
+    given = os.environ.get("ROVER_CACHE")
+    return Path(given) if given else Path.home() / ".cache" / "rover"
+
+
+def key_of(params: dict[str, Any], *sources: ModuleType | Path) -> str:
+    """Hash, 16 hex digits, of what makes a thing: its parameters and the modules or files involved."""
+    digest = hashlib.sha256(json.dumps(params, sort_keys=True).encode())
+    for source in sources:
+        digest.update((source if isinstance(source, Path) else Path(inspect.getfile(source))).read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cached_folder(kind: str, key: str, make: Callable[[Path], None]) -> Path:
+    """The folder <cache>/<kind>-<key>, made by `make(temporary folder)` if it is not there yet.
+
+    It appears complete or not at all: made beside its place and renamed.
+    """
+    folder = cache_root() / f"{kind}-{key}"
+    if folder.is_dir():
+        return folder
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    try:
+        make(temporary)
+        try:
+            temporary.rename(folder)
+        except OSError:
+            if not folder.is_dir():  # another process may have made the same one meanwhile
+                raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return folder
