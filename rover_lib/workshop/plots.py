@@ -324,10 +324,11 @@ def _observers(calibration: Calibration) -> dict[str, dict[str, Any]]:
 # --- 03: quantization -----------------------------------------------------------------------------
 
 
-def outlier_channels(calibration: Calibration) -> Figure:
+def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
     """The largest activation per channel, before and after channel scales.
 
-    Left: every projection's largest channel over its median one. Right: the projection where that was worst.
+    Left: a projection's largest channel over its median one, of the `count` projections where that was worst. Right:
+    the worst of all, channel by channel.
     """
     layers = {n: c for n, c in calibration.channels.items() if "in_max_scaled" in c}
 
@@ -340,7 +341,9 @@ def outlier_channels(calibration: Calibration) -> Figure:
     sides = {n: ("in",) if n.endswith(".up") else ("in", "out") for n in layers}
     pairs = [(n, s) for n in layers for s in sides[n]]
     worst, side = max(pairs, key=lambda row: peak(layers[row[0]][f"{row[1]}_max"]))
-    fig, axes = _axes(1, 2, height_in=max(3.4, 1.0 + 0.12 * len(layers)))
+    uneven = sorted(layers, key=lambda n: max(peak(layers[n][f"{s}_max"]) for s in sides[n]), reverse=True)[:count]
+    layers = {n: c for n, c in layers.items() if n in uneven}  # in the order of the data
+    fig, axes = _axes(1, 2, height_in=max(3.4, 1.0 + 0.2 * len(layers)))
     left, right = axes[0]
     y = {name: i for i, name in enumerate(layers)}
     for at, where, marker in (("in", "input", "o"), ("out", "output", "s")):
@@ -351,10 +354,10 @@ def outlier_channels(calibration: Calibration) -> Figure:
             left.scatter(
                 peaks, [y[n] for n in shown], color=colour, marker=marker, s=16, fc=face, label=f"{where}, {label}"
             )
-    left.set_yticks(list(y.values()), list(layers), fontsize=min(8, 260 / len(layers)))
+    left.set_yticks(list(y.values()), list(layers), fontsize=8)
     left.invert_yaxis()
     left.set(xscale="log", xlabel="largest channel / median channel")
-    left.set_title("all projections of the transformer", fontsize=11)
+    left.set_title(f"the {len(layers)} most uneven projections", fontsize=11)
     for key, colour, label in (
         (f"{side}_max", RED, "before"),
         (f"{side}_max_scaled", BLUE, "after channel scales"),
