@@ -1,7 +1,7 @@
 """The demo's run, made by `make demo`, held to the gates of params.yml."""
 
 import pytest
-from conftest import stage_of
+from policies import stage_of
 
 from rover_lib.onboard import load_policy
 from rover_lib.workshop.params import params

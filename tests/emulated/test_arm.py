@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import memory_samples
+from policies import memory_samples
 
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import arm

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import memory_samples
+from policies import memory_samples
 
 import rover_lib
 from rover_lib.onboard import artifact, load_policy

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import smooth_frame
 from hypothesis import given
 from hypothesis import strategies as st
+from policies import smooth_frame
 from torchvision.transforms.v2 import functional as tv
 
 from rover_lib.onboard.errors import FrameError

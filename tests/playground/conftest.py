@@ -1,5 +1,4 @@
 import pytest
-import torch
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -9,19 +8,3 @@ def cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROVER_CACHE", str(folder))
         yield folder
-
-
-@pytest.fixture(scope="session", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.fixture(scope="session")
-def recorded(cache, tmp_path_factory):
-    """Five drives of the expert."""
-    from rover_lib.playground.record import record_episodes
-
-    return record_episodes(tmp_path_factory.mktemp("data") / "episodes", count=5, seed=3)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from conftest import TINY, lerobot_policy, smooth_frame
 from lerobot.policies.act.processor_act import make_act_pre_post_processors
+from policies import TINY, lerobot_policy, smooth_frame
 from torch.utils.flop_counter import FlopCounterMode
 
 from rover_lib.onboard.preprocess import normalise

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import TINY, lerobot_policy, trainer_content
+from policies import TINY, lerobot_policy, trainer_content
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.checkpoint import expected_shapes, load_checkpoint

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import TINY, lerobot_policy, memory_samples, trainer_content
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from policies import TINY, lerobot_policy, memory_samples, trainer_content
 
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop import act

@@ -1,0 +1,134 @@
+"""Policies and recordings that are small enough for tests, and made by the same tools as real ones."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
+from torchvision.ops.misc import FrozenBatchNorm2d
+
+TINY = {
+    "dim_model": 64,
+    "n_heads": 4,
+    "dim_feedforward": 128,
+    "n_encoder_layers": 1,
+    "n_decoder_layers": 2,
+    "n_vae_encoder_layers": 1,
+    "chunk_size": 32,
+}
+
+
+def smooth_frame(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    """A picture with structure at several sizes, (height, width, 3) uint8."""
+    coarse = rng.random((5, 9, 3)).astype(np.float32)
+    return (cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 1) * 255).astype(np.uint8)
+
+
+def lerobot_policy(
+    cameras: dict[str, tuple[int, int]] | None = None, states: int = 2, actions: int = 2, seed: int = 0, **config
+) -> ACTPolicy:
+    """LeRobot's own policy with random weights, in eval mode; frozen statistics set so that its features are alive."""
+    cameras = cameras or {"observation.images.cam_front": (72, 128)}
+    config.setdefault("n_action_steps", config.get("chunk_size", 100))
+    torch.manual_seed(seed)
+    policy = ACTPolicy(
+        ACTConfig(
+            input_features={
+                **{k: PolicyFeature(FeatureType.VISUAL, (3, *size)) for k, size in cameras.items()},
+                "observation.state": PolicyFeature(FeatureType.STATE, (states,)),
+            },
+            output_features={"action": PolicyFeature(FeatureType.ACTION, (actions,))},
+            pretrained_backbone_weights=None,
+            device="cpu",
+            **config,
+        )
+    ).eval()
+    rng = np.random.default_rng(seed)
+    h, w = next(iter(cameras.values()))
+    x = np.stack([smooth_frame(rng, h, w) for _ in range(2)]).transpose(0, 3, 1, 2).astype(np.float32) / 64 - 2
+
+    def adopt(module: FrozenBatchNorm2d, args: tuple) -> None:
+        module.running_mean.copy_(args[0].mean((0, 2, 3)))
+        module.running_var.copy_(args[0].var((0, 2, 3)))
+        module.weight.uniform_(0.5, 1.5)  # a scale of 1 would hide a folding error
+        module.bias.normal_(0, 0.1)
+
+    hooks = [
+        m.register_forward_pre_hook(adopt) for m in policy.model.backbone.modules() if isinstance(m, FrozenBatchNorm2d)
+    ]
+    with torch.no_grad():
+        policy.model.backbone(torch.from_numpy(x))
+        for p in policy.parameters():  # biases of zero and norms of one would hide errors too
+            if p.dim() == 1:
+                p.add_(torch.randn_like(p) * 0.05)
+    for hook in hooks:
+        hook.remove()
+    return policy
+
+
+def trainer_config(policy: ACTPolicy) -> dict:
+    c = policy.config
+    _, height, width = next(iter(c.image_features.values())).shape
+    return {
+        "image_width": width,
+        "image_height": height,
+        "n_obs_steps": 1,
+        "chunk_size": c.chunk_size,
+        "n_action_steps": c.chunk_size,
+        "hidden_size": c.dim_model,
+        "n_encoder_layers": c.n_encoder_layers,
+        "n_decoder_layers": c.n_decoder_layers,
+        "n_heads": c.n_heads,
+        "feedforward_dim": c.dim_feedforward,
+        "dropout": 0.1,
+        "kl_weight": 10.0,
+        "vision_encoder": c.vision_backbone,
+        "pretrained_backbone": True,
+        "learning_rate": 1e-4,
+        "betas": [0.9, 0.999],
+        "device": "cuda",
+        "seed": 42,
+    }
+
+
+def trainer_content(policy: ACTPolicy) -> dict:
+    """What the user's trainer saves, optimizer and numpy scalar included."""
+    optimizer = torch.optim.AdamW([policy.model.action_head.weight], lr=1e-4)
+    policy.model.action_head.weight.grad = torch.ones_like(policy.model.action_head.weight)
+    optimizer.step()
+    return {
+        "epoch": 7,
+        "model_state_dict": policy.state_dict(),
+        "optimizer_state_dict": optimizer.state_dict(),
+        "scheduler_state_dict": {"last_epoch": 7},
+        "best_val_loss": np.mean([0.1, 0.2]),
+        "config": trainer_config(policy),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class MemorySample:
+    """A recorded sample without files."""
+
+    state: np.ndarray
+    picture: np.ndarray
+
+    def frame_bgr(self) -> np.ndarray:
+        return self.picture
+
+
+def memory_samples(count: int, height: int = 72, width: int = 128, seed: int = 0) -> list[MemorySample]:
+    rng = np.random.default_rng(seed)
+    return [
+        MemorySample(rng.uniform(-0.5, 0.5, 2).astype(np.float32), smooth_frame(rng, height, width))
+        for _ in range(count)
+    ]
+
+
+def stage_of(folder: Path, name: str) -> dict:
+    return json.loads((folder / f"{name}.json").read_text())
