@@ -8,3 +8,11 @@ def cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROVER_CACHE", str(folder))
         yield folder
+
+
+@pytest.fixture(scope="session")
+def recorded(cache, tmp_path_factory):
+    """Five drives of the expert."""
+    from rover_lib.playground.record import record_episodes
+
+    return record_episodes(tmp_path_factory.mktemp("data") / "episodes", count=5, seed=3)
