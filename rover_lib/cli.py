@@ -11,6 +11,7 @@ import click
 from rover_lib.onboard.errors import RoverError
 
 FILE = click.Path(path_type=Path)
+LONG_LIST = 12  # longer ones are for programs
 
 
 class Rover(click.Group):
@@ -30,7 +31,9 @@ class Rover(click.Group):
                 f"rover: this command needs {e.name}, which only a workstation has: make demo sets one up", err=True
             )
         except (OSError, MemoryError) as e:
-            if ctx.params.get("debug"):
+            if ctx.params.get("debug") or isinstance(
+                e, BrokenPipeError
+            ):  # click ends quietly when `head` has seen enough
                 raise
             click.echo(f"rover: {type(e).__name__}: {e}", err=True)
         ctx.exit(1)
@@ -47,13 +50,18 @@ def progress() -> Callable[..., Any]:
 
 def show(value: Any, as_json: bool) -> None:
     """Print a nested dict for people, or as JSON."""
+    from rover_lib.onboard.stage import plain
+
+    value = plain(value)
     if as_json:
-        click.echo(json.dumps(value, indent=2, default=str))
+        click.echo(json.dumps(value, indent=2))
         return
 
     def lines(v: Any, indent: str) -> None:
         for key, inner in v.items() if isinstance(v, dict) else enumerate(v):
-            if isinstance(inner, (dict, list)) and inner:
+            if isinstance(inner, list) and len(inner) > LONG_LIST:
+                click.echo(f"{indent}{key:<28} {len(inner)} values, see --json")
+            elif isinstance(inner, (dict, list)) and inner:
                 click.echo(f"{indent}{key}")
                 lines(inner, indent + "  ")
             else:

@@ -89,3 +89,38 @@ def test_a_damaged_checkpoint_leaves_no_artifact(tiny_file, tmp_path, monkeypatc
     torch.save(content, tmp_path / "nan.pth")
     result = rover("quantize", tmp_path / "nan.pth", "episodes", "-o", tmp_path / "out.pt")
     assert result.exit_code == 1 and "NaN" in result.output and not (tmp_path / "out.pt").exists()
+
+
+@pytest.fixture
+def drives(tmp_path, monkeypatch):
+    """Four drives of the expert, through the command line."""
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
+    result = rover("world", "record", tmp_path / "episodes", "--count", 4, "--seed", 5)
+    assert result.exit_code == 0, result.output
+    return tmp_path / "episodes"
+
+
+def test_quantizes_and_compares_on_recordings(tiny_file, drives, tmp_path):
+    for mode in ("fp32", "static", "dynamic"):
+        result = rover("quantize", tiny_file, drives, "-o", tmp_path / f"{mode}.pt", "--mode", mode, "--samples", 8)
+        assert result.exit_code == 0, result.output
+        assert f"{mode}.pt: {mode}, " in result.output
+    block = ("--float-block", "backbone.layer1", "--samples", 8)
+    result = rover("quantize", tiny_file, drives, "-o", tmp_path / "mixed.pt", *block)
+    assert result.exit_code == 0 and "mixed.pt: mixed, " in result.output
+    files = [tmp_path / f"{mode}.pt" for mode in ("fp32", "static", "mixed")]
+    result = rover("compare", *files, "--episodes", drives, "--json")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.output)
+    assert set(found) == {"static", "mixed"}
+    assert len(found["static"]["steering_mae_per_step_pct"]) == 32
+    plain = rover("compare", *files, "--episodes", drives)
+    assert "32 values, see --json" in plain.output and "steering_mae_us" in plain.output
+
+
+def test_inspects_recordings_and_drives_a_trial(drives, artifacts):
+    found = json.loads(rover("inspect", drives, "--json").output)
+    assert found["recordings"]["episodes"] == 4
+    result = rover("world", "trial", artifacts["static"], "--worlds", 1, "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.output)["trials"] == 1

@@ -75,16 +75,16 @@ def environment() -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """JSON's types from numpy's, torch's and pathlib's; a float that JSON cannot hold becomes None."""
     if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, (np.ndarray, torch.Tensor)):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, float) and not math.isfinite(value):
@@ -101,7 +101,7 @@ def write_stage(
     inputs: dict[str, str] | None = None,
 ) -> dict[str, Any]:
     """Write one stage's result atomically and return it as it was written."""
-    content = _plain(
+    content = plain(
         {
             "schema": SCHEMA,
             "stage": stage,
