@@ -106,7 +106,8 @@ def check_integrity(path: Path | str) -> None:
     with _open(path) as z:
         try:
             damaged = z.testzip()
-        except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError) as e:
+        # RuntimeError and its NotImplementedError: a damaged header may ask for a password, or an unknown compression
+        except (zipfile.BadZipFile, OSError, RuntimeError) as e:
             raise ArtifactError(f"{path}: damaged ({e}); copy the file again") from None
     if damaged:
         raise ArtifactError(f"{path}: damaged, the checksum of '{damaged}' does not match; copy the file again")

@@ -172,24 +172,6 @@ def build_policy(size: Size) -> ACTPolicy:
     return ACTPolicy(config)
 
 
-class LerobotDriver:
-    """LeRobot's ACTPolicy behind the interface of an artifact: predict_chunk(frame_bgr, state) and chunk."""
-
-    def __init__(self, policy: ACTPolicy):
-        self.policy = policy.eval()
-        self.chunk = policy.config.chunk_size
-
-    def predict_chunk(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
-        """Next actions, (chunk, 2) float32: steering clipped to [-1, 1], throttle to [0, 1]."""
-        _, height, width = self.policy.config.input_features[IMAGE].shape
-        image = torch.from_numpy(normalise(prepare_frame(frame_bgr, height, width)))[None]
-        given = torch.from_numpy(np.asarray(state, np.float32))[None]
-        device = next(self.policy.parameters()).device
-        batch = {IMAGE: image.to(device), STATE: given.to(device)}
-        chunk = self.policy.predict_action_chunk(batch)[0].cpu().numpy()
-        return np.clip(chunk, np.float32([-1, 0]), np.float32([1, 1]))
-
-
 def train(
     episodes_dir: Path | str,
     out_path: Path | str,

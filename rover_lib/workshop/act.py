@@ -38,7 +38,8 @@ class Affine:
     shift: tuple[float, ...]
 
 
-def _imagenet() -> Affine:
+def imagenet() -> Affine:
+    """The normalisation of pixels in [0, 1] that torchvision's weights were trained with."""
     return Affine(
         tuple(1 / s for s in IMAGENET_STD),
         tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True)),
@@ -66,7 +67,7 @@ class ActConfig:
     pre_norm: bool = False
     activation: str = "relu"
     rate_hz: float = 30.0
-    image_norm: tuple[Affine, ...] = field(default_factory=lambda: (_imagenet(),))  # of pixels in [0, 1]
+    image_norm: tuple[Affine, ...] = field(default_factory=lambda: (imagenet(),))  # of pixels in [0, 1]
     state_norm: Affine | None = None
     action_unnorm: Affine | None = None
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
-from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, Affine, _imagenet
+from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, Affine, imagenet
 
 TRAINER_KEYS = {  # of the trainer's config: what the shape of the policy needs
     "image_width", "image_height", "chunk_size", "hidden_size", "n_encoder_layers", "n_decoder_layers", "n_heads",
@@ -86,7 +86,7 @@ def _load_trainer(path: Path) -> Checkpoint:
         encoder_layers=_positive(path, raw, "n_encoder_layers"),
         decoder_layers=_positive(path, raw, "n_decoder_layers"),
         backbone=raw["vision_encoder"],
-        image_norm=(_imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
+        image_norm=(imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
     )
     optimizer = content.get("optimizer_state_dict")
     extra = {
@@ -100,10 +100,9 @@ def _load_trainer(path: Path) -> Checkpoint:
 
 def _numpy_scalars() -> list[Any]:
     """best_val_loss is np.mean's float64; older numpys pickled it as numpy.core, newer ones as numpy._core."""
-    scalar = np.core.multiarray.scalar if not hasattr(np, "_core") else np._core.multiarray.scalar
     names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
     dtypes = [type(np.dtype(t)) for t in (np.float64, np.float32, np.int64, np.int32)]
-    return [*((scalar, n) for n in names), np.dtype, *dtypes]
+    return [*((np._core.multiarray.scalar, n) for n in names), np.dtype, *dtypes]
 
 
 def _read_pickle(path: Path) -> Any:

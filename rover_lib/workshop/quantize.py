@@ -39,6 +39,7 @@ import rover_lib
 from rover_lib.onboard import artifact
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, Attention, FeedForward, block_of
 from rover_lib.workshop.checkpoint import Checkpoint
@@ -295,8 +296,6 @@ class Calibration:
     seconds: float = 0.0
 
     def save(self, path: Path | str) -> None:
-        from rover_lib.onboard.stage import atomic_path
-
         with atomic_path(path) as temporary:
             torch.save(self.__dict__, temporary)
 
@@ -735,6 +734,7 @@ def export(
     config = checkpoint.config
     quantized = isinstance(policy, QuantizedPolicy)
     module = policy.module if quantized else policy
+    reference = ACT(config, checkpoint.weights) if quantized else policy
     inputs = [inputs_of(s, config) for s in samples]
     if not inputs:
         raise QuantizeError("an artifact needs parity vectors, found no samples; give at least one")
@@ -752,7 +752,7 @@ def export(
     gap = (found - expected).abs().max().item()
     allowed = {n: tolerance for n in config.action_names}
     if quantized:
-        error = (found - predictions(ACT(config, checkpoint.weights), inputs)).abs().amax((0, 1))
+        error = (found - predictions(reference, inputs)).abs().amax((0, 1))
         allowed = {n: max(tolerance, int8_errors * e.item()) for n, e in zip(config.action_names, error, strict=True)}
     if gap > max(allowed.values()):
         raise QuantizeError(f"{path}: the traced graph differs from the policy by {gap:.3g}; nothing was written")
@@ -787,7 +787,7 @@ def export(
             "float_blocks": list(scheme.float_blocks) if scheme else [],
         },
         "weights_mb": _weights_mb(module, config, checkpoint, quantized),
-        "gmac": sum(act.multiply_accumulates(ACT(config, checkpoint.weights)).values()) / 1e9,
+        "gmac": sum(act.multiply_accumulates(reference).values()) / 1e9,
         "parity": {
             "tolerance": allowed,
             "reason": "float parts round differently on another processor, and flipped INT8 roundings grow over layers"

@@ -182,9 +182,8 @@ def test_a_loaded_policy_is_warm(report):
 
 
 def test_counts_stay_within_their_budget(report):
-    budgets = params().get("arm", {}).get("budget_m")
-    if not budgets:
-        pytest.skip("params.yml has no arm.budget_m")
+    budgets = params()["arm"]["budget_m"]
+    assert budgets
     for stem, budget_m in budgets.items():
         found_m = report["metrics"]["artifacts"][stem]["instructions_g"] * 1e3
         assert found_m == pytest.approx(budget_m, rel=0.02), f"{stem}: set params.yml's arm.budget_m if it is meant"

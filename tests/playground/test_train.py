@@ -4,10 +4,11 @@ import torch
 
 from rover_lib.onboard.errors import RoverError, WorldError
 from rover_lib.playground import train as train_module
-from rover_lib.playground.train import RECIPES, SIZES, LerobotDriver, build_policy, make_checkpoint, train
+from rover_lib.playground.train import RECIPES, SIZES, build_policy, make_checkpoint, train
 from rover_lib.playground.trial import run_trials
 from rover_lib.playground.world import World
 from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.compare import LerobotEager
 
 # the keys of the user's best_model.pth
 CHECKPOINT_KEYS = [
@@ -149,10 +150,8 @@ def test_a_checkpoint_that_was_made_is_taken_from_the_cache(recorded, trained, m
     assert [p.name for p in trained.parent.iterdir()] == [trained.name]
 
 
-def test_the_policy_can_be_driven(checkpoint):
-    policy = build_policy(SIZES["small"])
-    policy.load_state_dict(checkpoint["model_state_dict"])
-    driver = LerobotDriver(policy)
+def test_the_policy_can_be_driven(trained):
+    driver = LerobotEager(load_checkpoint(trained))
     chunk = driver.predict_chunk(np.zeros((360, 640, 3), np.uint8), np.zeros(2, np.float32))
     assert chunk.shape == (32, 2) and chunk.dtype == np.float32
     assert abs(chunk[:, 0]).max() <= 1 and chunk[:, 1].min() >= 0
@@ -206,8 +205,6 @@ def test_a_loss_that_is_not_finite_ends_the_training(recorded, tmp_path, monkeyp
 
 def test_a_checkpoint_for_trying_things_needs_no_recordings_and_plans_mild_actions(tmp_path):
     out = make_checkpoint(tmp_path / "best_model.pth", size="small", steps=3)
-    policy = build_policy(SIZES["small"])
-    policy.load_state_dict(torch.load(out, weights_only=False)["model_state_dict"])
-    chunk = LerobotDriver(policy).predict_chunk(World(1).render(), np.zeros(2, np.float32))
+    chunk = LerobotEager(load_checkpoint(out)).predict_chunk(World(1).render(), np.zeros(2, np.float32))
     assert abs(chunk[:, 0]).max() < 0.65
     assert 0 < chunk[:, 1].mean() < 0.2
