@@ -132,6 +132,88 @@ def folded_conv(w: Weights, bn: Weights, stride: int, padding: int, dilation: in
     return _load(conv, weight * gain[:, None, None, None], bn["bias"] - bn["running_mean"] * gain)
 
 
+class Pixels(nn.Module):
+    """A frame, (height, width, 3) uint8 RGB, as the stem's input in floats: (1, 3, height, width), normalised."""
+
+    def __init__(self, norm: Affine):
+        super().__init__()
+        # pixels are 0..255 here: the division by 255 is in the scale
+        self.norm = Normalise(Affine(tuple(s / 255 for s in norm.scale), norm.shift), (1, 3, 1, 1))
+
+    def forward(self, frame: Tensor) -> Tensor:
+        return self.norm(frame.permute(2, 0, 1)[None].float())  # channels-last in memory
+
+
+class Columns(nn.Module):
+    """A frame, (height, width, 3) uint8 RGB, as the INT8 input of a stem over columns: the pixels themselves.
+
+    For each second pixel, the 8 pixels around it in its row: (1, 24, rows, width / 2), padded with the colour that
+    normalises to zero. The stem's 7x7 convolution with stride 2 over 3 channels is a 7x1 convolution over these 24
+    (`column_conv`), which has half the instructions: XNNPACK's kernels want at least 8 channels. Normalisation is in
+    that convolution's weights, so a pixel is its own quantized value: nothing is computed in float, nothing rounded.
+    """
+
+    WINDOW = 8  # pixels: the kernel's 7, and one with weight 0 that fills the kernel's lanes
+
+    def __init__(self, norm: Affine, height: int, width: int):
+        super().__init__()
+        self.scale, self.zero_pixel = column_scale(norm)
+        self.dtype: torch.dtype | None = None  # of the quantized output; None: float
+        self.out_width = (width - 1) // 2 + 1
+        self.rows = 2 * ((height - 1) // 2) + 7
+        self.pitch = 2 * (self.out_width - 1) + self.WINDOW  # padded pixels in a row
+        colour = torch.tensor(zero_colour(norm)).round().to(torch.uint8)
+        for name, rows, pixels in (
+            ("left", height, 3),
+            ("right", height, self.pitch - width - 3),
+            ("top", 3, self.pitch),
+            ("bottom", self.rows - height - 3, self.pitch),
+        ):
+            self.register_buffer(name, colour.repeat(rows, pixels))
+
+    def forward(self, frame: Tensor) -> Tensor:
+        x = torch.cat([self.left, frame.flatten(1), self.right], 1)
+        x = torch.cat([self.top, x, self.bottom], 0)
+        if self.dtype == torch.qint8:
+            x = torch.bitwise_xor(x, 128).to(torch.int8)  # pixel - 128: the conversion keeps the bits
+        shape, strides = (self.rows, self.out_width, 3 * self.WINDOW), (3 * self.pitch, 6, 1)
+        x = x.as_strided(shape, strides).contiguous()
+        if self.dtype is None:
+            x = (x.float() - self.zero_pixel) * self.scale
+        else:
+            zero_point = self.zero_pixel - (128 if self.dtype == torch.qint8 else 0)
+            x = torch._make_per_tensor_quantized_tensor(x, self.scale, zero_point)
+        return x.permute(2, 0, 1)[None]  # channels-last in memory
+
+
+def zero_colour(norm: Affine) -> tuple[float, ...]:
+    """The pixel, 0..255 per channel, that normalises to zero: what the stem's padding means."""
+    return tuple(-255 * shift / scale for scale, shift in zip(norm.scale, norm.shift, strict=True))
+
+
+def column_scale(norm: Affine) -> tuple[float, int]:
+    """(scale, zero pixel) of columns: one for all channels, near their normalisation; the weights have the rest."""
+    return sum(norm.scale) / len(norm.scale) / 255, round(sum(zero_colour(norm)) / len(norm.scale))
+
+
+def column_conv(conv: nn.Conv2d, norm: Affine) -> nn.Conv2d:
+    """The stem's convolution of normalised pixels, as one of `Columns`."""
+    scale, zero_pixel = column_scale(norm)
+    pixel_scale = torch.tensor(norm.scale) / 255
+    weight = conv.weight * (pixel_scale / scale)[None, :, None, None]  # (out, 3, 7, 7)
+    windows = F.pad(weight.permute(0, 2, 3, 1), (0, 0, 0, 1)).flatten(2)  # (out, 7, 24): as pixels lie in a row
+    offset = pixel_scale * zero_pixel + torch.tensor(norm.shift)
+    bias = conv.bias + (conv.weight.sum((2, 3)) * offset).sum(1)
+    columns = nn.Conv2d(windows.shape[2], windows.shape[0], (7, 1), (2, 1), device="meta")
+    return _load(columns, windows.transpose(1, 2)[..., None], bias)
+
+
+def fits_columns(config: ActConfig) -> bool:
+    """Whether frames can be columns: one normalisation for all cameras, whose zero is a colour."""
+    norm = config.image_norm[0]
+    return all(n == norm for n in config.image_norm) and all(-0.5 < c < 255.5 for c in zero_colour(norm))
+
+
 class Residual(nn.Module):
     """One ResNet block: two (basic) or three (bottleneck) convolutions beside a shortcut."""
 
@@ -156,12 +238,15 @@ class Residual(nn.Module):
 
 
 class Backbone(nn.Module):
-    """ResNet up to its last feature map: (1, 3, height, width) normalised -> (1, channels, h, w)."""
+    """ResNet up to its last feature map: frames from Pixels, or from Columns -> (1, channels, h, w)."""
 
-    def __init__(self, w: Weights, config: ActConfig):
+    def __init__(self, w: Weights, config: ActConfig, columns: bool):
         super().__init__()
         kind, depths, _ = BACKBONES[config.backbone]
-        self.stem = nn.Sequential(folded_conv(w.at("conv1"), w.at("bn1"), 2, 3), nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+        first = folded_conv(w.at("conv1"), w.at("bn1"), 2, 3)
+        if columns:
+            first = column_conv(first, config.image_norm[0])
+        self.stem = nn.Sequential(first, nn.ReLU(), nn.MaxPool2d(3, 2, 1))
         dilation = 1
         for i, depth in enumerate(depths):
             stride = 1 if i == 0 else 2
@@ -207,27 +292,31 @@ class Attention(Pointwise):
 
     Channel scales (buffers, all None until `quantize` sets them) make the INT8 tensors inside even, and cancel exactly:
     q_in, k_in and v_in multiply the inputs, q_out, v_out and o_out the outputs; the keys' output scale is merged into
-    q_out (the scores only see products), the output projection's input scale into v_out.
+    q_out (the scores only see products), the output projection's input scale into v_out. Where the decoder looks at
+    the encoder's memory, `Memory` has applied k_in and v_in, once for all layers.
     """
 
-    def __init__(self, w: Weights, config: ActConfig, as_conv: bool, query: Tensor | None = None):
-        """query: (1, T, D) where it does not depend on the observation; its projection is then a constant."""
+    def __init__(self, w: Weights, config: ActConfig, as_conv: bool, *, cross: bool = False):
         super().__init__(as_conv)
-        self.heads = config.heads
+        self.heads, self.cross = config.heads, cross
         wq, wk, wv = w["in_proj_weight"].split(config.dim)
         bq, bk, bv = w["in_proj_bias"].split(config.dim)
-        self.register_buffer("constant_q", None if query is None else F.linear(query, wq, bq))
-        if query is None:
-            self.q = self.project(wq, bq)
+        self.q = self.project(wq, bq)
         self.k = self.project(wk, bk)
         self.v = self.project(wv, bv)
         self.o = self.project(w["out_proj.weight"], w["out_proj.bias"])
-        for name in ("q_in", "k_in", "v_in", "q_out", "v_out", "o_out"):
+        for name in ("constant_q", "q_in", "k_in", "v_in", "q_out", "v_out", "o_out"):
             self.register_buffer(name, None)
 
+    def fix_query(self, query: Tensor) -> None:
+        """query, (1, T, D), does not depend on the observation: its projection becomes a constant."""
+        self.constant_q = self.leave(self.q(self.enter(query)))
+        del self.q
+
     def forward(self, residual: Tensor, query: Tensor | None, key: Tensor, value: Tensor) -> Tensor:
-        """residual, query: (1, T, D); key, value: (1, M, D). Returns residual + attention."""
-        k = self.enter(_times(key, self.k_in))
+        """residual, query: (1, T, D); key, value: (1, M, D), or from `Memory`. Returns residual + attention."""
+        k = key if self.cross else self.enter(_times(key, self.k_in))
+        v = value if self.cross else self.enter(_times(value, self.v_in))
         if self.constant_q is not None:
             q = self.constant_q
         else:
@@ -235,10 +324,22 @@ class Attention(Pointwise):
             q = k if query is key else self.enter(_times(query, self.q_in))
             q = _times(self.leave(self.q(q)), self.q_out)
         k = self.leave(self.k(k))
-        v = _times(self.leave(self.v(self.enter(_times(value, self.v_in)))), self.v_out)
+        v = _times(self.leave(self.v(v)), self.v_out)
         q, k, v = (t.unflatten(2, (self.heads, -1)).transpose(1, 2) for t in (q, k, v))  # (1, H, T, D / H)
         y = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
         return _plus_scaled(residual, self.leave(self.o(self.enter(y))), self.o_out)
+
+
+class Memory(Pointwise):
+    """What the encoder found, (1, T, D), as all decoder layers' cross-attentions take it: keys' and values' input."""
+
+    def __init__(self, as_conv: bool):
+        super().__init__(as_conv)
+        for name in ("k_in", "v_in"):  # channel scales, as in Attention
+            self.register_buffer(name, None)
+
+    def forward(self, memory: Tensor, pos: Tensor) -> tuple[Tensor, Tensor]:
+        return self.enter(_times(memory + pos, self.k_in)), self.enter(_times(memory, self.v_in))
 
 
 class FeedForward(Pointwise):
@@ -294,16 +395,14 @@ class DecoderLayer(nn.Module):
         self.pre_norm, self.first = config.pre_norm, first
         self.norm1, self.norm2, self.norm3 = (layer_norm(w.at(f"norm{i}")) for i in (1, 2, 3))
         self.attention = Attention(w.at("self_attn"), config, as_conv)
+        self.cross_attention = Attention(w.at("multihead_attn"), config, as_conv, cross=True)
+        self.feed_forward = FeedForward(w, config, as_conv)
         self.register_buffer("start", None)
-        query = None
         if first:
             with torch.no_grad():
-                start = self._self_attend(torch.zeros_like(q_pos), q_pos)
-                query = (self.norm2(start) if self.pre_norm else start) + q_pos
-            self.start = start
+                self.start = self._self_attend(torch.zeros_like(q_pos), q_pos)
+                self.cross_attention.fix_query((self.norm2(self.start) if self.pre_norm else self.start) + q_pos)
             del self.attention, self.norm1
-        self.cross_attention = Attention(w.at("multihead_attn"), config, as_conv, query)
-        self.feed_forward = FeedForward(w, config, as_conv)
 
     def _self_attend(self, x: Tensor, q_pos: Tensor) -> Tensor:
         y = self.norm1(x) if self.pre_norm else x
@@ -311,11 +410,11 @@ class DecoderLayer(nn.Module):
         x = self.attention(x, y_pos, y_pos, y)
         return x if self.pre_norm else self.norm1(x)
 
-    def forward(self, x: Tensor | None, q_pos: Tensor, memory: Tensor, memory_pos: Tensor) -> Tensor:
-        """x, q_pos: (1, C, D), x None for the first layer; memory, memory_pos (with positions added): (1, T, D)."""
+    def forward(self, x: Tensor | None, q_pos: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        """x, q_pos: (1, C, D), x None for the first layer; key, value: from `Memory`."""
         x = self.start if self.first else self._self_attend(x, q_pos)
         y = self.norm2(x) if self.pre_norm else x
-        x = self.cross_attention(x, None if self.first else y + q_pos, memory_pos, memory)
+        x = self.cross_attention(x, None if self.first else y + q_pos, key, value)
         if self.pre_norm:
             return self.feed_forward(x, self.norm3(x))
         x = self.norm2(x)
@@ -340,21 +439,24 @@ class ACT(nn.Module):
     """The policy, for one observation at a time.
 
     weights: LeRobot's names without the leading `model.`; config: checked against them (see `checkpoint`).
-    as_conv: token projections as 1x1 convolutions (what static INT8 wants) instead of linears.
+    for_int8: arranged as static INT8 wants it: token projections as 1x1 convolutions instead of linears, and frames
+    as columns of pixels (see Columns) where their normalisation allows it, padded with a colour of whole numbers.
     forward(state (1, S) float32, *frames (height, width, 3) uint8 RGB, one per camera) -> (1, C, A) float32:
     raw state in, raw actions out, all normalisation inside.
     """
 
-    def __init__(self, config: ActConfig, weights: dict[str, Tensor], *, as_conv: bool = False):
+    def __init__(self, config: ActConfig, weights: dict[str, Tensor], *, for_int8: bool = False):
         super().__init__()
         self.config = config
         w = Weights(weights)
-        self.image_norm = nn.ModuleList(  # pixels are 0..255 here: the division by 255 is in the scale
-            Normalise(Affine(tuple(s / 255 for s in n.scale), n.shift), (1, 3, 1, 1)) for n in config.image_norm
+        columns = for_int8 and fits_columns(config)
+        self.image_input = nn.ModuleList(
+            Columns(norm, *size) if columns else Pixels(norm)
+            for norm, size in zip(config.image_norm, config.image_sizes, strict=True)
         )
         self.state_norm = Normalise(config.state_norm, (1, -1))
         self.action_unnorm = Normalise(config.action_unnorm, (1, 1, -1))
-        self.backbone = Backbone(w.at("backbone"), config)
+        self.backbone = Backbone(w.at("backbone"), config, columns)
         project = w.at("encoder_img_feat_input_proj")
         weight = project["weight"]
         self.image_project = _load(nn.Conv2d(*weight.shape[1::-1], 1, device="meta"), weight, project["bias"])
@@ -367,11 +469,12 @@ class ACT(nn.Module):
         self.register_buffer("pos", torch.cat(pos)[None])  # (1, T, D)
         self.register_buffer("q_pos", w["decoder_pos_embed.weight"][None])  # (1, C, D)
         self.encoder = nn.ModuleList(
-            EncoderLayer(w.at(f"encoder.layers.{i}"), config, as_conv) for i in range(config.encoder_layers)
+            EncoderLayer(w.at(f"encoder.layers.{i}"), config, for_int8) for i in range(config.encoder_layers)
         )
         self.encoder_norm = layer_norm(w.at("encoder.norm")) if config.pre_norm else nn.Identity()
+        self.memory = Memory(for_int8)
         self.decoder = nn.ModuleList(
-            DecoderLayer(w.at(f"decoder.layers.{i}"), config, as_conv, self.q_pos, first=i == 0)
+            DecoderLayer(w.at(f"decoder.layers.{i}"), config, for_int8, self.q_pos, first=i == 0)
             for i in range(config.decoder_layers)
         )
         self.norm = layer_norm(w.at("decoder.norm"))
@@ -380,18 +483,16 @@ class ACT(nn.Module):
 
     def forward(self, state: Tensor, *frames: Tensor) -> Tensor:
         tokens = [self.latent, self.state_project(self.state_norm(state))[:, None]]
-        for i, norm in enumerate(self.image_norm):  # by index: FX cannot iterate over frames while it traces
-            x = norm(frames[i].permute(2, 0, 1)[None].float())  # (1, 3, height, width), channels-last in memory
-            x = self.image_project(self.backbone(x))  # (1, D, h, w)
+        for i, look in enumerate(self.image_input):  # by index: FX cannot iterate over frames while it traces
+            x = self.image_project(self.backbone(look(frames[i])))  # (1, D, h, w)
             tokens.append(x.flatten(2).transpose(1, 2))  # (1, h * w, D)
         x = torch.cat(tokens, 1)
         for layer in self.encoder:
             x = layer(x, self.pos)
-        memory = self.encoder_norm(x)
-        memory_pos = memory + self.pos
+        key, value = self.memory(self.encoder_norm(x), self.pos)
         y = None
         for layer in self.decoder:
-            y = layer(y, self.q_pos, memory, memory_pos)
+            y = layer(y, self.q_pos, key, value)
         return self.action_unnorm(self.head(self.norm(y)))
 
 
@@ -423,7 +524,7 @@ def multiply_accumulates(model: ACT) -> dict[str, int]:
         def hook(module: nn.Module, args: tuple, out: Tensor) -> None:
             if isinstance(module, Attention):
                 residual, _, key, _ = args
-                add(name, 2 * residual.shape[1] * key.shape[1] * residual.shape[2])
+                add(name, 2 * residual.shape[1] * key.numel())  # queries x tokens x width
             elif isinstance(module, nn.Conv2d):
                 add(name, out.numel() * module.weight[0].numel())
             else:

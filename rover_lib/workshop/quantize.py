@@ -32,8 +32,10 @@ from torch.ao.quantization import (
     quantize_dynamic,
 )
 from torch.ao.quantization.backend_config import get_qnnpack_backend_config
+from torch.ao.quantization.fx.custom_config import PrepareCustomConfig
 from torch.ao.quantization.observer import UniformQuantizationObserverBase
 from torch.ao.quantization.quantize_fx import convert_fx, prepare_fx
+from torch.fx import GraphModule
 
 import rover_lib
 from rover_lib.onboard import artifact
@@ -247,36 +249,46 @@ def apply_channel_scales(model: ACT, maxima: dict[str, dict[str, Tensor]], smoot
         m.weight = nn.Parameter((matrix(m) * rows.reshape(-1, 1) * columns).view_as(m.weight), requires_grad=False)
         m.bias = nn.Parameter(m.bias * rows, requires_grad=False)
 
+    def input_scale(name: str, *matrices: Tensor) -> Tensor:
+        return _input_scale(maxima[name]["in_max"], list(matrices), smooth)
+
+    crosses = {f"decoder.{i}.cross_attention": layer.cross_attention for i, layer in enumerate(model.decoder)}
+    for p in "kv":  # all cross-attentions take the memory by the same scales, so that it is quantized once
+        even = [
+            matrix(getattr(m, p)) / _output_scale(maxima[f"{n}.{p}"]["out_max"])[:, None] for n, m in crosses.items()
+        ]
+        setattr(model.memory, f"{p}_in", input_scale(f"{next(iter(crosses))}.{p}", *even))
     for name, part in model.named_modules():
         if isinstance(part, Attention):
             seen = {p: maxima[f"{name}.{p}"] for p in "qkvo" if f"{name}.{p}" in maxima}
             out = {p: _output_scale(s["out_max"]) for p, s in seen.items()}
             even = {p: matrix(getattr(part, p)) / out[p][:, None] for p in seen}
-            shares = "q" in seen and not name.endswith("cross_attention")  # self-attention: one input for Q and K
-            part.k_in = _input_scale(seen["k"]["in_max"], [even["q"], even["k"]] if shares else [even["k"]], smooth)
-            part.v_in = _input_scale(seen["v"]["in_max"], [even["v"]], smooth)
-            o_in = _input_scale(seen["o"]["in_max"], [even["o"]], smooth)
+            if part.cross:
+                k_in, v_in = model.memory.k_in, model.memory.v_in
+            else:  # self-attention: one input for Q and K
+                k_in = part.k_in = input_scale(f"{name}.k", even["q"], even["k"])
+                v_in = part.v_in = input_scale(f"{name}.v", even["v"])
+            o_in = input_scale(f"{name}.o", even["o"])
             if "q" not in seen:
                 part.constant_q = part.constant_q * out["k"]
             else:
-                part.q_in = None if shares else _input_scale(seen["q"]["in_max"], [even["q"]], smooth)
-                rescale(part.q, 1 / out["q"], 1 / (part.k_in if shares else part.q_in))
+                part.q_in = input_scale(f"{name}.q", even["q"]) if part.cross else None
+                rescale(part.q, 1 / out["q"], 1 / (part.q_in if part.cross else k_in))
                 part.q_out = out["q"] * out["k"]
-            rescale(part.k, 1 / out["k"], 1 / part.k_in)
-            rescale(part.v, 1 / out["v"], 1 / part.v_in)
+            rescale(part.k, 1 / out["k"], 1 / k_in)
+            rescale(part.v, 1 / out["v"], 1 / v_in)
             part.v_out = out["v"] * o_in
             rescale(part.o, 1 / out["o"], 1 / o_in)
             part.o_out = out["o"]
         elif isinstance(part, FeedForward):
-            up, down = maxima[f"{name}.up"], maxima[f"{name}.down"]
-            part.down_out = _output_scale(down["out_max"])
-            middle = _input_scale(down["in_max"], [matrix(part.down) / part.down_out[:, None]], smooth)
+            part.down_out = _output_scale(maxima[f"{name}.down"]["out_max"])
+            middle = input_scale(f"{name}.down", matrix(part.down) / part.down_out[:, None])
             rescale(part.down, 1 / part.down_out, 1 / middle)
             passes = isinstance(part.act, nn.ReLU)
             rows = middle if passes else torch.ones(len(part.up.bias))
             if not passes:
                 part.down_in = middle
-            part.up_in = _input_scale(up["in_max"], [matrix(part.up) * rows[:, None]], smooth)
+            part.up_in = input_scale(f"{name}.up", matrix(part.up) * rows[:, None])
             rescale(part.up, rows, 1 / part.up_in)
 
 
@@ -290,6 +302,7 @@ class Calibration:
     samples: int
     smooth: float | None
     checkpoint: str  # sha256
+    image_sizes: tuple[tuple[int, int], ...]  # (height, width), one per camera
     channels: dict[str, dict[str, Tensor]] = field(repr=False)  # in_max, out_max, and the same after scaling
     observers: dict[str, Tensor] = field(repr=False)  # state of the prepared graph's observers
     ranges: dict[str, dict[str, float]] = field(repr=False)  # of each quantized layer's output: min, max
@@ -349,7 +362,7 @@ def calibrate(
     def inputs(what: str) -> Iterable[tuple[Tensor, Tensor]]:
         yield from (inputs_of(s, config) for s in (progress(samples, desc=what) if progress else samples))
 
-    model = ACT(config, checkpoint.weights, as_conv=True)
+    model = ACT(config, checkpoint.weights, for_int8=True)
     channels = channel_maxima(model, inputs("channel maxima"))
     if bad := [n for n, s in channels.items() if not all(torch.isfinite(t).all() for t in s.values())]:
         raise QuantizeError(f"calibration met NaN or Inf at {bad[:3]}; check the checkpoint and the recordings")
@@ -367,7 +380,16 @@ def calibrate(
     for node in prepared.graph.nodes:
         if node.op == "call_module" and _is_int8_name(str(node.target)) and (o := _observer_behind(prepared, node)):
             ranges[str(node.target)] = {"min": o.min_val.item(), "max": o.max_val.item()}
-    return Calibration(len(samples), smooth, checkpoint.sha256, channels, observers, ranges, time.monotonic() - start)
+    return Calibration(
+        samples=len(samples),
+        smooth=smooth,
+        checkpoint=checkpoint.sha256,
+        image_sizes=config.image_sizes,
+        channels=channels,
+        observers=observers,
+        ranges=ranges,
+        seconds=time.monotonic() - start,
+    )
 
 
 def _observer_behind(prepared: nn.Module, node: Any) -> RangeObserver | None:
@@ -424,7 +446,7 @@ def _qconfig(scheme: Scheme) -> QConfig:
     return QConfig(activation, weight)
 
 
-def _prepare(model: ACT, scheme: Scheme) -> torch.fx.GraphModule:
+def _prepare(model: ACT, scheme: Scheme) -> GraphModule:
     full = replace(scheme, float_blocks=())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # deprecation: known, and the reason for this module's walls
@@ -432,30 +454,54 @@ def _prepare(model: ACT, scheme: Scheme) -> torch.fx.GraphModule:
             model,
             _mapping(model.config, full),
             act.example_inputs(model.config),
+            PrepareCustomConfig().set_non_traceable_module_classes([act.Columns]),
             backend_config=get_qnnpack_backend_config(),
         )
 
 
-def _convert(prepared: torch.fx.GraphModule, config: act.ActConfig, scheme: Scheme, only: Iterable[str] | None = None):
+def _convert(prepared: GraphModule, config: act.ActConfig, scheme: Scheme, only: Iterable[str] | None = None):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return convert_fx(
+        converted = convert_fx(
             copy.deepcopy(prepared),
             qconfig_mapping=_mapping(config, scheme, only),
             backend_config=get_qnnpack_backend_config(),
         )
+    return _columns_are_int8(converted, KINDS[scheme.kind][0])
 
 
-def _prepared(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> torch.fx.GraphModule:
+def _columns_are_int8(converted: GraphModule, dtype: torch.dtype) -> GraphModule:
+    """Let columns arrive quantized, as they are, where FX has put a quantization behind them."""
+    for node in list(converted.graph.nodes):
+        if node.op != "call_module" or not isinstance(
+            columns := converted.get_submodule(str(node.target)), act.Columns
+        ):
+            continue
+        for user in list(node.users):
+            if user.target is torch.quantize_per_tensor:
+                columns.dtype = dtype
+                user.replace_all_uses_with(node)
+                converted.graph.erase_node(user)
+    converted.graph.eliminate_dead_code()
+    converted.recompile()
+    return converted
+
+
+def _prepared(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:
     """The observed graph as calibration left it, its observers seeing no more."""
     if calibration.checkpoint != checkpoint.sha256:
         raise QuantizeError("the calibration was made with another checkpoint; calibrate again")
+    if calibration.image_sizes != checkpoint.config.image_sizes:
+        raise QuantizeError(
+            f"the calibration was made with images of {calibration.image_sizes}, the policy takes "
+            f"{checkpoint.config.image_sizes} (height, width); calibrate again"
+        )
     if scheme.smooth != calibration.smooth:
         raise QuantizeError(
             f"the calibration was made with smooth {calibration.smooth}, the scheme has {scheme.smooth}"
         )
     torch.backends.quantized.engine = ENGINE
-    prepared = _prepare(_scaled(checkpoint, calibration, as_conv=True), scheme)
+    prepared = _prepare(_scaled(checkpoint, calibration, for_int8=True), scheme)
     state = prepared.state_dict()
     names = {k for k in state if "activation_post_process" in k}
     if names != set(calibration.observers):
@@ -467,8 +513,8 @@ def _prepared(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) 
     return prepared
 
 
-def _scaled(checkpoint: Checkpoint, calibration: Calibration, *, as_conv: bool) -> ACT:
-    model = ACT(checkpoint.config, checkpoint.weights, as_conv=as_conv)
+def _scaled(checkpoint: Checkpoint, calibration: Calibration, *, for_int8: bool) -> ACT:
+    model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
     if calibration.smooth is not None:
         apply_channel_scales(model, calibration.channels, calibration.smooth)
     return model
@@ -499,11 +545,13 @@ def quantize(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -
         module = _convert(prepared, checkpoint.config, scheme)
         left_float = {*scheme.float_blocks, *STAYS_FLOAT}
         convs = (
-            n for n, m in _scaled(checkpoint, calibration, as_conv=True).named_modules() if isinstance(m, nn.Conv2d)
+            n for n, m in _scaled(checkpoint, calibration, for_int8=True).named_modules() if isinstance(m, nn.Conv2d)
         )
         expected = [n for n in convs if block_of(n) not in left_float]
     found = {n: m for n, m in module.named_modules() if isinstance(m, INT8_MODULES)}
     check_acted(found, expected)
+    if scheme.mode != "dynamic" and scheme.kind == "symmetric":
+        check_fast(module.eval(), act.example_inputs(checkpoint.config))
     layers = [_layer(n, m) for n, m in found.items()]
     notes = [
         f"{row['name']}: its output never changed during calibration; is it dead?"
@@ -529,9 +577,61 @@ def check_acted(found: dict[str, nn.Module], expected: list[str]) -> None:
         raise QuantizeError(f"{len(missing)} of {len(expected)} layers stayed float: {', '.join(missing[:5])}")
 
 
+@torch.inference_mode()
+def check_fast(module: nn.Module, example: tuple[Tensor, ...]) -> None:
+    """Raise QuantizeError, naming the layers, unless every static INT8 layer dispatches to XNNPACK's SDOT kernels.
+
+    What torch 2.8 asks of a layer (`can_use_xnnp` in aten's qconv and qlinear) and XNNPACK of its scales: a qint8
+    input, symmetric qint8 weights in [-127, 127], per channel for convolutions only, and an output scale that is
+    neither 2^-32 nor 2^8 times the product of the others. A layer that fails would run QNNPACK's kernels, several
+    times slower on a Cortex-A76, or not at all.
+    """
+    slow: dict[str, str] = {}
+
+    def watch(name: str):
+        def hook(m: nn.Module, args: tuple[Tensor, ...]) -> None:
+            if reason := _why_slow(m, args[0]):
+                slow[name] = reason
+
+        return hook
+
+    static = {n: m for n, m in module.named_modules() if isinstance(m, INT8_MODULES)}
+    hooks = [m.register_forward_pre_hook(watch(n)) for n, m in static.items()]
+    try:
+        module(*example)
+    except RuntimeError as e:
+        # torch refuses some of these itself, without saying where; the hook of that layer has just run.
+        if not slow:
+            raise QuantizeError(f"the quantized policy does not run: {str(e).splitlines()[0][:200]}") from None
+    finally:
+        for h in hooks:
+            h.remove()
+    if slow:
+        listed = "; ".join(f"{name}: {reason}" for name, reason in list(slow.items())[:5])
+        raise QuantizeError(f"{len(slow)} of {len(static)} layers would miss the fast kernels: {listed}")
+
+
+def _why_slow(m: nn.Module, x: Tensor) -> str | None:
+    w = m.weight()
+    per_channel = w.qscheme() in (torch.per_channel_affine, torch.per_channel_symmetric)
+    if x.dtype != torch.qint8:
+        return f"its input is {str(x.dtype).removeprefix('torch.')}, not qint8"
+    if w.dtype != torch.qint8 or w.int_repr().min() < -127:
+        return "its weights are not qint8 in [-127, 127]"
+    if torch.any(w.q_per_channel_zero_points() if per_channel else torch.tensor(w.q_zero_point())):
+        return "its weights are not symmetric: a zero point is not 0"
+    if per_channel and isinstance(m, int8.Linear):
+        return "a linear with a scale per channel; it must be a 1x1 convolution, or have one scale"
+    scales = w.q_per_channel_scales() if per_channel else torch.tensor([w.q_scale()])
+    ratio = scales.double() * x.q_scale() / m.scale
+    if not ((ratio >= 2**-32) & (ratio < 2**8)).all():
+        return f"its scales give a ratio of {ratio.max():.3g}, outside [2^-32, 2^8)"
+    return None
+
+
 def _dynamic(checkpoint: Checkpoint, calibration: Calibration) -> nn.Module:
     torch.backends.quantized.engine = ENGINE
-    model = _scaled(checkpoint, calibration, as_conv=False)
+    model = _scaled(checkpoint, calibration, for_int8=False)
     spec = dict.fromkeys(_projections(model), per_channel_dynamic_qconfig)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -557,6 +657,25 @@ def _layer(name: str, m: nn.Module) -> dict[str, Any]:
         if row[key] is not None and not 0 < row[key] < float("inf"):
             raise QuantizeError(f"{name}: {key} is {row[key]}; its calibration range is no range")
     return row
+
+
+def backbone_of(quantized: QuantizedPolicy) -> nn.Module:
+    """The INT8 part of a static policy that is the same to the last bit on every processor: all up to the tokens.
+
+    Called like the policy; returns what `image_project` gives for the first camera, (1, D, h, w) int8. Raises
+    QuantizeError where that is not INT8.
+    """
+    module = copy.deepcopy(quantized.module)
+    nodes = [n for n in module.graph.nodes if n.target == "image_project"] if isinstance(module, GraphModule) else []
+    if not nodes or not isinstance(module.get_submodule("image_project"), INT8_MODULES):
+        raise QuantizeError(f"a {quantized.scheme.mode} policy whose image_project is not INT8 has no INT8 backbone")
+    (output,) = (n for n in module.graph.nodes if n.op == "output")
+    with module.graph.inserting_before(output):
+        output.args = (module.graph.call_method("int_repr", (nodes[0],)),)
+    module.graph.eliminate_dead_code()
+    module.delete_all_unused_submodules()
+    module.recompile()
+    return module
 
 
 # --- measuring ------------------------------------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """The inference-only ACT against LeRobot's own forward."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,8 +9,21 @@ from lerobot.policies.act.processor_act import make_act_pre_post_processors
 from policies import TINY, lerobot_policy, smooth_frame
 from torch.utils.flop_counter import FlopCounterMode
 
-from rover_lib.onboard.preprocess import normalise
-from rover_lib.workshop.act import ACT, block_of, blocks, example_inputs, multiply_accumulates
+from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise
+from rover_lib.workshop.act import (
+    ACT,
+    ActConfig,
+    Affine,
+    Columns,
+    Pixels,
+    block_of,
+    blocks,
+    column_conv,
+    example_inputs,
+    fits_columns,
+    imagenet,
+    multiply_accumulates,
+)
 from rover_lib.workshop.checkpoint import load_checkpoint
 
 FULL = {"n_decoder_layers": 7, "chunk_size": 32}
@@ -47,21 +62,27 @@ def observation(policy, seed=0):
     return frames, state
 
 
-def imagenet_stats(policy):
-    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
-    return {k: {"mean": mean[:, None, None], "std": std[:, None, None]} for k in policy.config.image_features}
+def image_stats(policy, mean=IMAGENET_MEAN, std=IMAGENET_STD):
+    stats = {"mean": torch.tensor(mean)[:, None, None], "std": torch.tensor(std)[:, None, None]}
+    return {k: stats for k in policy.config.image_features}
 
 
-@pytest.mark.parametrize("as_conv", [False, True], ids=["linear", "conv"])
+# Normalised zero, LeRobot's padding, is a whole pixel here, so that columns can be exact at the border too.
+WHOLE_MEAN = (124 / 255, 116 / 255, 104 / 255)
+
+
+@pytest.mark.parametrize("for_int8", [False, True], ids=["float", "for_int8"])
 @pytest.mark.parametrize("name", SHAPES)
-def test_equals_lerobot(name, as_conv, tmp_path):
+def test_equals_lerobot(name, for_int8, tmp_path):
     policy = lerobot_policy(**SHAPES[name])
-    saved(policy, tmp_path, imagenet_stats(policy))
+    mean = WHOLE_MEAN if for_int8 else IMAGENET_MEAN
+    saved(policy, tmp_path, image_stats(policy, mean))
     checkpoint = load_checkpoint(tmp_path)
-    model = ACT(checkpoint.config, checkpoint.weights, as_conv=as_conv)
+    model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
+    assert all(isinstance(m, Columns if for_int8 else Pixels) for m in model.image_input)
     for seed in range(2):
         frames, state = observation(policy, seed)
-        batch = {k: torch.from_numpy(normalise(f))[None] for k, f in frames.items()}
+        batch = {k: torch.from_numpy(normalise(f, mean))[None] for k, f in frames.items()}
         with torch.inference_mode():
             expected = policy.predict_action_chunk(batch | {"observation.state": torch.from_numpy(state)[None]})
             found = model(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames.values()))
@@ -79,7 +100,7 @@ def test_lerobots_processors_end_up_inside(mode, tmp_path):
     low, high = torch.tensor([-0.3, 0.1]), torch.tensor([0.9, 0.4])
     numbers = {"mean": (low + high) / 2, "std": high - low}
     numbers |= {"min": low, "max": high, "q01": low, "q99": high, "q10": low, "q90": high}
-    stats = imagenet_stats(policy) | {"observation.state": numbers, "action": numbers}
+    stats = image_stats(policy) | {"observation.state": numbers, "action": numbers}
     inner, outer = saved(policy, tmp_path, stats)
     checkpoint = load_checkpoint(tmp_path)
     frames, state = observation(policy)
@@ -89,6 +110,51 @@ def test_lerobots_processors_end_up_inside(mode, tmp_path):
         expected = outer(policy.predict_action_chunk(inner(raw))[0])
         found = ACT(checkpoint.config, checkpoint.weights)(torch.from_numpy(state)[None], torch.from_numpy(frame))[0]
     assert (found - expected).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("mean", "std", "columns"),
+    [
+        (IMAGENET_MEAN, IMAGENET_STD, True),
+        ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), True),
+        ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5), True),
+        ((-0.1, 0.5, 0.5), (0.5, 0.5, 0.5), False),  # no colour normalises to zero
+        ((0.5, 0.5, 1.01), (0.5, 0.5, 0.5), False),
+    ],
+)
+def test_columns_are_the_pixels_where_the_border_can_be_a_colour(mean, std, columns):
+    """The first convolution over columns, against the one over normalised pixels, away from the border."""
+    norm = Affine(tuple(1 / s for s in std), tuple(-m / s for m, s in zip(mean, std, strict=True)))
+    assert fits_columns(replace(ActConfig(), image_norm=(norm,))) == columns
+    if not columns:
+        return
+    torch.manual_seed(0)
+    conv = torch.nn.Conv2d(3, 8, 7, 2, 3).requires_grad_(False)
+    for size in ((36, 64), (35, 61), (7, 8)):
+        frame = torch.randint(0, 256, (*size, 3), dtype=torch.uint8)
+        expected = conv(Pixels(norm)(frame))
+        found = column_conv(conv, norm)(Columns(norm, *size)(frame))
+        assert found.shape == expected.shape
+        gap = (found - expected).abs()
+        assert gap[..., 2:-2, 2:-2].numel() == 0 or gap[..., 2:-2, 2:-2].max() < 1e-5
+        assert gap.max() < 0.5 / 255 / min(std) * conv.weight.abs().sum((1, 2, 3)).max() + 1e-5
+
+
+@pytest.mark.parametrize("dtype", [torch.qint8, torch.quint8])
+def test_quantized_columns_are_the_float_ones_exactly(dtype):
+    columns = Columns(imagenet(), 35, 61)
+    frame = torch.arange(35 * 61 * 3).remainder(256).to(torch.uint8).reshape(35, 61, 3)
+    expected = columns(frame)
+    columns.dtype = dtype
+    found = columns(frame)
+    assert found.dtype == dtype
+    assert found.is_contiguous(memory_format=torch.channels_last)
+    assert (found.dequantize() - expected).abs().max() < 1e-6
+
+
+def test_cameras_that_are_normalised_differently_keep_the_float_stem():
+    config = ActConfig(cameras=("a", "b"), image_norm=(imagenet(), Affine((2.0,) * 3, (-1.0,) * 3)))
+    assert not fits_columns(config)
 
 
 def test_counts_the_full_policys_arithmetic():

@@ -23,17 +23,17 @@ def inputs(checkpoint, count=4, seed=3):
     return [q.inputs_of(s, checkpoint.config) for s in memory_samples(count, *checkpoint.config.image_sizes[0], seed)]
 
 
-@pytest.mark.parametrize("as_conv", [False, True])
+@pytest.mark.parametrize("for_int8", [False, True])
 @pytest.mark.parametrize(
     "variant", [{}, {"pre_norm": True, "n_encoder_layers": 2}, {"feedforward_activation": "gelu"}], ids=str
 )
 @pytest.mark.parametrize("smooth", [0.0, 0.5, 1.0])
-def test_channel_scales_are_exact_in_float(variant, smooth, as_conv, tmp_path):
+def test_channel_scales_are_exact_in_float(variant, smooth, for_int8, tmp_path):
     from test_act import saved
 
     saved(lerobot_policy(**(TINY | variant)), tmp_path)
     checkpoint = load_checkpoint(tmp_path)
-    model = ACT(checkpoint.config, checkpoint.weights, as_conv=as_conv)
+    model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
     seen = inputs(checkpoint, 3)
     before = q.predictions(model, seen)
     maxima = q.channel_maxima(model, seen)
@@ -87,6 +87,115 @@ def test_symmetric_means_what_the_fast_kernels_want(tiny, calibration):
     assert dtypes == {torch.qint8}
     affine = quantize(tiny, Scheme("static", "affine"), calibration).module
     assert {n.args[3] for n in affine.graph.nodes if n.target is torch.quantize_per_tensor} == {torch.quint8}
+
+
+def slow_layers():
+    """Layers that torch would not run on the fast kernels, made by hand: (what the guard says, policy)."""
+
+    torch.backends.quantized.engine = q.ENGINE  # weights are packed for it
+
+    def linear(per_channel: bool):
+        w = torch.randn(16, 16).clamp(-1, 1)
+        if per_channel:
+            w = torch.quantize_per_channel(
+                w, torch.full((16,), 0.02), torch.zeros(16, dtype=torch.long), 0, torch.qint8
+            )
+        else:
+            w = torch.quantize_per_tensor(w.index_fill(0, torch.tensor(0), -9.0), 0.02, 0, torch.qint8)
+            assert w.int_repr().min() == -128
+        m = q.int8.Linear(16, 16)
+        m.set_weight_bias(w, torch.zeros(16))
+        m.scale, m.zero_point = 0.1, 0
+        return m
+
+    def conv(zero_point: int = 0, scale: float = 0.1):
+        w = torch.randn(16, 16, 1, 1).clamp(-1, 1)
+        m = q.int8.Conv2d(16, 16, 1)
+        points = torch.full((16,), zero_point)
+        m.set_weight_bias(torch.quantize_per_channel(w, torch.full((16,), 0.02), points, 0, torch.qint8), None)
+        m.scale, m.zero_point = scale, 0
+        return m
+
+    tokens, picture = torch.randn(1, 4, 16), torch.randn(1, 16, 3, 3)
+    yield "a linear with a scale per channel", linear(True), tokens, torch.qint8
+    yield r"not qint8 in \[-127, 127\]", linear(False), tokens, torch.qint8
+    yield "input is quint8, not qint8", conv(), picture, torch.quint8
+    yield "a zero point is not 0", conv(zero_point=3), picture, torch.qint8
+    yield r"ratio of .*, outside", conv(scale=2**-12), picture, torch.qint8
+
+
+class Sandwich(torch.nn.Module):
+    def __init__(self, inner, dtype, scale=0.05):
+        super().__init__()
+        self.inner, self.dtype, self.scale = inner, dtype, scale
+
+    def forward(self, x):
+        return self.inner(torch.quantize_per_tensor(x, self.scale, 0, self.dtype)).dequantize()
+
+
+@pytest.mark.parametrize(("reason", "layer", "x", "dtype"), slow_layers())
+def test_the_guard_names_a_layer_that_misses_the_fast_kernels(reason, layer, x, dtype):
+    scale = 2000.0 if "ratio" in reason else 0.05
+    with pytest.raises(QuantizeError, match=f"1 of 1 layers would miss the fast kernels: inner: .*{reason}"):
+        q.check_fast(Sandwich(layer, dtype, scale), (x,))
+
+
+def test_the_guard_sees_observers_of_another_type(tiny, calibration, monkeypatch):
+    """A symmetric scheme whose activations came out as quint8: what a wrong qconfig would do, without a word."""
+    with monkeypatch.context() as m:
+        m.setitem(q.KINDS, "symmetric", q.KINDS["affine"])
+        with pytest.raises(QuantizeError, match=r"miss the fast kernels: backbone\.stem\.0: its input is quint8"):
+            quantize(tiny, Scheme("static"), calibration)
+    quantize(tiny, Scheme("static"), calibration)
+
+
+def test_an_ignored_backend_config_is_an_error(tiny, calibration, monkeypatch):
+    """With FX's default backend the mapping acts on nothing, and the policy would stay float."""
+    from torch.ao.quantization.backend_config import get_native_backend_config
+
+    monkeypatch.setattr(q, "get_qnnpack_backend_config", get_native_backend_config)
+    with pytest.raises(QuantizeError):
+        quantize(tiny, Scheme("static"), calibration)
+
+
+def test_the_backbone_alone_gives_the_policys_tokens(tiny, calibration):
+    quantized = quantize(tiny, Scheme("static"), calibration)
+    backbone = q.backbone_of(quantized)
+    seen = []
+    project = quantized.module.get_submodule("image_project")
+    hook = project.register_forward_hook(lambda m, args, out: seen.append(out.int_repr()))
+    x = inputs(tiny, 1)[0]
+    quantized.module(*x)
+    hook.remove()
+    found = backbone(*x)
+    assert found.dtype == torch.int8 and torch.equal(found, seen[0]) and found.unique().numel() > 10
+    assert not any(n.startswith("encoder") for n, _ in backbone.named_modules())
+    for mode in ({"mode": "dynamic"}, {"mode": "mixed", "float_blocks": ("image_project",)}):
+        with pytest.raises(QuantizeError, match="no INT8 backbone"):
+            q.backbone_of(quantize(tiny, Scheme(**mode), calibration))
+
+
+def test_pixels_enter_the_first_convolution_as_they_are(tiny, calibration):
+    for kind, dtype in (("symmetric", torch.qint8), ("affine", torch.quint8)):
+        module = quantize(tiny, Scheme("static", kind), calibration).module
+        seen = []
+        conv = module.get_submodule("backbone.stem.0")
+        hook = conv.register_forward_pre_hook(lambda m, args, seen=seen: seen.append(args[0]))
+        state, frame = inputs(tiny, 1)[0]
+        module(state, frame)
+        hook.remove()
+        (x,) = seen
+        assert x.dtype == dtype
+        pixels = x.int_repr().int() + (128 if dtype == torch.qint8 else 0)
+        assert torch.equal(pixels[0, :, 3:75, 1].reshape(8, 3, 72)[1:7].permute(2, 0, 1), frame[:, :6].int())
+    mixed = quantize(tiny, Scheme("mixed", float_blocks=("backbone.stem",)), calibration).module
+    assert mixed(*inputs(tiny, 1)[0]).isfinite().all()
+
+
+def test_a_calibration_serves_one_image_size(tiny, calibration):
+    other = replace(tiny, config=replace(tiny.config, image_sizes=((96, 160),)))
+    with pytest.raises(QuantizeError, match=r"made with images of .*calibrate again"):
+        quantize(other, Scheme("static"), calibration)
 
 
 def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration):
