@@ -11,9 +11,10 @@ help:
 	@echo "make demo                                   record, train, quantize, compare and benchmark in the balloon world"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make test                                   lint, unit, parity, notebook tests and one whole run"
-	@echo "make arm NAME=demo                          count a run's instructions on an emulated Cortex-A76"
+	@echo "make arm NAME=demo [PEERS=1]                count a run's instructions on an emulated Cortex-A76;"
+	@echo "                                            NAME=full makes a policy of the real car's size, PEERS=1 adds other runtimes"
 	@echo "make lab                                    JupyterLab on the notebooks"
-	@echo "make notebooks                              put the demo's outputs into the committed notebooks"
+	@echo "make notebooks                              put the demo's outputs, and runs/full's count, into the committed notebooks"
 
 # uv installs the CUDA build of torch, gigabytes that its wheel insists on, in a minute where pip takes several.
 $(READY): pyproject.toml
@@ -40,14 +41,17 @@ lint: $(READY)
 test: lint demo
 	$(VENV)/bin/pytest
 
+# NAME=full needs no checkpoint: it makes one. quantize.json is the last that a run of it leaves.
 arm: $(READY)
-	$(ROVER) arm 'runs/$(NAME)'
+	@test '$(NAME)' != full -o -f runs/full/quantize.json || { echo $(ROVER) world full runs/full; $(ROVER) world full runs/full; }
+	$(ROVER) arm 'runs/$(NAME)' $(if $(PEERS),--peers) $(if $(filter full,$(NAME)),--details)
 
 lab: $(READY)
 	$(VENV)/bin/jupyter lab notebooks
 
 notebooks: demo
 	$(VENV)/bin/python -c "from rover_lib.workshop.run import publish; publish('runs/demo', 'notebooks')"
+	test ! -f runs/full/06_arm.ipynb || $(VENV)/bin/python -c "from rover_lib.workshop.run import publish; publish('runs/full', 'notebooks', ('06_arm',))"
 
 clean:
 	rm -rf $(VENV) runs

@@ -1,12 +1,16 @@
 """Runs inside the emulated Pi: one artifact through rover_lib.onboard alone, as a Pi would run it.
 
     guest.py ARTIFACT OBSERVATIONS FOLDER COUNTED
+    guest.py --backbone ENGINE MODULE INPUTS
 
 OBSERVATIONS is an npz of `state` (n, S) float32 and `frame_0000`... (h, w, 3) uint8 BGR; they are predicted in that
 order, and again from the first if there are fewer than COUNTED. Loading is section 0 of the plugin's counts, the first
 COUNTED inferences are sections 1, 2, ...; a frame is read outside of them, and prepared inside. Leaves in FOLDER
 `chunks.npy` (n, chunk, A) float32, `maps` (where what is loaded) and `versions.json`. Each line on stdout says what
 begins.
+
+The second form runs a TorchScript part of a policy, for its bits and not for a count: INPUTS is an npz of `state`
+(n, S) and prepared frames, as the part takes them; leaves `backbone.npy` (n, ...) of what it gave, in its folder.
 """
 
 import ctypes
@@ -57,8 +61,23 @@ def main(artifact: str, observations: str, folder: str, counted: str) -> None:
     print("done", flush=True)
 
 
+def backbone(engine: str, module: str, inputs: str) -> None:
+    torch.backends.quantized.engine = engine
+    torch.set_num_threads(1)
+    print("load", flush=True)
+    part, found = torch.jit.load(module).eval(), []
+    with np.load(inputs) as seen, torch.inference_mode(), torch.jit.optimized_execution(False):
+        for i, state in enumerate(torch.from_numpy(seen["state"])):
+            print("predict", flush=True)
+            found.append(part(state[None], torch.from_numpy(seen[f"frame_{i:04d}"])))
+    np.save("backbone.npy", torch.cat(found).numpy())
+
+
 if __name__ == "__main__":
     try:
-        main(*sys.argv[1:])
+        if sys.argv[1] == "--backbone":
+            backbone(*sys.argv[2:])
+        else:
+            main(*sys.argv[1:])
     except RoverError as e:
         sys.exit(f"error: {e}")

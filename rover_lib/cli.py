@@ -244,15 +244,32 @@ def benchmark(
     "--frames", type=click.IntRange(min=3), default=50, show_default=True, help="Held-out frames to judge with."
 )
 @click.option("--jobs", type=click.IntRange(min=1), help="Artifacts at a time [default: all cores].")
+@click.option("--peers", is_flag=True, help="Count ONNX Runtime, ExecuTorch and others beside them.")
+@click.option("--details", is_flag=True, help="Count the static policy part by part too, and what else was tried.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def arm(run_dir: Path, frames: int, jobs: int | None, as_json: bool) -> None:
+def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, details: bool, as_json: bool) -> None:
     """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
 
-    A count, never a time. Needs Debian 12 with qemu-user and gcc, which are installed when you are root.
+    A count, never a time. Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of params.yml
+    hold. Needs Debian 12 with qemu-user and gcc, which are installed when you are root.
     """
+    from rover_lib.onboard.stage import read_stage
     from rover_lib.workshop.arm import count_run, table
+    from rover_lib.workshop.run import execute
 
-    content = count_run(run_dir, frames=frames, jobs=jobs, progress=progress())
+    count_run(run_dir, frames=frames, jobs=jobs, progress=progress())
+    if peers:
+        from rover_lib.workshop.peers import count_peers
+
+        count_peers(run_dir, jobs=jobs, progress=progress())
+    if details:
+        from rover_lib.workshop.parts import count_parts
+        from rover_lib.workshop.tries import count_tries
+
+        count_parts(run_dir, progress=progress())
+        count_tries(run_dir, progress=progress())
+    execute("06_arm", run_dir)
+    content = read_stage(run_dir / "arm.json", "arm")
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
 
 
@@ -287,6 +304,35 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
     from rover_lib.playground.train import train as train_policy
 
     click.echo(f"trained: {train_policy(episodes, output, progress=progress(), **options)}")
+
+
+@main.command("leave-out")
+@click.argument("run_dir", type=FILE)
+@click.option("--frames", type=click.IntRange(min=1), default=100, show_default=True, help="Held-out frames.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def leave_out(run_dir: Path, frames: int, as_json: bool) -> None:
+    """Report what each layer and head of RUN_DIR's policy costs, and what leaving it out does to the actions.
+
+    A report only, in float: nothing is left out of any artifact. Leaves leave_out.json in RUN_DIR.
+    """
+    from rover_lib.workshop.ablation import report, table
+
+    content = report(run_dir, frames, progress())
+    click.echo(json.dumps(content, indent=2) if as_json else table(content))
+
+
+@world.command()
+@click.argument("run_dir", type=FILE)
+@click.option("--samples", type=click.IntRange(min=1), default=64, show_default=True, help="Calibration samples.")
+@click.option("--steps", type=click.IntRange(min=1), default=24, show_default=True, help="Training steps.")
+def full(run_dir: Path, **options: Any) -> None:
+    """Make a policy of the real car's size in RUN_DIR, and artifacts of it at several image sizes, for `rover arm`.
+
+    Real in format, size and ranges, but trained for a few steps only: it does not drive.
+    """
+    from rover_lib.playground.full import NOTE, full_run
+
+    click.echo(f"made: {full_run(run_dir, progress=progress(), **options)} ({NOTE})")
 
 
 @world.command()

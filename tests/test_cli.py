@@ -22,10 +22,13 @@ def rover(*args):
         ["quantize"],
         ["compare"],
         ["benchmark"],
+        ["arm"],
+        ["leave-out"],
         ["world"],
         ["world", "record"],
         ["world", "train"],
         ["world", "trial"],
+        ["world", "full"],
     ],
     ids=" ".join,
 )

@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -33,22 +34,25 @@ from threading import Event, Lock
 from typing import Any
 
 import numpy as np
+import torch
 
-from rover_lib.onboard.artifact import read_manifest
+from rover_lib.onboard.artifact import content_hash, read_manifest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy import load_policy
-from rover_lib.onboard.stage import sha256_of, write_stage
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from rover_lib.workshop import quantize as q
 from rover_lib.workshop.cache import cached_folder, key_of
-from rover_lib.workshop.compare import Fidelity, thinned
+from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.compare import Fidelity, gate, thinned
 from rover_lib.workshop.params import params
-from rover_lib.workshop.session import SMALL_GMAC, opened
+from rover_lib.workshop.session import opened
 
 REPOSITORY = Path(__file__).parents[2]
 PLUGIN = REPOSITORY / "emulated" / "count.c"
 GUEST = REPOSITORY / "emulated" / "guest.py"
 REQUIREMENTS = REPOSITORY / "requirements_pi.txt"
 
-REFERENCE = "policy_fp32"
+REFERENCE, STATIC = "policy_fp32", "policy_static"
 LABEL = "counted on an emulated Cortex-A76"
 NEEDS = {"qemu-aarch64": "qemu-user", "gcc": "gcc", "c++filt": "binutils"}  # command: its Debian package
 HEADERS = {"/usr/include/stdio.h": "libc6-dev"}
@@ -71,9 +75,38 @@ SDOT_MACS = 16  # multiply-accumulates of one SDOT: the floor is as if nothing e
 COUNTED = 10  # inferences after loading, each for itself
 STEADY = 3  # the first whose count is what all later ones cost
 FRAMES = 50
+SLOW_GMAC = 1.0  # FP32 of more takes a minute and a half per emulated inference, so that few frames must do
+BIT_FRAMES = 4
 KERNELS = 30  # named in the report, the rest summed up
 SAMPLE_S = 0.2  # the emulator's own memory grows slowly
-SILENCE_S = 1200  # one emulated inference of the full policy in FP32 takes about a minute
+SILENCE_S = 1200  # of its processor's time: loading the full policy in FP32 takes five minutes without a word
+WAITING = 6  # times as long by the clock, on a machine that has more to do
+
+PI5_CORES, PI5_GHZ, SIMD_PER_CYCLE = 4, 2.4, 2
+PUBLISHED_GMAC_PER_S = 207  # ResNet18 at 224x224 in INT8, ExecuTorch with XNNPACK, 8.75 ms p50 on a Pi 5
+LOOP_PER_SDOT = 80 / 64  # instructions of XNNPACK's inner loop per SDOT, counted here
+IPC_SEEN = PUBLISHED_GMAC_PER_S / SDOT_MACS / (PI5_CORES * PI5_GHZ) * LOOP_PER_SDOT
+PREDICTED = (
+    f"low: SIMD instructions / ({SIMD_PER_CYCLE} per cycle x {PI5_CORES} cores x {PI5_GHZ} GHz); "
+    f"high: all instructions / ({IPC_SEEN:.2f} per cycle x {PI5_CORES} cores x {PI5_GHZ} GHz)"
+)
+
+SAME_POLICY = 0.01  # of the multiply-accumulates: the instructions' gates are for one policy
+# What kernels do, by their names; the first that matches counts.
+INT8_SDOT, INT8_OTHER, REST = "INT8 products: SDOT", "INT8 products: all else", "rest"
+GROUPS = (
+    (
+        INT8_OTHER,
+        r"with SDOT|xnn_q\w*(gemm|conv)|neondot|q8(gemm|conv)|Mlas\w*(GemmQuant|Gemm[SU]8|QGemm|Qgemm|ConvSym|ConvDw)",
+    ),
+    ("float products", r"sgemm_(kernel|nn|nt|tn|tt)|sgemv|arm_gemm|xnn_f32\w*(gemm|conv)|Mlas\w*Gemm"),
+    ("softmax and exp", r"exp(f|_|\d|minus|on)|[Ss]oftmax|attention"),
+    ("LayerNorm", r"[Ll]ayer_?[Nn]orm|RowwiseMoments"),
+    ("to and from INT8", r"[Qq]uantize|lrintf|vcvt"),
+    ("the frame (OpenCV)", r"^\[cv2"),
+    ("copies", r"[Cc]opy|mem(set|move)|im2col|unfold|[Tt]ranspose|indirection|(?<![Nn])[Pp]ack(?!ag)|^\[libc"),
+    ("element-wise", r"VectorizedLoop|vectorized_loop|max_?pool|v(add|mul|clamp|max)|(add|mul|relu|clamp)\w*_kernel"),
+)
 
 BLOCK = np.dtype([(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot")])  # as in count.c
 SECTION = np.dtype("<u4,<u4,<u8,<u8,<u8,<u8,<u4,<u4,<u8,<u8")  # of an ELF file
@@ -248,8 +281,8 @@ def emulate(
     """Run an aarch64 program to its end, one core, and read the counts that it marked (see emulated/count.c).
 
     folder: for the counts, and what the program leaves. on_line: told each line on its stdout. stop: ends it when set.
-    Raises ArmError with the end of its stderr if it fails, or says nothing for SILENCE_S; whatever ends this, the
-    emulator ends with it.
+    Raises ArmError with the end of its stderr if it fails, or says nothing for SILENCE_S of its processor's time;
+    whatever ends this, the emulator ends with it.
     """
     qemu = [*_qemu(machine.root), "-plugin", f"{machine.plugin},folder={folder}", *command]
     peak: dict[str, float] = defaultdict(float)
@@ -268,7 +301,7 @@ def emulate(
             raise ArmError(f"the emulator does not start: {e}") from None
         try:
             readable.register(process.stdout, selectors.EVENT_READ)
-            heard = time.monotonic()
+            heard, heard_cpu_s = time.monotonic(), 0.0
             while True:
                 ready = readable.select(SAMPLE_S)
                 if stop and stop.is_set():
@@ -277,12 +310,13 @@ def emulate(
                 peak[step] = max(peak[step], peak_mb - outside_mb)
                 emulator_mb = outside_mb or emulator_mb
                 if not ready:
-                    if time.monotonic() - heard > SILENCE_S:
+                    silent_s = max(_cpu_s(process.pid) - heard_cpu_s, (time.monotonic() - heard) / WAITING)
+                    if silent_s > SILENCE_S:
                         raise ArmError(
                             f"the emulated program said nothing for {SILENCE_S} s after {step or 'its start'}"
                         )
                     continue
-                heard = time.monotonic()
+                heard, heard_cpu_s = time.monotonic(), _cpu_s(process.pid)
                 content = os.read(process.stdout.fileno(), 65536)
                 if not content:
                     break
@@ -307,7 +341,8 @@ def emulate(
 
 def _qemu(root: Path) -> list[str]:
     place = ["-B", hex(GUEST_BASE), "-R", hex(GUEST_SIZE)]
-    return ["qemu-aarch64", "-L", str(root), "-cpu", "cortex-a76", *place]
+    # setpriv: whoever started it may be killed before it can end its emulator
+    return ["setpriv", "--pdeathsig", "KILL", "qemu-aarch64", "-L", str(root), "-cpu", "cortex-a76", *place]
 
 
 def _environment(root: Path, home: Path) -> dict[str, str]:
@@ -343,6 +378,15 @@ def _memory_mb(pid: int) -> tuple[float, float]:
         elif not line[0].isupper():  # a mapping's addresses; the lines about it start in capitals
             in_guest = GUEST_BASE <= int(line.partition("-")[0], 16) < GUEST_BASE + GUEST_SIZE
     return (int(peak[1]) * 1024 / 1e6, outside_kb * 1024 / 1e6) if peak else (0.0, 0.0)
+
+
+def _cpu_s(pid: int) -> float:
+    """Processor time that a process has used; 0 if it ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _forget_peak(pid: int) -> None:
@@ -501,11 +545,7 @@ def count_artifact(
     artifact = Path(artifact).resolve()
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:
         folder = Path(scratch)
-        environment = _environment(machine.root, folder)
-        environment["PYTHONPATH"] += f":{REPOSITORY}"
-        environment["PYTHONDONTWRITEBYTECODE"] = "1"  # nothing of the emulated Python goes into the checkout
-        command = [machine.root / "usr" / "bin" / f"python{PYTHON}", GUEST, artifact]
-        command += [write_observations(folder / "observations.npz", samples), folder, str(counted)]
+        observations = write_observations(folder / "observations.npz", samples)
         before = ""
 
         def on_line(line: str) -> None:
@@ -514,7 +554,8 @@ def count_artifact(
                 on_step()
             before = line
 
-        done = emulate(machine, command, folder, environment=environment, on_line=on_line, stop=stop)
+        arguments = [artifact, observations, folder, str(counted)]
+        done = emulate_script(machine, GUEST, arguments, folder, on_line=on_line, stop=stop)
         return Counted(
             load=done.total(0),
             inferences=tuple(done.total(i) for i in range(1, counted + 1)),
@@ -529,14 +570,25 @@ def count_artifact(
         )
 
 
+def emulate_script(machine: Machine, script: Path, arguments: Sequence[Any], folder: Path, **options: Any) -> Emulation:
+    """`emulate` a Python script of ours in the emulated Pi, with rover_lib. options: of `emulate`."""
+    environment = _environment(machine.root, folder)
+    environment["PYTHONPATH"] += f":{REPOSITORY}"
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # nothing of the emulated Python goes into the checkout
+    command = [machine.root / "usr" / "bin" / f"python{PYTHON}", script, *map(str, arguments)]
+    return emulate(machine, command, folder, environment=environment, **options)
+
+
 def count_run(
     run_dir: Path | str, *, frames: int = FRAMES, jobs: int | None = None, progress: Progress = None
 ) -> dict[str, Any]:
     """Count every artifact of a run, write its arm.json and return what is in it.
 
-    Judged on `frames` of the run's held-out frames: each artifact's error against the FP32 artifact of its size, both
-    computed in the emulated Pi, and the same of this machine beside it. FP32 of a large policy takes minutes per frame
-    there: it is then computed there on a few frames, held against this machine's, and this machine's is the reference.
+    Judged on `frames` of the run's held-out frames: what each artifact predicts in the emulated Pi against what the
+    FP32 artifact of its image size predicts on this machine, and the same of this machine's predictions beside it.
+    FP32 takes up to minutes per frame there: it predicts a few frames there too, and must give what it gives here, to
+    the parity vectors' tolerance. An artifact of an image size without an FP32 is counted only. Of policy_static also
+    the bits that its INT8 backbone gives are compared (see `backbone_bits`).
     jobs: artifacts at a time, each in one thread and below 1 GB; the machine's cores if None. Raises ArmError, or what
     reading the run raises.
     """
@@ -552,42 +604,58 @@ def count_run(
         raise ArmError(f"{run_dir}: its recordings have no held-out frames to judge with; record more episodes")
     machine = prepare(progress)
     plans = {}
-    for stem, manifest in manifests.items():
-        slow = stem in references.values() and manifest["gmac"] >= SMALL_GMAC
-        plans[stem] = (samples[:STEADY], STEADY) if slow else (samples, COUNTED)
+    # What takes longest begins first, so that no core waits for it in the end.
+    for stem in sorted(artifacts, key=lambda stem: (stem not in references.values(), -manifests[stem]["gmac"])):
+        plans[stem] = _plan(stem, references, manifests[stem], samples)
     counts = _count_all(machine, artifacts, plans, jobs or os.cpu_count() or 1, progress)
-    here = {stem: _chunks_here(path, samples, progress) for stem, path in artifacts.items()}
-    there = {stem: c.chunks for stem, c in counts.items()}
-    differences = {}
-    for stem in set(references.values()):
-        both = len(there[stem])
-        differences[stem] = float(np.abs(there[stem] - here[stem][:both]).max())
-        if both < len(samples):
-            if not differences[stem] <= params()["parity"]["fp32"]:
-                raise ArmError(f"{artifacts[stem]}: differs by {differences[stem]:.2g} on the core; quantize again")
-            there[stem] = here[stem]
+    found = {stem: artifact_metrics(counted, manifests[stem]) for stem, counted in counts.items()}
+    at = {stem: [i for i, s in enumerate(samples) if any(s is p for p in plans[stem][0])] for stem in plans}
+    here, differences = {}, {}
+    for stem in {r for r in references.values() if r}:
+        here[stem] = _chunks_here(artifacts[stem], samples, progress)
+        differences[stem] = float(np.abs(counts[stem].chunks - here[stem][at[stem]]).max())
+        if not differences[stem] <= params()["parity"]["fp32"]:
+            raise ArmError(f"{artifacts[stem]}: differs by {differences[stem]:.2g} on the core; quantize again")
     ranges = again.recordings.action_range()
-    found = {}
-    for stem, counted in counts.items():
-        names, reference = manifests[stem]["action_names"], references[stem]
-        errors = errors_pct(there[reference], there[stem], names, ranges)
-        at_home = errors_pct(here[reference], here[stem], names, ranges)
-        found[stem] = artifact_metrics(counted, manifests[stem]) | errors
-        found[stem] |= {f"workstation_{key}": value for key, value in at_home.items()}
-        found[stem] |= {"reference": reference, "frames": len(samples), "frames_on_the_core": len(counted.chunks)}
+    for stem, reference in references.items():
+        if reference is None:
+            continue
+        names, expected = manifests[stem]["action_names"], here[reference][at[stem]]
+        is_reference = stem == reference
+        at_home = expected if is_reference else _chunks_here(artifacts[stem], plans[stem][0], progress)
+        found[stem] |= errors_pct(expected, counts[stem].chunks, names, ranges)
+        found[stem] |= {f"workstation_{k}": v for k, v in errors_pct(expected, at_home, names, ranges).items()}
+        found[stem] |= {"reference": reference, "frames_on_the_core": len(at[stem])}
         found[stem]["reference_max_difference"] = differences[reference]
+    metrics: dict[str, Any] = {"label": LABEL, "artifacts": dict(sorted(found.items()))}
+    if (run_dir / "load.json").exists() and (note := read_stage(run_dir / "load.json", "load")["metrics"].get("note")):
+        metrics["note"] = note
+    if STATIC in artifacts:
+        few = thinned(samples, BIT_FRAMES)
+        metrics["backbone_bits"] = backbone_bits(run_dir, machine, again.checkpoint, few)
+    metrics["gates"] = gates(metrics, params()["arm"]["gates"])
     how = {"frames": len(samples), "steady": STEADY, "cpu": "cortex-a76", "threads": 1}
     how["qemu"] = _call(["qemu-aarch64", "--version"], "the emulator does not run").splitlines()[0]
     inputs = {p.name: sha256_of(p) for p in artifacts.values()}
-    metrics = {"label": LABEL, "artifacts": found}
     return write_stage(run_dir / "arm.json", "arm", params=how, metrics=metrics, inputs=inputs)
 
 
-def reference_of(stem: str, artifacts: Iterable[str]) -> str:
-    """The FP32 artifact to judge by: policy_static_180x320 by policy_fp32_180x320 if there is one, or policy_fp32."""
+def reference_of(stem: str, artifacts: Iterable[str]) -> str | None:
+    """The FP32 artifact to judge by: policy_static_180x320 by policy_fp32_180x320, or by none if that is not there."""
     size = re.search(r"_\d+x\d+$", stem)
     own = REFERENCE + (size.group() if size else "")
-    return own if own in artifacts else REFERENCE
+    return own if own in artifacts else None
+
+
+def _plan(
+    stem: str, references: dict[str, str | None], manifest: dict[str, Any], samples: Sequence[Any]
+) -> tuple[Sequence[Any], int]:
+    """Which samples an artifact predicts in the emulated Pi, and how many inferences are counted one by one."""
+    if references[stem] is None or (stem == references[stem] and manifest["gmac"] >= SLOW_GMAC):
+        return samples[:STEADY], STEADY
+    # FP32 is only held against this machine's, and nobody would drive a Pi with dynamic: both are slow.
+    few = stem == references[stem] or manifest["mode"] == "dynamic"
+    return (thinned(samples, COUNTED) if few else samples), COUNTED
 
 
 def _count_all(
@@ -634,10 +702,49 @@ def errors_pct(
     return {f"{action}_mae_pct": float(mean[i] * report.pct(action)) for i, action in enumerate(actions)}
 
 
+def backbone_bits(
+    run_dir: Path | str,
+    machine: Machine,
+    checkpoint: Checkpoint,
+    samples: Sequence[Any],
+) -> dict[str, int]:
+    """Whether policy_static's INT8 backbone gives the same bits in the emulated Pi as on this machine.
+
+    The backbone (up to the image projection's INT8 output) is cut out of the same graph, made again from the run's
+    calibration, and run on prepared frames on both. Returns {frames, values, differing}: so many values were compared,
+    so many are not the same. Raises ArmError if the run's files are not those that policy_static.pt was made from.
+    """
+    run_dir = Path(run_dir)
+    stage = read_stage(run_dir / "quantize.json", "quantize")
+    made, calibrated = stage["metrics"]["modes"]["static"], run_dir / "calibration.pt"
+    found = content_hash(run_dir / f"{STATIC}.pt"), sha256_of(calibrated)
+    if found != (made["content_hash"], stage["inputs"]["calibration.pt"]):
+        raise ArmError(f"{run_dir}: {STATIC}.pt and calibration.pt are not those of quantize.json; quantize again")
+    scheme = q.Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
+    backbone = q.backbone_of(q.quantize(checkpoint, scheme, q.Calibration.load(calibrated))).eval()
+    inputs = [q.inputs_of(s, checkpoint.config) for s in samples]
+    with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch, torch.inference_mode():
+        folder = Path(scratch)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the trace: shapes are constants here, and meant to be
+            traced = torch.jit.freeze(torch.jit.trace(backbone, inputs[0], check_trace=False).eval())
+        traced.save(folder / "backbone.pt")
+        frames = {f"frame_{i:04d}": frame.numpy() for i, (_, frame) in enumerate(inputs)}
+        np.savez(folder / "inputs.npz", state=torch.cat([state for state, _ in inputs]).numpy(), **frames)
+        with torch.jit.optimized_execution(False):
+            here = torch.cat([traced(*x) for x in inputs]).numpy()
+        emulate_script(machine, GUEST, ["--backbone", q.ENGINE, "backbone.pt", "inputs.npz"], folder)
+        there = np.load(folder / "backbone.npy")
+    if (here.dtype, here.shape) != (there.dtype, there.shape):
+        raise ArmError(f"the backbone gives {there.dtype} {there.shape} on the core and {here.dtype} {here.shape} here")
+    return {"frames": len(here), "values": here.size, "differing": int((there != here).sum())}
+
+
 def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, Any]:
     """What arm.json says of one artifact; _g are 10**9 instructions. The floor is SDOT alone, for every mode."""
     floor_g = manifest["gmac"] / SDOT_MACS
     inferences_g = [n / 1e9 for n in counted.inferences]
+    low_ms, high_ms = predicted_ms(counted.simd / 1e9, counted.steady / 1e9)
     return {
         "instructions_g": counted.steady / 1e9,
         "simd_g": counted.simd / 1e9,
@@ -648,6 +755,9 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
         "second_g": inferences_g[1],
         "tenth_g": inferences_g[9] if len(inferences_g) >= 10 else None,
         "load_instructions_g": counted.load / 1e9,
+        "gmac": manifest["gmac"],
+        "image_height": manifest["cameras"][0]["height"],
+        "image_width": manifest["cameras"][0]["width"],
         "instructions_by_kernel": {name: row[0] / 1e9 for name, row in counted.kernels.items()},
         "simd_by_kernel": {name: row[1] / 1e9 for name, row in counted.kernels.items()},
         "sdot_by_kernel": {name: row[2] / 1e9 for name, row in counted.kernels.items()},
@@ -656,23 +766,112 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
         "emulator_memory_mb": counted.emulator_mb,
         "threads": counted.versions["threads"],
         "versions": counted.versions,
+        "computed_pi5_ms": {"low": low_ms, "high": high_ms, "formula": PREDICTED},
     }
 
 
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def predicted_ms(simd_g: float, instructions_g: float) -> tuple[float, float]:
+    """A range for the time of one inference on a Raspberry Pi 5, in ms, computed from counts. Nothing here was timed.
+
+    low: the SIMD instructions alone at two per cycle, which is what a Cortex-A76 can issue (Arm's optimisation guide),
+    on four cores at 2.4 GHz, all of them always busy. No program with this count can be faster.
+    high: all instructions at the rate that such kernels have been seen to reach on a Pi 5. Published: ResNet18 at
+    224x224 with XNNPACK's INT8 kernels in 8.75 ms, which is 207 GMAC/s, 67 % of the chip's SDOT peak, or 1.35 SDOT per
+    cycle and core. Their inner loop executes 80 instructions for 64 SDOT, hence 1.68 instructions per cycle (more, if
+    what is outside the loop is counted too).
+    Not known, and in neither: how evenly the work divides over four threads, waiting for memory (the published network
+    has 11 MB of weights, the full policy 66), and whether float kernels, which are most of FP32's, reach that rate. So
+    high is a careful estimate and no bound.
+    """
+    cycles_per_ms = PI5_CORES * PI5_GHZ * 1e6
+    return simd_g * 1e9 / (SIMD_PER_CYCLE * cycles_per_ms), instructions_g * 1e9 / (IPC_SEEN * cycles_per_ms)
+
+
+def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any]]:
+    """What static artifacts must reach, as `compare.gate` rows. metrics: of arm.json; limits: params.yml's arm.gates.
+
+    A gate that this run has no artifact for is left out: the instructions are for the user's policy, known by its
+    multiply-accumulates. Errors are held against this machine's: as many times, the worse of the actions.
+    """
+    rows = []
+    for stem, found in metrics["artifacts"].items():
+        known = limits["policies"].get(stem, {})
+        if known and abs(found["gmac"] / known["gmac"] - 1) < SAME_POLICY:
+            rows += [gate(f"{stem} {key}", found[key], "<=", known[key]) for key in known if key != "gmac"]
+        if not re.fullmatch(rf"{STATIC}(_\d+x\d+)?", stem) or found.get("reference") is None:
+            continue
+        home = {k.removeprefix("workstation_"): v for k, v in found.items() if k.startswith("workstation_")}
+        worse = max(found[k] / at_home if at_home else float("inf") for k, at_home in home.items())
+        off_pct = 100 * abs(found["tenth_g"] / found["instructions_g"] - 1)
+        rows += [
+            gate(f"{stem} error, times the workstation's", worse, "<=", limits["x_workstation_error"]),
+            gate(f"{stem} frames judged on the core", found["frames_on_the_core"], ">=", limits["frames"]),
+            gate(f"{stem} tenth inference off the third, %", off_pct, "<=", limits["tenth_pct"]),
+            gate(f"{stem} peak_memory_mb", found["peak_memory_mb"], "<=", limits["peak_memory_mb"]),
+            gate(
+                f"{stem} peak_memory_loading_mb",
+                found["peak_memory_loading_mb"],
+                "<=",
+                limits["peak_memory_loading_mb"],
+            ),
+        ]
+    if bits := metrics.get("backbone_bits"):
+        rows.append(
+            gate(f"{STATIC} backbone values that differ", bits["differing"], "<=", limits["backbone_differing"])
+        )
+    return rows
+
+
+def group_kernels(found: dict[str, Any]) -> dict[str, float]:
+    """An artifact's or a peer's instructions by what they do, 10**9 each, in a fixed order; the sum is instructions_g.
+
+    found: with instructions_by_kernel and, to part a product's SDOT from what feeds it, sdot_by_kernel.
+    """
+    groups = dict.fromkeys((INT8_SDOT, *(name for name, _ in GROUPS), REST), 0.0)
+    sdot = found.get("sdot_by_kernel", {})
+    for kernel, instructions_g in found["instructions_by_kernel"].items():
+        group = next((name for name, pattern in GROUPS if re.search(pattern, kernel)), REST)
+        products_g = sdot.get(kernel, 0.0) if group == INT8_OTHER else 0.0
+        groups[INT8_SDOT] += products_g
+        groups[group] += instructions_g - products_g
+    return groups
+
+
 def table(content: dict[str, Any]) -> str:
-    """arm.json for people: one line per artifact, fewest instructions first."""
+    """arm.json for people: the counts, fewest instructions first; the computed time by itself; the gates."""
+    metrics = content["metrics"]
+    counted = metrics["artifacts"] | {n: m for n, m in metrics.get("peers", {}).items() if "artifact" not in m}
+    rows = sorted(counted.items(), key=lambda item: item[1]["instructions_g"])
+    wide = max(24, *(len(stem) for stem in counted))
     lines = [
         f"{LABEL}, G instructions per inference; errors against FP32 in percent of the recorded range",
-        f"{'':24} {'steady':>7} {'SIMD':>7} {'x floor':>7} {'first':>7} {'tenth':>7} {'load':>7}"
-        f" {'MB':>6} {'loading':>7} {'steering':>8} {'throttle':>8}",
+        f"{'':{wide}} {'steady':>7} {'SIMD':>7} {'x floor':>7} {'first':>7} {'tenth':>7} {'load':>7}"
+        f" {'MB':>6} {'loading':>7} {'steering':>8} {'throttle':>8} {'frames':>6}",
     ]
-    found = content["metrics"]["artifacts"]
-    for stem, m in sorted(found.items(), key=lambda item: item[1]["instructions_g"]):
-        tenth = "-" if m["tenth_g"] is None else f"{m['tenth_g']:.4g}"
-        errors = [f"{m[k]:8.3f}" for k in ("steering_mae_pct", "throttle_mae_pct") if m.get(k) is not None]
-        lines.append(
-            f"{stem:24} {m['instructions_g']:7.4g} {m['simd_g']:7.4g} {m['x_floor']:7.2f}"
-            f" {m['first_g']:7.4g} {tenth:>7} {m['load_instructions_g']:7.4g}"
-            f" {m['peak_memory_mb']:6.0f} {m['peak_memory_loading_mb']:7.0f} {' '.join(errors)}"
-        )
+    columns = ("instructions_g", "simd_g", "x_floor", "first_g", "tenth_g", "load_instructions_g")
+    columns += ("peak_memory_mb", "peak_memory_loading_mb", "steering_mae_pct", "throttle_mae_pct")
+    columns += ("frames_on_the_core",)
+    for stem, m in rows:
+        cells = zip(columns, (7, 7, 7, 7, 7, 7, 6, 7, 8, 8, 6), strict=True)
+        lines.append(" ".join([f"{stem:{wide}}", *(_cell(m.get(key), key, width) for key, width in cells)]))
+    lines += ["", f"computed from these counts for a Raspberry Pi 5, ms, never timed ({PREDICTED})"]
+    for stem, m in rows:
+        low, high = predicted_ms(m["simd_g"], m["instructions_g"])
+        lines.append(f"{stem:{wide}} {low:7.3g} to {high:.3g}")
+    if note := metrics.get("note"):
+        lines += ["", f"note: {note}"]
+    if metrics.get("gates"):
+        lines += ["", "gates (params.yml)"]
+        for row in metrics["gates"]:
+            verdict = {True: "pass", False: "FAIL", None: "not measured"}[row["passed"]]
+            shown = "-" if row["found"] is None else f"{row['found']:.4g}"
+            lines.append(f"{row['gate']:56} {shown:>8} {row['relation']} {row['limit']:<6g} {verdict}")
     return "\n".join(lines)
+
+
+def _cell(value: float | None, key: str, width: int) -> str:
+    form = ".3f" if key.endswith("_pct") else ".0f" if key.endswith("_mb") else ".2f" if key == "x_floor" else ".4g"
+    return f"{'-' if value is None else format(value, form):>{width}}"

@@ -7,7 +7,7 @@ import json
 import re
 import zipfile
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,8 @@ TRAINER_KEYS = {  # of the trainer's config: what the shape of the policy needs
 }  # fmt: skip
 TRAINER_CAMERA = "cam_front"
 TWO_ACTIONS = ("steering", "throttle")
+FEATURE_PX = 32  # a ResNet sees one feature per so many pixels a side
+SQUEEZED = 0.05  # of the aspect ratio: 432x240 for 640x360 is 0.013
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,31 @@ class Checkpoint:
     weights: dict[str, Tensor] = field(repr=False)
     sha256: str  # of the trainer's file, or of model.safetensors
     report: dict[str, Any] = field(repr=False)
+
+    def at_size(self, height: int, width: int) -> "Checkpoint":
+        """The same weights for images of another size, in pixels: none of ACT's weights depends on it.
+
+        Positions are normalised to the feature map, so the policy runs at any size; how well it still drives is to be
+        measured. Raises CheckpointError for several cameras, for less than one feature (32 pixels) a side, and for
+        another aspect ratio (by more than 5 %), because the picture would be squeezed.
+        """
+        if len(self.config.cameras) != 1:
+            raise CheckpointError(
+                f"{self.path}: has {len(self.config.cameras)} cameras; another size is only known for one"
+            )
+        if not all(isinstance(n, int) and not isinstance(n, bool) for n in (height, width)):
+            raise CheckpointError(f"an image size must be two whole numbers, found {height!r} and {width!r}")
+        if min(height, width) < FEATURE_PX:
+            raise CheckpointError(
+                f"an image of {width}x{height} is smaller than one feature of the backbone; use at least {FEATURE_PX}"
+            )
+        ((trained_height, trained_width),) = self.config.image_sizes
+        if abs(width * trained_height / (height * trained_width) - 1) > SQUEEZED:
+            raise CheckpointError(
+                f"an image of {width}x{height} has another aspect ratio than {trained_width}x{trained_height}, which "
+                "the policy was trained with; choose one that squeezes the picture by less than 5 %"
+            )
+        return replace(self, config=replace(self.config, image_sizes=((height, width),)))
 
 
 def load_checkpoint(path: Path | str) -> Checkpoint:

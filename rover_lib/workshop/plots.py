@@ -6,6 +6,7 @@ Colours are Okabe and Ito's, which colour-blind people can tell apart; a mode ha
 Figures are drawn for a notebook's width at 100 dots per inch.
 """
 
+import re
 import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.table import Table
 
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.workshop.compare import Fidelity
@@ -51,11 +53,14 @@ NAMES = {
     "mixed": "mixed",
     "static_affine": "static, affine",
     "lerobot": "LeRobot, eager FP32",
+    "torch_affine": "torch, affine",
+    "onnxruntime": "ONNX Runtime INT8",
+    "executorch": "ExecuTorch INT8",
 }
 
 # Instructions of one inference of the full policy (15.02 GMAC, 360x640), in 1e9: label, all, SIMD among them.
-# Counted on an emulated Cortex-A76, one thread, third inference: ours by workshop.arm, on random weights; the others in
-# the experiment that it grew from, with the same method. `make arm` counts the artifacts of a run.
+# What notebook 03 shows of a run that `make arm` has not counted. Source: runs/full/arm.json of
+# `make arm NAME=full PEERS=1`, committed with notebook 06; to be filled in from there and from nowhere else.
 COUNTED = (
     ("FP32, TorchScript", 6.10, 3.80),
     ("INT8 affine (quint8): QNNPACK's kernels", 5.35, 4.40),
@@ -371,20 +376,34 @@ def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
     return fig
 
 
-def instruction_counts() -> Figure:
-    """Why symmetric: instructions of one inference of the full policy, by what ran. Not measured in this run."""
-    fig, axes = _axes(1, height_in=3.0)
-    ax, y = axes[0, 0], np.arange(len(COUNTED))
-    total, simd = (np.array([row[i] for row in COUNTED]) for i in (1, 2))
-    ax.barh(y, simd, color=BLUE, label="SIMD (vector) instructions")
-    ax.barh(y, total - simd, left=simd, color=SKY, label="all others")
-    _values(ax, y, total, "{:.2f}")
-    ax.set_yticks(y, [row[0] for row in COUNTED])
+def instruction_counts(found: Mapping[str, Any] | None = None) -> Figure:
+    """Why symmetric: instructions of one inference, by what ran.
+
+    found: metrics of the run's arm.json; if None, the full policy's, as recorded in COUNTED.
+    """
+    rows, title = list(COUNTED), "full policy, 360x640, 15 GMAC; recorded, not of this run"
+    if found is not None:
+        counted = whole_size(found)
+        rows = [(NAMES.get(n, n), m["instructions_g"], m["simd_g"]) for n, m in counted.items()]
+        floor_g, gmac = (next(iter(counted.values()))[key] for key in ("floor_g", "gmac"))
+        rows.append(("dot-product instructions alone", floor_g, floor_g))
+        title = f"this run's artifacts, {gmac:.3g} GMAC"
+    fig, axes = _axes(1, height_in=1.2 + 0.36 * len(rows))
+    ax, y = axes[0, 0], np.arange(len(rows))
+    total, simd = (np.array([row[i] for row in rows]) for i in (1, 2))
+    _simd_bars(ax, y, total, simd)
+    ax.set_yticks(y, [row[0] for row in rows])
     ax.invert_yaxis()
     ax.set_xlabel("instructions of one inference (10^9)")
-    ax.set_title("counted on an emulated Cortex-A76: full policy, 360x640, 15 GMAC", fontsize=11)
+    ax.set_title(f"counted on an emulated Cortex-A76: {title}", fontsize=11)
     _legend(ax, loc="lower right")
     return fig
+
+
+def _simd_bars(ax: Axes, y: np.ndarray, total: np.ndarray, simd: np.ndarray) -> None:
+    ax.barh(y, simd, color=BLUE, label="SIMD (vector) instructions")
+    ax.barh(y, total - simd, left=simd, color=SKY, label="all others")
+    _values(ax, y, total, "{:.3g}")
 
 
 def errors_by_choice(table: Mapping[str, Mapping[str, float]], title: str, budget_pct: float | None = None) -> Figure:
@@ -611,15 +630,20 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> Figure:
         colLoc="left",
         bbox=(0, 0, 1, 1),
     )
+    _plain_table(table)
+    for (row, column), cell in table.get_celld().items():
+        if row and column == 3:
+            cell.set_facecolor(verdict[rows[row - 1]["passed"]][1])
+    return fig
+
+
+def _plain_table(table: Table) -> None:
     table.auto_set_font_size(False)
     table.set_fontsize(10)
-    for (row, column), cell in table.get_celld().items():
+    for (row, _), cell in table.get_celld().items():
         cell.set_edgecolor("#DDDDDD")
         if row == 0:
             cell.set_text_props(weight="bold")
-        elif column == 3:
-            cell.set_facecolor(verdict[rows[row - 1]["passed"]][1])
-    return fig
 
 
 def _limit(row: Mapping[str, Any]) -> str:
@@ -669,3 +693,113 @@ def latency(benchmarks: Sequence[Mapping[str, Any]]) -> Figure:
 def host_name(env: Mapping[str, Any]) -> str:
     """ "this machine" for the one that draws: a committed figure need not name it."""
     return "this machine" if env["host"] == socket.gethostname() else str(env["host"])
+
+
+# --- 06: the ruler --------------------------------------------------------------------------------
+
+NEAR = 2  # times the fewest instructions: shown once more, closer
+GROUP_COLOURS = (BLUE, SKY, BLACK, RED, PURPLE, ORANGE, "#F0E442", GREEN, "#8C6D31", GREY)
+
+
+def whole_size(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """Artifacts of the image size of training, by mode, and peers that are none of them, most instructions first.
+
+    metrics: of arm.json.
+    """
+    ours = {stem.removeprefix("policy_"): m for stem, m in metrics["artifacts"].items()}
+    ours = {mode: m for mode, m in ours.items() if not re.search(r"_\d+x\d+$", mode)}
+    counted = ours | {name: m for name, m in metrics.get("peers", {}).items() if "artifact" not in m}
+    return dict(sorted(counted.items(), key=lambda item: -item[1]["instructions_g"]))
+
+
+def counted(metrics: Mapping[str, Any]) -> Figure:
+    """Instructions against the floor, and beside them the error on the same core. metrics: of arm.json."""
+    rows = whole_size(metrics)
+    fig, axes = _axes(1, 2, height_in=1.4 + 0.4 * len(rows), sharey=True, width_ratios=(1.5, 1))
+    (left, right), y = axes[0], np.arange(len(rows))
+    total, simd = (np.array([m[key] for m in rows.values()]) for key in ("instructions_g", "simd_g"))
+    _simd_bars(left, y, total, simd)
+    floor_g = next(m["floor_g"] for m in rows.values())
+    left.axvline(floor_g, color=RED, ls="--", lw=1.2, label=f"floor: dot products alone, {floor_g:.2g}")
+    frames = max(m.get("frames_on_the_core") or 0 for m in rows.values())
+    left.set_yticks(y, [NAMES.get(n, n) for n in rows])
+    left.invert_yaxis()
+    left.set_xlabel("instructions of one inference (10^9)")
+    left.set_title("counted on an emulated Cortex-A76", fontsize=11)
+    keys = [k for k in next(iter(metrics["artifacts"].values())) if k.endswith("_mae_pct") and "workstation" not in k]
+    height = 0.8 / max(len(keys), 1)
+    for i, key in enumerate(keys):
+        # An error on other frames is another error: what was judged on fewer has no bar here.
+        judged = [at for at, m in enumerate(rows.values()) if m.get("frames_on_the_core") == frames and key in m]
+        known = [(at, list(rows.values())[at][key]) for at in judged]
+        at, values = [at + (i - (len(keys) - 1) / 2) * height for at, _ in known], [value for _, value in known]
+        right.barh(at, values, height, color=_action_colour(key, i), label=key.removesuffix("_mae_pct"))
+        _values(right, at, values, "{:.2f}")
+    right.set_xlabel("mean error against FP32\n(% of the recorded range)")
+    right.set_title(f"computed on it, {frames} frames", fontsize=11)
+    _legend(left, loc="lower right")
+    _legend(right, loc="upper right")
+    return fig
+
+
+def counted_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
+    """What the instructions do. groups: {artifact or peer: {group: 10**9 instructions}}, groups in one order."""
+    totals = {name: sum(found.values()) for name, found in groups.items()}
+    near = {name: found for name, found in groups.items() if totals[name] < NEAR * min(totals.values())}
+    panels = [groups, near] if 1 < len(near) < len(groups) else [groups]
+    rows = [len(shown) for shown in panels]
+    fig, axes = _axes(len(panels), height_in=1.3 + 0.5 * len(panels) + 0.36 * sum(rows), height_ratios=rows)
+    for ax, shown in zip(axes[:, 0], panels, strict=True):
+        y, left = np.arange(len(shown)), np.zeros(len(shown))
+        for colour, group in zip(GROUP_COLOURS, next(iter(shown.values())), strict=True):
+            width = np.array([found[group] for found in shown.values()])
+            ax.barh(y, width, left=left, color=colour, label=group)
+            left += width
+        _values(ax, y, left, "{:.3g}")
+        ax.set_yticks(y, [NAMES.get(n, n) for n in shown])
+        ax.invert_yaxis()
+    axes[0, 0].set_title("counted on an emulated Cortex-A76", fontsize=11)
+    if len(panels) > 1:
+        axes[1, 0].set_title("those of the fewest instructions, closer", fontsize=11)
+    axes[-1, 0].set_xlabel("instructions of one inference (10^9)")
+    _legend_below(fig, axes[0, 0], 4)
+    return fig
+
+
+def counted_by_size(metrics: Mapping[str, Any]) -> Figure:
+    """What a smaller image saves: static INT8 and its floor by image size. metrics: of arm.json."""
+    rows = [m for stem, m in metrics["artifacts"].items() if re.fullmatch(r"policy_static(_\d+x\d+)?", stem)]
+    rows.sort(key=lambda m: m["gmac"])
+    fig, axes = _axes(1, height_in=3.4)
+    ax, x = axes[0, 0], np.array([m["image_height"] * m["image_width"] for m in rows]) / 1e3
+    lines = (("instructions_g", BLUE, "o-", "all instructions"), ("simd_g", SKY, "s-", "SIMD instructions"))
+    for key, colour, style, label in (*lines, ("floor_g", RED, "--", "floor: dot products alone")):
+        ax.plot(x, [m[key] for m in rows], style, color=colour, lw=1.8, label=label)
+    for at, m in zip(x, rows, strict=True):
+        ax.annotate(f"{m['instructions_g']:.3g}", (at, m["instructions_g"]), (0, 7), textcoords="offset points",
+                    ha="center", fontsize=9)  # fmt: skip
+    ax.set_xticks(x, [f"{m['image_width']}x{m['image_height']}" for m in rows])
+    ax.set(ylim=(0, 1.12 * max(m["instructions_g"] for m in rows)), ylabel="instructions of one inference (10^9)")
+    ax.set_xlabel("image, width x height in pixels; the axis is in proportion to their number")
+    ax.set_title("static INT8, counted on an emulated Cortex-A76", fontsize=11)
+    ax.set_xlim(0, None)
+    _legend(ax, loc="lower right")
+    return fig
+
+
+def computed_times(metrics: Mapping[str, Any]) -> Figure:
+    """The computed range of a Raspberry Pi 5's time, in a table of its own. metrics: of arm.json."""
+    rows = sorted(metrics["artifacts"].items(), key=lambda item: -item[1]["instructions_g"])
+    cells = []
+    for stem, m in rows:
+        mode, time_ms = re.sub(r"^policy_|_\d+x\d+$", "", stem), m["computed_pi5_ms"]
+        size = f"{m['image_width']}x{m['image_height']}"
+        cells.append([NAMES.get(mode, mode), size, f"{time_ms['low']:.3g} to {time_ms['high']:.3g}"])
+    fig, axes = _axes(1, height_in=0.4 + 0.27 * (len(rows) + 1))
+    axes[0, 0].axis("off")
+    heads = ["artifact", "image", "computed time on a Pi 5 (ms), not measured"]
+    table = axes[0, 0].table(
+        cells, colLabels=heads, colWidths=(0.35, 0.2, 0.45), cellLoc="left", colLoc="left", bbox=(0, 0, 1, 1)
+    )
+    _plain_table(table)
+    return fig

@@ -31,6 +31,7 @@ from rover_lib.workshop.session import TTY_VARIABLE
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
+AFTERWARDS = ("06_arm",)  # of a run that is there, and of what `rover arm` found in it
 KERNEL_ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",  # rover_lib/__init__.py says why; a cell may import torch before it
     # Both are known, and noise in a stored output: QNNPACK ignores reduce_range, tqdm misses widgets.
@@ -112,11 +113,23 @@ def run(
     return folder
 
 
+def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:
+    """Execute one notebook on a run that is there; returns the executed one, in the run's folder.
+
+    Raises NotebookError, in one sentence with the notebook, the cell and its error; then an earlier one stays.
+    """
+    folder, source = Path(run_dir).resolve(), Path(notebooks) / f"{name}.ipynb"
+    if not source.is_file() or not folder.is_dir():
+        raise NotebookError(f"{folder if source.is_file() else source}: not found; run from a checkout, on a run of it")
+    _execute(source, folder, {"run_dir": str(folder), **overrides}, False)
+    return folder / source.name
+
+
 def _clear(folder: Path) -> None:
     """Remove what an earlier run left, so that no file of it can be taken for this one's."""
-    stages = ("load", "calibrate", "quantize", "compare", "arm", f"benchmark-{socket.gethostname()}")
+    stages = ("load", "calibrate", "quantize", "compare", "arm", "parts", f"benchmark-{socket.gethostname()}")
     old = [folder / f"{s}.json" for s in stages] + [folder / "calibration.pt", *folder.glob("policy_*.pt")]
-    for path in [*old, *(folder / f"{n}.ipynb" for n in NAMES)]:
+    for path in [*old, *(folder / f"{n}.ipynb" for n in NAMES + AFTERWARDS)]:
         path.unlink(missing_ok=True)
     shutil.rmtree(folder / "figures", ignore_errors=True)
 
@@ -183,15 +196,18 @@ def _subclasses(kind: type) -> set[type]:
 # --- publishing what they showed --------------------------------------------------------------------------------------
 
 
-def publish(run_dir: Path | str, notebooks_dir: Path | str = NOTEBOOKS) -> list[Path]:
+def publish(
+    run_dir: Path | str, notebooks_dir: Path | str = NOTEBOOKS, names: tuple[str, ...] | None = None
+) -> list[Path]:
     """Put a run's outputs into the repository's notebooks: no counts, no papermill metadata, no paths of this machine.
 
-    Cells are matched by id, and their sources must be the same. Large pictures get 256 colours. Raises NotebookError if
-    a notebook was not run, has changed since, still holds a path, or is larger than 1 MB; then nothing is written.
+    names: of the notebooks, without .ipynb; the five of a run if None. Cells are matched by id, and their sources must
+    be the same. Large pictures get 256 colours. Raises NotebookError if a notebook was not run, has changed since,
+    still holds a path, or is larger than 1 MB; then nothing is written.
     """
     run_dir, notebooks_dir = Path(run_dir).resolve(), Path(notebooks_dir).resolve()
     made = {}
-    for name in NAMES:
+    for name in NAMES if names is None else names:
         target, executed = notebooks_dir / f"{name}.ipynb", run_dir / f"{name}.ipynb"
         if not executed.is_file():
             raise NotebookError(f"{executed}: not there; execute the run first")

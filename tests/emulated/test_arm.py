@@ -3,14 +3,16 @@
 import os
 import struct
 import subprocess
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from policies import memory_samples
 
-from rover_lib.onboard.stage import read_stage
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import arm
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT
@@ -111,13 +113,6 @@ def test_kernels_are_summed_and_the_rest_is_other():
     assert found == {"bar": (100, 100, 0), "foo": (55, 20, 10), "other": (1, 0, 0)}
 
 
-def test_an_image_size_is_judged_by_fp32_of_its_own():
-    there = ("policy_fp32", "policy_fp32_180x320", "policy_static")
-    assert arm.reference_of("policy_static", there) == "policy_fp32"
-    assert arm.reference_of("policy_static_180x320", there) == "policy_fp32_180x320"
-    assert arm.reference_of("policy_static_240x432", there) == "policy_fp32"
-
-
 def test_packages_are_named_when_they_cannot_be_installed(monkeypatch):
     monkeypatch.setattr(arm, "missing_packages", lambda: ["qemu-user"])
     monkeypatch.setattr(arm.os, "geteuid", lambda: 1000)
@@ -135,21 +130,49 @@ def tiny_run(tiny_file, tmp_path_factory) -> Path:
     """A run's folder with two artifacts of the tests' small policy, always the same."""
     folder = tmp_path_factory.mktemp("run")
     checkpoint, samples = load_checkpoint(tiny_file), memory_samples(16)
+    scheme, options = q.Scheme("static"), {"samples": samples[:3]}
+    # Another image size, without an FP32 of its own.
+    small = checkpoint.at_size(54, 96)
+    calibration = q.calibrate(small, samples[:4])
+    static = q.quantize(small, scheme, calibration)
+    q.export(static, small, folder / "policy_static_54x96.pt", calibration=calibration, **options)
     calibration = q.calibrate(checkpoint, samples)
-    options = {"samples": samples[:3]}
+    calibration.save(folder / "calibration.pt")
     q.export(ACT(checkpoint.config, checkpoint.weights), checkpoint, folder / "policy_fp32.pt", **options)
-    static = q.quantize(checkpoint, q.Scheme("static"), calibration)
-    q.export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
+    static = q.quantize(checkpoint, scheme, calibration)
+    digest = q.export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
+    modes = {"static": {"scheme": asdict(scheme), "content_hash": digest}}
+    inputs = {"calibration.pt": sha256_of(folder / "calibration.pt")}
+    write_stage(folder / "quantize.json", "quantize", params={}, metrics={"modes": modes}, inputs=inputs)
     return folder
 
 
 @pytest.fixture(scope="module")
-def report(machine, tiny_run) -> dict:
-    """count_run on held-out frames from memory."""
+def again(tiny_file) -> SimpleNamespace:
+    """What `opened` would give: held-out frames from memory."""
     recordings = SimpleNamespace(action_range=lambda: {"steering": (-0.5, 0.5), "throttle": (0.0, 0.1)})
-    again = SimpleNamespace(parts=SimpleNamespace(held_out=memory_samples(12, seed=1)), recordings=recordings)
+    parts = SimpleNamespace(held_out=memory_samples(12, seed=1))
+    return SimpleNamespace(checkpoint=load_checkpoint(tiny_file), parts=parts, recordings=recordings)
+
+
+@pytest.fixture(scope="module")
+def counts() -> dict[str, arm.Counted]:
+    """What the emulated Pi said of each artifact of `report`."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def report(machine, tiny_run, again, counts) -> dict:
+    """count_run on held-out frames from memory."""
+    count_all = arm._count_all
+
+    def keep(*args):
+        counts.update(count_all(*args))
+        return counts
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(arm, "opened", lambda run_dir: again)
+        patch.setattr(arm, "_count_all", keep)
         return count_run(tiny_run, frames=12)
 
 
@@ -161,11 +184,90 @@ def test_a_run_is_counted(report, tiny_run):
     assert sum(static["instructions_by_kernel"].values()) == pytest.approx(static["instructions_g"])
     assert any("neondot" in kernel for kernel in static["instructions_by_kernel"])
     assert static["reference_max_difference"] < 1e-4
-    assert fp32["steering_mae_pct"] == fp32["throttle_mae_pct"] == 0
+    assert fp32["workstation_steering_mae_pct"] == fp32["workstation_throttle_mae_pct"] == 0
+    assert fp32["steering_mae_pct"] < 1e-3 and fp32["throttle_mae_pct"] < 1e-2  # another order of sums
+    assert fp32["frames_on_the_core"] == 10
     assert 0 < static["steering_mae_pct"] < 2 * static["workstation_steering_mae_pct"]
     assert 100 < static["peak_memory_mb"] < 500
-    assert static["threads"] == 1
+    assert static["threads"] == 1 and static["frames_on_the_core"] == 12
+    low_ms, high_ms = arm.predicted_ms(static["simd_g"], static["instructions_g"])
+    assert static["computed_pi5_ms"] == {"low": low_ms, "high": high_ms, "formula": arm.PREDICTED}
     assert "policy_static" in arm.table(report)
+
+
+def test_an_image_size_without_fp32_is_only_counted(report):
+    static, small = (report["metrics"]["artifacts"][f"policy_static{size}"] for size in ("", "_54x96"))
+    assert (small["image_height"], small["image_width"]) == (54, 96)
+    assert 0 < small["sdot_g"] < static["sdot_g"] and small["instructions_g"] < static["instructions_g"]
+    assert small["tenth_g"] is None and not [key for key in small if "mae" in key or "reference" in key]
+
+
+def test_gates_are_of_what_drives(report):
+    rows = {row["gate"]: row for row in report["metrics"]["gates"]}
+    assert not [name for name in rows if "instructions" in name or "54x96" in name or "fp32" in name]
+    assert not rows["policy_static frames judged on the core"]["passed"]
+    assert rows["policy_static peak_memory_mb"]["passed"] and rows["policy_static peak_memory_loading_mb"]["passed"]
+    assert rows["policy_static tenth inference off the third, %"]["passed"]
+
+
+def test_the_int8_backbone_is_the_same_bit_for_bit(report):
+    bits = report["metrics"]["backbone_bits"]
+    assert bits == {"frames": 4, "values": 4 * 64 * 3 * 4, "differing": 0}
+
+
+def test_bits_that_differ_are_found(machine, tiny_run, again, monkeypatch):
+    def flipped(_: Machine, folder: Path, arguments: list[str]) -> None:
+        torch.backends.quantized.engine = q.ENGINE
+        with np.load(folder / "inputs.npz") as seen, torch.inference_mode():
+            frame = torch.from_numpy(seen["frame_0000"])
+            found = torch.jit.load(folder / "backbone.pt")(torch.from_numpy(seen["state"]), frame).numpy()
+        found[0, 0, 0, 0] += 1
+        np.save(folder / "backbone.npy", found)
+
+    monkeypatch.setattr(arm, "_emulate_guest", flipped)
+    bits = arm.backbone_bits(tiny_run, machine, again.checkpoint, memory_samples(1))
+    assert bits == {"frames": 1, "values": 64 * 3 * 4, "differing": 1}
+
+
+def test_another_calibration_has_no_bits_to_compare(machine, tiny_run, again, tmp_path):
+    for name in ("policy_static.pt", "quantize.json"):
+        (tmp_path / name).write_bytes((tiny_run / name).read_bytes())
+    q.calibrate(again.checkpoint, memory_samples(4, seed=5)).save(tmp_path / "calibration.pt")
+    with pytest.raises(ArmError, match=r"calibration\.pt are not those of quantize\.json"):
+        arm.backbone_bits(tmp_path, machine, again.checkpoint, memory_samples(1))
+
+
+def test_a_slow_fp32_is_held_against_this_machines(report, tiny_run, again, counts, tmp_path, monkeypatch):
+    for path in tiny_run.glob("policy_*.pt"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+
+    def fewer(_, artifacts, plans, *args):
+        """The same emulated inferences, as many as are asked for."""
+        return {
+            stem: replace(c, chunks=c.chunks[: len(plans[stem][0])], inferences=c.inferences[: plans[stem][1]])
+            for stem, c in counts.items()
+        }
+
+    monkeypatch.setattr(arm, "opened", lambda run_dir: again)
+    monkeypatch.setattr(arm, "_count_all", fewer)
+    monkeypatch.setattr(arm, "backbone_bits", lambda *args: report["metrics"]["backbone_bits"])
+    monkeypatch.setattr(arm, "SLOW_GMAC", 0.0)
+    found = count_run(tmp_path, frames=12)["metrics"]["artifacts"]
+    fp32, static, before = found["policy_fp32"], found["policy_static"], report["metrics"]["artifacts"]["policy_static"]
+    assert (fp32["frames_on_the_core"], fp32["tenth_g"]) == (arm.STEADY, None)
+    assert 0 < static["reference_max_difference"] < 1e-4
+    same = ("instructions_g", "tenth_g", "frames_on_the_core", "steering_mae_pct", "throttle_mae_pct")
+    assert {key: static[key] for key in same} == {key: before[key] for key in same}
+
+
+def test_an_fp32_that_differs_on_the_core_is_no_reference(machine, tiny_run, again, monkeypatch):
+    monkeypatch.setattr(arm, "opened", lambda run_dir: again)
+    monkeypatch.setattr(arm, "SLOW_GMAC", 0.0)
+    fake = SimpleNamespace(chunks=np.full((arm.STEADY, 32, 2), 0.5, np.float32))
+    monkeypatch.setattr(arm, "_count_all", lambda _, artifacts, *args: dict.fromkeys(artifacts, fake))
+    monkeypatch.setattr(arm, "artifact_metrics", lambda counted, manifest: {})
+    with pytest.raises(ArmError, match=r"policy_fp32\.pt: differs by .* on the core"):
+        count_run(tiny_run, frames=4)
 
 
 def test_a_count_is_repeatable(report, machine, tiny_run):

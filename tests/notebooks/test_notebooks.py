@@ -9,15 +9,16 @@ import nbformat
 import pytest
 
 from rover_lib.onboard.stage import write_stage
+from rover_lib.workshop import arm, session
 from rover_lib.workshop import run as runs
-from rover_lib.workshop import session
-from rover_lib.workshop.run import NAMES, NOTEBOOK_LIMIT, NOTEBOOKS, parameters_of
+from rover_lib.workshop.params import params
+from rover_lib.workshop.run import AFTERWARDS, NAMES, NOTEBOOK_LIMIT, NOTEBOOKS, parameters_of
 
-PATHS = [NOTEBOOKS / f"{name}.ipynb" for name in NAMES]
+PATHS = [NOTEBOOKS / f"{name}.ipynb" for name in NAMES + AFTERWARDS]
 MOST_LINES = 12
 
 
-@pytest.fixture(params=PATHS, ids=NAMES)
+@pytest.fixture(params=PATHS, ids=NAMES + AFTERWARDS)
 def path(request):
     return request.param
 
@@ -59,9 +60,10 @@ def test_cells_call_check_and_show(notebook):
         assert imports or len(lines) <= MOST_LINES, f"{cell.id} has {len(lines)} lines"
 
 
-def test_every_notebook_asserts_something_or_writes_a_figure(notebook):
+def test_every_notebook_writes_a_figure_and_what_it_found(notebook, path):
     text = "\n".join(c.source for c in code(notebook))
-    assert "plots.save(" in text and "write_stage(" in text
+    assert "plots.save(" in text
+    assert ("write_stage(" in text) == (path.stem in NAMES)  # afterwards there is nothing to find, only to show
 
 
 def test_committed_outputs_are_clean(notebook, path):
@@ -78,6 +80,61 @@ def test_committed_outputs_are_clean(notebook, path):
 def test_all_know_the_run_folder():
     assert all("run_dir" in parameters_of(p) for p in PATHS)
     assert {"checkpoint", "episodes"} <= parameters_of(PATHS[0])
+
+
+# --- the ruler's notebook ---
+
+
+def counted(fewer: float, **changed):
+    """What arm.json says of an artifact, as far as the notebook reads it."""
+    kernels = {"xnn_qs8_qc8w_gemm_minmax_fp32_ukernel_4x16c4__asm_aarch64_neondot_ld128": 1.2 * fewer, "other": 0.2}
+    found = {
+        "instructions_g": 1.2 * fewer + 0.2,
+        "simd_g": 1.0 * fewer,
+        "floor_g": 0.94 * fewer,
+        "gmac": 15.02 * fewer,
+        "image_height": 360,
+        "image_width": 640,
+        "tenth_g": 1.2 * fewer + 0.2,
+        "instructions_by_kernel": kernels,
+        "sdot_by_kernel": {next(iter(kernels)): 0.9 * fewer},
+        "peak_memory_mb": 300,
+        "peak_memory_loading_mb": 300,
+        "frames_on_the_core": 50,
+        "reference": "policy_fp32",
+        "computed_pi5_ms": dict(zip(("low", "high"), arm.predicted_ms(fewer, 1.2 * fewer + 0.2), strict=True)),
+    }
+    errors = {f"{where}{action}_mae_pct": 0.1 for where in ("", "workstation_") for action in ("steering", "throttle")}
+    return found | errors | changed
+
+
+def shown(path):
+    cells = nbformat.read(path, as_version=4).cells
+    return "".join(o.text for c in cells if c.cell_type == "code" for o in c.outputs if o.output_type == "stream")
+
+
+def test_counts_are_drawn(tmp_path):
+    small = {key: value for key, value in counted(0.3, image_height=180, image_width=320).items() if "mae" not in key}
+    small |= {"reference": None, "tenth_g": None}
+    artifacts = {"policy_fp32": counted(4), "policy_static": counted(1), "policy_static_180x320": small}
+    peer = {key: value for key, value in counted(1.1).items() if key != "sdot_by_kernel"}
+    metrics = {"label": arm.LABEL, "artifacts": artifacts, "peers": {"another runtime": peer}, "note": "cannot drive"}
+    metrics["backbone_bits"] = {"frames": 4, "values": 123456, "differing": 0}
+    metrics["gates"] = arm.gates(metrics, params()["arm"]["gates"])
+    write_stage(tmp_path / "arm.json", "arm", params={}, metrics=metrics)
+    text = shown(runs.execute("06_arm", tmp_path))
+    assert arm.LABEL in text and "cannot drive" in text and "0 of 123,456 INT8 values" in text
+    assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {
+        f"06_{figure}" for figure in ("counted", "by_kernel", "by_size", "computed_times", "gates")
+    }
+
+
+def test_nothing_counted_is_a_sentence(tmp_path):
+    (tmp_path / "mine").mkdir()
+    assert "make arm NAME=mine counts" in shown(runs.execute("06_arm", tmp_path / "mine"))
+    assert {p.name for p in (tmp_path / "mine").iterdir()} == {"06_arm.ipynb"}
+    with pytest.raises(runs.NotebookError, match="not found"):
+        runs.execute("06_arm", tmp_path / "nothing")
 
 
 # --- executing and publishing ---
@@ -139,7 +196,9 @@ def test_what_a_run_was_not_asked_to_know_is_refused(one_notebook, tmp_path):
 
 
 def test_an_old_run_is_cleared_but_for_other_hosts(tmp_path):
-    for name in ("load.json", "policy_static.pt", "benchmark-pi.json", "best_model.pth"):
+    for name in ("load.json", "arm.json", "parts.json", "06_arm.ipynb", "policy_static.pt"):
+        (tmp_path / name).touch()
+    for name in ("benchmark-pi.json", "best_model.pth"):
         (tmp_path / name).touch()
     runs._clear(tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {"benchmark-pi.json", "best_model.pth"}
@@ -159,6 +218,14 @@ def test_publishing_takes_outputs_without_counts_and_noise(one_notebook, tmp_pat
     assert parameters.source == "a = 1  # one"
     assert [o.output_type for o in work.outputs] == ["stream", "execute_result"]
     assert work.outputs[1].execution_count is None
+
+
+def test_publishing_is_of_the_notebooks_that_are_named(one_notebook, tmp_path):
+    for name in ("01_load", "06_arm"):
+        written(one_notebook, name, ("work", "print(1)"))
+        written(tmp_path / "run", name, ("work", "print(1)", [stream("1\n")]))
+    assert [p.stem for p in runs.publish(tmp_path / "run", one_notebook, ("06_arm",))] == ["06_arm"]
+    assert not nbformat.read(one_notebook / "01_load.ipynb", as_version=4).cells[0].outputs
 
 
 def test_publishing_refuses_paths_and_changed_cells(one_notebook, tmp_path):

@@ -9,10 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from policies import TINY, lerobot_policy, trainer_content
+from policies import TINY, lerobot_policy, memory_samples, trainer_content
 
 from rover_lib.onboard.errors import CheckpointError
+from rover_lib.workshop.act import ACT
 from rover_lib.workshop.checkpoint import expected_shapes, load_checkpoint
+from rover_lib.workshop.compare import LerobotEager
+from rover_lib.workshop.quantize import inputs_of
 
 
 def write(content, path):
@@ -129,10 +132,10 @@ def test_refuses_damaged_files(tiny_file, tmp_path):
 
 @pytest.fixture
 def folder(tmp_path):
-    from test_act import imagenet_stats, saved
+    from test_act import image_stats, saved
 
     policy = lerobot_policy(**TINY)
-    saved(policy, tmp_path, imagenet_stats(policy))
+    saved(policy, tmp_path, image_stats(policy))
     return tmp_path
 
 
@@ -181,3 +184,35 @@ def test_refuses_damaged_folders(folder):
     (folder / "config.json").write_text("{")
     with pytest.raises(CheckpointError, match="JSON"):
         load_checkpoint(folder)
+
+
+@pytest.mark.parametrize("size", [(54, 96), (75, 131), (144, 256)])
+def test_at_another_size_it_is_lerobots_policy_of_that_size(tiny, size):
+    other = tiny.at_size(*size)
+    assert other.config == replace(tiny.config, image_sizes=(size,)) and other.weights is tiny.weights
+    ours, lerobot = ACT(other.config, other.weights), LerobotEager(other)
+    (sample,) = memory_samples(1, *size)
+    with torch.inference_mode():
+        found = ours(*inputs_of(sample, other.config))[0].numpy()
+    lerobot._low, lerobot._high = -np.inf, np.inf  # what is clipped would be the same anyway
+    expected = lerobot.predict_chunk(sample.picture, sample.state)
+    assert np.abs(found - expected).max() < 1e-5 < np.abs(found).max()
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        ((54.0, 96.0), "two whole numbers"),
+        ((18, 32), "smaller than one feature"),
+        ((96, 96), r"96x96 has another aspect ratio than 128x72"),
+    ],
+)
+def test_a_size_that_makes_no_sense_is_refused(tiny, size, words):
+    with pytest.raises(CheckpointError, match=words):
+        tiny.at_size(*size)
+
+
+def test_another_size_is_for_one_camera(tiny):
+    two = replace(tiny, config=replace(tiny.config, cameras=("left", "right"), image_sizes=((72, 128),) * 2))
+    with pytest.raises(CheckpointError, match="2 cameras"):
+        two.at_size(54, 96)

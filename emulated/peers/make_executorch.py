@@ -1,0 +1,95 @@
+"""A policy for ExecuTorch: static INT8 by its XNNPACK quantizer, lowered to XNNPACK.
+
+    make_executorch.py CHECKPOINT CALIBRATION ARTIFACT
+
+Runs on the workstation with ExecuTorch's packages before ours (see rover_lib/workshop/peers.py); arguments and the
+printed JSON line are those of make_onnxruntime.py, ARTIFACT is a .pte.
+
+The quantizer's own recipe: symmetric INT8 weights per channel, INT8 activations, ranges by histogram. It is set for the
+whole graph, with a filter: by module type or name it passes over convolutions without a word. What is INT8 and what is
+float is as in make_onnxruntime.py.
+"""
+
+import json
+import logging
+import sys
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+from unittest.mock import patch
+
+import torch
+import torch.nn.functional as F
+from executorch.backends.xnnpack.partition.xnnpack_partitioner import XnnpackPartitioner
+from executorch.backends.xnnpack.quantizer.xnnpack_quantizer import XNNPACKQuantizer, get_symmetric_quantization_config
+from executorch.exir import EdgeCompileConfig, to_edge_transform_and_lower
+from float_policy import float_policy, observations
+from torch import Tensor, nn
+from torchao.quantization.pt2e.quantize_pt2e import convert_pt2e, prepare_pt2e
+
+from rover_lib.workshop.act import Residual
+
+INT8 = tuple(f"{c.__module__}.{c.__qualname__}" for c in (nn.Conv2d, nn.Linear, nn.ReLU, nn.MaxPool2d, Residual))
+STAYS_FLOAT = ("head", "state_project")
+LAYERS = ("aten.conv2d", "aten.linear")
+PRODUCTS = ("aten.convolution", "aten.linear", "aten.addmm", "aten.mm")  # what those are after export
+
+
+def attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """F.scaled_dot_product_attention without its care for rows that are all masked, which costs ten operators."""
+    return (q * q.shape[-1] ** -0.5 @ k.transpose(-2, -1)).softmax(-1) @ v
+
+
+def is_int8(node: torch.fx.Node) -> bool:
+    """The quantizer's filter: whether it may quantize a node, by the module that the node comes from."""
+    stack = list(node.meta.get("nn_module_stack", {}).values())
+    if node.op != "call_function" or not stack:  # weights, and what has no module: part of the others' patterns
+        return True
+    name, kind = stack[-1]
+    kind = kind if isinstance(kind, str) else f"{kind.__module__}.{kind.__qualname__}"
+    return kind in INT8 and not str(name).endswith(STAYS_FLOAT)
+
+
+def layers_of(graph: torch.fx.Graph) -> dict[str, bool]:
+    """Each convolution and linear by its module's name: whether both its input and its weight come out of INT8."""
+    found = {}
+    for node in graph.nodes:
+        if node.op == "call_function" and str(node.target).startswith(LAYERS):
+            name, _ = list(node.meta["nn_module_stack"].values())[-1]
+            found[str(name)] = all("dequantize" in str(source.target) for source in node.args[:2])
+    return found
+
+
+def main(checkpoint: str, calibration: str, artifact: str) -> None:
+    warnings.simplefilter("ignore")
+    logging.disable(logging.WARNING)
+    model, example = float_policy(checkpoint)
+    quantizer = XNNPACKQuantizer().set_global(get_symmetric_quantization_config(is_per_channel=True))
+    quantizer.set_filter_function(is_int8)
+    with torch.no_grad():
+        with patch.object(F, "scaled_dot_product_attention", attention):  # here alone: ExecuTorch's passes use it too
+            graph = torch.export.export(model, example).module()
+        graph = prepare_pt2e(graph, quantizer)
+        for observation in observations(calibration):
+            graph(*map(torch.from_numpy, observation))
+        graph = convert_pt2e(graph)
+        layers = layers_of(graph.graph)
+        edge = to_edge_transform_and_lower(
+            torch.export.export(graph, example),
+            partitioner=[XnnpackPartitioner()],
+            compile_config=EdgeCompileConfig(_check_ir_validity=False),
+        )
+    left = [str(n.target) for n in edge.exported_program().graph.nodes if n.op == "call_function"]
+    if left := [target for target in left if any(product in target for product in PRODUCTS)]:
+        sys.exit(f"error: XNNPACK did not take {len(left)} convolutions and linears: {left[:3]}")
+    Path(artifact).write_bytes(edge.to_executorch().buffer)
+    report = {
+        "int8_layers": sum(layers.values()),
+        "float_layers": [name for name, int8 in layers.items() if not int8],
+        "versions": {"executorch": version("executorch"), "torchao": version("torchao"), "torch": torch.__version__},
+    }
+    print(json.dumps(report))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

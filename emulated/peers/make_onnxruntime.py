@@ -1,0 +1,97 @@
+"""A policy for ONNX Runtime: exported in float, then static INT8 by its own tools.
+
+    make_onnxruntime.py CHECKPOINT CALIBRATION ARTIFACT
+
+Runs on the workstation with ONNX Runtime's packages before ours (see rover_lib/workshop/peers.py). CALIBRATION: see
+float_policy.observations. Writes ARTIFACT, an .onnx of inputs `state` and `frame`, and prints one JSON line:
+{"int8_layers": how many convolutions and linears became INT8, "float_layers": [the others], "versions"}.
+
+As ONNX Runtime's documentation has it for ARM: QDQ, symmetric INT8 weights per channel, signed activations, ranges by
+minimum and maximum. Adds of the backbone are INT8 too, so that nothing is float between its convolutions. Float stay
+attention's products, the transformer's residual stream and, since that is best for its accuracy, the two-row head and
+the state's projection: with those two in INT8, throttle was four times as far off on the demo's policy.
+"""
+
+import json
+import sys
+import tempfile
+import warnings
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from float_policy import float_policy, observations
+from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+from onnxruntime.quantization.shape_inference import quant_pre_process
+
+LAYERS = ("Conv", "Gemm", "MatMul")
+INT8 = (*LAYERS, "Add", "Relu", "MaxPool")
+OPSET = 17
+
+
+class Recorded(CalibrationDataReader):
+    """The calibration frames, one by one."""
+
+    def __init__(self, calibration: str):
+        self.rest = observations(calibration)
+
+    def get_next(self) -> dict[str, np.ndarray] | None:
+        observation = next(self.rest, None)
+        return dict(zip(("state", "frame"), observation, strict=True)) if observation else None
+
+
+def stays_float(graph: onnx.GraphProto) -> list[str]:
+    """Nodes that quantize_static shall leave alone, by what they compute."""
+    constants = {i.name for i in graph.initializer}
+    users = Counter(name for node in graph.node for name in node.input)
+    used_by = {name: node.op_type for node in graph.node for name in node.input}  # of a value that has one user
+    found = []
+    for node in graph.node:
+        product = node.op_type in LAYERS and node.input[1] not in constants  # a constant query comes first
+        residual = node.op_type == "Add" and not (users[node.output[0]] == 1 and used_by[node.output[0]] == "Relu")
+        if product or residual or "/head/" in node.name or "/state_project/" in node.name:
+            found.append(node.name)
+    return found
+
+
+def layers_of(graph: onnx.GraphProto) -> dict[str, bool]:
+    """Each convolution and linear by name: whether both its input and its weight come out of INT8."""
+    constants = {i.name for i in graph.initializer}
+    from_int8 = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}
+    layers = (n for n in graph.node if n.op_type in LAYERS and from_int8.get(n.input[1], n.input[1]) in constants)
+    return {n.name: n.input[0] in from_int8 and n.input[1] in from_int8 for n in layers}
+
+
+def main(checkpoint: str, calibration: str, artifact: str) -> None:
+    warnings.simplefilter("ignore")  # of the trace: shapes are constants here, and meant to be
+    model, example = float_policy(checkpoint)
+    with tempfile.TemporaryDirectory() as scratch:
+        exported, prepared = Path(scratch) / "float.onnx", Path(scratch) / "prepared.onnx"
+        names = {"input_names": ["state", "frame"], "output_names": ["chunk"]}
+        torch.onnx.export(model, example, str(exported), opset_version=OPSET, dynamo=False, **names)
+        quant_pre_process(exported, prepared, skip_symbolic_shape=True)
+        quantize_static(
+            prepared,
+            artifact,
+            Recorded(calibration),
+            quant_format=QuantFormat.QDQ,
+            op_types_to_quantize=list(INT8),
+            nodes_to_exclude=stays_float(onnx.load(prepared).graph),
+            per_channel=True,
+            activation_type=QuantType.QInt8,
+            weight_type=QuantType.QInt8,
+        )
+    layers = layers_of(onnx.load(artifact).graph)
+    report = {
+        "int8_layers": sum(layers.values()),
+        "float_layers": [name for name, int8 in layers.items() if not int8],
+        "versions": {"onnxruntime": onnxruntime.__version__, "onnx": onnx.__version__, "torch": torch.__version__},
+    }
+    print(json.dumps(report))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
