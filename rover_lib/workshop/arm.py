@@ -807,9 +807,9 @@ def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any
         worse = max(found[k] / at_home if at_home else float("inf") for k, at_home in home.items())
         off_pct = 100 * abs(found["tenth_g"] / found["instructions_g"] - 1)
         rows += [
-            gate(f"{stem} error, times the workstation's", worse, "<=", limits["x_workstation_error"]),
+            gate(f"{stem} error, x workstation's", worse, "<=", limits["x_workstation_error"]),
             gate(f"{stem} frames judged on the core", found["frames_on_the_core"], ">=", limits["frames"]),
-            gate(f"{stem} tenth inference off the third, %", off_pct, "<=", limits["tenth_pct"]),
+            gate(f"{stem} tenth off the third, %", off_pct, "<=", limits["tenth_pct"]),
             gate(f"{stem} peak_memory_mb", found["peak_memory_mb"], "<=", limits["peak_memory_mb"]),
             gate(
                 f"{stem} peak_memory_loading_mb",

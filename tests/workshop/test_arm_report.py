@@ -106,10 +106,10 @@ def test_gates_of_the_cars_policy_hold():
     [
         ({"instructions_g": 1.47, "tenth_g": 1.47}, "instructions_g"),
         ({"simd_g": 1.11}, "simd_g"),
-        ({"throttle_mae_pct": 0.211}, "error, times the workstation's"),
-        ({"workstation_steering_mae_pct": 0.0}, "error, times the workstation's"),
+        ({"throttle_mae_pct": 0.211}, "error, x workstation's"),
+        ({"workstation_steering_mae_pct": 0.0}, "error, x workstation's"),
         ({"frames_on_the_core": 49}, "frames judged on the core"),
-        ({"tenth_g": 1.38}, "tenth inference off the third, %"),
+        ({"tenth_g": 1.38}, "tenth off the third, %"),
         ({"peak_memory_mb": 501}, "peak_memory_mb"),
         ({"peak_memory_loading_mb": 601}, "peak_memory_loading_mb"),
     ],

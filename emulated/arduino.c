@@ -1,0 +1,414 @@
+/* An emulated Arduino Uno with a transmitter on its receiver's pins, and a ruler on its servo pins. Needs libsimavr.
+ *
+ * As a library (cc -shared -fPIC): stepped from a test, no clock of this world in it.
+ * As a program (cc -DPROGRAM): in real time, its serial line on a pty.
+ *     arduino ROVER.elf --link PATH [--log CSV] [--reset-on-open] [--boot-ms N]
+ *         --link           a symbolic link to the pty, for pyserial to open
+ *         --log            one line per pulse of a servo pin and per event: monotonic_s,event,pin,pulse_us,period_us
+ *         --reset-on-open  what DTR does to an Uno when its port is opened, and after it
+ *         --boot-ms        the boot loader's time: nothing runs for so long
+ *     Where this machine stalls for more than 20 ms, so does the Arduino; the log then has "stall" with microseconds.
+ *     Standard input takes, a line each: transmitter STEERING_US THROTTLE_US (0: no signal), reset, hang ADDRESS, quit.
+ *
+ * Written against simavr 1.6, which needs help in two places, see on_compare and on_flags.
+ */
+#include <stdbool.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "avr_ioport.h"
+#include "avr_timer.h"
+#include "avr_uart.h"
+#include "sim_avr.h"
+#include "sim_cycle_timers.h"
+#include "sim_elf.h"
+#include "sim_interrupts.h"
+
+enum { HZ = 16000000, BYTE_CYCLES = HZ / 11520, QUEUE = 1 << 16 }; /* 8N1 at 115200 */
+enum { STEERING, THROTTLE, CHANNELS };
+enum event_kind { PULSE = 1, CUT = 2, LINE_IN = 3, RESET = 4 }; /* CUT: a pulse that a reset ended */
+static const double PERIOD_US[CHANNELS] = {21316, 1016};
+
+struct uno_event {
+    double at_us; /* PULSE, CUT: when the pin rose. LINE_IN: when the host's line was wholly in. */
+    double pulse_us, period_us; /* period_us: since the pin rose before that, 0 for the first after a reset */
+    int32_t kind, channel;
+};
+
+struct channel {
+    struct uno *uno;
+    avr_irq_t *out, *in;          /* the servo's pin, the receiver's pin */
+    avr_cycle_count_t rise, rise_before;
+    bool high;
+    double sent_us, period_us;    /* the transmitter's pulse; 0: none */
+    bool in_high;
+};
+
+struct uno {
+    avr_t *avr;
+    avr_irq_t *serial_in;
+    avr_uart_t *uart;
+    struct channel channels[CHANNELS];
+    uint16_t queue[QUEUE];
+    uint8_t output[QUEUE];
+    struct uno_event events[QUEUE];
+    unsigned queue_head, queue_tail, output_head, output_tail, event_head, event_tail;
+    uint32_t hung_at; /* flash address of the instruction that hang replaced, 0: none */
+    uint8_t hung_code[2];
+    void (*chip_reset)(avr_t *);
+};
+
+static double us(avr_cycle_count_t cycles) { return cycles * 1e6 / HZ; }
+
+static void event(struct uno *uno, enum event_kind kind, int channel, double at_us, double pulse_us, double period_us) {
+    uno->events[uno->event_head++ % QUEUE] = (struct uno_event){at_us, pulse_us, period_us, (int32_t)kind, channel};
+}
+
+static void on_servo_pin(struct avr_irq_t *irq, uint32_t value, void *param) {
+    struct channel *channel = param;
+    struct uno *uno = channel->uno;
+    bool high = value & 1;
+    (void)irq;
+    if (high == channel->high) return;
+    channel->high = high;
+    if (high) {
+        channel->rise_before = channel->rise;
+        channel->rise = uno->avr->cycle;
+        return;
+    }
+    event(uno, PULSE, (int)(channel - uno->channels), us(channel->rise), us(uno->avr->cycle - channel->rise),
+          channel->rise_before ? us(channel->rise - channel->rise_before) : 0);
+}
+
+static void on_serial_out(struct avr_irq_t *irq, uint32_t value, void *param) {
+    struct uno *uno = param;
+    (void)irq;
+    uno->output[uno->output_head++ % QUEUE] = (uint8_t)value;
+}
+
+/* simavr 1.6 applies what is written to OCRnx in the fast PWM modes with TOP in a register either never (ICRn) or at
+ * once, raising the pin again in the middle of a period (OCRnA). The chip takes it over at the next overflow, and so
+ * does simavr if it finds it in comp_cycles then. */
+static void on_compare(struct avr_t *avr, avr_io_addr_t address, uint8_t value, void *param) {
+    avr_timer_comp_t *compare = param;
+    avr_timer_t *timer = compare->timer;
+    avr->data[address] = value;
+    uint32_t ticks = avr->data[compare->r_ocr] | (compare->r_ocrh ? avr->data[compare->r_ocrh] << 8 : 0);
+    if (timer->tov_cycles) /* running; a stopped timer reads OCRnx when it is started */
+        compare->comp_cycles = ticks <= timer->tov_top ? (ticks + 1) * timer->cs_div_value : 0;
+}
+
+/* simavr 1.6 clears all flags of a timer when any is written; the chip clears those written as 1. */
+static void on_flags(struct avr_t *avr, avr_io_addr_t address, uint8_t value, void *param) {
+    avr_timer_t *timer = param;
+    avr_int_vector_t *vectors[] = {&timer->overflow, &timer->icr, &timer->comp[0].interrupt, &timer->comp[1].interrupt};
+    for (size_t i = 0; i < sizeof vectors / sizeof *vectors; i++)
+        if (vectors[i]->raised.reg == address && value >> vectors[i]->raised.bit & 1)
+            avr_clear_interrupt(avr, vectors[i]);
+}
+
+static avr_cycle_count_t feed(avr_t *avr, avr_cycle_count_t when, void *param) {
+    struct uno *uno = param;
+    if (uno->queue_head == uno->queue_tail) return 0;
+    uint16_t byte = uno->queue[uno->queue_tail++ % QUEUE];
+    avr_raise_irq(uno->serial_in, byte);
+    /* The byte is with the program one byte's time after simavr was given it. */
+    if (byte == '\n') event(uno, LINE_IN, -1, us(avr->cycle + BYTE_CYCLES), 0, 0);
+    return when + (uno->uart->cycles_per_byte > BYTE_CYCLES ? uno->uart->cycles_per_byte : BYTE_CYCLES);
+}
+
+static avr_cycle_count_t cycles(double microseconds) { return (avr_cycle_count_t)(microseconds * HZ / 1e6 + 0.5); }
+
+static avr_cycle_count_t transmit(avr_t *avr, avr_cycle_count_t when, void *param) {
+    struct channel *channel = param;
+    (void)avr;
+    if (channel->in_high) { /* the pulse that ends here may have had another width than the next */
+        channel->in_high = false;
+        avr_raise_irq(channel->in, 0);
+        return channel->sent_us > 0 ? when + cycles(channel->period_us - channel->sent_us) : 0;
+    }
+    if (channel->sent_us <= 0) return 0;
+    channel->in_high = true;
+    avr_raise_irq(channel->in, 1);
+    return when + cycles(channel->sent_us);
+}
+
+/* Called in each reset, the watchdog's included, after simavr forgot its cycle timers. */
+static void on_reset(avr_t *avr) {
+    struct uno *uno = avr->custom.data;
+    if (uno->chip_reset) uno->chip_reset(avr);
+    if (uno->hung_at) {
+        memcpy(avr->flash + uno->hung_at, uno->hung_code, 2);
+        uno->hung_at = 0;
+    }
+    event(uno, RESET, -1, us(avr->cycle), 0, 0);
+    for (int i = 0; i < CHANNELS; i++) {
+        struct channel *channel = &uno->channels[i];
+        if (!channel->out) continue; /* avr_init's own reset */
+        if (channel->high) event(uno, CUT, i, us(channel->rise), us(avr->cycle - channel->rise), 0);
+        channel->high = false;
+        channel->rise = channel->rise_before = 0;
+        avr_raise_irq(channel->out, 0); /* a pin of a chip in reset floats; the servo's side pulls it down */
+        if (channel->sent_us > 0 || channel->in_high)
+            avr_cycle_timer_register(avr, cycles(1), transmit, channel);
+    }
+    if (uno->queue_head != uno->queue_tail) avr_cycle_timer_register(avr, BYTE_CYCLES, feed, uno);
+}
+
+static void no_sleep(avr_t *avr, avr_cycle_count_t cycles_to_sleep) {
+    (void)avr;
+    (void)cycles_to_sleep; /* simulated time passes by itself */
+}
+
+struct uno *uno_new(const char *elf) {
+    elf_firmware_t firmware;
+    memset(&firmware, 0, sizeof firmware);
+    if (elf_read_firmware(elf, &firmware)) return NULL;
+    struct uno *uno = calloc(1, sizeof *uno);
+    avr_t *avr = avr_make_mcu_by_name("atmega328p");
+    if (!uno || !avr) return NULL;
+    uno->avr = avr;
+    avr_init(avr);
+    avr->log = LOG_ERROR;
+    avr->sleep = no_sleep;
+    firmware.frequency = HZ;
+    strcpy(firmware.mmcu, "atmega328p");
+    avr_load_firmware(avr, &firmware);
+    avr->frequency = HZ;
+
+    uint32_t flags = 0;
+    avr_ioctl(avr, AVR_IOCTL_UART_GET_FLAGS('0'), &flags);
+    flags &= ~(uint32_t)(AVR_UART_FLAG_STDIO | AVR_UART_FLAG_POLL_SLEEP);
+    avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &flags);
+    uno->serial_in = avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
+    avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_serial_out, uno);
+
+    for (avr_io_t *io = avr->io_port; io; io = io->next) {
+        if (!strcmp(io->kind, "uart")) uno->uart = (avr_uart_t *)io;
+        avr_timer_t *timer = (avr_timer_t *)io;
+        if (strcmp(io->kind, "timer") || (timer->name != '1' && timer->name != '2')) continue;
+        avr->io[AVR_DATA_TO_IO(timer->overflow.raised.reg)].w.c = on_flags;
+        avr->io[AVR_DATA_TO_IO(timer->overflow.raised.reg)].w.param = timer;
+        for (int i = 0; i < AVR_TIMER_COMP_COUNT; i++) {
+            if (!timer->comp[i].r_ocr) continue;
+            avr->io[AVR_DATA_TO_IO(timer->comp[i].r_ocr)].w.c = on_compare;
+            avr->io[AVR_DATA_TO_IO(timer->comp[i].r_ocr)].w.param = &timer->comp[i];
+        }
+    }
+
+    static const struct { char out, out_bit, in, in_bit; } PINS[CHANNELS] = {{'B', 2, 'D', 2}, {'D', 3, 'B', 0}};
+    for (int i = 0; i < CHANNELS; i++) {
+        struct channel *channel = &uno->channels[i];
+        channel->uno = uno;
+        channel->out = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ(PINS[i].out), PINS[i].out_bit);
+        channel->in = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ(PINS[i].in), PINS[i].in_bit);
+        avr_irq_register_notify(channel->out, on_servo_pin, channel);
+    }
+    avr->custom.data = uno;
+    uno->chip_reset = avr->reset;
+    avr->reset = on_reset;
+    return uno;
+}
+
+void uno_free(struct uno *uno) {
+    avr_terminate(uno->avr);
+    free(uno);
+}
+
+double uno_now_us(struct uno *uno) { return us(uno->avr->cycle); }
+
+/* Bytes for the serial line, behind those still waiting. A byte | 0x8000 comes with a framing error. */
+void uno_send(struct uno *uno, const uint16_t *bytes, int n) {
+    if (uno->queue_head == uno->queue_tail) avr_cycle_timer_register(uno->avr, 1, feed, uno);
+    while (n-- > 0 && uno->queue_head - uno->queue_tail < QUEUE) uno->queue[uno->queue_head++ % QUEUE] = *bytes++;
+}
+
+/* The transmitter's pulse from its next one on; 0: no signal. period_us 0: the nominal one. */
+void uno_transmitter(struct uno *uno, int index, double pulse_us, double period_us) {
+    struct channel *channel = &uno->channels[index];
+    bool idle = channel->sent_us <= 0 && !channel->in_high;
+    channel->sent_us = pulse_us;
+    channel->period_us = period_us > 0 ? period_us : PERIOD_US[index];
+    if (idle && pulse_us > 0) avr_cycle_timer_register(uno->avr, 1, transmit, channel);
+}
+
+/* The reset button. */
+void uno_reset(struct uno *uno) {
+    avr_reset(uno->avr);
+    avr_regbit_set(uno->avr, uno->avr->reset_flags.extrf);
+}
+
+/* The code at a flash address becomes an endless loop, until the next reset. */
+void uno_hang(struct uno *uno, uint32_t address) {
+    static const uint8_t LOOP[2] = {0xFF, 0xCF}; /* rjmp to itself */
+    uno->hung_at = address;
+    memcpy(uno->hung_code, uno->avr->flash + address, 2);
+    memcpy(uno->avr->flash + address, LOOP, 2);
+}
+
+/* 0: fine. Otherwise simavr's state: the program stopped or crashed. */
+int uno_run_us(struct uno *uno, double microseconds) {
+    avr_cycle_count_t end = uno->avr->cycle + cycles(microseconds);
+    while (uno->avr->cycle < end) {
+        int state = avr_run(uno->avr);
+        if (state == cpu_Done || state == cpu_Crashed) return state;
+    }
+    return 0;
+}
+
+int uno_read(struct uno *uno, uint8_t *bytes, int n) {
+    int i = 0;
+    while (i < n && uno->output_tail != uno->output_head) bytes[i++] = uno->output[uno->output_tail++ % QUEUE];
+    return i;
+}
+
+int uno_events(struct uno *uno, struct uno_event *events, int n) {
+    int i = 0;
+    while (i < n && uno->event_tail != uno->event_head) events[i++] = uno->events[uno->event_tail++ % QUEUE];
+    return i;
+}
+
+#ifdef PROGRAM
+#include <errno.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <pty.h>
+#include <termios.h>
+#include <time.h>
+#include <unistd.h>
+
+static double monotonic(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (double)t.tv_sec + (double)t.tv_nsec * 1e-9;
+}
+
+/* false: quit. */
+static bool obey(struct uno *uno, const char *line) {
+    double steering_us, throttle_us;
+    unsigned address;
+    if (sscanf(line, "transmitter %lf %lf", &steering_us, &throttle_us) == 2) {
+        uno_transmitter(uno, STEERING, steering_us, 0);
+        uno_transmitter(uno, THROTTLE, throttle_us, 0);
+    } else if (sscanf(line, "hang %x", &address) == 1) {
+        uno_hang(uno, address);
+    } else if (!strncmp(line, "reset", 5)) {
+        uno_reset(uno);
+    } else if (!strncmp(line, "quit", 4)) {
+        return false;
+    } else {
+        fprintf(stderr, "arduino: not understood: %s\n", line);
+    }
+    return true;
+}
+
+int main(int argc, char **argv) {
+    const char *elf = NULL, *link_path = NULL, *log_path = NULL;
+    bool reset_on_open = false;
+    double boot_s = 0;
+    for (int i = 1; i < argc; i++) {
+        bool more = i + 1 < argc;
+        if (!strcmp(argv[i], "--link") && more) link_path = argv[++i];
+        else if (!strcmp(argv[i], "--log") && more) log_path = argv[++i];
+        else if (!strcmp(argv[i], "--boot-ms") && more) boot_s = atof(argv[++i]) * 1e-3;
+        else if (!strcmp(argv[i], "--reset-on-open")) reset_on_open = true;
+        else elf = argv[i];
+    }
+    if (!elf || !link_path) {
+        fprintf(stderr, "usage: arduino ROVER.elf --link PATH [--log CSV] [--reset-on-open] [--boot-ms N]\n");
+        return 2;
+    }
+    struct uno *uno = uno_new(elf);
+    if (!uno) {
+        fprintf(stderr, "arduino: cannot load %s\n", elf);
+        return 1;
+    }
+    int master, slave;
+    char name[64];
+    struct termios raw;
+    memset(&raw, 0, sizeof raw);
+    cfmakeraw(&raw);
+    if (openpty(&master, &slave, name, &raw, NULL)) {
+        perror("arduino: openpty");
+        return 1;
+    }
+    close(slave); /* so that POLLHUP tells whether somebody has the port open */
+    fcntl(master, F_SETFL, O_NONBLOCK);
+    FILE *log = log_path ? fopen(log_path, "w") : NULL;
+    if (log_path && !log) {
+        perror(log_path);
+        return 1;
+    }
+    if (log) setvbuf(log, NULL, _IOLBF, 0);
+    unlink(link_path);
+    if (symlink(name, link_path)) {
+        perror(link_path);
+        return 1;
+    }
+    static const char *const EVENTS[] = {"", "pulse", "cut", "line", "reset"};
+    static const char *const PINS[] = {"", "steering", "throttle"};
+    double start = monotonic(); /* when simulated time was 0 */
+    bool open = false, running = true;
+    int state = 0;
+    char input[128];
+    size_t input_length = 0;
+    while (running && !state) {
+        state = uno_run_us(uno, 500);
+        struct pollfd files[2] = {{master, POLLIN, 0}, {0, POLLIN, 0}};
+        double ahead = start + uno_now_us(uno) * 1e-6 - monotonic();
+        poll(files, 2, 0);
+        if (ahead < -0.02) { /* this machine had no time for us: the Arduino stood still too, rather than hurry now */
+            if (log) fprintf(log, "%.6f,stall,,%.0f,0\n", monotonic(), -ahead * 1e6);
+            start -= ahead;
+        }
+        bool open_now = !(files[0].revents & POLLHUP);
+        if (open_now && !open) {
+            if (log) fprintf(log, "%.6f,open,,0,0\n", monotonic());
+            if (reset_on_open) {
+                uno_reset(uno);
+                start += boot_s; /* stands still for so long */
+                ahead += boot_s;
+            }
+        }
+        open = open_now;
+        if (files[0].revents & POLLIN) {
+            uint8_t bytes[512];
+            uint16_t words[512];
+            ssize_t n = read(master, bytes, sizeof bytes);
+            for (ssize_t i = 0; i < n; i++) words[i] = bytes[i];
+            if (n > 0) uno_send(uno, words, (int)n);
+        }
+        if (files[1].revents & (POLLIN | POLLHUP)) {
+            ssize_t n = read(0, input + input_length, sizeof input - 1 - input_length);
+            if (n <= 0) break; /* whoever started it is gone */
+            input_length += (size_t)n;
+            input[input_length] = 0;
+            for (char *end; (end = strchr(input, '\n'));) {
+                *end = 0;
+                running = obey(uno, input) && running;
+                input_length -= (size_t)(end + 1 - input);
+                memmove(input, end + 1, input_length + 1);
+            }
+            if (input_length == sizeof input - 1) input_length = 0;
+        }
+        uint8_t bytes[512];
+        int n = uno_read(uno, bytes, sizeof bytes);
+        /* What nobody reads is lost, as on a wire. */
+        if (n > 0 && open && write(master, bytes, (size_t)n) < 0 && errno != EAGAIN) perror("arduino: write");
+        struct uno_event events[256];
+        n = uno_events(uno, events, 256);
+        for (int i = 0; log && i < n; i++)
+            fprintf(log, "%.6f,%s,%s,%.2f,%.2f\n", start + events[i].at_us * 1e-6, EVENTS[events[i].kind],
+                    PINS[events[i].channel + 1], events[i].pulse_us, events[i].period_us);
+        if (ahead > 0) {
+            struct timespec pause = {(time_t)ahead, (long)((ahead - (double)(time_t)ahead) * 1e9)};
+            nanosleep(&pause, NULL);
+        }
+    }
+    unlink(link_path);
+    if (state) fprintf(stderr, "arduino: the program stopped: simavr's state %d\n", state);
+    return state != 0;
+}
+#endif

@@ -1,0 +1,61 @@
+/* The lines that the host and the Arduino exchange: ../README.md has them in one table. Plain C, no Arduino. */
+#ifndef ROVER_PROTOCOL_H
+#define ROVER_PROTOCOL_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define PROTOCOL_VERSION 1
+#define FIRMWARE_VERSION "1.0.0"
+
+enum {
+    HOST_LINE_MAX = 63,     /* the longest line of the host without its end: ">D 65535 4294967295 65535 65535*12345678" */
+    BOARD_LINE_MAX = 127,   /* the longest line of the Arduino, its end included */
+    LINE_LIFETIME_MS = 50   /* a line whose end comes later than this after its start is stale: 45 characters take 4 ms */
+};
+
+enum command_kind { COMMAND_HELLO = 'Q', COMMAND_ARM = 'A', COMMAND_DRIVE = 'D', COMMAND_NEUTRAL = 'N' };
+
+struct command {
+    char kind;
+    uint32_t boot, sequence;           /* not in COMMAND_HELLO */
+    uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE only; any number, vehicle.c knows which are safe */
+};
+
+enum reading { READING, READ_COMMAND, READ_BAD };
+
+struct reader {
+    char line[HOST_LINE_MAX];
+    uint8_t length;       /* 0: waiting for a '>' */
+    bool noise;           /* bytes that belong to no line came since the last end of a line */
+    uint32_t started_ms;
+};
+
+/* CRC-32 of Ethernet, zip and PNG (reflected 0xEDB88320, start and final value 0xFFFFFFFF): zlib.crc32 in Python. */
+uint32_t crc32(const char *text, size_t length);
+
+/* Takes one byte. READ_COMMAND once per whole, fresh, well-formed line, which is then in *command; READ_BAD once per
+ * line that was not; READING in between. Any bytes at all may be given, and a '>' always starts a new line. */
+enum reading reader_take(struct reader *reader, uint8_t byte, uint32_t now_ms, struct command *command);
+
+/* A line of the Arduino, built from its parts. Parts that do not fit make line_end return 0: no line then. */
+struct line {
+    char text[BOARD_LINE_MAX + 1];
+    uint8_t length; /* more than BOARD_LINE_MAX: did not fit */
+};
+
+void line_begin(struct line *line, char kind);
+void line_text(struct line *line, const char *text);
+void line_char(struct line *line, char c);
+void line_number(struct line *line, uint32_t number);
+uint8_t line_end(struct line *line);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

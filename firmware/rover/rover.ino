@@ -1,0 +1,62 @@
+/* The rover's Arduino: ../README.md says what it does, on which pins, and what it is told over the serial line. */
+#include "board.h"
+
+static struct vehicle vehicle;
+static struct reader reader;
+static struct line line;
+static bool hello_due, status_due;
+static uint32_t status_ms;
+
+static const uint16_t STATUS_MS = 20;
+
+void setup() {
+  pulses_begin();
+  vehicle_start(&vehicle, boot_number());
+  receiver_begin();
+  serial_begin();
+  serial_put("\n", 1);  /* ends a line that a reset cut, so that the hello is whole */
+  watchdog_begin();
+  hello_due = true;
+}
+
+static void take(uint8_t byte, uint32_t now_ms) {
+  struct command command;
+  switch (reader_take(&reader, byte, now_ms, &command)) {
+    case READ_COMMAND:
+      if (command.kind == COMMAND_HELLO) {
+        hello_due = true;
+      } else {
+        vehicle_command(&vehicle, &command, now_ms);
+        status_due = true;
+      }
+      break;
+    case READ_BAD:
+      count(&vehicle.bad_lines);
+      break;
+    case READING:
+      break;
+  }
+}
+
+void loop() {
+  uint16_t pulse_us, period_us;
+  uint32_t now_ms = clock_ms();
+  if (receiver_take(STEERING, &pulse_us, &period_us)) vehicle_received(&vehicle, STEERING, pulse_us, period_us, now_ms);
+  if (receiver_take(THROTTLE, &pulse_us, &period_us)) vehicle_received(&vehicle, THROTTLE, pulse_us, period_us, now_ms);
+  int byte;
+  for (uint8_t n = 0; n < 64 && (byte = serial_take()) >= 0; n++) take((uint8_t)byte, now_ms);
+  for (uint8_t lost = serial_lost(); lost; lost--) count(&vehicle.lost_bytes);
+  vehicle_tick(&vehicle, now_ms);
+  pulses_set(vehicle.steering_us, vehicle.throttle_us);
+
+  /* A line that finds no room is tried again; a status is then the newest. */
+  if (hello_due && serial_put(line.text, vehicle_hello(&vehicle, reset_cause(), &line))) hello_due = false;
+  if (!hello_due && (status_due || now_ms - status_ms >= STATUS_MS)) {
+    if (serial_put(line.text, vehicle_status(&vehicle, now_ms, &line))) {
+      status_due = false;
+      status_ms = now_ms;
+    }
+  }
+  watchdog_feed();
+  rest();
+}

@@ -1,0 +1,466 @@
+"""The serial link to the rover's Arduino: commands out, telemetry in, by the protocol of firmware/README.md.
+
+The Arduino is the one that keeps the car safe: it stops by itself 150 ms after the last valid command, and hands over
+to the human at the first move of a stick. What is here adds: nothing out of range is sent, leaving the link sends
+neutral, and what the Arduino says is known with the time at which it came.
+"""
+
+import contextlib
+import logging
+import re
+import termios
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from numbers import Integral
+
+import serial
+
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.pwm import Pulses, PwmCalibration
+
+PROTOCOL_VERSION = 1
+BAUD = 115200
+LINE_MAX = 128  # of the Arduino's lines
+SEQUENCES = 1 << 32
+BOOT_S = 4.0  # a boot loader gives the sketch its turn after 1 to 2 s
+SILENT_S = 0.3  # nothing may be asked before: an Arduino that is being reset has its boot loader listening
+HELLO_EVERY_S = 0.5
+REPEAT_S = 0.05
+ANSWER_S = 0.5
+STALE_S = 0.5  # the Arduino speaks every 20 ms
+WRITE_TIMEOUT_S = 0.01
+READ_TIMEOUT_S = 0.05
+
+# serial.SerialException is an OSError, termios.error is not; TypeError is pyserial's of a port just closed elsewhere.
+PORT_ERRORS = (OSError, termios.error, TypeError)
+
+_log = logging.getLogger(__name__)
+
+
+class LinkError(RoverError):
+    """An Arduino that is not there, speaks another protocol, refused to be armed, or no longer answers."""
+
+
+class State(Enum):
+    """Who drives."""
+
+    MANUAL = "M"  # the human's transmitter
+    AUTONOMOUS = "A"  # the host
+    STOPPED = "S"  # nobody: neutral until the host arms again or the human moves a stick
+
+
+REASONS = {
+    "r": "after a reset",
+    "h": "the human moved a stick",
+    "a": "armed by the host",
+    "t": "no valid command for 150 ms",
+    "s": "the transmitter's signal was lost",
+    "n": "the host asked for neutral",
+}
+RESULTS = {
+    "-": "no command yet",
+    "k": "done",
+    "i": "ignored: not autonomous",
+    "r": "out of range",
+    "o": "an old command, or one for another start of the Arduino",
+    "s": "refused: the transmitter gives no signal",
+    "t": "refused: the throttle stick is not at rest",
+}
+RESETS = {"p": "power-on", "e": "reset pin", "b": "brown-out", "w": "watchdog", "-": "unknown"}
+
+
+@dataclass(frozen=True)
+class Hello:
+    """What the Arduino says after each reset, and when asked. boot: number of this start, 0 to 65535."""
+
+    protocol: int
+    firmware: str
+    boot: int
+    sequence: int
+    reset: str  # a value of RESETS
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """One status of the Arduino. Pulses and periods in whole microseconds; None is "no pulse", never 0.
+
+    host_s: time.monotonic() (or the link's clock) at which its line was complete here; uptime_ms: the Arduino's
+    clock, which wraps at 2^32. sequence: of the last command that it took as new; result: what became of the last one,
+    a key of RESULTS. steering_us, throttle_us: what its pins do. receiver_*: the transmitter's pulses. The counters
+    stay at 65535: lines that were no command, commands that were replayed or another start's, pulses out of range,
+    bytes lost.
+    """
+
+    host_s: float
+    boot: int
+    uptime_ms: int
+    sequence: int
+    result: str
+    state: State
+    reason: str  # why the state is what it is, a key of REASONS
+    steering_us: int
+    throttle_us: int
+    receiver_steering_us: int | None
+    receiver_steering_period_us: int | None
+    receiver_throttle_us: int | None
+    receiver_throttle_period_us: int | None
+    bad_lines: int
+    old_commands: int
+    out_of_range: int
+    lost_bytes: int
+
+    @property
+    def pulses(self) -> Pulses:
+        """What goes to the servos."""
+        return Pulses(self.steering_us, self.throttle_us)
+
+    @property
+    def why(self) -> str:
+        """Who drives and why, in words."""
+        return f"{self.state.name.lower()}: {REASONS[self.reason]}"
+
+
+def frame(body: str) -> bytes:
+    """The line of a body: with its CRC-32 and its end."""
+    return f"{body}*{zlib.crc32(body.encode('ascii')):08X}\n".encode("ascii")
+
+
+_NUMBER = r"(0|[1-9][0-9]{0,9})"
+_PULSE = rf"(?:{_NUMBER} {_NUMBER}|- -)"
+_HELLO = re.compile(rf"<H {_NUMBER} (\S+)(?: {_NUMBER} {_NUMBER} ([pebw-]))?(?: .*)?", re.ASCII)
+_STATUS = re.compile(
+    rf"<S {_NUMBER} {_NUMBER} {_NUMBER} ([{''.join(RESULTS)}]) ([MAS]) ([{''.join(REASONS)}]) {_NUMBER} {_NUMBER} "
+    rf"{_PULSE} {_PULSE} {_NUMBER} {_NUMBER} {_NUMBER} {_NUMBER}",
+    re.ASCII,
+)
+
+
+def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
+    """What a line of the Arduino says; None if it is garbled or not one. line: without its end."""
+    if len(line) > LINE_MAX or not line.startswith(b"<"):
+        return None
+    body, star, crc = line.rpartition(b"*")
+    if not star or crc != b"%08X" % zlib.crc32(body):
+        return None
+    try:
+        text = body.decode("ascii")
+    except UnicodeDecodeError:
+        return None
+    if found := _HELLO.fullmatch(text):
+        protocol, firmware, boot, sequence, reset = found.groups()
+        if int(protocol) == PROTOCOL_VERSION and boot is None:
+            return None
+        # Of another protocol only the first two are known to mean the same.
+        return Hello(int(protocol), firmware, int(boot or 0), int(sequence or 0), RESETS[reset or "-"])
+    if not (found := _STATUS.fullmatch(text)):
+        return None
+    boot, uptime, sequence, result, state, reason, *numbers = found.groups()
+    return Telemetry(
+        host_s, int(boot), int(uptime), int(sequence), result, State(state), reason,
+        *(None if n is None else int(n) for n in numbers),
+    )  # fmt: skip
+
+
+class ServoLink:
+    """The Arduino on `port`, from entering the context until leaving it, which sends neutral first, by any door.
+
+        with ServoLink("/dev/ttyUSB0") as link:
+            link.arm()
+            while ...:
+                link.send_action(steering, throttle)  # at least every 150 ms
+
+    Any thread may call any method. Nothing is reconnected behind the caller's back: when the port fails, each call
+    raises LinkError, the Arduino stops by itself, and the caller decides whether to open a new link, whose Arduino is
+    then in manual and has to be armed again. An Arduino that reset itself meanwhile is talked to again under its new
+    number, but it ignores all commands until arm().
+    """
+
+    def __init__(
+        self,
+        port: str,
+        *,
+        calibration: PwmCalibration | None = None,
+        boot_s: float = BOOT_S,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self.port = port
+        self.calibration = calibration or PwmCalibration()
+        self.boot_s = boot_s
+        self._clock = clock
+        self._serial: serial.Serial | None = None
+        self._reader: threading.Thread | None = None
+        self._closing = threading.Event()
+        self._heard = threading.Condition()  # guards the four below
+        self._hello: Hello | None = None
+        self._hellos = 0
+        self._telemetry: Telemetry | None = None
+        self._failure: LinkError | None = None
+        self._sending = threading.RLock()  # guards the two below, and keeps lines whole; never taken inside _heard
+        self._boot = 0
+        self._sequence = 0
+        self._asked = 0.0
+        self.resets = 0  # of the Arduino, while it was open
+        self.garbled = 0  # lines of the Arduino that were dropped
+
+    def __enter__(self) -> "ServoLink":
+        self.open()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def open(self) -> Hello:
+        """Opens the port, which resets most Arduinos, and waits for the hello.
+
+        Raises LinkError if the port cannot be opened, is in use, nothing there says hello within `boot_s` seconds, or
+        it speaks another protocol.
+        """
+        if self._serial:
+            raise LinkError(f"{self.port}: the link is open already; close it first")
+        try:
+            self._serial = serial.Serial(
+                self.port, BAUD, timeout=READ_TIMEOUT_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True
+            )
+            self._serial.reset_input_buffer()  # what it said before this reset
+        except (*PORT_ERRORS, ValueError) as error:
+            self._release()
+            raise LinkError(f"{self.port}: cannot be opened ({error}); is the Arduino plugged in, is the user in group "
+                            "dialout, and does no other program have the port?") from error  # fmt: skip
+        self._closing.clear()
+        with self._heard:
+            self._hello = self._telemetry = self._failure = None
+        self._reader = threading.Thread(target=self._read, name=f"servo link {self.port}", daemon=True)
+        self._reader.start()
+        try:
+            return self._wait_for_hello()
+        except BaseException:
+            self._release()
+            raise
+
+    def _wait_for_hello(self) -> Hello:
+        opened = self._clock()
+        self._asked = opened
+        while True:
+            with self._heard:
+                self._heard.wait_for(lambda: self._hello or self._failure, timeout=REPEAT_S)
+                hello, failure, running = self._hello, self._failure, self._telemetry
+            if failure:
+                raise failure
+            if hello:
+                break
+            now = self._clock()
+            if now - opened > self.boot_s:
+                raise LinkError(
+                    f"{self.port}: no hello from an Arduino within {self.boot_s:g} s; is it the rover's, and is the "
+                    f"firmware on it (make flash PORT={self.port})?"
+                )
+            # It was not reset by opening its port if it goes on talking; a boot loader must not be talked to.
+            due = SILENT_S if running and running.host_s - opened > SILENT_S / 2 else self.boot_s / 2
+            if now - opened > due and now - self._asked > HELLO_EVERY_S / 2:
+                self._asked = now
+                self._write(frame(">Q"))
+        if hello.protocol != PROTOCOL_VERSION:
+            raise LinkError(
+                f"{self.port}: the Arduino speaks protocol {hello.protocol} (firmware {hello.firmware}), this program "
+                f"{PROTOCOL_VERSION}; put the matching firmware on it: make flash PORT={self.port}"
+            )
+        return hello
+
+    def close(self) -> None:
+        """Neutral first, then the port. Raises nothing: an Arduino that cannot be reached stops by itself."""
+        if not self._serial:
+            return
+        try:
+            self.neutral()
+        except LinkError as error:
+            _log.warning("closing without an answer to neutral, the Arduino stops by itself: %s", error)
+        finally:
+            self._release()
+
+    def _release(self) -> None:
+        self._closing.set()
+        port, self._serial = self._serial, None
+        if port:
+            with contextlib.suppress(*PORT_ERRORS, AttributeError):
+                port.cancel_read()
+            if self._reader and self._reader is not threading.current_thread():
+                self._reader.join(1.0)
+            with contextlib.suppress(*PORT_ERRORS):
+                port.reset_output_buffer()  # else the kernel waits up to 30 s for a line that is stuck
+            with contextlib.suppress(*PORT_ERRORS):
+                port.close()
+        self._reader = None
+
+    def arm(self) -> Telemetry:
+        """Hands the car to the host: from here on, commands have to come. Returns the status that says so.
+
+        Raises LinkError if the Arduino refuses (no transmitter, throttle stick not at rest), or does not answer within
+        0.5 s.
+        """
+        for telemetry in self._ask(">A"):
+            if telemetry.state is State.AUTONOMOUS:
+                return telemetry
+            if telemetry.result in "st":
+                remedy = "switch the transmitter on" if telemetry.result == "s" else "let go of the throttle stick"
+                raise LinkError(f"{self.port}: arming was {RESULTS[telemetry.result]}; {remedy} and try again")
+        raise LinkError(f"{self.port}: no answer to arming within {ANSWER_S:g} s; {self._last_words()}")
+
+    def neutral(self) -> Telemetry:
+        """Stops the car if the host drives it, until arm(); a human at the wheel goes on. Returns the status.
+
+        Raises LinkError if the Arduino does not answer within 0.5 s; it stops by itself then.
+        """
+        for telemetry in self._ask(">N"):
+            if telemetry.state is not State.AUTONOMOUS:
+                return telemetry
+        raise LinkError(f"{self.port}: no answer to neutral within {ANSWER_S:g} s; {self._last_words()}")
+
+    def _ask(self, kind: str) -> Iterator[Telemetry]:
+        """Sends a command, again and again; yields what the Arduino says about it, until ANSWER_S are over."""
+        first = None
+        end = self._clock() + ANSWER_S
+        while self._clock() < end:
+            number = self._send(kind)
+            first = number if first is None else first
+            until = self._clock() + REPEAT_S
+            seen = None
+            while (left := until - self._clock()) > 0:
+                with self._heard:
+                    self._heard.wait_for(lambda: self._telemetry is not seen or self._failure, timeout=left)  # noqa: B023
+                    if self._failure:
+                        raise self._failure
+                    seen = self._telemetry
+                # A status from before the command says nothing about it.
+                if seen and (seen.sequence - first) % SEQUENCES < SEQUENCES // 2 and seen.boot == self._boot:
+                    yield seen
+
+    def send(self, steering_us: int, throttle_us: int) -> int:
+        """Sends two pulses, whole microseconds; returns the command's number. Waits at most 10 ms, for a full buffer.
+
+        Raises LinkError for pulses outside the calibration's range, and if the port failed; nothing is sent then.
+        """
+        for channel, value in ((self.calibration.steering, steering_us), (self.calibration.throttle, throttle_us)):
+            low, high = channel.pulse_us(channel.low), channel.pulse_us(channel.high)
+            if isinstance(value, bool) or not isinstance(value, Integral) or not low <= value <= high:
+                raise LinkError(
+                    f"{channel.name} pulse must be whole microseconds from {low} to {high}, found {value!r}: not sent"
+                )
+        return self._send(">D", int(steering_us), int(throttle_us))
+
+    def send_action(self, steering: float, throttle: float) -> int:
+        """Sends steering in [-1, 1] and throttle in [0, 1] as pulses. PwmError for all else; otherwise as send()."""
+        pulses = self.calibration.pulses(steering, throttle)
+        return self.send(pulses.steering_us, pulses.throttle_us)
+
+    def latest(self) -> Telemetry | None:
+        """The newest status, None before the first. Raises LinkError if the port failed, or 0.5 s passed without."""
+        with self._heard:
+            if self._failure:
+                raise self._failure
+            telemetry = self._telemetry
+        if telemetry and (age := self._clock() - telemetry.host_s) > STALE_S:
+            raise LinkError(f"{self.port}: the Arduino said nothing for {age:.1f} s; is it still plugged in?")
+        return telemetry
+
+    def round_trip_s(self) -> float:
+        """Seconds from a question to its answer. Raises LinkError if none comes within 0.5 s."""
+        with self._heard:
+            before = self._hellos
+        start = self._clock()
+        self._write(frame(">Q"))
+        with self._heard:
+            self._heard.wait_for(lambda: self._hellos > before or self._failure, timeout=ANSWER_S)
+            if self._failure:
+                raise self._failure
+            if self._hellos == before:
+                raise LinkError(f"{self.port}: no answer within {ANSWER_S:g} s; is it still plugged in?")
+            return self._clock() - start
+
+    @property
+    def hello(self) -> Hello | None:
+        """The newest hello: firmware, number of the start, reason of the reset."""
+        with self._heard:
+            return self._hello
+
+    def _last_words(self) -> str:
+        with self._heard:
+            telemetry = self._telemetry
+        return f"its last status was {telemetry.why}" if telemetry else "it never sent a status"
+
+    def _send(self, kind: str, *values: int) -> int:
+        with self._heard:
+            if self._failure:
+                raise self._failure
+        with self._sending:
+            self._sequence = (self._sequence + 1) % SEQUENCES
+            self._write(frame(" ".join([kind, *map(str, (self._boot, self._sequence, *values))])))
+            return self._sequence
+
+    def _write(self, line: bytes) -> None:
+        port = self._serial
+        if not port:
+            raise LinkError(f"{self.port}: the link is closed")
+        try:
+            with self._sending:
+                port.write(line)
+        except serial.SerialTimeoutException as error:
+            # What waits there is old by the time it gets through: the next command must be the newest.
+            with contextlib.suppress(*PORT_ERRORS):
+                port.reset_output_buffer()
+            raise LinkError(
+                f"{self.port}: the port took no data for {WRITE_TIMEOUT_S * 1e3:g} ms; the Arduino stops by itself"
+            ) from error
+        except PORT_ERRORS as error:
+            raise self._fail(f"{self.port}: writing failed ({error}); is it still plugged in?") from error
+
+    def _fail(self, sentence: str) -> LinkError:
+        with self._heard:
+            self._failure = self._failure or LinkError(sentence)
+            self._heard.notify_all()
+            return self._failure
+
+    def _read(self) -> None:
+        """The reader thread: drains the port as fast as it fills."""
+        port, pending, skipping = self._serial, b"", False
+        while not self._closing.is_set():
+            try:
+                data = port.read(max(1, port.in_waiting))
+            except PORT_ERRORS as error:
+                if not self._closing.is_set():
+                    self._fail(f"{self.port}: reading failed ({error}); is it still plugged in?")
+                return
+            now = self._clock()
+            *lines, pending = (pending + data).split(b"\n")
+            for line in lines:
+                if not skipping:
+                    self._hear(line, now)
+                skipping = False
+            if len(pending) > LINE_MAX:
+                pending, skipping = b"", True
+                self.garbled += 1
+
+    def _hear(self, line: bytes, now: float) -> None:
+        said = parse(line, now)
+        if said is None:
+            self.garbled += bool(line)
+            return
+        if isinstance(said, Hello):
+            with self._sending:
+                if self._hello and said.boot != self._boot:
+                    self.resets += 1
+                if not self._hello or said.boot != self._boot:
+                    self._boot, self._sequence = said.boot, said.sequence
+        elif self._hello and said.boot != self._boot and now - self._asked > HELLO_EVERY_S:
+            self._asked = now  # it was reset, and that hello was lost
+            with contextlib.suppress(LinkError):
+                self._write(frame(">Q"))
+        with self._heard:
+            if isinstance(said, Hello):
+                self._hello, self._hellos = said, self._hellos + 1
+            else:
+                self._telemetry = said
+            self._heard.notify_all()

@@ -1,0 +1,243 @@
+"""An emulated Arduino for tests: the firmware as it is flashed, in simavr, with pulses measured on its pins."""
+
+import atexit
+import ctypes
+import functools
+import re
+import shutil
+import subprocess
+import tempfile
+import zlib
+from pathlib import Path
+from types import SimpleNamespace
+
+REPOSITORY = Path(__file__).parents[1]
+PACKAGES = {  # Debian's, and what shows that each is there
+    "gcc": lambda: shutil.which("gcc"),
+    "make": lambda: shutil.which("make"),
+    "gcc-avr": lambda: shutil.which("avr-gcc"),
+    "binutils-avr": lambda: shutil.which("avr-ar"),
+    "avr-libc": lambda: Path("/usr/lib/avr/include/avr/io.h").exists(),
+    "arduino-core-avr": lambda: Path("/usr/share/arduino/hardware/arduino/avr/cores/arduino").exists(),
+    "libsimavr-dev": lambda: Path("/usr/include/simavr/sim_avr.h").exists(),
+    "libelf-dev": lambda: Path("/usr/include/libelf.h").exists(),
+}
+PULSE, CUT, LINE_IN, RESET = 1, 2, 3, 4
+PIN = {"steering": 0, "throttle": 1}
+BYTE_US = 1e6 / 11520
+
+
+def missing_packages() -> list[str]:
+    return [name for name, there in PACKAGES.items() if not there()]
+
+
+@functools.cache
+def _folder() -> Path:
+    folder = tempfile.mkdtemp(prefix="rover-uno-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def _run(*command: object) -> str:
+    done = subprocess.run([str(c) for c in command], capture_output=True, text=True)
+    assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout}{done.stderr}"
+    return done.stdout
+
+
+@functools.cache
+def firmware() -> Path:
+    """The compiled sketch, an ELF file."""
+    _run("make", "-C", REPOSITORY / "firmware", f"BUILD={_folder()}/firmware")
+    return _folder() / "firmware" / "rover.elf"
+
+
+def symbol(name: str) -> int:
+    """Flash address of a function of the firmware."""
+    found = re.search(rf"^([0-9a-f]+) \w {name}$", _run("avr-nm", firmware()), re.M)
+    assert found, f"no symbol {name} in the firmware"
+    return int(found[1], 16)
+
+
+def compiled(name: str, *arguments: object) -> Path:
+    """What gcc makes of `arguments`, with warnings as errors."""
+    path = _folder() / name
+    if not path.exists():
+        _run(
+            "gcc",
+            "-O2",
+            "-g",
+            "-Wall",
+            "-Wextra",
+            "-Werror",
+            "-I",
+            REPOSITORY / "firmware/rover",
+            "-o",
+            path,
+            *arguments,
+        )
+    return path
+
+
+_EMULATOR = REPOSITORY / "emulated" / "arduino.c"
+_SIMAVR = ("-I/usr/include/simavr", _EMULATOR, "-lsimavr", "-lelf", "-lutil")
+
+
+def program() -> Path:
+    """The emulated Arduino as a program with a pty."""
+    return compiled("arduino", "-DPROGRAM", *_SIMAVR)
+
+
+class _Event(ctypes.Structure):
+    _fields_ = (
+        ("at_us", ctypes.c_double),
+        ("pulse_us", ctypes.c_double),
+        ("period_us", ctypes.c_double),
+        ("kind", ctypes.c_int32),
+        ("channel", ctypes.c_int32),
+    )
+
+
+@functools.cache
+def _library() -> ctypes.CDLL:
+    library = ctypes.CDLL(str(compiled("libarduino.so", "-shared", "-fPIC", *_SIMAVR)))
+    library.uno_new.restype = ctypes.c_void_p
+    library.uno_now_us.restype = ctypes.c_double
+    pointer, real = ctypes.c_void_p, ctypes.c_double
+    for name, arguments in {
+        "uno_new": [ctypes.c_char_p],
+        "uno_free": [pointer],
+        "uno_now_us": [pointer],
+        "uno_send": [pointer, ctypes.POINTER(ctypes.c_uint16), ctypes.c_int],
+        "uno_transmitter": [pointer, ctypes.c_int, real, real],
+        "uno_reset": [pointer],
+        "uno_hang": [pointer, ctypes.c_uint32],
+        "uno_run_us": [pointer, real],
+        "uno_read": [pointer, ctypes.c_char_p, ctypes.c_int],
+        "uno_events": [pointer, ctypes.POINTER(_Event), ctypes.c_int],
+    }.items():
+        getattr(library, name).argtypes = arguments
+    return library
+
+
+def line(body: str) -> bytes:
+    """A line of the protocol, by zlib: independent of both sides' own code."""
+    return f"{body}*{zlib.crc32(body.encode()):08X}\n".encode()
+
+
+def body_of(text: bytes) -> str | None:
+    """What is in a line, None if its CRC is wrong."""
+    body, _, crc = text.decode("ascii", "replace").rpartition("*")
+    return body if crc == f"{zlib.crc32(body.encode()):08X}" else None
+
+
+FIELDS = [
+    *("boot", "uptime_ms", "sequence", "result", "state", "reason", "steering_us", "throttle_us"),
+    *("receiver_steering_us", "receiver_steering_period_us", "receiver_throttle_us", "receiver_throttle_period_us"),
+    *("bad", "old", "out_of_range", "lost"),
+]
+
+
+def status_of(body: str) -> SimpleNamespace:
+    kind, *values = body.split(" ")
+    assert kind == "<S"
+    assert len(values) == len(FIELDS)
+    return SimpleNamespace(**{k: int(v) if v.isdigit() else v for k, v in zip(FIELDS, values, strict=True)})
+
+
+class Uno:
+    """The board, stepped. `events`: all that was measured, in the order of its end; `lines`: all that it said."""
+
+    def __init__(self):
+        self._c = _library()
+        self._uno = self._c.uno_new(str(firmware()).encode())
+        assert self._uno, f"simavr cannot load {firmware()}"
+        self.events: list[SimpleNamespace] = []
+        self.lines: list[str] = []
+        self._rest = b""
+        self.sequence = 0
+        self.boot = None
+
+    def close(self) -> None:
+        if self._uno:
+            self._c.uno_free(self._uno)
+            self._uno = None
+
+    @property
+    def now_us(self) -> float:
+        return self._c.uno_now_us(self._uno)
+
+    def run_ms(self, ms: float) -> list[SimpleNamespace]:
+        """Lets time pass; the events that it brought."""
+        state = self._c.uno_run_us(self._uno, ms * 1000)
+        assert state == 0, f"the firmware stopped: simavr's state {state}"
+        buffer, new = (_Event * 512)(), []
+        while n := self._c.uno_events(self._uno, buffer, 512):
+            new += [
+                SimpleNamespace(
+                    kind=e.kind, channel=e.channel, at_us=e.at_us, pulse_us=e.pulse_us, period_us=e.period_us
+                )
+                for e in buffer[:n]
+            ]
+        self.events += new
+        text = ctypes.create_string_buffer(4096)
+        while n := self._c.uno_read(self._uno, text, len(text)):
+            self._rest += text.raw[:n]
+        *whole, self._rest = self._rest.split(b"\n")
+        for said in filter(None, whole):
+            body = body_of(said)
+            assert body is not None or any(e.kind == RESET for e in new), f"the firmware said {said!r}"
+            if body:
+                self.lines.append(body)
+                if body.startswith("<H "):
+                    self.boot, self.sequence = int(body.split()[3]), int(body.split()[4])
+        return new
+
+    def send(self, data: bytes, *, framing_errors: bool = False) -> None:
+        flag = 0x8000 if framing_errors else 0
+        self._c.uno_send(self._uno, (ctypes.c_uint16 * len(data))(*(b | flag for b in data)), len(data))
+
+    def command(self, kind: str, *values: int, boot: int | None = None, sequence: int | None = None) -> bytes:
+        """Sends the next command: "A", "N", or "D" with two pulses. Returns its line."""
+        if sequence is None:
+            self.sequence = sequence = self.sequence + 1
+        text = line(" ".join(map(str, (f">{kind}", self.boot if boot is None else boot, sequence, *values))))
+        self.send(text)
+        return text
+
+    def transmitter(
+        self, steering_us: float | None = None, throttle_us: float | None = None, **period_us: float
+    ) -> None:
+        """The human's sticks, from their next pulse on; 0 is no signal, None leaves a channel as it is."""
+        for channel, pulse_us in enumerate((steering_us, throttle_us)):
+            if pulse_us is not None:
+                period = period_us.get(f"{'throttle' if channel else 'steering'}_period_us", 0)
+                self._c.uno_transmitter(self._uno, channel, pulse_us, period)
+
+    def reset(self) -> None:
+        self._c.uno_reset(self._uno)
+
+    def hang(self) -> None:
+        """loop() becomes an endless loop, until the next reset."""
+        self._c.uno_hang(self._uno, symbol("loop"))
+
+    @property
+    def status(self) -> SimpleNamespace:
+        """The newest status."""
+        return status_of(next(said for said in reversed(self.lines) if said.startswith("<S ")))
+
+    def drive(self, steering_us: int, throttle_us: int, ms: float, every_ms: float = 33) -> list[SimpleNamespace]:
+        """Commands at a rate, for a time."""
+        end, events = self.now_us + ms * 1000, []
+        while self.now_us < end:
+            self.command("D", steering_us, throttle_us)
+            events += self.run_ms(max(0.1, min(every_ms, (end - self.now_us) / 1000)))
+        return events
+
+
+def pulses(events: list[SimpleNamespace], pin: str, after_us: float = 0) -> list[SimpleNamespace]:
+    """The whole pulses of "steering" or "throttle" that began after a time."""
+    return [e for e in events if e.kind == PULSE and e.channel == PIN[pin] and e.at_us >= after_us]
+
+
+def widths(events: list[SimpleNamespace], pin: str, after_us: float = 0) -> set[float]:
+    return {e.pulse_us for e in pulses(events, pin, after_us)}
