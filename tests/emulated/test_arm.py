@@ -216,7 +216,7 @@ def test_the_int8_backbone_is_the_same_bit_for_bit(report):
 
 
 def test_bits_that_differ_are_found(machine, tiny_run, again, monkeypatch):
-    def flipped(_: Machine, folder: Path, arguments: list[str]) -> None:
+    def flipped(_: Machine, script: Path, arguments: list[str], folder: Path) -> None:
         torch.backends.quantized.engine = q.ENGINE
         with np.load(folder / "inputs.npz") as seen, torch.inference_mode():
             frame = torch.from_numpy(seen["frame_0000"])
@@ -224,7 +224,7 @@ def test_bits_that_differ_are_found(machine, tiny_run, again, monkeypatch):
         found[0, 0, 0, 0] += 1
         np.save(folder / "backbone.npy", found)
 
-    monkeypatch.setattr(arm, "_emulate_guest", flipped)
+    monkeypatch.setattr(arm, "emulate_script", flipped)
     bits = arm.backbone_bits(tiny_run, machine, again.checkpoint, memory_samples(1))
     assert bits == {"frames": 1, "values": 64 * 3 * 4, "differing": 1}
 
