@@ -58,14 +58,14 @@ NAMES = {
     "executorch": "ExecuTorch INT8",
 }
 
-# Instructions of one inference of the full policy (15.02 GMAC, 360x640), in 1e9: label, all, SIMD among them.
-# What notebook 03 shows of a run that `make arm` has not counted. Source: runs/full/arm.json of
-# `make arm NAME=full PEERS=1`, committed with notebook 06; to be filled in from there and from nowhere else.
+# Instructions of one inference of the full policy (15 GMAC, 360x640), in 1e9: label, all, SIMD among them. What
+# notebook 03 shows of a run that `make arm` has not counted. Source: `make arm NAME=full PEERS=1`, as in notebook 06.
 COUNTED = (
-    ("FP32, TorchScript", 6.10, 3.80),
-    ("INT8 affine (quint8): QNNPACK's kernels", 5.35, 4.40),
-    ("INT8 symmetric (qint8): XNNPACK, all that FX can", 1.66, 1.12),
-    ("ours: attention, residuals float; channel scales", 1.53, 1.09),
+    ("FP32, TorchScript", 6.08, 3.81),
+    ("INT8 affine (quint8): QNNPACK's kernels", 5.03, 4.34),
+    ("INT8 in ONNX Runtime 1.31.1", 1.66, 1.12),
+    ("INT8 in ExecuTorch 1.5.1: XNNPACK", 1.49, 1.08),
+    ("INT8 symmetric (qint8), ours: XNNPACK", 1.44, 1.08),
     ("dot-product instructions alone", 0.94, 0.94),
 )
 
@@ -381,7 +381,7 @@ def instruction_counts(found: Mapping[str, Any] | None = None) -> Figure:
 
     found: metrics of the run's arm.json; if None, the full policy's, as recorded in COUNTED.
     """
-    rows, title = list(COUNTED), "full policy, 360x640, 15 GMAC; recorded, not of this run"
+    rows, title = list(COUNTED), "full policy at 360x640, recorded, not of this run"
     if found is not None:
         counted = whole_size(found)
         rows = [(NAMES.get(n, n), m["instructions_g"], m["simd_g"]) for n, m in counted.items()]
@@ -395,7 +395,7 @@ def instruction_counts(found: Mapping[str, Any] | None = None) -> Figure:
     ax.set_yticks(y, [row[0] for row in rows])
     ax.invert_yaxis()
     ax.set_xlabel("instructions of one inference (10^9)")
-    ax.set_title(f"counted on an emulated Cortex-A76: {title}", fontsize=11)
+    ax.set_title(f"{title}; counted on an emulated Cortex-A76", fontsize=10, loc="right")
     _legend(ax, loc="lower right")
     return fig
 
@@ -721,22 +721,22 @@ def counted(metrics: Mapping[str, Any]) -> Figure:
     _simd_bars(left, y, total, simd)
     floor_g = next(m["floor_g"] for m in rows.values())
     left.axvline(floor_g, color=RED, ls="--", lw=1.2, label=f"floor: dot products alone, {floor_g:.2g}")
-    frames = max(m.get("frames_on_the_core") or 0 for m in rows.values())
     left.set_yticks(y, [NAMES.get(n, n) for n in rows])
     left.invert_yaxis()
     left.set_xlabel("instructions of one inference (10^9)")
     left.set_title("counted on an emulated Cortex-A76", fontsize=11)
     keys = [k for k in next(iter(metrics["artifacts"].values())) if k.endswith("_mae_pct") and "workstation" not in k]
     height = 0.8 / max(len(keys), 1)
+    judged = [m if keys and keys[0] in m and m.get("reference") != f"policy_{n}" else None for n, m in rows.items()]
+    frames = sorted({m["frames_on_the_core"] for m in judged if m})
+    over = " to ".join(str(n) for n in frames[:: len(frames) - 1 or 1])
     for i, key in enumerate(keys):
-        # An error on other frames is another error: what was judged on fewer has no bar here.
-        judged = [at for at, m in enumerate(rows.values()) if m.get("frames_on_the_core") == frames and key in m]
-        known = [(at, list(rows.values())[at][key]) for at in judged]
+        known = [(at, m[key]) for at, m in enumerate(judged) if m is not None]
         at, values = [at + (i - (len(keys) - 1) / 2) * height for at, _ in known], [value for _, value in known]
         right.barh(at, values, height, color=_action_colour(key, i), label=key.removesuffix("_mae_pct"))
         _values(right, at, values, "{:.2f}")
     right.set_xlabel("mean error against FP32\n(% of the recorded range)")
-    right.set_title(f"computed on it, {frames} frames", fontsize=11)
+    right.set_title(f"computed on it, {over} frames", fontsize=11)
     _legend(left, loc="lower right")
     _legend(right, loc="upper right")
     return fig
