@@ -13,7 +13,6 @@ The second form runs a TorchScript part of a policy, for its bits and not for a 
 (n, S) and prepared frames, as the part takes them; leaves `backbone.npy` (n, ...) of what it gave, in its folder.
 """
 
-import ctypes
 import json
 import platform
 import sys
@@ -22,16 +21,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from mark import mark
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.errors import RoverError
-
-GETPPID, MARK = 173, 0xC0FFEE  # as in count.c; without the plugin it is a system call that does nothing
-libc = ctypes.CDLL(None)
-
-
-def mark(starts: bool, section: int) -> None:
-    libc.syscall(GETPPID, ctypes.c_ulong(MARK), ctypes.c_ulong(starts), ctypes.c_ulong(section))
 
 
 def main(artifact: str, observations: str, folder: str, counted: str) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from guest import mark
+from mark import mark
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.errors import RoverError

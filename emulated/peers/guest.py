@@ -1,6 +1,6 @@
 """Runs inside the emulated Pi: another engine on its own form of the policy, one thread, no torch in the process.
 
-    guest.py ENGINE ARTIFACT OBSERVATIONS FOLDER COUNTED HEIGHT WIDTH
+    guest.py ARTIFACT OBSERVATIONS FOLDER COUNTED ENGINE HEIGHT WIDTH
 
 ENGINE is onnxruntime (ARTIFACT an .onnx) or executorch (a .pte); both take `state` (1, S) float32 and `frame`
 (1, 3, HEIGHT, WIDTH) float32 (see planes.py) and give (1, chunk, A) float32. OBSERVATIONS, the marks and what is left
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from mark import mark
 from planes import planes
 
 import rover_lib
@@ -28,14 +29,7 @@ package.__path__ = [str(Path(rover_lib.__file__).parent / "onboard")]
 sys.modules[package.__name__] = package
 from rover_lib.onboard.preprocess import prepare_frame  # noqa: E402
 
-GETPPID, MARK = 173, 0xC0FFEE  # as in ../count.c; without the plugin it is a system call that does nothing
-libc = ctypes.CDLL(None)
-
 Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # state (1, S), planes -> (chunk, A), all float32
-
-
-def mark(starts: bool, section: int) -> None:
-    libc.syscall(GETPPID, ctypes.c_ulong(MARK), ctypes.c_ulong(starts), ctypes.c_ulong(section))
 
 
 def ticks() -> dict[str, int]:
@@ -88,7 +82,7 @@ def executorch(artifact: str) -> Predict:
     return predict
 
 
-def main(engine: str, artifact: str, observations: str, folder: str, counted: str, height: str, width: str) -> None:
+def main(artifact: str, observations: str, folder: str, counted: str, engine: str, height: str, width: str) -> None:
     print("load", flush=True)
     mark(True, 0)
     predict = {"onnxruntime": onnxruntime, "executorch": executorch}[engine](artifact)

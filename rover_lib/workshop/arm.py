@@ -152,19 +152,19 @@ def prepare(progress: Progress = None) -> Machine:
 
 
 def _install_missing() -> None:
-    missing = missing_packages()
-    if not missing:
-        return
-    command = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *missing]
+    if missing := missing_packages():
+        install(missing, f"counting needs the Debian packages {' '.join(missing)}, which are not here")
+
+
+def install(packages: Sequence[str], refusal: str) -> None:
+    """Install Debian packages. refusal: what the ArmError says, before the command to type, where that cannot be."""
+    command = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *packages]
     if os.geteuid() != 0 or not shutil.which("apt-get"):
-        raise ArmError(
-            f"counting needs the Debian packages {' '.join(missing)}, which are not here: sudo {' '.join(command)}"
-        )
-    print(f"installing Debian packages: {' '.join(missing)}", file=sys.stderr)
+        raise ArmError(f"{refusal}: sudo {' '.join(command)}")
+    print(f"installing Debian packages: {' '.join(packages)}", file=sys.stderr)
     _call(["apt-get", "update", "--quiet"], "apt-get cannot read the package lists")
-    _call(
-        command, f"apt-get cannot install {' '.join(missing)}", env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    )
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    _call(command, f"apt-get cannot install {' '.join(packages)}", env=environment)
 
 
 def _call(command: Sequence[Any], what: str, **options: Any) -> str:
@@ -476,10 +476,14 @@ class Names:
 
 
 def by_kernel(blocks: np.ndarray, names: Names, at_most: int = KERNELS) -> dict[str, tuple[int, int, int]]:
-    """Executed (instructions, SIMD, SDOT) by function, demangled, most first; what is beyond `at_most` is "other"."""
+    """Executed (instructions, SIMD, SDOT) by function, demangled, most first; what is beyond `at_most` is "other".
+
+    Where a library was stripped of names, its blocks that hold an SDOT stand apart from the rest of it.
+    """
     found: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
     for block in blocks:
-        row = found[names[int(block["address"])]]
+        name = names[int(block["address"])]
+        row = found[f"{name} loops with SDOT" if name.startswith("[") and block["sdot"] else name]
         for i, what in enumerate(("instructions", "simd", "sdot")):
             row[i] += int(block["entered"]) * int(block[what])
     mangled = sorted(found, key=lambda n: -found[n][0])
@@ -542,7 +546,24 @@ def count_artifact(
     samples: with frame_bgr() and state; the first ones come again if there are fewer than `counted`, which is at
     least STEADY. on_step: told after each inference. Raises ArmError with what the guest said, if it fails there.
     """
-    artifact = Path(artifact).resolve()
+    return count_guest(machine, GUEST, artifact, samples, counted=counted, on_step=on_step, stop=stop)
+
+
+def count_guest(
+    machine: Machine,
+    script: Path,
+    artifact: Path | str,
+    samples: Sequence[Any],
+    *further: Any,
+    packages: Path | None = None,
+    counted: int = COUNTED,
+    on_step: Callable[[], None] = lambda: None,
+    stop: Event | None = None,
+) -> Counted:
+    """`count_artifact` by another script, which is told and leaves what emulated/guest.py is told and leaves.
+
+    further: arguments after those. packages: laid before the Pi's own.
+    """
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:
         folder = Path(scratch)
         observations = write_observations(folder / "observations.npz", samples)
@@ -554,8 +575,8 @@ def count_artifact(
                 on_step()
             before = line
 
-        arguments = [artifact, observations, folder, str(counted)]
-        done = emulate_script(machine, GUEST, arguments, folder, on_line=on_line, stop=stop)
+        arguments = [Path(artifact).resolve(), observations, folder, counted, *further]
+        done = emulate_script(machine, script, arguments, folder, packages=packages, on_line=on_line, stop=stop)
         return Counted(
             load=done.total(0),
             inferences=tuple(done.total(i) for i in range(1, counted + 1)),
@@ -570,10 +591,22 @@ def count_artifact(
         )
 
 
-def emulate_script(machine: Machine, script: Path, arguments: Sequence[Any], folder: Path, **options: Any) -> Emulation:
-    """`emulate` a Python script of ours in the emulated Pi, with rover_lib. options: of `emulate`."""
+def emulate_script(
+    machine: Machine,
+    script: Path,
+    arguments: Sequence[Any],
+    folder: Path,
+    *,
+    packages: Path | None = None,
+    **options: Any,
+) -> Emulation:
+    """`emulate` a Python script of ours in the emulated Pi, with rover_lib and what lies beside emulated/guest.py.
+
+    packages: laid before the Pi's own. options: of `emulate`.
+    """
     environment = _environment(machine.root, folder)
-    environment["PYTHONPATH"] += f":{REPOSITORY}"
+    places = [*([packages] if packages else []), environment["PYTHONPATH"], REPOSITORY, GUEST.parent]
+    environment["PYTHONPATH"] = ":".join(map(str, places))
     environment["PYTHONDONTWRITEBYTECODE"] = "1"  # nothing of the emulated Python goes into the checkout
     command = [machine.root / "usr" / "bin" / f"python{PYTHON}", script, *map(str, arguments)]
     return emulate(machine, command, folder, environment=environment, **options)
@@ -661,21 +694,31 @@ def _plan(
 def _count_all(
     machine: Machine, artifacts: dict[str, Path], plans: dict[str, tuple], jobs: int, progress: Progress
 ) -> dict[str, Counted]:
-    """Several emulated machines side by side: a count does not depend on who else is running."""
+    def count(samples: Sequence[Any], counted: int, artifact: Path) -> Callable[..., Counted]:
+        return lambda **how: count_artifact(machine, artifact, samples, counted=counted, **how)
+
+    todo = {stem: count(*plan, artifacts[stem]) for stem, plan in plans.items()}
     steps = sum(max(len(samples), counted) for samples, counted in plans.values())
-    bar = iter(progress(range(steps), desc="emulated inferences", total=steps) if progress else range(steps))
+    return side_by_side(todo, steps, "emulated inferences", jobs, progress)
+
+
+def side_by_side(
+    todo: dict[str, Callable[..., Counted]], steps: int, what: str, jobs: int, progress: Progress
+) -> dict[str, Counted]:
+    """Count several emulated machines, `jobs` at a time: a count does not depend on who else is running.
+
+    todo: called with on_step and stop, see `count_artifact`; the others end when one fails. steps: of all of them
+    together; what: they are, for the bar.
+    """
+    bar = iter(progress(range(steps), desc=what, total=steps) if progress else range(steps))
     one_at_a_time, stop = Lock(), Event()
 
     def on_step() -> None:
         with one_at_a_time:
             next(bar, None)
 
-    def count(stem: str) -> Counted:
-        samples, counted = plans[stem]
-        return count_artifact(machine, artifacts[stem], samples, counted=counted, on_step=on_step, stop=stop)
-
-    with ThreadPoolExecutor(min(jobs, len(plans))) as pool:
-        started = {stem: pool.submit(count, stem) for stem in plans}
+    with ThreadPoolExecutor(min(jobs, len(todo))) as pool:
+        started = {name: pool.submit(count, on_step=on_step, stop=stop) for name, count in todo.items()}
         try:
             for future in as_completed(started.values()):
                 future.result()
@@ -683,7 +726,7 @@ def _count_all(
             stop.set()  # when one failed, or the user does not want to wait
             pool.shutdown(cancel_futures=True)
     next(bar, None)
-    return {stem: future.result() for stem, future in started.items()}
+    return {name: future.result() for name, future in started.items()}
 
 
 def _chunks_here(path: Path, samples: Sequence[Any], progress: Progress) -> np.ndarray:
@@ -702,6 +745,21 @@ def errors_pct(
     return {f"{action}_mae_pct": float(mean[i] * report.pct(action)) for i, action in enumerate(actions)}
 
 
+def requantized(run_dir: Path | str, checkpoint: Checkpoint, stem: str = STATIC) -> q.QuantizedPolicy:
+    """The policy that a run's artifact was exported from, made again from the run's calibration.
+
+    Raises ArmError if the run's files are not those that the artifact was made from.
+    """
+    run_dir = Path(run_dir)
+    stage = read_stage(run_dir / "quantize.json", "quantize")
+    made, calibrated = stage["metrics"]["modes"][stem.removeprefix("policy_")], run_dir / "calibration.pt"
+    found = content_hash(run_dir / f"{stem}.pt"), sha256_of(calibrated)
+    if found != (made["content_hash"], stage["inputs"]["calibration.pt"]):
+        raise ArmError(f"{run_dir}: {stem}.pt and calibration.pt are not those of quantize.json; quantize again")
+    scheme = q.Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
+    return q.quantize(checkpoint, scheme, q.Calibration.load(calibrated))
+
+
 def backbone_bits(
     run_dir: Path | str,
     machine: Machine,
@@ -710,18 +768,11 @@ def backbone_bits(
 ) -> dict[str, int]:
     """Whether policy_static's INT8 backbone gives the same bits in the emulated Pi as on this machine.
 
-    The backbone (up to the image projection's INT8 output) is cut out of the same graph, made again from the run's
-    calibration, and run on prepared frames on both. Returns {frames, values, differing}: so many values were compared,
-    so many are not the same. Raises ArmError if the run's files are not those that policy_static.pt was made from.
+    The backbone (up to the image projection's INT8 output) is cut out of the same graph (see `requantized`) and run on
+    prepared frames on both. Returns {frames, values, differing}: so many values were compared, so many are not the
+    same. Raises ArmError if the run's files are not those that policy_static.pt was made from.
     """
-    run_dir = Path(run_dir)
-    stage = read_stage(run_dir / "quantize.json", "quantize")
-    made, calibrated = stage["metrics"]["modes"]["static"], run_dir / "calibration.pt"
-    found = content_hash(run_dir / f"{STATIC}.pt"), sha256_of(calibrated)
-    if found != (made["content_hash"], stage["inputs"]["calibration.pt"]):
-        raise ArmError(f"{run_dir}: {STATIC}.pt and calibration.pt are not those of quantize.json; quantize again")
-    scheme = q.Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
-    backbone = q.backbone_of(q.quantize(checkpoint, scheme, q.Calibration.load(calibrated))).eval()
+    backbone = q.backbone_of(requantized(run_dir, checkpoint)).eval()
     inputs = [q.inputs_of(s, checkpoint.config) for s in samples]
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch, torch.inference_mode():
         folder = Path(scratch)

@@ -25,7 +25,6 @@ from rover_lib.onboard.stage import sha256_of, write_stage
 from rover_lib.workshop import act, arm
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.arm import LABEL, SDOT_MACS, ArmError, Machine, Names, Progress, by_kernel, prepare
-from rover_lib.workshop.params import params
 from rover_lib.workshop.session import opened
 
 GUEST = arm.REPOSITORY / "emulated" / "parts.py"
@@ -281,18 +280,8 @@ def count_parts(run_dir: Path | str, progress: Progress = None, artifact: str = 
     again = opened(run_dir)
     if not again.parts.held_out:
         raise ArmError(f"{run_dir}: its recordings have no held-out frames to count with; record more episodes")
-    calibration = q.Calibration.load(run_dir / "calibration.pt")
-    how = manifest["calibration"]
-    scheme = q.Scheme(
-        manifest["mode"],
-        manifest["scheme"],
-        how["observer"],
-        how["channel_scales"],
-        params()["quantization"]["percentile"],
-        tuple(how["float_blocks"]),
-    )
     machine = prepare(progress)
-    quantized = q.quantize(again.checkpoint, scheme, calibration)
+    quantized = arm.requantized(run_dir, again.checkpoint, artifact)
     counted = count_pieces(machine, path, quantized, again.parts.held_out[0])
     macs = act.multiply_accumulates(act.ACT(again.checkpoint.config, again.checkpoint.weights))
     metrics = {"label": LABEL, **parts_metrics(counted, macs)}

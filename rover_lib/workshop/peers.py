@@ -13,10 +13,8 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Event, Lock
 from typing import Any
 
 import numpy as np
@@ -127,7 +125,8 @@ def _fetch(packages: Sequence[str], folder: Path, *where: str) -> None:
 
 def _compile(folder: Path) -> None:
     """policy.so from executorch.cpp, as ExecuTorch's own CMake package would compile and link it."""
-    _install_compiler()
+    if not shutil.which(COMPILER):
+        arm.install([COMPILER_PACKAGE], f"ExecuTorch needs the Debian package {COMPILER_PACKAGE}")
     sdk = folder / "executorch"
     command = [COMPILER, "-std=c++17", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "policy.so", SHIM]
     command += ["-DC10_USING_CUSTOM_GENERATED_MACROS", "-DET_EVENT_TRACER_ENABLED"]
@@ -138,18 +137,6 @@ def _compile(folder: Path) -> None:
     libraries = ("", "_backend_xnnpack", "_kernels_optimized", "_kernels_quantized", "_threadpool")
     command += ["-Wl,--no-as-needed", *(f"-lexecutorch{name}" for name in libraries)]
     arm._call(command, f"{SHIM.name} does not compile")
-
-
-def _install_compiler() -> None:
-    if shutil.which(COMPILER):
-        return
-    command = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", COMPILER_PACKAGE]
-    if os.geteuid() != 0 or not shutil.which("apt-get"):
-        raise ArmError(f"ExecuTorch needs the Debian package {COMPILER_PACKAGE}: sudo {' '.join(command)}")
-    print(f"installing Debian packages: {COMPILER_PACKAGE}", file=sys.stderr)
-    arm._call(["apt-get", "update", "--quiet"], "apt-get cannot read the package lists")
-    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    arm._call(command, f"apt-get cannot install {COMPILER_PACKAGE}", env=environment)
 
 
 # --- their form of the policy -----------------------------------------------------------------------------------------
@@ -214,63 +201,17 @@ def affine(run_dir: Path, checkpoint: Checkpoint, samples: Sequence[Sample], fol
 # --- counting ---------------------------------------------------------------------------------------------------------
 
 
-class StrippedNames(arm.Names):
-    """Function names where a library has them; where it was stripped, its blocks that hold an SDOT by themselves.
-
-    blocks: of one section (arm.BLOCK). The engines' wheels export next to none of their kernels' names.
-    """
-
-    def __init__(self, maps: str, blocks: np.ndarray):
-        super().__init__(maps)
-        self._with_sdot = set(blocks["address"][blocks["sdot"] > 0].tolist())
-
-    def __getitem__(self, address: int) -> str:
-        name = super().__getitem__(address)
-        return f"{name} loops with SDOT" if name.startswith("[") and address in self._with_sdot else name
-
-
 def count_peer(
     machine: Machine,
     engine: Engine,
     artifact: Path,
     samples: Sequence[Any],
     size: tuple[int, int],
-    *,
-    counted: int = arm.COUNTED,
-    on_step: Callable[[], None] = lambda: None,
-    stop: Event | None = None,
+    **how: Any,
 ) -> Counted:
-    """As arm.count_artifact, of an engine's artifact. size: (height, width) of the image that it takes."""
-    with tempfile.TemporaryDirectory(prefix="rover-peer-") as scratch:
-        folder = Path(scratch)
-        environment = arm._environment(machine.root, folder)
-        environment["PYTHONPATH"] = f"{packages_there(engine)}:{environment['PYTHONPATH']}:{REPOSITORY}"
-        environment["PYTHONDONTWRITEBYTECODE"] = "1"  # nothing of the emulated Python goes into the checkout
-        observations = arm.write_observations(folder / "observations.npz", samples)
-        command = [machine.root / "usr" / "bin" / f"python{arm.PYTHON}", GUEST, engine.name, artifact.resolve()]
-        command += [observations, folder, str(counted), *map(str, size)]
-        before = ""
-
-        def on_line(line: str) -> None:
-            nonlocal before
-            if before == "predict":  # a step has ended when the next one begins
-                on_step()
-            before = line
-
-        done = arm.emulate(machine, command, folder, environment=environment, on_line=on_line, stop=stop)
-        steady = done.sections[arm.STEADY]
-        return Counted(
-            load=done.total(0),
-            inferences=tuple(done.total(i) for i in range(1, counted + 1)),
-            simd=done.total(arm.STEADY, "simd"),
-            sdot=done.total(arm.STEADY, "sdot"),
-            kernels=arm.by_kernel(steady, StrippedNames((folder / "maps").read_text(), steady)),
-            peak_mb=done.peak_mb["predict"],
-            peak_loading_mb=done.peak_mb["load"],
-            emulator_mb=done.emulator_mb,
-            chunks=np.load(folder / "chunks.npy"),
-            versions=json.loads((folder / "versions.json").read_text()),
-        )
+    """`arm.count_artifact` of an engine's artifact. size: (height, width) of the image that it takes. how: of that."""
+    there = packages_there(engine)
+    return arm.count_guest(machine, GUEST, artifact, samples, engine.name, *size, packages=there, **how)
 
 
 def count_peers(
@@ -314,7 +255,8 @@ def count_peers(
         path = affine(run_dir, checkpoint, thinned(again.parts.choosing, 8), folder)
         todo["torch_affine"] = lambda **how: arm.count_artifact(machine, path, samples[::2], **how)
         made["torch_affine"] = path, {}
-    counts = _side_by_side(todo, max(len(samples), arm.COUNTED), jobs or os.cpu_count() or 1, progress)
+    steps = max(len(samples), arm.COUNTED) * len(todo)
+    counts = arm.side_by_side(todo, steps, "peers, emulated", jobs or os.cpu_count() or 1, progress)
 
     here = arm._chunks_here(reference, samples, progress)
     peers = {}
@@ -362,27 +304,3 @@ def with_peers(
     inputs = content["inputs"] | {f"{p.parent.name}/{p.name}": sha256_of(p) for p in artifacts}
     metrics = content["metrics"] | {"peers": peers}
     return write_stage(run_dir / "arm.json", "arm", params=content["params"], metrics=metrics, inputs=inputs)
-
-
-def _side_by_side(
-    todo: dict[str, Callable[..., Counted]], inferences: int, jobs: int, progress: Progress
-) -> dict[str, Counted]:
-    """Several emulated machines at a time; the others end when one fails."""
-    steps = inferences * len(todo)
-    bar = iter(progress(range(steps), desc="peers, emulated", total=steps) if progress else range(steps))
-    one_at_a_time, stop = Lock(), Event()
-
-    def on_step() -> None:
-        with one_at_a_time:
-            next(bar, None)
-
-    with ThreadPoolExecutor(min(jobs, len(todo))) as pool:
-        started = {name: pool.submit(count, on_step=on_step, stop=stop) for name, count in todo.items()}
-        try:
-            for future in as_completed(started.values()):
-                future.result()
-        finally:
-            stop.set()  # when one failed, or the user does not want to wait
-            pool.shutdown(cancel_futures=True)
-    next(bar, None)
-    return {name: future.result() for name, future in started.items()}

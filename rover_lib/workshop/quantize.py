@@ -613,16 +613,15 @@ def check_fast(module: nn.Module, example: tuple[Tensor, ...]) -> None:
 
 def _why_slow(m: nn.Module, x: Tensor) -> str | None:
     w = m.weight()
-    per_channel = w.qscheme() in (torch.per_channel_affine, torch.per_channel_symmetric)
+    per_channel, scales, zero_points = _weight_qparams(w)
     if x.dtype != torch.qint8:
         return f"its input is {str(x.dtype).removeprefix('torch.')}, not qint8"
     if w.dtype != torch.qint8 or w.int_repr().min() < -127:
         return "its weights are not qint8 in [-127, 127]"
-    if torch.any(w.q_per_channel_zero_points() if per_channel else torch.tensor(w.q_zero_point())):
+    if zero_points.any():
         return "its weights are not symmetric: a zero point is not 0"
     if per_channel and isinstance(m, int8.Linear):
         return "a linear with a scale per channel; it must be a 1x1 convolution, or have one scale"
-    scales = w.q_per_channel_scales() if per_channel else torch.tensor([w.q_scale()])
     ratio = scales.double() * x.q_scale() / m.scale
     if not ((ratio >= 2**-32) & (ratio < 2**8)).all():
         return f"its scales give a ratio of {ratio.max():.3g}, outside [2^-32, 2^8)"
@@ -638,10 +637,15 @@ def _dynamic(checkpoint: Checkpoint, calibration: Calibration) -> nn.Module:
         return quantize_dynamic(model, spec, dtype=torch.qint8)
 
 
+def _weight_qparams(w: Tensor) -> tuple[bool, Tensor, Tensor]:
+    """Whether a quantized weight has a scale per channel, its scales and its zero points, (channels,) or (1,) each."""
+    if w.qscheme() in (torch.per_channel_affine, torch.per_channel_symmetric):
+        return True, w.q_per_channel_scales(), w.q_per_channel_zero_points()
+    return False, torch.tensor([w.q_scale()]), torch.tensor([w.q_zero_point()])
+
+
 def _layer(name: str, m: nn.Module) -> dict[str, Any]:
-    weight = m.weight()
-    per_channel = weight.qscheme() in (torch.per_channel_affine, torch.per_channel_symmetric)
-    scales = weight.q_per_channel_scales() if per_channel else torch.tensor([weight.q_scale()])
+    per_channel, scales, _ = _weight_qparams(m.weight())
     static = not isinstance(m, dynamic_int8.Linear)
     row = {
         "name": name,

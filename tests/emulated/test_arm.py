@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import needs
 import numpy as np
 import pytest
 import torch
@@ -20,11 +21,7 @@ from rover_lib.workshop.arm import ArmError, Machine, count_artifact, count_run,
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.params import params
 
-MISSING = arm.missing_packages()
-pytestmark = [
-    pytest.mark.emulated,
-    pytest.mark.skipif(bool(MISSING), reason=f"needs the Debian packages {' '.join(MISSING)}"),
-]
+pytestmark = [pytest.mark.emulated, needs.qemu]
 
 SVC = 0xD4000001
 START, ROUNDS, SECTION = 0x400000, 1000, 7

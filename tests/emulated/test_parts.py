@@ -1,20 +1,21 @@
 """A prediction in parts against the prediction as a whole, on the emulated core and without it."""
 
+from dataclasses import asdict
 from itertools import pairwise
 from types import SimpleNamespace
 
+import needs
 import pytest
 import torch
 from policies import memory_samples
 
-from rover_lib.onboard.stage import read_stage
+from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import act, arm, parts
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.arm import ArmError, count_artifact, prepare
 from rover_lib.workshop.parts import FRAME, REST, count_parts, count_pieces, cut, graph_of, part_of_nodes
 
-MISSING = arm.missing_packages()
-emulated = pytest.mark.skipif(bool(MISSING), reason=f"needs the Debian packages {' '.join(MISSING)}")
 pytestmark = pytest.mark.emulated
 
 
@@ -70,6 +71,11 @@ def run(tiny, calibration, artifacts, tmp_path_factory):
     for name in ("static", "dynamic"):
         (folder / f"policy_{name}.pt").write_bytes(artifacts[name].read_bytes())
     calibration.save(folder / "calibration.pt")
+    modes = {
+        "static": {"scheme": asdict(q.Scheme("static")), "content_hash": content_hash(folder / "policy_static.pt")}
+    }
+    inputs = {"calibration.pt": sha256_of(folder / "calibration.pt")}
+    write_stage(folder / "quantize.json", "quantize", params={}, metrics={"modes": modes}, inputs=inputs)
     held_out = memory_samples(1, seed=1)
     again = SimpleNamespace(checkpoint=tiny, parts=SimpleNamespace(held_out=held_out))
     with pytest.MonkeyPatch.context() as patch:
@@ -77,7 +83,7 @@ def run(tiny, calibration, artifacts, tmp_path_factory):
         yield folder, held_out
 
 
-@emulated
+@needs.qemu
 def test_parts_sum_up_to_the_whole(run, tiny):
     folder, held_out = run
     content = count_parts(folder)
@@ -96,7 +102,7 @@ def test_parts_sum_up_to_the_whole(run, tiny):
     assert "decoder.1.cross_attention" in parts.table(content)
 
 
-@emulated
+@needs.qemu
 def test_pieces_of_another_policy_are_refused(run, tiny, calibration):
     folder, held_out = run
     other = q.quantize(tiny, q.Scheme("static", observer="minmax"), calibration)

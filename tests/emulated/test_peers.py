@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
+import needs
 import numpy as np
 import pytest
 import torch
@@ -26,11 +27,10 @@ from rover_lib.workshop.peers import ENGINES
 
 pytestmark = pytest.mark.emulated
 RANGES = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.1)}
-MISSING = arm.missing_packages()
 needs_engines = pytest.mark.skipif(
-    os.environ.get("ROVER_PEERS") != "1" or bool(MISSING),
+    os.environ.get("ROVER_PEERS") != "1" or bool(needs.QEMU_MISSING),
     reason="fetches 2 GB of other engines and takes minutes: ROVER_PEERS=1"
-    + (f", and the Debian packages {' '.join(MISSING)}" if MISSING else ""),
+    + (f", and the Debian packages {' '.join(needs.QEMU_MISSING)}" if needs.QEMU_MISSING else ""),
 )
 
 
@@ -203,7 +203,7 @@ def test_counts_of_another_policy_are_refused(tiny_run, tmp_path):
         peers.count_peers(tmp_path)
 
 
-@pytest.mark.skipif(bool(MISSING), reason=f"needs the Debian packages {' '.join(MISSING)}")
+@needs.qemu
 def test_blocks_of_a_stripped_library_are_told_apart(tmp_path):
     source = tmp_path / "one.c"
     source.write_text("int one(int a) { return a * 3; }\n")
@@ -211,7 +211,7 @@ def test_blocks_of_a_stripped_library_are_told_apart(tmp_path):
         ["gcc", "-shared", "-fPIC", "-fvisibility=hidden", "-s", "-o", tmp_path / "one.so", source], check=True
     )
     blocks = np.array([(0x5000001100, 2, 8, 4, 4), (0x5000001140, 1, 5, 0, 0)], arm.BLOCK)
-    names = peers.StrippedNames(f"5000000000-5000010000 r-xp 0 08:01 1    {tmp_path / 'one.so'}\n", blocks)
+    names = arm.Names(f"5000000000-5000010000 r-xp 0 08:01 1    {tmp_path / 'one.so'}\n")
     assert arm.by_kernel(blocks, names) == {"[one.so] loops with SDOT": (16, 8, 8), "[one.so]": (5, 0, 0)}
 
 

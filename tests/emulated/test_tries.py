@@ -1,15 +1,12 @@
 """What was tried: each operation runs in the emulated Pi, and what was kept costs less than what it replaced."""
 
+import needs
 import pytest
 
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop import arm, tries
+from rover_lib.workshop import tries
 
-MISSING = arm.missing_packages()
-pytestmark = [
-    pytest.mark.emulated,
-    pytest.mark.skipif(bool(MISSING), reason=f"needs the Debian packages {' '.join(MISSING)}"),
-]
+pytestmark = [pytest.mark.emulated, needs.qemu]
 
 
 def test_what_was_kept_is_the_cheaper_way(tmp_path):
