@@ -143,11 +143,11 @@ def quantize(checkpoint: Path, episodes: Path, output: Path, mode: str, samples:
 
     `rover run` does this for all modes, chooses the observer and the blocks by measurement, and compares.
     """
+    from rover_lib.onboard.params import params
     from rover_lib.workshop import quantize as q
     from rover_lib.workshop.act import ACT
     from rover_lib.workshop.checkpoint import load_checkpoint
     from rover_lib.workshop.episodes import choose_calibration, load_recordings, split
-    from rover_lib.workshop.params import params
 
     p = params()
     how_many, seed = samples or p["calibration"]["samples"], p["calibration"]["seed"]
@@ -183,10 +183,10 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_jso
 
     Errors are shares of the recorded range and microseconds of servo pulse.
     """
+    from rover_lib.onboard.params import params
     from rover_lib.onboard.policy import load_policy
     from rover_lib.workshop import compare as c
     from rover_lib.workshop.episodes import load_recordings, split
-    from rover_lib.workshop.params import params
 
     p = params()["calibration"]
     fp32 = load_policy(reference)

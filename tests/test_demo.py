@@ -4,7 +4,7 @@ import pytest
 from policies import stage_of
 
 from rover_lib.onboard import load_policy
-from rover_lib.workshop.params import params
+from rover_lib.onboard.params import params
 
 STAGES = ("load", "calibrate", "quantize", "compare")
 

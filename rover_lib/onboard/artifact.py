@@ -10,13 +10,15 @@ import json
 import re
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.stage import atomic_path
+
+if TYPE_CHECKING:
+    import torch
 
 SCHEMA = 1
 MANGLED = re.compile(rb"___torch_mangle_\d+")
@@ -41,13 +43,15 @@ MANIFEST_KEYS = {
 
 
 def save_artifact(
-    path: Path | str, module: torch.jit.ScriptModule, manifest: dict[str, Any], parity: dict[str, np.ndarray]
+    path: Path | str, module: "torch.jit.ScriptModule", manifest: dict[str, Any], parity: dict[str, np.ndarray]
 ) -> str:
     """Write the artifact atomically; return its content hash.
 
     parity: `state` (n, S) float32, `frame_<camera>` (n, height, width, 3) uint8 RGB, `chunk` (n, C, A) float32.
     Raises ArtifactError if the manifest lacks something.
     """
+    import torch  # here, because reading what an artifact says of itself needs no torch
+
     check_manifest(manifest, str(path))
     vectors = io.BytesIO()
     np.savez_compressed(vectors, **parity)

@@ -11,14 +11,13 @@ import os
 import platform
 import socket
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import torch
 
 from rover_lib.onboard.errors import RoverError
 
@@ -64,13 +63,14 @@ def environment() -> dict[str, Any]:
         commit = found.stdout.strip() or None
     except (OSError, subprocess.SubprocessError):
         commit = None
+    torch = sys.modules.get("torch")  # what did not load it is not about it
     return {
         "host": socket.gethostname(),
         "machine": platform.machine(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "torch": torch.__version__,
-        "engine": torch.backends.quantized.engine,
+        "torch": torch.__version__ if torch else version("torch"),
+        "engine": torch.backends.quantized.engine if torch else None,
         "commit": commit,
     }
 
@@ -81,10 +81,8 @@ def plain(value: Any) -> Any:
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
         return [plain(v) for v in value]
-    if isinstance(value, (np.ndarray, torch.Tensor)):
+    if hasattr(value, "tolist"):  # numpy's arrays and scalars, torch's tensors
         return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, float) and not math.isfinite(value):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.playground.record import record_episodes
 from rover_lib.playground.train import make_checkpoint
@@ -16,7 +17,6 @@ from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_bloc
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.episodes import Sample, choose_calibration
-from rover_lib.workshop.params import params
 from rover_lib.workshop.quantize import Calibration, Scheme, calibrate, export, quantize
 from rover_lib.workshop.session import Opened, load
 

@@ -23,13 +23,13 @@ from torch import Tensor, nn
 
 from rover_lib.onboard import preprocess
 from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.params import params
 from rover_lib.onboard.preprocess import normalise, prepare_frame
 from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.playground import record
 from rover_lib.workshop import episodes as episodes_module
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.episodes import Sample, load_recordings, split
-from rover_lib.workshop.params import params
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy

@@ -38,13 +38,13 @@ import torch
 
 from rover_lib.onboard.artifact import content_hash, read_manifest
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import Fidelity, gate, thinned
-from rover_lib.workshop.params import params
 from rover_lib.workshop.session import opened
 
 REPOSITORY = Path(__file__).parents[2]

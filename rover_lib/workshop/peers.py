@@ -21,6 +21,7 @@ import numpy as np
 from torch import nn
 
 from rover_lib.onboard.artifact import read_manifest
+from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import ACTION_LIMITS
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
@@ -31,7 +32,6 @@ from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.episodes import Sample, choose_calibration
-from rover_lib.workshop.params import params
 from rover_lib.workshop.session import opened
 
 FOLDER = REPOSITORY / "emulated" / "peers"

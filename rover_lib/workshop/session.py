@@ -11,10 +11,10 @@ from pathlib import Path
 import torch
 
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.episodes import Recordings, Split, load_recordings, split
-from rover_lib.workshop.params import params
 
 TTY_VARIABLE = "ROVER_PROGRESS_TTY"  # the terminal of who started a run: the notebooks' bars are drawn there
 SMALL_GMAC = 1.0  # below this a second thread costs more, on a busy machine, than it brings

@@ -13,13 +13,13 @@ import pytest
 import torch
 from policies import memory_samples
 
+from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import arm
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.arm import ArmError, Machine, count_artifact, count_run, emulate, prepare
 from rover_lib.workshop.checkpoint import load_checkpoint
-from rover_lib.workshop.params import params
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
 

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import nbformat
 import pytest
 
+from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import arm, session
 from rover_lib.workshop import run as runs
-from rover_lib.workshop.params import params
 from rover_lib.workshop.run import AFTERWARDS, NAMES, NOTEBOOK_LIMIT, NOTEBOOKS, parameters_of
 
 PATHS = [NOTEBOOKS / f"{name}.ipynb" for name in NAMES + AFTERWARDS]

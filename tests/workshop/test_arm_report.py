@@ -7,10 +7,10 @@ import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
+from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop import arm
 from rover_lib.workshop import run as runs
-from rover_lib.workshop.params import params
 
 # As counted: {kernel: (instructions, SDOT among them, group)}, 10**9
 KERNELS = {

@@ -1,4 +1,4 @@
-"""params.yml: every gate and default that notebooks, tests and playbooks share."""
+"""params.yml: every gate and default that notebooks, tests, playbooks and the car share."""
 
 from pathlib import Path
 from typing import Any
@@ -7,11 +7,15 @@ import yaml
 
 from rover_lib.onboard.errors import ParamsError
 
-PATH = Path(__file__).parents[2] / "params.yml"
+PLACES = (Path(__file__).parents[2] / "params.yml", Path("/etc/rover/params.yml"))  # a checkout's; an installed rover's
 
 
-def params(path: Path | str = PATH) -> dict[str, Any]:
-    """The content of params.yml. Raises ParamsError if it is missing or not YAML."""
+def params(path: Path | str | None = None) -> dict[str, Any]:
+    """The content of params.yml, of the first of PLACES if no path is given.
+
+    Raises ParamsError if it is missing or not YAML.
+    """
+    path = path or next((p for p in PLACES if p.is_file()), PLACES[0])
     try:
         content = yaml.safe_load(Path(path).read_text())
     except FileNotFoundError:
