@@ -2,8 +2,6 @@
 
 import json
 import math
-import stat
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,13 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rover_lib.onboard.benchmark import (
-    Host,
     benchmark,
     check_gates,
     floor_ms,
     latency_metrics,
     peak_memory_alone_mb,
-    throttled_means,
 )
 from rover_lib.onboard.errors import ParamsError, PolicyError
 
@@ -78,38 +74,6 @@ class Machine:
 @pytest.fixture
 def machine():
     return Machine()
-
-
-@pytest.fixture
-def bare_host(tmp_path):
-    """A host that tells nothing."""
-    return Host(sys_root=tmp_path, proc_root=tmp_path, vcgencmd=str(tmp_path / "none"))
-
-
-@pytest.fixture
-def pi_host(tmp_path):
-    """A Raspberry Pi's files, and a vcgencmd that says it has been throttled."""
-    zone = tmp_path / "sys/class/thermal/thermal_zone0"
-    zone.mkdir(parents=True)
-    (zone / "type").write_text("cpu-thermal\n")
-    (zone / "temp").write_text("61350\n")
-    other = tmp_path / "sys/class/thermal/thermal_zone1"
-    other.mkdir()
-    (other / "type").write_text("rp1_adc\n")
-    (other / "temp").write_text("70000\n")
-    for core, khz in enumerate((2400000, 1500000)):
-        cpu = tmp_path / f"sys/devices/system/cpu/cpu{core}/cpufreq"
-        cpu.mkdir(parents=True)
-        (cpu / "scaling_cur_freq").write_text(f"{khz}\n")
-    (tmp_path / "proc/self").mkdir(parents=True)
-    (tmp_path / "proc/self/status").write_text("Name:\tpython\nVmPeak:\t 900000 kB\nVmHWM:\t  400000 kB\n")
-    (tmp_path / "proc/stat").write_text(
-        "cpu  8 0 0 8 0 0 0 0 0 0\ncpu0 3 0 1 5 1 0 0 0 0 0\ncpu1 4 0 0 2 0 0 0 0 0 0\n"
-    )
-    command = tmp_path / "vcgencmd"
-    command.write_text("#!/bin/sh\n[ $1 = get_throttled ] && echo throttled=0x50000\n")
-    command.chmod(command.stat().st_mode | stat.S_IXUSR)
-    return Host(sys_root=tmp_path / "sys", proc_root=tmp_path / "proc", vcgencmd=str(command))
 
 
 # ---- arithmetic
@@ -243,20 +207,6 @@ def test_what_a_pi_tells(machine, pi_host):
     assert metrics["throttled_means"] == ["under-voltage since the start", "throttled since the start"]
     assert metrics["peak_memory_mb"] == pytest.approx(409.6)
     assert metrics["cpu_per_core_pct"] == [0, 0]  # its ticks stand still
-    assert pi_host.core_ticks() == [(4, 10), (4, 6)]
-
-
-def test_broken_readings_are_none(pi_host):
-    (pi_host.sys_root / "class/thermal/thermal_zone0/temp").write_text("hot")
-    assert pi_host.temperature_c() == 70.0
-    Path(pi_host.vcgencmd).write_text("#!/bin/sh\necho VCHI initialization failed; exit 255\n")
-    assert pi_host.throttled() is None
-
-
-def test_throttled_means():
-    assert throttled_means(None) is None
-    assert throttled_means("0x0") == []
-    assert throttled_means("0x80008") == ["soft temperature limit now", "soft temperature limit since the start"]
 
 
 def test_soak_has_a_time_series(machine, pi_host):

@@ -1,0 +1,90 @@
+"""What the machine says about itself: temperature, clock, throttling, memory. What it cannot tell is None, not 0."""
+
+import resource
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+# vcgencmd get_throttled: what is so now, and (16 bits higher) what has been since the start
+THROTTLED_BITS = {0: "under-voltage", 1: "frequency capped", 2: "throttled", 3: "soft temperature limit"}
+
+
+@dataclass(frozen=True)
+class Host:
+    """Reads the machine's state. Paths and the command are arguments for the tests' sake."""
+
+    sys_root: Path = Path("/sys")
+    proc_root: Path = Path("/proc")
+    vcgencmd: str = "vcgencmd"
+
+    def temperature_c(self) -> float | None:
+        """The processor's temperature; of another zone if none says it is the processor's."""
+        readings = {}
+        for zone in sorted(self.sys_root.glob("class/thermal/thermal_zone*")):
+            milli_c = _number_in(zone / "temp")
+            if milli_c is not None:
+                readings[_text_in(zone / "type") or zone.name] = milli_c / 1000
+        cpu = [c for name, c in readings.items() if "cpu" in name.lower() or name == "x86_pkg_temp"]
+        return max(cpu or readings.values(), default=None)
+
+    def clock_mhz(self) -> float | None:
+        """The slowest core's clock now."""
+        files = self.sys_root.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_cur_freq")
+        return min((khz / 1000 for f in files if (khz := _number_in(f)) is not None), default=None)
+
+    def throttled(self) -> str | None:
+        """What `vcgencmd get_throttled` says on a Raspberry Pi, such as "0x0"."""
+        try:
+            found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
+        except (OSError, subprocess.SubprocessError):
+            return None
+        name, _, value = found.stdout.strip().partition("=")
+        return value if found.returncode == 0 and name == "throttled" and value.startswith("0x") else None
+
+    def process_peak_memory_mb(self) -> float | None:
+        """The most memory that this process has had resident, ever."""
+        for line in (_text_in(self.proc_root / "self/status") or "").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024 / 1e6
+        # ru_maxrss second: a child inherits its parent's, VmHWM starts anew
+        kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return kib * (1 if sys.platform == "darwin" else 1024) / 1e6 or None
+
+    def core_ticks(self) -> list[tuple[int, int]] | None:
+        """Per core (busy, all) ticks since the machine's start."""
+        rows = [line.split() for line in (_text_in(self.proc_root / "stat") or "").splitlines()]
+        cores = [[int(v) for v in r[1:9]] for r in rows if r and r[0].startswith("cpu") and r[0] != "cpu"]
+        return [(sum(c) - c[3] - c[4], sum(c)) for c in cores if len(c) > 4] or None  # 3, 4: idle, waiting for disks
+
+    def reading(self) -> dict[str, Any]:
+        """Temperature, clock and throttling now."""
+        return {
+            "temperature_c": self.temperature_c(),
+            "clock_mhz": self.clock_mhz(),
+            "throttled": self.throttled(),
+        }
+
+
+def throttled_means(value: str | None) -> list[str] | None:
+    """The sentences behind get_throttled's bits; None if there was no reading."""
+    if value is None:
+        return None
+    bits = int(value, 16)
+    now = [f"{name} now" for bit, name in THROTTLED_BITS.items() if bits >> bit & 1]
+    return now + [f"{name} since the start" for bit, name in THROTTLED_BITS.items() if bits >> (bit + 16) & 1]
+
+
+def _text_in(path: Path) -> str | None:
+    try:
+        return path.read_text().strip()
+    except (OSError, ValueError):
+        return None
+
+
+def _number_in(path: Path) -> float | None:
+    try:
+        return float(_text_in(path) or "")
+    except ValueError:
+        return None

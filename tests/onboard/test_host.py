@@ -1,0 +1,31 @@
+"""What a machine tells about itself: of one that tells nothing, and of a Raspberry Pi."""
+
+from pathlib import Path
+
+from rover_lib.onboard.host import Host, throttled_means
+
+
+def test_what_a_host_cannot_tell_is_none(bare_host):
+    assert bare_host.reading() == {"temperature_c": None, "clock_mhz": None, "throttled": None}
+    assert bare_host.core_ticks() is None
+    assert bare_host.process_peak_memory_mb() > 10  # from the system's accounts
+
+
+def test_what_a_pi_tells(pi_host):
+    assert pi_host.reading() == {"temperature_c": 61.35, "clock_mhz": 1500, "throttled": "0x50000"}
+    assert pi_host.core_ticks() == [(4, 10), (4, 6)]
+    assert abs(pi_host.process_peak_memory_mb() - 409.6) < 1e-9
+
+
+def test_broken_readings_are_none(pi_host):
+    (pi_host.sys_root / "class/thermal/thermal_zone0/temp").write_text("hot")
+    assert pi_host.temperature_c() == 70.0
+    Path(pi_host.vcgencmd).write_text("#!/bin/sh\necho VCHI initialization failed; exit 255\n")
+    assert pi_host.throttled() is None
+    assert Host(vcgencmd=str(pi_host.proc_root)).throttled() is None  # no program
+
+
+def test_throttled_means():
+    assert throttled_means(None) is None
+    assert throttled_means("0x0") == []
+    assert throttled_means("0x80008") == ["soft temperature limit now", "soft temperature limit since the start"]
