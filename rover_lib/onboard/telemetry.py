@@ -1,0 +1,635 @@
+"""The flight log, one line per control tick, and the status line for people. Neither ever holds up the loop.
+
+    with FlightLog(path, header={"hz": 30, "fade_s": 0.5, "stop_s": 1.0}, max_bytes=10_000_000, keep=3) as log:
+        log.tick(Tick(t_s=time.monotonic() - log.start_s, ...))
+        log.event("camera unplugged", level=logging.WARNING, frame=812)
+    flight = read_log(path)
+
+A log is text. Each file begins with a header, a line of JSON that names the columns of the ticks; a tick is a line of
+values between commas, an empty one where there is none; events, and what the machine says of itself once a second,
+are lines of JSON. All end in a checksum (CRC-16 of what stands before it): a line that a power cut or a full disk
+damaged is skipped, not believed.
+
+`tick` and `event` put their row into a bounded queue, nothing else. Three threads do what can take long or fail: one
+reads the machine, writes the file and syncs it; one passes events on to `logging` (logger "rover"), whose stream may
+be a terminal that somebody stopped; one writes the status line.
+"""
+
+import binascii
+import contextlib
+import errno
+import glob
+import json
+import logging
+import os
+import select
+import shutil
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple, TextIO
+
+import numpy as np
+
+from rover_lib.onboard.errors import ParamsError, RoverError
+from rover_lib.onboard.host import Host, throttled_means
+from rover_lib.onboard.servo_link import State
+from rover_lib.onboard.stage import plain
+
+SCHEMA = 1
+QUEUE_TICKS = 2048  # a minute at 30 Hz that a disk may do without; 1 MB
+QUEUE_EVENTS = 256
+BATCH_LINES = 16  # formatted between two writes, each of which lets the other threads run
+RETRY_S = 1.0
+MACHINE_S = 1.0
+CLOSE_S = 2.0
+MIN_BYTES = 20_000
+EVENT_CHARACTERS = 800
+MISSING = "ticks are missing before this one"
+BACK_S = 1.0  # a tick that is so much older than the one before it belongs to another drive
+
+_log = logging.getLogger("rover")
+
+
+class LogError(RoverError):
+    """A flight log that is not there, or in which nothing can be read."""
+
+
+class Tick(NamedTuple):
+    """One control tick. None says "not known" or "none yet"."""
+
+    t_s: float  # since FlightLog.start_s, by the same clock
+    late_ms: float  # the command went out so long after its deadline
+    state: str  # who drives: M, A, S as the Arduino says, "" not known
+    reason: str  # why, a key of servo_link.REASONS
+    steering: float  # commanded, [-1, 1]
+    throttle: float  # commanded, [0, 1]
+    steering_us: int  # commanded pulses
+    throttle_us: int
+    pins_steering_us: int | None  # what the Arduino last said that its pins do
+    pins_throttle_us: int | None
+    plan: int  # number of the plan in use, 0: none
+    plan_age_ms: float | None  # since the capture of that plan's frame
+    latency_ms: float | None  # of that plan, from capture to ready
+    fade: float  # how much throttle the plan's age allows, 1 to 0
+    frame: int  # number of the newest frame
+
+
+_FORMATS = dict.fromkeys(Tick._fields, "d") | {
+    "t_s": ".4f",
+    "late_ms": ".3f",
+    "state": "",
+    "reason": "",
+    "steering": ".4f",
+    "throttle": ".4f",
+    "plan_age_ms": ".1f",
+    "latency_ms": ".1f",
+    "fade": ".3f",
+}
+_TEXTS = ("state", "reason")
+
+
+class Event(NamedTuple):
+    """Something that happened: when (seconds since the start), what, and what belongs to it."""
+
+    t_s: float
+    text: str
+    fields: dict[str, Any]
+
+
+def _sealed(row: dict[str, Any]) -> bytes:
+    """A line of JSON with its checksum as the last member."""
+    body = json.dumps(plain(row), separators=(",", ":"), default=str)[:-1].encode()
+    return b'%s,"crc":"%04X"}\n' % (body, binascii.crc_hqx(body, 0))
+
+
+def _tick_line(tick: Tick) -> bytes:
+    values = ["" if v is None else format(v, f) for v, f in zip(tick, _FORMATS.values(), strict=True)]
+    body = ",".join(values).encode()
+    return b"%s,%04X\n" % (body, binascii.crc_hqx(body, 0))
+
+
+def _event_line(event: Event) -> bytes:
+    fields = event.fields
+    if len(whole := repr(fields)) > EVENT_CHARACTERS:  # files are bounded, a traceback is not
+        fields = {"cut": whole[:EVENT_CHARACTERS]}
+    text = event.text[:EVENT_CHARACTERS]
+    return _sealed({"kind": "event", "t_s": round(event.t_s, 4), "event": text, "fields": fields})
+
+
+class FlightLog:
+    """The flight log of one drive, from entering the context until leaving it.
+
+    path: the file; None only passes events on to logging. Drives that are there already are kept: a new one is
+    appended. header: what the drive was started with; the figure looks for hz, fade_s and stop_s in it. max_bytes: a
+    file that would grow beyond is renamed to path.1, path.1 to path.2 and so on, and only `keep` such older files
+    stay. flush_s: the file is synced to the disk so often. Raises ParamsError for limits that make no sense, at once;
+    afterwards nothing: a disk that is full or gone is said once, counted in `failures`, and tried again every second.
+    Ticks come from one thread; events from any.
+    """
+
+    def __init__(
+        self,
+        path: Path | str | None,
+        *,
+        header: dict[str, Any],
+        max_bytes: int,
+        keep: int,
+        flush_s: float = 0.5,
+        clock: Callable[[], float] = time.monotonic,
+        host: Host | None = None,
+    ):
+        if max_bytes < MIN_BYTES or keep < 0 or not 0 < flush_s <= 1:
+            raise ParamsError(
+                f"a flight log needs max_bytes from {MIN_BYTES}, keep from 0 and flush_s in (0, 1], found {max_bytes}, "
+                f"{keep} and {flush_s}; see params.yml"
+            )
+        self.path = Path(path) if path is not None else None
+        self.start_s = clock()
+        self.failures = 0
+        self.last_error: str | None = None
+        self.dropped = 0  # ticks for which the queue had no room
+        self._header = {
+            "schema": SCHEMA,
+            "kind": "header",
+            "start": datetime.now().astimezone().isoformat(),
+            "start_monotonic_s": self.start_s,
+            "columns": [*Tick._fields, "crc"],
+            "drive": header,
+        }
+        self._max_bytes, self._keep, self._flush_s, self._clock = max_bytes, keep, flush_s, clock
+        self._host = host or Host()
+        self._ticked = 0
+        self._ticks: deque[tuple[int, Tick]] = deque(maxlen=QUEUE_TICKS if self.path else 0)
+        self._events: deque[Event] = deque(maxlen=QUEUE_EVENTS if self.path else 0)
+        self._sayings: deque[tuple[int, str, dict[str, Any]]] = deque(maxlen=QUEUE_EVENTS)
+        self._say_now = threading.Event()
+        self._closing = threading.Event()
+        self._threads: list[threading.Thread] = []
+        # Of the writing thread alone:
+        self._file: int | None = None
+        self._size = self._header_end = self._part = self._written = 0
+        self._unwritten = b""  # of a batch that the disk did not take
+        self._failed_since: float | None = None
+        self._retry_s = self._machine_s = 0.0
+        self._vcgencmd = False
+        self._bad_row_said = False
+
+    def __enter__(self) -> "FlightLog":
+        self._threads = [threading.Thread(target=self._run_speaker, name="flight log events", daemon=True)]
+        if self.path:
+            self._threads.append(threading.Thread(target=self._run_writer, name="flight log", daemon=True))
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def tick(self, row: Tick) -> None:
+        """Put a row in. Takes a microsecond, waits for nothing, raises nothing."""
+        self._ticked += 1
+        self._ticks.append((self._ticked, row))
+
+    def event(self, text: str, *, level: int = logging.INFO, **fields: Any) -> None:
+        """Note that something happened, with what belongs to it, in the file and in `logging`. As harmless as tick."""
+        self._events.append(Event(self._clock() - self.start_s, text, fields))
+        self._say(level, text, fields)
+
+    def close(self) -> None:
+        """Write what is left. Waits 2 s at most: a disk or a terminal that is stuck is left behind."""
+        self._closing.set()
+        self._say_now.set()
+        end = time.monotonic() + CLOSE_S
+        for thread in reversed(self._threads):
+            thread.join(max(0.0, end - time.monotonic()))
+
+    def _say(self, level: int, text: str, fields: dict[str, Any]) -> None:
+        self._sayings.append((level, text, fields))
+        self._say_now.set()
+
+    def _run_speaker(self) -> None:
+        """The thread that talks to logging."""
+        while True:
+            self._say_now.wait()
+            self._say_now.clear()
+            closing = self._closing.is_set()
+            while self._sayings:
+                level, text, fields = self._sayings.popleft()
+                with contextlib.suppress(Exception):  # a handler that fails must not end this thread
+                    _log.log(level, "%s", "; ".join([text, *(f"{k} {v}" for k, v in fields.items())]))
+            if closing:
+                return
+
+    def _run_writer(self) -> None:
+        """The thread that writes."""
+        self._vcgencmd = shutil.which(self._host.vcgencmd) is not None  # a program that is not there is not started
+        while True:
+            closing = self._closing.wait(self._flush_s)
+            try:
+                if closing or time.monotonic() >= self._retry_s:
+                    self._write_all()
+            except Exception as error:
+                self._fail(error)
+            if closing:
+                self._release()
+                return
+
+    def _write_all(self) -> None:
+        """Empty the queues into the file and sync it. OSError if the disk does not take it."""
+        if self._file is None:
+            self._open()
+        if self._failed_since is not None:
+            failed_s = round(time.monotonic() - self._failed_since, 1)
+            self.event("the flight log is written again", level=logging.WARNING, failed_s=failed_s)
+            self._failed_since = None
+        if self._unwritten:
+            self._write(self._unwritten)
+        if time.monotonic() >= self._machine_s:
+            self._machine_s = time.monotonic() + MACHINE_S
+            self._write(self._machine_line())
+        for queue, line in ((self._ticks, self._tick_lines), (self._events, _event_line)):
+            left = len(queue)  # what comes in meanwhile is the next turn's
+            while left > 0:
+                rows = [queue.popleft() for _ in range(min(left, BATCH_LINES))]
+                left -= len(rows)
+                self._write(b"".join(self._lines(rows, line)))
+        os.fsync(self._file)
+
+    def _lines(self, rows: Iterable[Any], line: Callable[[Any], bytes]) -> Iterable[bytes]:
+        for row in rows:
+            try:
+                yield line(row)
+            except Exception as error:
+                self.failures += 1
+                self.last_error = f"{type(error).__name__}: {error}"
+                if not self._bad_row_said:
+                    self._bad_row_said = True
+                    self._say(logging.WARNING, f"a row is not in the flight log: {self.last_error}", {})
+
+    def _tick_lines(self, row: tuple[int, Tick]) -> bytes:
+        number, tick = row
+        lost, self._written = number - self._written - 1, number
+        line = _tick_line(tick)
+        if not lost:
+            return line
+        self.dropped += lost
+        return _event_line(Event(tick.t_s, MISSING, {"ticks": lost})) + line
+
+    def _machine_line(self) -> bytes:
+        row: dict[str, Any] = {"kind": "machine", "t_s": round(self._clock() - self.start_s, 4)}
+        row["temperature_c"] = self._host.temperature_c()
+        row["throttled"] = self._host.throttled() if self._vcgencmd else None
+        return _sealed(row)
+
+    def _write(self, data: bytes) -> None:
+        self._unwritten = data
+        if self._size + len(data) > self._max_bytes and self._size > self._header_end:
+            self._release()
+            self._shift()
+            self._open()
+        done = os.write(self._file, data)
+        self._size += done
+        # From the start of a line that was cut: whatever file is next has it whole, and none has it twice.
+        self._unwritten = b"" if done == len(data) else data[data.rfind(b"\n", 0, done) + 1 :]
+        if self._unwritten:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _open(self) -> None:
+        path = self.path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        header = _sealed(self._header | {"part": self._part + 1})
+        if path.is_file() and path.stat().st_size + len(header) > self._max_bytes:
+            self._shift()
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
+        self._size = os.fstat(self._file).st_size
+        if self._size and os.pread(self._file, 1, self._size - 1) != b"\n":
+            header = b"\n" + header  # ends what a power cut, or a full disk, left of a line
+        if os.write(self._file, header) != len(header):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._size += len(header)
+        self._header_end = len(header)
+        self._part += 1
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)  # the name of a new file is to survive a power cut too
+        finally:
+            os.close(folder)
+
+    def _shift(self) -> None:
+        """Make room for a new file."""
+        for old in _older(self.path):
+            if int(old.suffix[1:]) >= self._keep:
+                old.unlink()
+            else:
+                old.replace(_numbered(self.path, int(old.suffix[1:]) + 1))
+        if self._keep:
+            self.path.replace(_numbered(self.path, 1))
+        else:
+            self.path.unlink()
+
+    def _fail(self, error: Exception) -> None:
+        self.failures += 1
+        self.last_error = f"{type(error).__name__}: {error}"
+        self._retry_s = time.monotonic() + RETRY_S
+        if self._failed_since is None:
+            self._failed_since = time.monotonic()
+            text = f"{self.path}: the flight log cannot be written ({self.last_error}); driving goes on without"
+            self._say(logging.WARNING, text, {})
+        self._release()
+
+    def _release(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            with contextlib.suppress(OSError):
+                os.close(file)
+
+
+def _numbered(path: Path, number: int) -> Path:
+    return path.with_name(f"{path.name}.{number}")
+
+
+def _older(path: Path) -> list[Path]:
+    """path.N, ..., path.2, path.1: the oldest first."""
+    found = [p for p in path.parent.glob(f"{glob.escape(path.name)}.*") if p.suffix[1:].isdecimal()]
+    return sorted((p for p in found if p.stem == path.name), key=lambda p: -int(p.suffix[1:]))
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One drive, as its log tells it.
+
+    header: empty if it was damaged; header["drive"] is what the drive was started with. ticks: a column per field of
+    Tick, (n,) float64 with NaN for "not known", text for state and reason. machine: t_s and temperature_c, (m,)
+    float64, and throttled, a list of texts and None. drive: its index among the `drives` of these files. damaged:
+    lines that were skipped, of all drives.
+    """
+
+    path: Path
+    header: dict[str, Any]
+    ticks: dict[str, np.ndarray]
+    events: list[Event]
+    machine: dict[str, Any]
+    drive: int
+    drives: int
+    damaged: int
+
+    @property
+    def period_ms(self) -> float | None:
+        """Between two ticks, by the header's hz, else as the ticks were; None if nothing tells."""
+        hz = self.header.get("drive", {}).get("hz")
+        if isinstance(hz, (int, float)) and hz > 0:
+            return 1000 / hz
+        return float(np.median(np.diff(self.ticks["t_s"])) * 1000) if len(self.ticks["t_s"]) > 1 else None
+
+    def summary(self) -> dict[str, Any]:
+        """The drive in figures; None where nothing was measured.
+
+        jitter is by how much commands were late, missed is how many deadlines passed meanwhile. plan_age is over
+        ticks that had a plan, latency over plans.
+        """
+        ticks, period_ms = self.ticks, self.period_ms
+        t_s, late_ms, plans = ticks["t_s"], ticks["late_ms"], ticks["plan"]
+        _, first = np.unique(plans, return_index=True)
+        latency_ms = ticks["latency_ms"][first][plans[first] > 0] if len(plans) else plans
+        durations_s = np.diff(t_s, append=t_s[-1:] + (period_ms or 0) / 1000)
+        states = {s.value: s.name.lower() for s in State} | {"": "not known"}
+        throttled = next((v for v in reversed(self.machine["throttled"]) if v is not None), None)
+        missing = (e.fields.get("ticks", 0) for e in self.events if e.text == MISSING)
+        return {
+            "start": self.header.get("start"),
+            "seconds": float(t_s[-1] - t_s[0]) if len(t_s) else 0.0,
+            "ticks": len(t_s),
+            "missed": int(np.nansum(late_ms // period_ms)) if period_ms else None,
+            "jitter_p50_ms": _percentile(late_ms, 50),
+            "jitter_p99_ms": _percentile(late_ms, 99),
+            "jitter_max_ms": _percentile(late_ms, 100),
+            "plans": len(latency_ms),
+            "plan_age_p95_ms": _percentile(ticks["plan_age_ms"], 95),
+            "latency_p50_ms": _percentile(latency_ms, 50),
+            "latency_p95_ms": _percentile(latency_ms, 95),
+            "seconds_in": {
+                states.get(str(s), str(s)): float(durations_s[ticks["state"] == s].sum())
+                for s in np.unique(ticks["state"])
+            },
+            "temperature_max_c": _percentile(self.machine["temperature_c"], 100),
+            "throttled": throttled,
+            "throttled_means": throttled_means(throttled),
+            "events": [{"t_s": e.t_s, "event": e.text, **e.fields} for e in self.events],
+            "ticks_not_logged": sum(missing),
+            "drive": self.drive,
+            "drives": self.drives,
+            "damaged_lines": self.damaged,
+        }
+
+
+def _percentile(values: np.ndarray, q: float) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(np.percentile(values, q)) if len(values) else None
+
+
+class _Drive:
+    """One drive while it is read."""
+
+    def __init__(self, header: dict[str, Any]):
+        self.header = header
+        self.ticks: list[list[Any]] = []
+        self.events: list[Event] = []
+        self.machine: list[dict[str, Any]] = []
+
+    def begins(self, header: dict[str, Any]) -> bool:
+        """Whether `header` is another drive's, and not that of this one's next file."""
+        return any(header.get(key) != self.header.get(key) for key in ("start", "start_monotonic_s"))
+
+    def goes_on(self, t_s: float) -> bool:
+        return not self.ticks or t_s > self.ticks[-1][0] - BACK_S
+
+
+def read_log(path: Path | str, drive: int = -1) -> Flight:
+    """Read a flight log, with the older files path.1, path.2, ... that belong to it.
+
+    drive: which of the drives in these files, as an index: -1 is the last one, 0 the first. Raises LogError if the
+    file is not there, holds no line of a flight log, has no such drive, or is of another version.
+    """
+    path = Path(path)
+    try:
+        files = [p.read_bytes() for p in (*_older(path), path)]
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror}); name a file that rover drive wrote") from error
+    drives: list[_Drive] = []
+    damaged = 0
+    for line in (line for data in files for line in data.split(b"\n") if line):
+        row = _row(line)
+        if row is None:
+            damaged += 1
+            continue
+        is_tick, is_header = isinstance(row, list), isinstance(row, dict) and row["kind"] == "header"
+        if is_header and (not drives or drives[-1].begins(row)):
+            drives.append(_Drive(row))
+        elif not drives or (is_tick and not drives[-1].goes_on(row[0])):
+            drives.append(_Drive({}))  # its header was damaged
+        if is_tick:
+            drives[-1].ticks.append(row)
+        elif isinstance(row, Event):
+            drives[-1].events.append(row)
+        elif row["kind"] == "machine":
+            drives[-1].machine.append(row)
+    if not drives:
+        raise LogError(f"{path}: no line of a flight log in it, {damaged} of something else; name a file that rover "
+                       "drive wrote")  # fmt: skip
+    if not -len(drives) <= drive < len(drives):
+        raise LogError(f"{path}: no drive {drive}, it has {len(drives)}; choose from 0 to {len(drives) - 1}, or -1")
+    chosen = drives[drive]
+    if chosen.header.get("schema", SCHEMA) != SCHEMA:
+        raise LogError(f"{path}: of version {chosen.header['schema']}, this program reads {SCHEMA}; update it")
+    columns = zip(*chosen.ticks, strict=True) if chosen.ticks else [()] * len(Tick._fields)
+    return Flight(
+        path=path,
+        header=chosen.header,
+        ticks={n: np.array(c, str if n in _TEXTS else float) for n, c in zip(Tick._fields, columns, strict=True)},
+        events=chosen.events,
+        machine={
+            "t_s": np.array([m["t_s"] for m in chosen.machine], float),
+            "temperature_c": np.array([m["temperature_c"] for m in chosen.machine], float),  # None becomes NaN
+            "throttled": [m["throttled"] for m in chosen.machine],
+        },
+        drive=drive % len(drives),
+        drives=len(drives),
+        damaged=damaged,
+    )
+
+
+def _row(line: bytes) -> list[Any] | Event | dict[str, Any] | None:
+    """What a line says: the values of a tick, an event, or a header's or the machine's members; None if damaged."""
+    try:
+        if line.startswith(b"{"):
+            body, _, crc = line.rpartition(b',"crc":"')
+            if crc != b'%04X"}' % binascii.crc_hqx(body, 0):
+                return None
+            row = json.loads(body + b"}")
+            if row["kind"] != "event":
+                return row
+            return Event(row["t_s"], row["event"], row["fields"])
+        body, _, crc = line.rpartition(b",")
+        if crc != b"%04X" % binascii.crc_hqx(body, 0):
+            return None
+        texts = body.decode().split(",")
+        return [
+            text if name in _TEXTS else float(text) if text else np.nan
+            for name, text in zip(Tick._fields, texts, strict=True)
+        ]
+    except (ValueError, KeyError):
+        return None
+
+
+class StatusLine:
+    """One line for people on a stream, from a thread of its own, from entering the context until leaving it.
+
+        with StatusLine(lambda: f"{speed} m/s") as status:
+            logging.getLogger("rover").addHandler(status.handler)
+
+    A terminal has one line that is written over 4 times a second; anything else gets a line every 10 s. What goes to
+    `handler` is written above that line, and waits for nothing: a terminal that was stopped gets it later, or never.
+    """
+
+    def __init__(
+        self,
+        callback: Callable[[], str],
+        stream: TextIO | None = None,
+        *,
+        every_s: float = 0.25,
+        plain_every_s: float = 10.0,
+    ):
+        self._callback = callback
+        self._stream = stream if stream is not None else sys.stderr
+        self._terminal = self._stream.isatty()
+        try:
+            self._fd: int | None = self._stream.fileno()
+        except (OSError, AttributeError):
+            self._fd = None
+        self._every_s = every_s if self._terminal else plain_every_s
+        self._lines: deque[str] = deque(maxlen=QUEUE_EVENTS)
+        self._wake = threading.Event()
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="status line", daemon=True)
+        self.handler: logging.Handler = _StatusHandler(self)
+
+    def __enter__(self) -> "StatusLine":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def say(self, text: str) -> None:
+        """Write a line that stays. Waits for nothing."""
+        self._lines.append(text)
+        self._wake.set()
+
+    def close(self) -> None:
+        """Write what is left, and end. Waits half a second at most."""
+        self._closing = True
+        self._wake.set()
+        self._thread.join(0.5)
+
+    def _run(self) -> None:
+        due_s = time.monotonic() + self._every_s
+        while True:
+            self._wake.wait(max(0.0, due_s - time.monotonic()))
+            self._wake.clear()
+            closing = self._closing
+            text = "".join(f"{self._clear}{self._lines.popleft()}\n" for _ in range(len(self._lines)))
+            if closing or self._terminal or time.monotonic() >= due_s:
+                text += self._status() + ("\n" if closing or not self._terminal else "")
+            if time.monotonic() >= due_s:
+                due_s = time.monotonic() + self._every_s
+            try:
+                self._write(text)
+            except (OSError, ValueError):  # nobody is there to read
+                return
+            if closing:
+                return
+
+    @property
+    def _clear(self) -> str:
+        return "\r\x1b[K" if self._terminal else ""
+
+    def _status(self) -> str:
+        try:
+            text = self._callback()
+        except Exception as error:
+            text = f"no status: {type(error).__name__}: {error}"
+        if self._terminal:
+            with contextlib.suppress(OSError):
+                text = text[: max(1, os.get_terminal_size(self._fd).columns - 1)]
+        return self._clear + text
+
+    def _write(self, text: str) -> None:
+        if self._fd is None:
+            self._stream.write(text)
+            self._stream.flush()
+            return
+        # Not through the stream's buffer: its lock, held by a thread that is stuck, would hang the program's end.
+        data = text.encode(errors="replace")
+        while data:
+            # Nothing is written that would have to wait, as far as the kernel can tell beforehand.
+            if not select.select([], [self._fd], [], 0 if not self._closing else 0.1)[1]:
+                return
+            data = data[os.write(self._fd, data) :]
+
+
+class _StatusHandler(logging.Handler):
+    def __init__(self, status: StatusLine):
+        super().__init__()
+        self._status = status
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            self._status.say(self.format(record))
+        except Exception:
+            self.handleError(record)
