@@ -2,15 +2,19 @@
  *
  * As a library (cc -shared -fPIC): stepped from a test, no clock of this world in it.
  * As a program (cc -DPROGRAM): in real time, its serial line on a pty.
- *     arduino ROVER.elf --link PATH [--log CSV] [--reset-on-open] [--boot-ms N]
+ *     arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N]
  *         --link           a symbolic link to the pty, for pyserial to open
- *         --log            one line per pulse of a servo pin and per event: monotonic_s,event,pin,pulse_us,period_us
+ *         --log            on standard output, a line each: monotonic_s,event,pin,pulse_us,period_us
+ *                          all: every pulse of a servo pin, every line of the host, every event
+ *                          changes: of the pulses those that differ from the one before on their pin, and no lines
+ *                          monotonic_s is when the pin rose; a log that nobody reads is lost, "lost" then has how many
  *         --reset-on-open  what DTR does to an Uno when its port is opened, and after it
  *         --boot-ms        the boot loader's time: nothing runs for so long
  *     Where this machine stalls for more than 20 ms, so does the Arduino; the log then has "stall" with microseconds.
  *     Standard input takes, a line each: transmitter STEERING_US THROTTLE_US (0: no signal), reset, hang ADDRESS, quit.
+ *     It ends with whoever started it.
  *
- * Written against simavr 1.6, which needs help in two places, see on_compare and on_flags.
+ * Written against simavr 1.6, which needs help in three places, see on_compare, on_flags and INT1.
  */
 #include <stdbool.h>
 #include <stdint.h>
@@ -18,6 +22,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "avr_extint.h"
 #include "avr_ioport.h"
 #include "avr_timer.h"
 #include "avr_uart.h"
@@ -198,6 +203,9 @@ struct uno *uno_new(const char *elf) {
         }
     }
 
+    /* INT1, which nobody uses, sees the throttle's pin low, and simavr would look at it in every second cycle. */
+    avr_extint_set_strict_lvl_trig(avr, 1, 0);
+
     static const struct { char out, out_bit, in, in_bit; } PINS[CHANNELS] = {{'B', 2, 'D', 2}, {'D', 3, 'B', 0}};
     for (int i = 0; i < CHANNELS; i++) {
         struct channel *channel = &uno->channels[i];
@@ -273,6 +281,7 @@ int uno_events(struct uno *uno, struct uno_event *events, int n) {
 #ifdef PROGRAM
 #include <errno.h>
 #include <fcntl.h>
+#include <math.h>
 #include <poll.h>
 #include <pty.h>
 #include <termios.h>
@@ -283,6 +292,44 @@ static double monotonic(void) {
     struct timespec t;
     clock_gettime(CLOCK_MONOTONIC, &t);
     return (double)t.tv_sec + (double)t.tv_nsec * 1e-9;
+}
+
+enum { PINS_NONE, PINS_CHANGES, PINS_ALL };
+static const double CHANGE_US = 0.4; /* an edge is known to 0.25 us, the finest timer steps by 0.5 us */
+
+static struct {
+    int fd, what;
+    unsigned lost;
+    struct uno_event last[CHANNELS];
+} pin_log;
+
+/* The Arduino does not wait for who reads its log. */
+static void put_log(double at_s, const char *what, const char *pin, double pulse_us, double period_us) {
+    if (!pin_log.what) return;
+    if (pin_log.lost && dprintf(pin_log.fd, "%.6f,lost,,%u,0\n", at_s, pin_log.lost) > 0) pin_log.lost = 0;
+    if (dprintf(pin_log.fd, "%.6f,%s,%s,%.2f,%.2f\n", at_s, what, pin, pulse_us, period_us) < 0) pin_log.lost++;
+}
+
+static void log_event(const struct uno_event *event, double start_s) {
+    static const char *const EVENTS[] = {"", "pulse", "cut", "line", "reset"};
+    static const char *const PINS[] = {"", "steering", "throttle"};
+    if (pin_log.what == PINS_CHANGES && event->kind == LINE_IN) return;
+    if (event->kind == PULSE) {
+        struct uno_event last = pin_log.last[event->channel];
+        pin_log.last[event->channel] = *event;
+        if (pin_log.what == PINS_CHANGES && fabs(event->pulse_us - last.pulse_us) < CHANGE_US &&
+            fabs(event->period_us - last.period_us) < CHANGE_US)
+            return;
+    }
+    put_log(start_s + event->at_us * 1e-6, EVENTS[event->kind], PINS[event->channel + 1], event->pulse_us,
+            event->period_us);
+}
+
+/* start_s: when simulated time was 0. */
+static void log_events(struct uno *uno, double start_s) {
+    struct uno_event events[256];
+    for (int n; (n = uno_events(uno, events, 256));)
+        for (int i = 0; i < n; i++) log_event(&events[i], start_s);
 }
 
 /* false: quit. */
@@ -305,21 +352,26 @@ static bool obey(struct uno *uno, const char *line) {
 }
 
 int main(int argc, char **argv) {
-    const char *elf = NULL, *link_path = NULL, *log_path = NULL;
+    const char *elf = NULL, *link_path = NULL, *log = NULL;
     bool reset_on_open = false;
     double boot_s = 0;
     for (int i = 1; i < argc; i++) {
         bool more = i + 1 < argc;
         if (!strcmp(argv[i], "--link") && more) link_path = argv[++i];
-        else if (!strcmp(argv[i], "--log") && more) log_path = argv[++i];
+        else if (!strcmp(argv[i], "--log") && more) log = argv[++i];
         else if (!strcmp(argv[i], "--boot-ms") && more) boot_s = atof(argv[++i]) * 1e-3;
         else if (!strcmp(argv[i], "--reset-on-open")) reset_on_open = true;
         else elf = argv[i];
     }
-    if (!elf || !link_path) {
-        fprintf(stderr, "usage: arduino ROVER.elf --link PATH [--log CSV] [--reset-on-open] [--boot-ms N]\n");
+    if (log) pin_log.what = !strcmp(log, "all") ? PINS_ALL : !strcmp(log, "changes") ? PINS_CHANGES : PINS_NONE;
+    if (!elf || !link_path || (log && !pin_log.what)) {
+        fprintf(stderr, "usage: arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N]\n");
         return 2;
     }
+    pid_t parent = getppid();
+    pin_log.fd = dup(1);
+    dup2(2, 1); /* simavr also talks on standard output */
+    fcntl(pin_log.fd, F_SETFL, O_NONBLOCK);
     struct uno *uno = uno_new(elf);
     if (!uno) {
         fprintf(stderr, "arduino: cannot load %s\n", elf);
@@ -336,38 +388,33 @@ int main(int argc, char **argv) {
     }
     close(slave); /* so that POLLHUP tells whether somebody has the port open */
     fcntl(master, F_SETFL, O_NONBLOCK);
-    FILE *log = log_path ? fopen(log_path, "w") : NULL;
-    if (log_path && !log) {
-        perror(log_path);
-        return 1;
-    }
-    if (log) setvbuf(log, NULL, _IOLBF, 0);
     unlink(link_path);
     if (symlink(name, link_path)) {
         perror(link_path);
         return 1;
     }
-    static const char *const EVENTS[] = {"", "pulse", "cut", "line", "reset"};
-    static const char *const PINS[] = {"", "steering", "throttle"};
     double start = monotonic(); /* when simulated time was 0 */
     bool open = false, running = true;
     int state = 0;
     char input[128];
     size_t input_length = 0;
-    while (running && !state) {
+    /* Not only when standard input ends: another child may hold the other end of that open. */
+    while (running && !state && getppid() == parent) {
         state = uno_run_us(uno, 500);
         struct pollfd files[2] = {{master, POLLIN, 0}, {0, POLLIN, 0}};
         double ahead = start + uno_now_us(uno) * 1e-6 - monotonic();
         poll(files, 2, 0);
         if (ahead < -0.02) { /* this machine had no time for us: the Arduino stood still too, rather than hurry now */
-            if (log) fprintf(log, "%.6f,stall,,%.0f,0\n", monotonic(), -ahead * 1e6);
+            put_log(monotonic(), "stall", "", -ahead * 1e6, 0);
             start -= ahead;
         }
+        log_events(uno, start);
         bool open_now = !(files[0].revents & POLLHUP);
         if (open_now && !open) {
-            if (log) fprintf(log, "%.6f,open,,0,0\n", monotonic());
+            put_log(monotonic(), "open", "", 0, 0);
             if (reset_on_open) {
                 uno_reset(uno);
+                log_events(uno, start);
                 start += boot_s; /* stands still for so long */
                 ahead += boot_s;
             }
@@ -397,11 +444,6 @@ int main(int argc, char **argv) {
         int n = uno_read(uno, bytes, sizeof bytes);
         /* What nobody reads is lost, as on a wire. */
         if (n > 0 && open && write(master, bytes, (size_t)n) < 0 && errno != EAGAIN) perror("arduino: write");
-        struct uno_event events[256];
-        n = uno_events(uno, events, 256);
-        for (int i = 0; log && i < n; i++)
-            fprintf(log, "%.6f,%s,%s,%.2f,%.2f\n", start + events[i].at_us * 1e-6, EVENTS[events[i].kind],
-                    PINS[events[i].channel + 1], events[i].pulse_us, events[i].period_us);
         if (ahead > 0) {
             struct timespec pause = {(time_t)ahead, (long)((ahead - (double)(time_t)ahead) * 1e9)};
             nanosleep(&pause, NULL);

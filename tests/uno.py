@@ -3,32 +3,20 @@
 import atexit
 import ctypes
 import functools
-import re
 import shutil
-import subprocess
 import tempfile
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
-REPOSITORY = Path(__file__).parents[1]
-PACKAGES = {  # Debian's, and what shows that each is there
-    "gcc": lambda: shutil.which("gcc"),
-    "make": lambda: shutil.which("make"),
-    "gcc-avr": lambda: shutil.which("avr-gcc"),
-    "binutils-avr": lambda: shutil.which("avr-ar"),
-    "avr-libc": lambda: Path("/usr/lib/avr/include/avr/io.h").exists(),
-    "arduino-core-avr": lambda: Path("/usr/share/arduino/hardware/arduino/avr/cores/arduino").exists(),
-    "libsimavr-dev": lambda: Path("/usr/include/simavr/sim_avr.h").exists(),
-    "libelf-dev": lambda: Path("/usr/include/libelf.h").exists(),
-}
+from rover_lib.playground import arduino
+
+REPOSITORY = arduino.REPOSITORY
+missing_packages = arduino.missing_packages
+symbol = arduino.symbol
 PULSE, CUT, LINE_IN, RESET = 1, 2, 3, 4
 PIN = {"steering": 0, "throttle": 1}
 BYTE_US = 1e6 / 11520
-
-
-def missing_packages() -> list[str]:
-    return [name for name, there in PACKAGES.items() if not there()]
 
 
 @functools.cache
@@ -38,53 +26,17 @@ def _folder() -> Path:
     return Path(folder)
 
 
-def _run(*command: object) -> str:
-    done = subprocess.run([str(c) for c in command], capture_output=True, text=True)
-    assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout}{done.stderr}"
-    return done.stdout
-
-
-@functools.cache
 def firmware() -> Path:
     """The compiled sketch, an ELF file."""
-    _run("make", "-C", REPOSITORY / "firmware", f"BUILD={_folder()}/firmware")
-    return _folder() / "firmware" / "rover.elf"
-
-
-def symbol(name: str) -> int:
-    """Flash address of a function of the firmware."""
-    found = re.search(rf"^([0-9a-f]+) \w {name}$", _run("avr-nm", firmware()), re.M)
-    assert found, f"no symbol {name} in the firmware"
-    return int(found[1], 16)
+    return arduino.build().firmware
 
 
 def compiled(name: str, *arguments: object) -> Path:
     """What gcc makes of `arguments`, with warnings as errors."""
     path = _folder() / name
     if not path.exists():
-        _run(
-            "gcc",
-            "-O2",
-            "-g",
-            "-Wall",
-            "-Wextra",
-            "-Werror",
-            "-I",
-            REPOSITORY / "firmware/rover",
-            "-o",
-            path,
-            *arguments,
-        )
+        arduino.call(*arduino.CC, "-I", REPOSITORY / "firmware/rover", "-o", path, *arguments)
     return path
-
-
-_EMULATOR = REPOSITORY / "emulated" / "arduino.c"
-_SIMAVR = ("-I/usr/include/simavr", _EMULATOR, "-lsimavr", "-lelf", "-lutil")
-
-
-def program() -> Path:
-    """The emulated Arduino as a program with a pty."""
-    return compiled("arduino", "-DPROGRAM", *_SIMAVR)
 
 
 class _Event(ctypes.Structure):
@@ -99,7 +51,7 @@ class _Event(ctypes.Structure):
 
 @functools.cache
 def _library() -> ctypes.CDLL:
-    library = ctypes.CDLL(str(compiled("libarduino.so", "-shared", "-fPIC", *_SIMAVR)))
+    library = ctypes.CDLL(str(compiled("libarduino.so", "-shared", "-fPIC", *arduino.WITH_SIMAVR)))
     library.uno_new.restype = ctypes.c_void_p
     library.uno_now_us.restype = ctypes.c_double
     pointer, real = ctypes.c_void_p, ctypes.c_double

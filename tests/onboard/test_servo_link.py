@@ -3,7 +3,6 @@
 import os
 import pty
 import select
-import subprocess
 import threading
 import time
 import tty
@@ -12,13 +11,13 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import serial
-import uno
 from hypothesis import given
 from hypothesis import strategies as st
 from uno import body_of, line
 
 from rover_lib.onboard.errors import PwmError, RoverError
 from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
+from rover_lib.playground.arduino import Arduino, missing_packages
 
 STATUS = "<S 7 1234 5 k M r 1456 120 1460 21316 - - 1 2 3 4"
 
@@ -338,39 +337,25 @@ def test_threads_share_a_link():
 # ---- the real firmware, in real time
 
 
-class Emulated:
-    """The emulated Arduino as a process; `tell` gives it a line, `log` what was on its pins."""
+class Emulated(Arduino):
+    """The emulated Arduino, and what was on its pins since it started."""
 
-    def __init__(self, folder):
-        self.port, self._log = str(folder / "port"), folder / "log.csv"
-        command = [uno.program(), uno.firmware(), "--link", self.port, "--log", self._log, "--reset-on-open"]
-        self.process = subprocess.Popen(
-            [*command, "--boot-ms", "200"], stdin=subprocess.PIPE, text=True, stdout=subprocess.DEVNULL
-        )
-        until(lambda: os.path.lexists(self.port), 10)
-
-    def tell(self, text):
-        self.process.stdin.write(text + "\n")
-        self.process.stdin.flush()
+    def __init__(self):
+        super().__init__()
+        self._seen = []
 
     def widths(self, pin, after, before=float("inf")):
-        """Widths of a pin's pulses that ended between two times of time.monotonic()."""
-        rows = [row.split(",") for row in self._log.read_text().splitlines()]
-        return {
-            round(float(row[3]))
-            for row in rows
-            if row[1] == "pulse" and row[2] == pin and after < float(row[0]) < before
-        }
+        """Widths of a pin's pulses that began between two times of time.monotonic()."""
+        self._seen += self.pulses()
+        return {round(e.pulse_us) for e in self._seen if e.kind == "pulse" and e.pin == pin and after < e[0] < before}
 
 
 @pytest.fixture
-def emulated(tmp_path):
-    if missing := uno.missing_packages():
+def emulated():
+    if missing := missing_packages():
         pytest.skip(f"needs the Debian packages {' '.join(missing)}")
-    board = Emulated(tmp_path)
-    yield board
-    board.process.stdin.close()
-    board.process.wait(10)
+    with Emulated() as board:
+        yield board
 
 
 SLACK_S = 0.15  # this machine may be busy; what the firmware promises is judged in tests/emulated, without a clock
@@ -389,7 +374,7 @@ def drive(link, seconds, steering_us=1800, throttle_us=600):
 
 @pytest.mark.emulated
 def test_the_real_firmware_arms_drives_and_stops(emulated):
-    emulated.tell("transmitter 1460 124")
+    emulated.transmitter(1460, 124)
     with ServoLink(emulated.port) as link:
         assert link.hello.firmware == "1.0.0"
         until(lambda: link.latest() and link.latest().receiver_steering_us and link.latest().receiver_throttle_us)
@@ -427,19 +412,19 @@ def test_the_real_firmware_without_a_transmitter_refuses(emulated):
 
 @pytest.mark.emulated
 def test_the_human_and_the_watchdog_are_seen_by_the_host(emulated):
-    emulated.tell("transmitter 1460 124")
+    emulated.transmitter(1460, 124)
     with ServoLink(emulated.port) as link:
         until(lambda: link.latest() and link.latest().receiver_steering_us and link.latest().receiver_throttle_us)
         link.arm()
         drive(link, 0.2)
-        emulated.tell("transmitter 1600 124")
+        emulated.transmitter(1600, 124)
         drive(link, 0.2)
         assert link.latest().why == "manual: the human moved a stick"
-        emulated.tell("transmitter 1460 124")
+        emulated.transmitter(1460, 124)
         time.sleep(0.1)
         link.arm()
         drive(link, 0.2)
-        emulated.tell(f"hang {uno.symbol('loop'):x}")
+        emulated.hang()
         drive(link, 0.4)
         assert link.resets == 1
         assert link.hello.reset == "watchdog"
