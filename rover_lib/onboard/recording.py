@@ -1,24 +1,39 @@
-"""Write one drive as an episode folder, in the format of the user's recorder.
+"""One drive as an episode folder, in the format of the user's recorder: written here, and its controls read again.
 
 episode_YYYYMMDD_HHMMSS/
   episode_data.json   control_data.csv   frame_data.csv   frames/frame_%06d.jpg
+
+"No pulse" is a flag, not a 0. What is recorded on the car has two more columns for each control, steering_measured and
+throttle_measured: true or false in JSON, True or False in CSV. Where it is false, that channel has no value: its
+normalized, raw_us and period_us are null in JSON and empty in CSV, which pandas reads as NaN and no program takes for
+"stopped". Files without the two columns are the user's recorder's (and the playground's, where nothing is ever lost):
+in them a pulse or period of 0 says "not measured". More columns may follow.
 """
 
+import contextlib
 import csv
+import errno
 import json
 import math
 import os
 import shutil
-import tempfile
+import stat
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from io import FileIO
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import cv2
 import numpy as np
 
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.stage import plain
 
+CHANNELS = ("steering", "throttle")
 CONTROL_FIELDS = (
     "arduino_timestamp",
     "system_timestamp",
@@ -29,17 +44,32 @@ CONTROL_FIELDS = (
     "steering_period_us",
     "throttle_period_us",
 )
+FLAG_FIELDS = ("steering_measured", "throttle_measured")
 FRAME_FIELDS = ("frame_id", "timestamp", "image_path")
+
+LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
+ARDUINO_WRAP_MS = 1 << 32  # its clock starts again after 49.7 days
+BURST_SHARE = 0.3  # arriving within this share of the usual interval means: both were waiting in a buffer
+BURST_MIN = 3  # fewer than this is jitter of the USB line, less than a frame's time, and left alone
+CLOCKS_APART_S = 0.5  # between two controls: more is the system's clock being set
+
+
+class EpisodeExists(EpisodeError):
+    """A folder of this name is there, or is being recorded."""
 
 
 class EpisodeWriter:
     """Collect one episode; the folder appears, complete, when the `with` block ends well, and not otherwise.
 
+    Until then all is in a hidden folder beside it, on the disk and not in memory.
+
     folder: Path to make, e.g. episodes/episode_20251007_144013; its name is the episode's id. Must not exist.
-    label: what was done, e.g. "hit red balloon". fps: the camera's rate. resolution: (width, height).
-    start_time_s, end_time_s: system time of the recording's ends; the first and last sample's when left out.
+    label: what was done, e.g. "hit red balloon". fps: the camera's rate. resolution: (width, height); None for that of
+    the first frame. start_time_s, end_time_s: system time of the recording's ends; the first and last sample's when
+    left out.
+    flags: write the two columns that say what was measured (see above).
     Raises EpisodeError for an existing folder, frames of another size, times or pulses that are no finite
-    numbers, or an episode without a frame or a control.
+    numbers, an episode without a frame or a control, or a disk that takes no more.
     """
 
     def __init__(
@@ -48,91 +78,173 @@ class EpisodeWriter:
         *,
         label: str,
         fps: float = 30,
-        resolution: tuple[int, int] = (640, 360),
+        resolution: tuple[int, int] | None = (640, 360),
         start_time_s: float | None = None,
         end_time_s: float | None = None,
         arduino_port: str = "",
         jpeg_quality: int = 95,
         pwm: PwmCalibration | None = None,
+        flags: bool = False,
     ):
         self.folder = Path(folder)
-        self.label, self.fps, self.resolution = str(label), fps, (int(resolution[0]), int(resolution[1]))
+        self.label, self.fps = str(label), fps
+        self.resolution = resolution and (int(resolution[0]), int(resolution[1]))
         self.start_time_s, self.end_time_s = start_time_s, end_time_s
         self.arduino_port, self.jpeg_quality = arduino_port, jpeg_quality
         self.pwm = pwm or PwmCalibration()
-        self._controls: list[dict[str, Any]] = []
-        self._frames: list[dict[str, Any]] = []
+        self.flags = flags
+        self.metadata: dict[str, Any] = {}  # what else is to be noted of this episode
+        self.controls = self.frames = 0
+        self._extra: dict[str, None] = {}  # names of further columns, in order
+        self._first_s, self._last_s = math.inf, -math.inf
         self._temporary: Path | None = None
+        self._rows: dict[str, FileIO] = {}
 
     def __enter__(self) -> "EpisodeWriter":
-        self._refuse_existing()
-        self.folder.parent.mkdir(parents=True, exist_ok=True)
-        # beside the target, so that the rename stays within one filesystem; hidden from loaders
-        self._temporary = Path(tempfile.mkdtemp(dir=self.folder.parent, prefix=f".{self.folder.name}."))
-        (self._temporary / "frames").mkdir()
+        self.open()
         return self
 
-    def __exit__(self, kind, error, trace) -> None:
-        try:
-            if kind is None:
-                self._finish()
-        finally:
-            shutil.rmtree(self._temporary, ignore_errors=True)
-            self._temporary = None
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.finish()
+        else:
+            self.discard()
+
+    def open(self) -> None:
+        """Starts the episode. Raises EpisodeExists for a folder that is there, or that another program records."""
+        self._refuse_existing()
+        # beside the target, so that the rename stays within one filesystem; hidden from loaders
+        temporary = self.folder.with_name(f".{self.folder.name}.part")
+        with self._disk():
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                temporary.mkdir()
+            except FileExistsError:
+                raise EpisodeExists(
+                    f"{self.folder}: is being recorded, or was when its program was killed: name another folder, or "
+                    f"delete {temporary.name}"
+                ) from None
+            self._temporary = temporary
+            (temporary / "frames").mkdir()
+            self._rows = {name: (temporary / f"{name}.rows").open("ab", buffering=0) for name in ("control", "frame")}
 
     def control(
         self,
         t_system_s: float,
         arduino_ms: int,
-        steering_us: int,
-        throttle_us: int,
-        steering_period_us: int,
-        throttle_period_us: int,
+        steering_us: int | None,
+        throttle_us: int | None,
+        steering_period_us: int | None,
+        throttle_period_us: int | None,
+        **extra: Any,
     ) -> None:
-        """Add one reading of the transmitter. Pulses and periods of 0 say "not measured".
+        """Add one reading of the transmitter, at system time `t_system_s`; `extra` makes further columns.
 
-        The normalised values follow the firmware's rule: 4 decimals, 0 where no pulse was measured.
+        Pulses and periods of 0 say "not measured"; with flags, None does too. Without flags, the normalised values
+        follow the firmware's rule: 4 decimals, 0 where no pulse was measured.
         """
         self._must_be_open()
-        whole = {
-            "arduino_timestamp": arduino_ms,
-            "steering_raw_us": steering_us,
-            "throttle_raw_us": throttle_us,
-            "steering_period_us": steering_period_us,
-            "throttle_period_us": throttle_period_us,
-        }
-        for name, value in whole.items():
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-                raise EpisodeError(f"{self.folder.name}: {name} must be a whole number from 0, found {value!r}")
-            whole[name] = int(value)
-        actions = self.pwm.actions_from_pulses(steering_us, throttle_us, steering_period_us, throttle_period_us)
-        row = {
-            "system_timestamp": self._time(t_system_s),
-            "steering_normalized": round(actions.steering or 0.0, 4) + 0.0,  # + 0.0: no "-0.0" in the file
-            "throttle_normalized": round(actions.throttle or 0.0, 4) + 0.0,
-            **whole,
-        }
-        self._controls.append({name: row[name] for name in CONTROL_FIELDS})
+        row: dict[str, Any] = dict.fromkeys(CONTROL_FIELDS)
+        row["arduino_timestamp"] = self._whole("arduino_timestamp", arduino_ms)
+        row["system_timestamp"] = self._time(t_system_s)
+        for name, pulse_us, period_us, flag in (
+            ("steering", steering_us, steering_period_us, FLAG_FIELDS[0]),
+            ("throttle", throttle_us, throttle_period_us, FLAG_FIELDS[1]),
+        ):
+            action = None
+            if not (self.flags and (pulse_us is None or period_us is None)):
+                pulse_us = self._whole(f"{name}_raw_us", pulse_us)
+                period_us = self._whole(f"{name}_period_us", period_us)
+                action = self.pwm.channel(name).action(pulse_us, period_us)
+            if action is not None or not self.flags:
+                row[f"{name}_normalized"] = round(action or 0.0, 4) + 0.0  # + 0.0: no "-0.0" in the file
+                row[f"{name}_raw_us"], row[f"{name}_period_us"] = pulse_us, period_us
+            if self.flags:
+                row[flag] = action is not None
+        if extra:
+            if taken := extra.keys() & {*CONTROL_FIELDS, *FLAG_FIELDS}:
+                raise EpisodeError(f"{self.folder.name}: {min(taken)} is no further column: give it another name")
+            row |= plain(extra)
+            self._extra |= dict.fromkeys(extra)
+        self._append("control", row, row["system_timestamp"])
+        self.controls += 1
 
     def frame(self, t_s: float, frame_bgr: np.ndarray) -> None:
         """Add one picture: (height, width, 3) uint8 BGR of that resolution, at system time `t_s`."""
         self._must_be_open()
         t_s = self._time(t_s)
-        shape = (self.resolution[1], self.resolution[0], 3)
+        if self.resolution is None and isinstance(frame_bgr, np.ndarray) and frame_bgr.ndim == 3:
+            self.resolution = frame_bgr.shape[1], frame_bgr.shape[0]
+        shape = (self.resolution[1], self.resolution[0], 3) if self.resolution else ("height", "width", 3)
         if not isinstance(frame_bgr, np.ndarray) or frame_bgr.shape != shape or frame_bgr.dtype != np.uint8:
             found = f"{getattr(frame_bgr, 'dtype', type(frame_bgr).__name__)} {getattr(frame_bgr, 'shape', '')}"
             raise EpisodeError(f"{self.folder.name}: frames must be uint8 {shape}, found {found}: check the camera")
-        number = len(self._frames) + 1
+        number = self.frames + 1
         relative = f"frames/frame_{number:06d}.jpg"
         ok, jpeg = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         if not ok:
             raise EpisodeError(f"{self.folder.name}: frame {number} could not be written as JPEG: check the camera")
-        (self._temporary / relative).write_bytes(jpeg.tobytes())
-        self._frames.append({"frame_id": number, "timestamp": t_s, "image_path": relative})
+        picture = self._temporary / relative
+        try:
+            with self._disk():
+                picture.write_bytes(jpeg)
+        except EpisodeError:
+            with contextlib.suppress(OSError):  # a part of it is no picture, and the episode may go on without
+                picture.unlink()
+            raise
+        self._append("frame", {"frame_id": number, "timestamp": t_s, "image_path": relative}, t_s)
+        self.frames = number
+
+    def finish(self) -> Path:
+        """Makes the folder appear and returns it; leaves nothing where that fails, and says why."""
+        try:
+            self._must_be_open()
+            with self._disk():
+                self._write()
+                self._refuse_existing()  # rename would replace an empty folder without a word
+                self._temporary.rename(self.folder)
+            return self.folder
+        finally:
+            self.discard()
+
+    def discard(self) -> None:
+        """Ends the episode; what is not finished is gone."""
+        for file in self._rows.values():
+            file.close()
+        self._rows = {}
+        if self._temporary:
+            shutil.rmtree(self._temporary, ignore_errors=True)
+        self._temporary = None
+
+    def _append(self, kind: str, row: dict[str, Any], t_s: float) -> None:
+        try:
+            line = json.dumps(row, allow_nan=False).encode() + b"\n"
+        except (TypeError, ValueError) as e:
+            raise EpisodeError(f"{self.folder.name}: a column cannot be written ({e}): give numbers or text") from None
+        with self._disk():
+            file = self._rows[kind]
+            if (written := file.write(line)) < len(line):
+                file.truncate(file.tell() - written)  # half a row would spoil the next one
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._first_s, self._last_s = min(self._first_s, t_s), max(self._last_s, t_s)
+
+    @contextlib.contextmanager
+    def _disk(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as e:
+            raise EpisodeError(
+                f"{self.folder}: cannot be written ({e.strerror or e}): make room, or name another folder"
+            ) from e
 
     def _must_be_open(self) -> None:
         if self._temporary is None:
             raise EpisodeError(f"{self.folder.name}: not open: use it as `with EpisodeWriter(...) as writer:`")
+
+    def _whole(self, name: str, value: object) -> int:
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
+            raise EpisodeError(f"{self.folder.name}: {name} must be a whole number from 0, found {value!r}")
+        return int(value)
 
     def _time(self, t_s: float) -> float:
         try:
@@ -145,19 +257,21 @@ class EpisodeWriter:
 
     def _refuse_existing(self) -> None:
         if os.path.lexists(self.folder):
-            raise EpisodeError(f"{self.folder}: exists already: name another folder, or move this one away first")
+            raise EpisodeExists(f"{self.folder}: exists already: name another folder, or move this one away first")
 
-    def _finish(self) -> None:
-        if not self._controls or not self._frames:
+    def _write(self) -> None:
+        """The three files, in the hidden folder."""
+        if not self.controls or not self.frames:
             raise EpisodeError(
-                f"{self.folder.name}: {len(self._controls)} controls and {len(self._frames)} frames are no "
+                f"{self.folder.name}: {self.controls} controls and {self.frames} frames are no "
                 "episode: check that the camera and the Arduino deliver"
             )
-        times = [c["system_timestamp"] for c in self._controls] + [f["timestamp"] for f in self._frames]
-        start_s = min(times) if self.start_time_s is None else self._time(self.start_time_s)
-        end_s = max(times) if self.end_time_s is None else self._time(self.end_time_s)
+        for file in self._rows.values():
+            file.close()
+        start_s = self._first_s if self.start_time_s is None else self._time(self.start_time_s)
+        end_s = self._last_s if self.end_time_s is None else self._time(self.end_time_s)
         duration_s = end_s - start_s
-        episode = {
+        head = {
             "episode_id": self.folder.name,
             "action_label": self.label,
             "start_time": start_s,
@@ -167,25 +281,175 @@ class EpisodeWriter:
                 "camera_fps": self.fps,
                 "camera_resolution": list(self.resolution),
                 "arduino_port": self.arduino_port,
-                "total_control_samples": len(self._controls),
-                "total_frames": len(self._frames),
-                "avg_control_rate": len(self._controls) / duration_s if duration_s > 0 else 0,
-                "avg_frame_rate": len(self._frames) / duration_s if duration_s > 0 else 0,
+                "total_control_samples": self.controls,
+                "total_frames": self.frames,
+                "avg_control_rate": self.controls / duration_s if duration_s > 0 else 0,
+                "avg_frame_rate": self.frames / duration_s if duration_s > 0 else 0,
+                **plain(self.metadata),
             },
-            "control_samples": self._controls,
-            "frame_samples": self._frames,
         }
-        (self._temporary / "episode_data.json").write_text(json.dumps(episode, indent=2, allow_nan=False))
-        for name, fields, rows in (
-            ("control_data.csv", CONTROL_FIELDS, self._controls),
-            ("frame_data.csv", FRAME_FIELDS, self._frames),
-        ):
-            with (self._temporary / name).open("w", newline="") as f:
-                table = csv.DictWriter(f, fields)  # ends lines with CR LF, as the user's recorder did
+        columns = {
+            "control": (*CONTROL_FIELDS, *(FLAG_FIELDS if self.flags else ()), *self._extra),
+            "frame": FRAME_FIELDS,
+        }
+        with (self._temporary / "episode_data.json").open("w") as f:
+            # As json.dumps(episode, indent=2) would, but a row at a time: a long drive does not fit in memory.
+            f.write(json.dumps(head, indent=2, allow_nan=False).removesuffix("\n}"))
+            for kind in columns:
+                f.write(f',\n  "{kind}_samples": [')
+                for i, row in enumerate(self._read_rows(kind, columns[kind])):
+                    f.write((",\n" if i else "\n") + textwrap.indent(json.dumps(row, indent=2), "    "))
+                f.write("\n  ]")
+            f.write("\n}")
+            _to_disk(f)
+        for kind in columns:
+            with (self._temporary / f"{kind}_data.csv").open("w", newline="") as f:
+                table = csv.DictWriter(f, columns[kind])  # ends lines with CR LF, as the user's recorder did
                 table.writeheader()
-                table.writerows(rows)
-        umask = os.umask(0)
-        os.umask(umask)
-        self._temporary.chmod(0o777 & ~umask)  # mkdtemp's 0700 would hide the episode from other users
-        self._refuse_existing()  # rename would replace an empty folder without a word
-        self._temporary.rename(self.folder)
+                table.writerows(self._read_rows(kind, columns[kind]))
+                _to_disk(f)
+        for kind in columns:
+            (self._temporary / f"{kind}.rows").unlink()
+
+    def _read_rows(self, kind: str, columns: tuple[str, ...]) -> Iterator[dict[str, Any]]:
+        with (self._temporary / f"{kind}.rows").open() as f:
+            for line in f:
+                row = json.loads(line)
+                yield {name: row.get(name) for name in columns}
+
+
+def _to_disk(file: IO[str]) -> None:
+    file.flush()
+    os.fsync(file.fileno())  # a power cut after the rename must not leave an empty file
+
+
+def number_of(value: object) -> float | None:
+    """A finite number from JSON or from a CSV's text; NaN for one that is none or absurd, None for another type."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        return None
+    try:
+        found = float(value)
+    except OverflowError:
+        return math.nan
+    except ValueError:
+        return None
+    return found if abs(found) < LARGEST else math.nan
+
+
+def no_pulse(row: Mapping[str, Any], channel: str) -> bool:
+    """Whether a control of a file says that "steering" or "throttle" was not measured: by its flag, or by no value."""
+    flag = row.get(f"{channel}_measured")
+    values = (row.get(f"{channel}_{part}") for part in ("normalized", "raw_us", "period_us"))
+    return str(flag).strip().lower() in ("false", "0") or all(v is None or v == "" for v in values)
+
+
+def arduino_step_s(before_s: float, after_s: float) -> float:
+    """Seconds between two readings of the Arduino's clock, over its wrap too; NaN where that says nothing.
+
+    It says nothing where it stood still or went back (a reset), or is no number (NaN).
+    """
+    step_s, wrap_s = after_s - before_s, ARDUINO_WRAP_MS / 1000
+    if before_s < wrap_s and -wrap_s < step_s < -wrap_s / 2:
+        step_s += wrap_s
+    return step_s if step_s > 0 else math.nan
+
+
+def arrived_late(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[bool]:
+    """For each of some controls whether the next one came so soon after it that both had waited in a buffer.
+
+    The Arduino measured them one usual interval apart, by its own clock.
+    """
+    steps = [step for a, b in pairwise(arduino_s) if (step := arduino_step_s(a, b)) < 1]
+    usual_s = float(np.median(steps)) if steps else 0.033
+    return [b - a < BURST_SHARE * usual_s for a, b in pairwise(system_s)] + [False]
+
+
+@dataclass(frozen=True, eq=False)
+class Controls:
+    """What a transmitter sent. times_s: (n,) float64 seconds from the first, which never go back. steering_us,
+    throttle_us: (n,) int64 microseconds, as measured. A hole in the recording is a long step in time. left_out: so many
+    controls were not usable, mostly because no pulse was measured.
+    """
+
+    times_s: np.ndarray
+    steering_us: np.ndarray
+    throttle_us: np.ndarray
+    left_out: int
+
+
+def read_controls(folder: Path | str, pwm: PwmCalibration | None = None) -> Controls:
+    """The controls of an episode folder with both pulses measured, from control_data.csv, or else episode_data.json.
+
+    Times are the system's, unless its clock was set meanwhile or controls arrived in a burst: then they are the
+    Arduino's. Raises EpisodeError where no control is left.
+    """
+    folder, pwm = Path(folder), pwm or PwmCalibration()
+    for name, read in (("control_data.csv", _csv_rows), ("episode_data.json", _json_rows)):
+        rows = read(folder / name)
+        timed = [(row, t_s, arduino) for row in rows if (t_s := _found(row, "system_timestamp")) is not None
+                 and (arduino := _found(row, "arduino_timestamp")) is not None]  # fmt: skip
+        pulses = [_pulses(row, pwm) for row, _, _ in timed]
+        keep = [i for i, found in enumerate(pulses) if found]
+        if not keep:
+            continue
+        times_s = _times([t_s for _, t_s, _ in timed], [ms / 1000 for _, _, ms in timed])[keep]
+        steering_us, throttle_us = np.array([pulses[i] for i in keep], np.int64).T
+        return Controls(times_s - times_s[0], steering_us, throttle_us, len(rows) - len(keep))
+    raise EpisodeError(
+        f"{folder}: no control with both pulses measured in control_data.csv or episode_data.json: give the folder "
+        "of one episode, recorded with the transmitter on"
+    )
+
+
+def _found(row: Mapping[str, Any], name: str) -> float | None:
+    found = number_of(row.get(name))
+    return None if found is None or math.isnan(found) else found
+
+
+def _pulses(row: Mapping[str, Any], pwm: PwmCalibration) -> tuple[int, int] | None:
+    """Both pulses of a control in whole microseconds, None if one was not measured."""
+    pulses = []
+    for name in CHANNELS:
+        pulse_us, period_us = _found(row, f"{name}_raw_us"), _found(row, f"{name}_period_us")
+        if no_pulse(row, name) or pulse_us is None or period_us is None or pulse_us != int(pulse_us):
+            return None
+        if not pwm.channel(name).measured(pulse_us, period_us):
+            return None
+        pulses.append(int(pulse_us))
+    return pulses[0], pulses[1]
+
+
+def _times(system_s: list[float], arduino_s: list[float]) -> np.ndarray:
+    """Seconds from the first control, never decreasing, in the order of the file."""
+    steps_s = np.diff(system_s)
+    clock_s = np.array([arduino_step_s(a, b) for a, b in pairwise(arduino_s)])
+    late = "".join("x" if x else " " for x in arrived_late(system_s, arduino_s))
+    with np.errstate(invalid="ignore"):
+        was_set = (steps_s < 0) | (np.abs(steps_s - clock_s) > CLOCKS_APART_S)
+    if was_set.any() or "x" * BURST_MIN in late:
+        steps_s = np.where(np.isnan(clock_s), steps_s.clip(0), clock_s)
+    return np.concatenate([[0.0], np.cumsum(steps_s)])
+
+
+def _data_of(path: Path) -> bytes:
+    """A data file's bytes, none where it cannot be read."""
+    try:
+        # opening a pipe would wait for ever
+        return path.read_bytes() if stat.S_ISREG(path.stat().st_mode) else b""
+    except OSError:
+        return b""
+
+
+def _csv_rows(path: Path) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    with contextlib.suppress(csv.Error):  # what comes before the damage counts
+        rows.extend(csv.DictReader(_data_of(path).decode("utf-8-sig", errors="replace").splitlines()))
+    return rows
+
+
+def _json_rows(path: Path) -> list[dict[str, Any]]:
+    try:
+        content = json.loads(_data_of(path))
+        return [row for row in content["control_samples"] if isinstance(row, dict)]
+    except (ValueError, RecursionError, TypeError, KeyError):
+        return []

@@ -6,7 +6,8 @@
 
 How a recording becomes samples:
 - A control is a measurement, per channel, only if the firmware saw a pulse (`pwm.Channel.measured`). Where
-  it did not, the file says 0 by the firmware's rule; such a value is missing here, never 0. Throttle and
+  it did not, the file says so by a flag and no value, or by the old recorder's 0 (onboard/recording.py); such
+  a value is missing here, never 0. Throttle and
   steering of a frame are each the nearest *measured* control within `sync_s`: one lost reading between two
   good ones costs nothing (controls come every 33 ms), a longer hole leaves its frames without an action.
 - Controls that waited in the serial buffer arrive in one burst, with system times that say nothing. They are
@@ -37,17 +38,23 @@ import numpy as np
 
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.pwm import NEUTRAL, PwmCalibration
-from rover_lib.onboard.recording import CONTROL_FIELDS, FRAME_FIELDS
+from rover_lib.onboard.recording import (
+    BURST_MIN,
+    CHANNELS,
+    CONTROL_FIELDS,
+    FRAME_FIELDS,
+    arduino_step_s,
+    arrived_late,
+    no_pulse,
+    number_of,
+)
 from rover_lib.onboard.stage import sha256_of
 
-ACTION_NAMES = ("steering", "throttle")
+ACTION_NAMES = CHANNELS
 DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
-BURST_SHARE = 0.3  # arriving within this share of the usual interval means: both were waiting in a buffer
-BURST_MIN = 3  # fewer than this is jitter of the USB line, less than `sync_s`, and left alone
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged, two in a row are a hole in time
 HOLE_S = 0.5  # and so is this, whatever is usual: no camera of a moving car is that slow
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
-LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
 DISAGREES = 1e-3  # recorded action against the one computed from its pulse; the recordings hold 5e-5
 
 
@@ -366,7 +373,8 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict
     data = _read_bytes(path, faults)
     if data is None:
         return []
-    table = csv.DictReader(data.decode("utf-8-sig", errors="replace").splitlines())
+    # What a cut row lacks is not "no pulse", which is empty.
+    table = csv.DictReader(data.decode("utf-8-sig", errors="replace").splitlines(), restval="missing")
     rows = []
     try:
         if missing := [name for name in fields if name not in (table.fieldnames or ())]:
@@ -378,21 +386,6 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict
     return rows
 
 
-def _number(value: object) -> float | None:
-    """A finite number from JSON or from a CSV's text; NaN for one that is none or absurd, None for another
-    type.
-    """
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        return None
-    try:
-        found = float(value)
-    except OverflowError:
-        return math.nan
-    except ValueError:
-        return None
-    return found if abs(found) < LARGEST else math.nan
-
-
 def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults) -> list[_Control]:
     """Usable readings, ordered by system time."""
     controls = []
@@ -400,7 +393,9 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"control {i} is a {type(row).__name__}, not an object")
             continue
-        values = {name: _number(row.get(name)) for name in CONTROL_FIELDS}
+        lost = [name for name in ACTION_NAMES if no_pulse(row, name)]
+        wanted = [name for name in CONTROL_FIELDS if name.split("_")[0] not in lost]
+        values = {name: number_of(row.get(name)) for name in wanted}
         bad = [name for name, value in values.items() if value is None]
         nan = [name for name, value in values.items() if value is not None and math.isnan(value)]
         if bad:
@@ -410,7 +405,11 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
             faults.add(path, "not_finite", f"control {i}: {nan[0]} is {_shown(row.get(nan[0]))}")
         if "system_timestamp" in nan:
             continue  # without a time it can be no frame's action
-        actions = tuple(_read_action(name, values, i, path, pwm, faults) for name in ACTION_NAMES)
+        for name in lost:
+            faults.add(path, f"{name}_no_pulse", f"control {i}: not measured; such values are missing, not 0")
+        actions = tuple(
+            None if name in lost else _read_action(name, values, i, path, pwm, faults) for name in ACTION_NAMES
+        )
         controls.append(_Control(values["system_timestamp"], values["arduino_timestamp"] / 1000, actions))
     return _sorted_by_time(controls, [c.system_s for c in controls], path, "control", faults)
 
@@ -447,9 +446,7 @@ def _sorted_by_time(items: list, times_s: list[float], path: Path, what: str, fa
 
 def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list[_Control]:
     """Give the controls of a serial burst the times at which they were measured, or drop them."""
-    arduino_steps = [b.arduino_s - a.arduino_s for a, b in pairwise(controls) if 0 < b.arduino_s - a.arduino_s < 1]
-    usual_s = float(np.median(arduino_steps)) if arduino_steps else 0.033
-    late = [b.system_s - a.system_s < BURST_SHARE * usual_s for a, b in pairwise(controls)] + [False]
+    late = arrived_late([c.system_s for c in controls], [c.arduino_s for c in controls])
     placed: list[_Control] = []
     moved = dropped = 0
     farthest_s = 0.0
@@ -466,10 +463,8 @@ def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list
             continue
         for k in range(len(run) - 2, -1, -1):
             control, after = run[k], run[k + 1]
-            step_s = after.arduino_s - control.arduino_s
-            if (
-                not step_s > 0
-            ):  # a restart, readings that were sent twice, or no number: before that the clock says nothing
+            step_s = arduino_step_s(control.arduino_s, after.arduino_s)
+            if math.isnan(step_s):  # a restart, readings that were sent twice, or no number
                 dropped += k + 1
                 break
             time_s = placed[-1].system_s - step_s
@@ -499,8 +494,8 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
             continue
         number, time_s, name = (
-            _number(row.get("frame_id")),
-            _number(row.get("timestamp")),
+            number_of(row.get("frame_id")),
+            number_of(row.get("timestamp")),
             row.get("image_path"),
         )
         if number is None or time_s is None or not isinstance(name, str) or not name:
