@@ -169,6 +169,7 @@ class FlightLog:
         self._events: deque[Event] = deque(maxlen=QUEUE_EVENTS if self.path else 0)
         self._sayings: deque[tuple[int, str, dict[str, Any]]] = deque(maxlen=QUEUE_EVENTS)
         self._say_now = threading.Event()
+        self._spoken = False  # nothing more will be said
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
         # Of the writing thread alone:
@@ -203,10 +204,11 @@ class FlightLog:
 
     def close(self) -> None:
         """Write what is left. Waits 2 s at most: a disk or a terminal that is stuck is left behind."""
-        self._closing.set()
-        self._say_now.set()
         end = time.monotonic() + CLOSE_S
-        for thread in reversed(self._threads):
+        self._closing.set()
+        for thread in reversed(self._threads):  # the speaker last: the writer may have something to say
+            self._spoken = thread is self._threads[0]
+            self._say_now.set()
             thread.join(max(0.0, end - time.monotonic()))
 
     def _say(self, level: int, text: str, fields: dict[str, Any]) -> None:
@@ -218,7 +220,7 @@ class FlightLog:
         while True:
             self._say_now.wait()
             self._say_now.clear()
-            closing = self._closing.is_set()
+            closing = self._spoken
             while self._sayings:
                 level, text, fields = self._sayings.popleft()
                 with contextlib.suppress(Exception):  # a handler that fails must not end this thread
@@ -584,9 +586,10 @@ class StatusLine:
             self._wake.clear()
             closing = self._closing
             text = "".join(f"{self._clear}{self._lines.popleft()}\n" for _ in range(len(self._lines)))
-            if closing or self._terminal or time.monotonic() >= due_s:
+            due = time.monotonic() >= due_s
+            if closing or due or self._terminal:
                 text += self._status() + ("\n" if closing or not self._terminal else "")
-            if time.monotonic() >= due_s:
+            if due:
                 due_s = time.monotonic() + self._every_s
             try:
                 self._write(text)
@@ -606,7 +609,7 @@ class StatusLine:
             text = f"no status: {type(error).__name__}: {error}"
         if self._terminal:
             with contextlib.suppress(OSError):
-                text = text[: max(1, os.get_terminal_size(self._fd).columns - 1)]
+                text = text[: (os.get_terminal_size(self._fd).columns or 80) - 1]
         return self._clear + text
 
     def _write(self, text: str) -> None:
