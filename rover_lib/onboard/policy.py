@@ -37,6 +37,13 @@ class Policy:
         frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it; a mapping by camera name if there are several.
         state: (S,) float, for this car [steering, throttle] as last commanded.
         Returns (chunk, A) float32; steering in [-1, 1], throttle in [0, 1], other actions as predicted.
+        Raises as predict_unclipped().
+        """
+        return np.clip(self.predict_unclipped(frame_bgr, state), self._low, self._high)
+
+    def predict_unclipped(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
+        """As predict_chunk(), for who wants to know how far beyond an end a prediction was.
+
         Raises FrameError for a frame that is no picture, PolicyError for a state that is not finite or of another
         shape, and for a prediction that is not finite: nobody gets a number that must not drive a car.
         """
@@ -49,7 +56,7 @@ class Policy:
         chunk = self.run(state, [prepare_frame(f, c["height"], c["width"]) for f, c in frames])
         if not np.isfinite(chunk).all():
             raise PolicyError(f"{self.path}: the policy predicted NaN or Inf; stop the car and quantize again")
-        return np.clip(chunk, self._low, self._high)
+        return chunk
 
     def _frames(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray]) -> list[tuple[np.ndarray, dict[str, Any]]]:
         cameras = self.manifest["cameras"]

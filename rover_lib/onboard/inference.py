@@ -1,0 +1,290 @@
+"""Plans beside the control loop: a thread that asks the policy about the newest frame, and the policy's own process.
+
+    with PolicyProcess("policy_static.pt") as policy:
+        with Planner(camera, policy.predict, commanded, policy.rate_hz) as planner:
+            plan = planner.newest()
+
+The policy runs in a process of its own, so that nothing it does takes the control loop's turn, and it can be ended when
+it hangs.
+"""
+
+import contextlib
+import ctypes
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rover_lib.onboard.camera import Camera
+from rover_lib.onboard.errors import PolicyError, RoverError
+from rover_lib.onboard.plan import Commanded, Plan
+
+LOAD_S = 120.0  # torch and a full policy from a slow card
+POLL_S = 0.05
+WAIT_S = 0.1
+END_S = 1.0
+NICE = 5  # the control loop goes first
+PR_SET_PDEATHSIG = 1
+_REQUEST = struct.Struct("<IIff")  # height, width, state
+
+Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint8 BGR, state (2,) -> (chunk, 2)
+
+
+class Planner:
+    """Asks for a plan for the newest frame, again and again, in a thread; a context manager.
+
+    predict: gives (chunk, 2) actions, unclipped, for a frame and a state, or raises. rate_hz: of the actions.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        predict: Predict,
+        commanded: Commanded,
+        rate_hz: float,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._camera, self._predict, self._commanded, self._rate_hz = camera, predict, commanded, rate_hz
+        self._clock = clock
+        self._closing = threading.Event()
+        self._news = threading.Event()
+        self._plan: Plan | None = None
+        self._failure: RoverError | None = None
+        self._asked_s: float | None = None
+        self._thread = threading.Thread(target=self._run, name="planner", daemon=True)
+
+    def __enter__(self) -> "Planner":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join(END_S)
+
+    def newest(self) -> Plan | None:
+        """The newest plan, None before the first. Raises what the camera or the policy raised."""
+        if self._failure:
+            raise self._failure
+        return self._plan
+
+    def wait(self, timeout_s: float) -> Plan | None:
+        """The newest plan, as soon as there is one. Raises as newest()."""
+        self._news.wait(timeout_s)
+        return self.newest()
+
+    @property
+    def asking_s(self) -> float:
+        """So long the policy has been asked without an answer; 0 while it is not."""
+        asked = self._asked_s
+        return 0.0 if asked is None else self._clock() - asked
+
+    def _run(self) -> None:
+        number = frame_number = 0
+        try:
+            while not self._closing.is_set():
+                frame = self._camera.wait(frame_number, WAIT_S)
+                if frame is None:
+                    continue
+                frame_number = frame.number
+                state = self._commanded.state(frame.captured_s, self._rate_hz)
+                self._asked_s = self._clock()
+                actions = self._predict(frame.image, state)
+                self._asked_s = None
+                number += 1
+                self._plan = Plan(number, frame.captured_s, self._clock(), actions)
+                self._news.set()
+        except RoverError as error:
+            self._failure = error
+        except Exception as error:  # whatever it is, the loop must learn of it and stop the car
+            self._failure = PolicyError(f"the policy failed ({type(error).__name__}: {error}); the car is stopped")
+        self._news.set()
+
+
+class PolicyProcess:
+    """An artifact in a process of its own; a context manager. predict() is for one thread at a time.
+
+    threads: of torch, None: all cores but one, which is the loop's. Raises ArtifactError's sentences as PolicyError if
+    the artifact cannot be used here.
+    """
+
+    def __init__(self, artifact: Path | str, *, threads: int | None = None):
+        self.artifact = Path(artifact)
+        self.threads = threads or max(1, (os.cpu_count() or 1) - 1)
+        self.manifest: dict[str, Any] = {}
+        self._process: subprocess.Popen | None = None
+        self._pipe: Connection | None = None
+        self._closing = threading.Event()
+
+    def __enter__(self) -> "PolicyProcess":
+        ours, theirs = Pipe()
+        command = [sys.executable, "-m", __name__, str(theirs.fileno()), str(self.artifact), str(self.threads)]
+        # A session of its own, so that the terminal's Ctrl-C comes to the loop alone, which stops the car first.
+        self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], start_new_session=True)
+        theirs.close()
+        self._pipe = ours
+        try:
+            self.manifest = json.loads(self._answer(LOAD_S))
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the process, whatever it is doing."""
+        self._closing.set()
+        if self._process:
+            self._process.terminate()
+            try:
+                self._process.wait(END_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        if self._pipe:
+            with contextlib.suppress(OSError):
+                self._pipe.close()
+
+    @property
+    def rate_hz(self) -> float:
+        """Of the actions of a chunk."""
+        return float(self.manifest["rate_hz"])
+
+    @property
+    def chunk(self) -> int:
+        """Actions of a plan."""
+        return int(self.manifest["chunk"])
+
+    @property
+    def pids(self) -> tuple[int, ...]:
+        """Of the process."""
+        return (self._process.pid,) if self._process else ()
+
+    def predict(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
+        """(chunk, 2) float32 as Policy.predict_unclipped(), for one camera. Waits until it comes, or close().
+
+        Raises PolicyError with what the policy raised, or if its process has ended.
+        """
+        frame = np.ascontiguousarray(frame_bgr)
+        try:
+            self._pipe.send_bytes(_REQUEST.pack(*frame.shape[:2], *map(float, state)))
+            self._pipe.send_bytes(frame.data.cast("B"))
+        except (OSError, ValueError) as error:
+            raise self._ended() from error
+        answer = self._answer(None)
+        return np.frombuffer(answer, np.float32).reshape(-1, 2)
+
+    def _answer(self, timeout_s: float | None) -> bytes:
+        end = None if timeout_s is None else time.monotonic() + timeout_s
+        try:
+            while not self._pipe.poll(POLL_S):
+                if self._closing.is_set():
+                    raise PolicyError(f"{self.artifact}: the policy was closed")
+                if end and time.monotonic() > end:
+                    raise PolicyError(f"{self.artifact}: not loaded within {timeout_s:g} s; is the memory full?")
+            answer = self._pipe.recv_bytes()
+        except (EOFError, OSError) as error:
+            raise self._ended() from error
+        if answer[:1] == b"!":
+            raise PolicyError(answer[1:].decode(errors="replace"))
+        return answer[1:]
+
+    def _ended(self) -> PolicyError:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(END_S)
+        code = self._process.returncode
+        how = signal.Signals(-code).name if code and code < 0 else f"exit code {code}"
+        return PolicyError(f"{self.artifact}: the policy's process ended ({how}); is there enough memory?")
+
+
+class PolicyThread:
+    """As PolicyProcess, but in this process, to compare: what hangs here cannot be ended."""
+
+    def __init__(self, artifact: Path | str, *, threads: int | None = None):
+        self.artifact, self.threads = artifact, threads or max(1, (os.cpu_count() or 1) - 1)
+        self.pids = ()
+
+    def __enter__(self) -> "PolicyThread":
+        from rover_lib.onboard.policy import load_policy
+
+        policy = load_policy(self.artifact, threads=self.threads)
+        self.manifest, self.rate_hz, self.chunk = policy.manifest, policy.rate_hz, policy.chunk
+        self.predict = policy.predict_unclipped
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        pass
+
+
+def late(predict: Predict, latency_s: float) -> Predict:
+    """predict, but an answer takes at least so long."""
+
+    def predict_late(frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
+        end = time.monotonic() + latency_s
+        try:
+            return predict(frame_bgr, state)
+        finally:
+            time.sleep(max(0.0, end - time.monotonic()))
+
+    return predict_late
+
+
+def serve(pipe: Connection, artifact: str, threads: int) -> None:
+    """The policy's process: an answer to each request until the other side is gone.
+
+    An answer is "=" and bytes (first the manifest, then chunks), or "!" and the sentence of an error.
+    """
+    with contextlib.suppress(EOFError, OSError):
+        try:
+            # Here, because the side that drives must not load torch.
+            from rover_lib.onboard.policy import load_policy
+
+            policy = load_policy(artifact, threads=threads)
+            names = list(policy.state_names), list(policy.action_names)
+            if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
+                raise PolicyError(
+                    f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}; this car "
+                    "has one camera, steering and throttle"
+                )
+        except RoverError as error:
+            return pipe.send_bytes(b"!" + str(error).encode())
+        except Exception as error:
+            return pipe.send_bytes(f"!{artifact}: cannot be loaded ({type(error).__name__}: {error})".encode())
+        pipe.send_bytes(b"=" + json.dumps(policy.manifest).encode())
+        while True:
+            height, width, *state = _REQUEST.unpack(pipe.recv_bytes())
+            frame = np.frombuffer(pipe.recv_bytes(), np.uint8).reshape(height, width, 3)
+            try:
+                chunk = policy.predict_unclipped(frame, np.array(state, np.float32))
+            except RoverError as error:
+                pipe.send_bytes(b"!" + str(error).encode())
+            except Exception as error:
+                what = " ".join(str(error).split())[-300:]
+                pipe.send_bytes(f"!{artifact}: inference failed ({type(error).__name__}: {what})".encode())
+            else:
+                pipe.send_bytes(b"=" + np.ascontiguousarray(chunk, np.float32).tobytes())
+
+
+def main(fd: str, artifact: str, threads: str) -> None:
+    """What PolicyProcess starts."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a policy that hangs must not outlive the loop
+    os.nice(NICE)
+    serve(Connection(int(fd)), artifact, int(threads))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

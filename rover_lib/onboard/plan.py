@@ -1,0 +1,213 @@
+"""Use an action chunk by time: what the policy meant for now, although it looked at a frame that is 100 ms old.
+
+    follower = Follower(settings, rate_hz=30)
+    follower.add(Plan(1, captured_s, ready_s, actions))
+    command = follower.command(now_s)          # at each tick
+
+Nothing here knows a clock, a thread or a device: times come in as arguments, seconds of one monotonic clock.
+"""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from rover_lib.onboard.errors import ParamsError, PolicyError
+
+STEERING, THROTTLE = 0, 1
+ROUNDING = 1e-6  # of times, in steps
+LIMITS = np.array([[-1.0, 0.0], [1.0, 1.0]])  # lowest and highest [steering, throttle]
+OVERSHOOT = 0.25  # a learned action may be a little beyond an end, as a transmitter is: it is clipped
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How plans become commands; the section `drive` of params.yml, which says why. Those that exist are valid.
+
+    blend_ticks: ticks over which a fresh plan takes over, 0: at once. fade_s, stop_s: ages of a plan from which the
+    throttle fades, and at which the car is stopped. compensate: whether the time since the frame is made up for.
+    ensemble: LeRobot's coefficient of temporal ensembling, None: off. throttle_limit: of the throttle, in [0, 1].
+    frozen_frames, black_frames: so many in a row are a fault of the camera; black_level: mean of a black one.
+    """
+
+    fade_s: float = 0.5
+    stop_s: float = 1.0
+    blend_ticks: int = 3
+    compensate: bool = True
+    ensemble: float | None = None
+    throttle_limit: float = 0.2
+    frozen_frames: int = 5
+    black_frames: int = 4
+    black_level: float = 8.0
+
+    def __post_init__(self):
+        def must(holds: bool, what: str) -> None:
+            if not holds:
+                raise ParamsError(f"drive: {what}; look at the section 'drive' of params.yml")
+
+        for name in ("fade_s", "stop_s", "throttle_limit", "black_level"):
+            value = getattr(self, name)
+            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+            must(number, f"{name} must be a finite number, found {value!r}")
+        for name in ("blend_ticks", "frozen_frames", "black_frames"):
+            value = getattr(self, name)
+            must(type(value) is int and value >= 0, f"{name} must be a whole number from 0, found {value!r}")
+        must(0 < self.fade_s <= self.stop_s, f"0 < fade_s <= stop_s must hold, found {self.fade_s} and {self.stop_s}")
+        must(0 <= self.throttle_limit <= 1, f"throttle_limit must be in [0, 1], found {self.throttle_limit}")
+        must(self.frozen_frames != 1 and self.black_frames != 1, "one frame alone is no fault: 0 (off) or from 2")
+        ensemble = self.ensemble
+        if ensemble is not None:
+            must(type(ensemble) in (int, float) and math.isfinite(ensemble), f"ensemble must be finite: {ensemble!r}")
+
+    @classmethod
+    def of(cls, section: Mapping[str, Any], **overrides: Any) -> "Settings":
+        """From a mapping such as params.yml's; overrides that are not None win. ParamsError for unknown names."""
+        known = {f.name for f in fields(cls)}
+        if unknown := sorted(set(section) - known):
+            raise ParamsError(f"drive: unknown {unknown}, known are {sorted(known)}; look at params.yml")
+        return cls(**{**section, **{k: v for k, v in overrides.items() if v is not None}})
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """One inference's chunk. actions[i] is meant for captured_s + i / rate.
+
+    number: 1, 2, ... captured_s: of the frame that it looked at. ready_s: when it was here. actions: (chunk, 2)
+    float, clipped to steering in [-1, 1] and throttle in [0, 1]. Raises PolicyError for what is not finite, or beyond
+    an end by more than OVERSHOOT: this is the last boundary before the servos.
+    """
+
+    number: int
+    captured_s: float
+    ready_s: float
+    actions: np.ndarray
+
+    def __post_init__(self):
+        actions = np.asarray(self.actions, float)
+        if actions.ndim != 2 or actions.shape[1] != 2 or len(actions) == 0:
+            raise PolicyError(f"a plan must be (chunk, 2) actions, found {actions.shape}; is it a policy of this car?")
+        if not np.isfinite(actions).all():
+            raise PolicyError(f"plan {self.number} is not finite; stop the car and quantize again")
+        if (actions < LIMITS[0] - OVERSHOOT).any() or (actions > LIMITS[1] + OVERSHOOT).any():
+            raise PolicyError(
+                f"plan {self.number} has actions from {actions.min(0).round(3).tolist()} to "
+                f"{actions.max(0).round(3).tolist()}, outside the range of a servo; stop the car"
+            )
+        object.__setattr__(self, "actions", np.clip(actions, *LIMITS))
+
+    @property
+    def latency_s(self) -> float:
+        """From the frame to the plan."""
+        return self.ready_s - self.captured_s
+
+    def at(self, step: float) -> np.ndarray:
+        """(2,) [steering, throttle] meant for `step` steps after the first, between steps in proportion.
+
+        Before the first and after the last it is that one.
+        """
+        step = min(max(step, 0.0), len(self.actions) - 1.0)
+        i = min(int(step), len(self.actions) - 2) if len(self.actions) > 1 else 0
+        share = step - i
+        return self.actions[i] if share == 0 else (1 - share) * self.actions[i] + share * self.actions[i + 1]
+
+
+@dataclass(frozen=True)
+class Command:
+    """What to do at a tick. steering in [-1, 1], throttle in [0, 1]; fade: the throttle's factor for the plan's age."""
+
+    steering: float
+    throttle: float
+    plan: Plan
+    age_s: float  # since the frame of the plan in use
+    fade: float
+
+
+class Follower:
+    """Turns plans into commands. rate_hz: of the plans' steps. Not for several threads at a time."""
+
+    def __init__(self, settings: Settings, rate_hz: float):
+        self.settings = settings
+        self.rate_hz = rate_hz
+        self._plans: deque[Plan] = deque(maxlen=64)  # more than one is kept for ensembling only
+        self._offset = np.zeros(2)  # of the command from what the newest plan says, when it took over
+        self._blended = 0  # ticks since then
+
+    @property
+    def plan(self) -> Plan | None:
+        """The newest."""
+        return self._plans[-1] if self._plans else None
+
+    def add(self, plan: Plan, now_s: float) -> None:
+        """A fresh plan takes over at this tick. One that looked at an older frame than the newest is left aside."""
+        before = self.plan
+        if before and plan.captured_s <= before.captured_s:
+            return
+        if before and self.settings.blend_ticks:
+            old = self._wanted(now_s) * [1.0, self._fade(now_s - before.captured_s)]
+        if self.settings.ensemble is None:
+            self._plans.clear()
+        self._plans.append(plan)
+        if before and self.settings.blend_ticks:
+            self._offset, self._blended = old - self._meant(now_s), 0
+
+    def stop_s(self) -> float:
+        """Age of the newest plan at which the car is stopped: the settings', or the chunk's end if that is earlier."""
+        return min(self.settings.stop_s, len(self._plans[-1].actions) / self.rate_hz) if self._plans else 0.0
+
+    def command(self, now_s: float) -> Command | None:
+        """What the newest plan meant for now; None without a plan, or with one that is too old to drive by."""
+        plan = self.plan
+        if plan is None or not (age_s := now_s - plan.captured_s) < self.stop_s():
+            return None
+        fade = self._fade(age_s)
+        steering, throttle = np.clip(self._wanted(now_s) * [1.0, fade], *LIMITS)
+        self._blended += 1
+        return Command(float(steering), min(float(throttle), self.settings.throttle_limit), plan, age_s, fade)
+
+    def _fade(self, age_s: float) -> float:
+        stop_s = self.stop_s()
+        fade_s = min(self.settings.fade_s, stop_s)
+        return 1.0 if age_s <= fade_s else max(0.0, (stop_s - age_s) / (stop_s - fade_s)) if stop_s > fade_s else 0.0
+
+    def _wanted(self, now_s: float) -> np.ndarray:
+        """The plans' action, on its way from the plan before."""
+        left = 1 - (self._blended + 1) / (self.settings.blend_ticks + 1)
+        return self._meant(now_s) + self._offset * max(0.0, left)
+
+    def _meant(self, now_s: float) -> np.ndarray:
+        if self.settings.ensemble is None:
+            return self.plan.at(self._step(self.plan, now_s))
+        # As LeRobot's ACTTemporalEnsembler: exp(-coefficient * i), i = 0 is the oldest plan that reaches until now.
+        steps = [(p, self._step(p, now_s)) for p in self._plans]
+        reach = [p.at(step) for p, step in steps if step < len(p.actions) - 1 + ROUNDING] or [self.plan.at(math.inf)]
+        weights = np.exp(-self.settings.ensemble * np.arange(len(reach)))
+        return np.average(reach, axis=0, weights=weights)
+
+    def _step(self, plan: Plan, now_s: float) -> float:
+        return (now_s - (plan.captured_s if self.settings.compensate else plan.ready_s)) * self.rate_hz
+
+
+class Commanded:
+    """What was commanded lately, for the policy's state. Not for several threads at a time but one writer."""
+
+    def __init__(self, keep_s: float = 3.0, rate_hz: float = 100.0):
+        self._sent: deque[tuple[float, float, float]] = deque(maxlen=max(2, int(keep_s * rate_hz)))
+
+    def add(self, at_s: float, steering: float, throttle: float) -> None:
+        """A command that was really sent, at that time."""
+        self._sent.append((at_s, steering, throttle))
+
+    def state(self, captured_s: float, rate_hz: float) -> np.ndarray:
+        """(2,) float32 [steering, throttle]: the policy's state for a frame captured then; neutral at the start.
+
+        In training a frame's state is the action of the frame before it, which is the control nearest to that frame
+        in time (episodes.py). So it is the command nearest to one step before the capture, if it is within one.
+        """
+        before_s = captured_s - 1 / rate_hz
+        nearest = min(tuple(self._sent), key=lambda c: abs(c[0] - before_s), default=None)
+        if nearest is None or nearest[0] - before_s > 1 / rate_hz:
+            return np.zeros(2, np.float32)
+        return np.array(nearest[1:], np.float32)

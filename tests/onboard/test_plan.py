@@ -1,0 +1,207 @@
+"""Chunks used by time: against the arithmetic, LeRobot's own ensembler, and wild sequences of plans."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.plan import Commanded, Follower, Plan, Settings
+
+RATE = 30.0
+STEP = 1 / RATE
+
+
+def ramp(start=0.0, slope=0.01, throttle=0.05, chunk=32):
+    return np.stack([start + slope * np.arange(chunk), np.full(chunk, throttle)], 1)
+
+
+def follower(**settings):
+    return Follower(Settings(**{"blend_ticks": 0, "throttle_limit": 1.0, **settings}), RATE)
+
+
+def test_a_plan_is_used_by_time():
+    f = follower()
+    f.add(Plan(1, captured_s=10.0, ready_s=10.15, actions=ramp()), 10.15)
+    command = f.command(10.15)  # 4.5 steps after the frame that it looked at
+    assert command.steering == pytest.approx(0.045)
+    assert command.age_s == pytest.approx(0.15)
+    assert f.command(10.2).steering == pytest.approx(0.06)
+
+
+def test_without_compensation_it_begins_when_it_is_ready():
+    f = follower(compensate=False)
+    f.add(Plan(1, 10.0, 10.15, ramp()), 10.15)
+    assert f.command(10.15).steering == pytest.approx(0.0)
+
+
+def test_before_its_first_and_after_its_last_action_it_is_that_one():
+    plan = Plan(1, 0.0, 0.0, ramp())
+    assert plan.at(-3)[0] == 0.0
+    assert plan.at(math.inf)[0] == pytest.approx(0.31)
+    assert Plan(1, 0.0, 0.0, ramp(chunk=1)).at(5)[0] == 0.0
+
+
+def test_nothing_to_drive_by():
+    f = follower()
+    assert f.command(0.0) is None
+    f.add(Plan(1, 0.0, 0.1, ramp()), 0.1)
+    assert f.command(0.99) is not None
+    assert f.command(1.0) is None
+
+
+def test_a_short_chunk_ends_before_the_limit():
+    f = follower()
+    f.add(Plan(1, 0.0, 0.0, ramp(chunk=8)), 0.0)
+    assert f.command(0.26) is not None
+    assert f.command(8 * STEP) is None
+
+
+def test_the_throttle_fades_with_the_plans_age():
+    f = follower()
+    f.add(Plan(1, 0.0, 0.1, ramp()), 0.1)
+    assert f.command(0.5).throttle == pytest.approx(0.05)
+    assert f.command(0.75).throttle == pytest.approx(0.025)
+    assert f.command(0.75).fade == pytest.approx(0.5)
+    assert f.command(0.9999).throttle == pytest.approx(0.0, abs=1e-4)
+    assert f.command(0.75).steering == pytest.approx(0.225)  # steering does not fade
+
+
+def test_fade_can_be_switched_off():
+    f = follower(fade_s=1.0, stop_s=1.0)
+    f.add(Plan(1, 0.0, 0.1, ramp()), 0.1)
+    assert f.command(0.99).throttle == pytest.approx(0.05)
+
+
+def test_the_throttles_limit():
+    f = follower(throttle_limit=0.03)
+    f.add(Plan(1, 0.0, 0.0, ramp()), 0.0)
+    assert f.command(0.1).throttle == 0.03
+
+
+def test_an_older_frames_plan_is_left_aside():
+    f = follower()
+    f.add(Plan(1, 1.0, 1.1, ramp(0.5)), 1.1)
+    f.add(Plan(2, 0.9, 1.2, ramp(-0.5)), 1.2)
+    assert f.plan.number == 1
+
+
+def test_a_fresh_plan_takes_over_in_steps():
+    f = follower(blend_ticks=3)
+    f.add(Plan(1, 0.0, 0.0, ramp(0.0, 0.0)), 0.0)
+    f.command(0.0)
+    f.add(Plan(2, 0.1, 0.1, ramp(0.4, 0.0)), 0.1)
+    found = [f.command(0.1 + i * STEP).steering for i in range(5)]
+    assert found == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.4])
+
+
+def test_a_plan_that_comes_while_another_takes_over():
+    f = follower(blend_ticks=3)
+    f.add(Plan(1, 0.0, 0.0, ramp(0.0, 0.0)), 0.0)
+    f.command(0.0)
+    f.add(Plan(2, 0.1, 0.1, ramp(0.4, 0.0)), 0.1)
+    before = f.command(0.1).steering  # 0.1, on its way to 0.4
+    f.add(Plan(3, 0.1 + STEP, 0.1 + STEP, ramp(0.4, 0.0)), 0.1 + STEP)
+    assert before < f.command(0.1 + STEP).steering < 0.4
+
+
+@given(
+    st.lists(st.tuples(st.floats(-1, 1), st.floats(0, 1)), min_size=2, max_size=12),
+    st.integers(0, 6),
+    st.integers(1, 9),
+)
+def test_no_jump_beyond_what_blending_allows(levels, blend, every):
+    """Of constant plans: commands stay among what the plans said, and a settled one is left in equal steps."""
+    f = follower(blend_ticks=blend)
+    now, before = 0.0, None
+    for i, level in enumerate(levels):
+        f.add(Plan(i + 1, now, now, np.tile(level, (32, 1))), now)
+        low, high = np.min(levels[: i + 1], 0), np.max(levels[: i + 1], 0)
+        for tick in range(every):
+            command = f.command(now)
+            found = np.array([command.steering, command.throttle])
+            assert (low - 1e-9 <= found).all()
+            assert (found <= high + 1e-9).all()
+            if tick == 0 and before is not None and every > blend:
+                assert found - before == pytest.approx((np.array(level) - before) / (blend + 1), abs=1e-9)
+            before = found
+            now += STEP
+
+
+@pytest.mark.parametrize("coefficient", [0.01, 0.0, -0.1])
+def test_ensembling_is_lerobots(coefficient):
+    from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
+
+    rng = np.random.default_rng(0)
+    chunk, oracle = 8, ACTTemporalEnsembler(coefficient, 8)
+    f = Follower(Settings(blend_ticks=0, ensemble=coefficient, throttle_limit=1.0, fade_s=1.0), RATE)
+    for i in range(20):
+        actions = rng.uniform([-1, 0], [1, 1], (chunk, 2))
+        wanted = oracle.update(torch.tensor(actions, dtype=torch.float64)[None])[0].numpy()
+        now = i * STEP
+        f.add(Plan(i + 1, now, now, actions), now)
+        command = f.command(now)
+        assert [command.steering, command.throttle] == pytest.approx(wanted.tolist(), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [
+        np.full((4, 2), np.nan),
+        np.array([[0.0, np.inf]]),
+        np.array([[0.0, 5.0]]),
+        np.array([[-1.3, 0.0]]),
+        np.array([[0.0, -0.3]]),
+        np.zeros((4, 3)),
+        np.zeros(4),
+        np.zeros((0, 2)),
+    ],
+)
+def test_no_plan_of_what_must_not_drive(actions):
+    with pytest.raises(PolicyError):
+        Plan(1, 0.0, 0.0, actions)
+
+
+def test_a_little_beyond_an_end_is_clipped():
+    plan = Plan(1, 0.0, 0.0, np.array([[1.1, -0.02], [-1.2, 1.2]]))
+    assert plan.actions.tolist() == [[1.0, 0.0], [-1.0, 1.0]]
+
+
+def test_the_state_is_what_was_commanded_a_step_before():
+    """As in training: a frame's state is the action of the frame before it."""
+    commanded = Commanded()
+    assert commanded.state(0.0, RATE).tolist() == [0.0, 0.0]
+    for i in range(10):  # each frame's command goes out 3 ms after it
+        commanded.add(i * STEP + 0.003, i / 10, 0.0)
+    for frame in range(1, 10):
+        assert commanded.state(frame * STEP, RATE)[0] == pytest.approx((frame - 1) / 10)
+    assert commanded.state(0.0, RATE).tolist() == [0.0, 0.0]  # before the first command: neutral
+
+
+def test_settings_of_params():
+    settings = Settings.of(params()["drive"])
+    assert settings.fade_s < settings.stop_s <= 32 / RATE
+    assert Settings.of(params()["drive"], throttle_limit=0.05, ensemble=None).throttle_limit == 0.05
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"fade_s": 2.0},
+        {"stop_s": math.nan},
+        {"fade_s": True},
+        {"blend_ticks": 1.5},
+        {"blend_ticks": -1},
+        {"throttle_limit": 1.1},
+        {"frozen_frames": 1},
+        {"ensemble": "a"},
+        {"speed": 1},
+    ],
+)
+def test_settings_that_make_no_sense(wrong):
+    with pytest.raises(ParamsError, match=r"params\.yml"):
+        Settings.of(wrong)
