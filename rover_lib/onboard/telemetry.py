@@ -392,8 +392,8 @@ class Flight:
     def summary(self) -> dict[str, Any]:
         """The drive in figures; None where nothing was measured.
 
-        jitter is by how much commands were late, missed is how many deadlines passed meanwhile. plan_age is over
-        ticks that had a plan, latency over plans.
+        jitter: by how much commands were late. missed: deadlines for which there was no tick, other than those whose
+        line the disk did not take. plan_age is over the ticks that had a plan, latency over the plans.
         """
         ticks, period_ms = self.ticks, self.period_ms
         t_s, late_ms, plans = ticks["t_s"], ticks["late_ms"], ticks["plan"]
@@ -402,12 +402,16 @@ class Flight:
         durations_s = np.diff(t_s, append=t_s[-1:] + (period_ms or 0) / 1000)
         states = {s.value: s.name.lower() for s in State} | {"": "not known"}
         throttled = next((v for v in reversed(self.machine["throttled"]) if v is not None), None)
-        missing = (e.fields.get("ticks", 0) for e in self.events if e.text == MISSING)
+        not_logged = sum(e.fields.get("ticks", 0) for e in self.events if e.text == MISSING)
+        missed = None
+        if period_ms:
+            passed = np.rint(np.diff(t_s * 1000 - late_ms) / period_ms) - 1
+            missed = max(0, int(passed[passed > 0].sum()) - not_logged)
         return {
             "start": self.header.get("start"),
             "seconds": float(t_s[-1] - t_s[0]) if len(t_s) else 0.0,
             "ticks": len(t_s),
-            "missed": int(np.nansum(late_ms // period_ms)) if period_ms else None,
+            "missed": missed,
             "jitter_p50_ms": _percentile(late_ms, 50),
             "jitter_p99_ms": _percentile(late_ms, 99),
             "jitter_max_ms": _percentile(late_ms, 100),
@@ -423,7 +427,7 @@ class Flight:
             "throttled": throttled,
             "throttled_means": throttled_means(throttled),
             "events": [{"t_s": e.t_s, "event": e.text, **e.fields} for e in self.events],
-            "ticks_not_logged": sum(missing),
+            "ticks_not_logged": not_logged,
             "drive": self.drive,
             "drives": self.drives,
             "damaged_lines": self.damaged,

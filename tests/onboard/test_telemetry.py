@@ -354,7 +354,8 @@ def test_a_long_failure_loses_the_oldest_and_marks_the_gap(path, monkeypatch):
     assert flight.ticks["frame"].tolist() == list(range(150, 200))
     assert log.dropped == 150
     assert {e.text: e.fields for e in flight.events}[telemetry.MISSING] == {"ticks": 150}
-    assert flight.summary()["ticks_not_logged"] == 150
+    found = flight.summary()
+    assert (found["ticks_not_logged"], found["missed"]) == (150, 0)
 
 
 def test_a_row_that_is_none_is_left_out(path, caplog):
@@ -450,10 +451,11 @@ def test_a_tick_costs_the_loop_little(path):
 
 
 def test_summary(path, pi_host):
-    late_ms = [0.1] * 97 + [40.0, 100.5, 1.0]
+    late_ms = [0.1] * 97 + [30.0, 4.5, 1.0]
     rows = [
         tick(
             k,
+            t_s=(k + 3 * (k > 50)) / 30 + late / 1000,  # three were missed
             late_ms=late,
             state="" if k < 10 else "A" if k < 70 else "M",
             plan=k // 10,
@@ -465,13 +467,13 @@ def test_summary(path, pi_host):
     write(path, rows, host=pi_host)
     found = read_log(path).summary()
     json.dumps(found, allow_nan=False)
-    assert (found["ticks"], found["missed"], found["plans"]) == (100, 1 + 3, 9)
+    assert (found["ticks"], found["missed"], found["plans"]) == (100, 3, 9)
     assert found["jitter_p50_ms"] == 0.1
-    assert found["jitter_max_ms"] == 100.5
+    assert found["jitter_max_ms"] == 30.0
     assert found["plan_age_p95_ms"] == pytest.approx(np.percentile(np.arange(10, 100), 95))
     assert (found["latency_p50_ms"], found["latency_p95_ms"]) == (105.0, pytest.approx(108.6))
-    assert found["seconds"] == pytest.approx(3.3)
-    assert found["seconds_in"] == pytest.approx({"not known": 1 / 3, "autonomous": 2.0, "manual": 1.0}, abs=1e-3)
+    assert found["seconds"] == pytest.approx(3.4009)
+    assert found["seconds_in"] == pytest.approx({"not known": 1 / 3, "autonomous": 2.1, "manual": 1.0}, abs=2e-3)
     assert found["temperature_max_c"] == 61.35
     assert found["throttled_means"] == ["under-voltage since the start", "throttled since the start"]
 
