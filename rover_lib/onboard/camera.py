@@ -246,7 +246,8 @@ def _paced(images: Iterator[np.ndarray], rate_hz: float, closing: threading.Even
 
 def _fifo(path: Path, closing: threading.Event) -> Iterator[Read]:
     """JPEGs from a FIFO, the last of those that are there; its end is the end of the camera."""
-    yield from _decoded(_split(_pieces(path, closing), newest=True))
+    for image in _decoded(_split(_pieces(path, closing), newest=True)):
+        yield image, None
 
 
 def _pieces(path: Path, closing: threading.Event) -> Iterator[bytes]:
@@ -290,8 +291,8 @@ def _split(pieces: Iterator[bytes], newest: bool = False) -> Iterator[bytes]:
             raise CameraError(f"no JPEG in {JPEG_MOST / 1e6:g} MB of the stream; write JPEGs one after another")
 
 
-def _decoded(jpegs: Iterator[bytes]) -> Iterator[Read]:
+def _decoded(jpegs: Iterator[bytes]) -> Iterator[np.ndarray]:
     for jpeg in jpegs:
         image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
         if image is not None:  # a damaged one is no frame
-            yield image, None
+            yield image

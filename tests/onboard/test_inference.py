@@ -1,0 +1,175 @@
+"""Plans beside the loop, and the policy in its own process: what it computes, and all the ways in which it can fail."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from rover_lib.onboard import load_policy
+from rover_lib.onboard.camera import CameraError, Frame
+from rover_lib.onboard.errors import PolicyError
+from rover_lib.onboard.inference import Planner, PolicyProcess, PolicyThread, late
+from rover_lib.onboard.plan import Commanded
+
+FRAME = np.random.default_rng(0).integers(0, 256, (36, 64, 3), np.uint8)
+CHUNK = np.tile(np.array([0.1, 0.05], np.float32), (8, 1))
+
+
+class Frames:
+    """A camera that gives a frame whenever it is asked."""
+
+    def __init__(self, fails_after=None):
+        self.number, self.fails_after = 0, fails_after
+
+    def wait(self, after, timeout_s):
+        time.sleep(0.002)
+        self.number += 1
+        if self.fails_after and self.number > self.fails_after:
+            raise CameraError("camera: unplugged")
+        return Frame(FRAME, time.monotonic(), self.number, 0, 100.0)
+
+
+def until_raises(planner, kind, match, seconds=3):
+    end = time.monotonic() + seconds
+    with pytest.raises(kind, match=match):
+        while time.monotonic() < end:
+            planner.newest()
+            time.sleep(0.002)
+
+
+def test_plans_follow_the_frames():
+    states = []
+
+    def predict(frame, state):
+        states.append(state.tolist())
+        return CHUNK
+
+    commanded = Commanded()
+    with Planner(Frames(), predict, commanded, 30.0) as planner:
+        first = planner.wait(2.0)
+        commanded.add(time.monotonic() - 1 / 30, 0.25, 0.5)
+        time.sleep(0.05)
+        later = planner.newest()
+    assert later.number > first.number
+    assert later.captured_s > first.captured_s
+    assert 0 <= later.latency_s < 0.1
+    assert later.actions == pytest.approx(CHUNK)
+    assert states[0] == [0.0, 0.0]
+    assert [0.25, 0.5] in states
+
+
+@pytest.mark.parametrize(
+    ("chunk", "match"),
+    [
+        (np.full((8, 2), np.nan, np.float32), "not finite"),
+        (np.full((8, 2), 3.0, np.float32), "outside the range"),
+        (np.zeros((8, 3), np.float32), "must be"),
+    ],
+)
+def test_a_chunk_that_must_not_drive(chunk, match):
+    with Planner(Frames(), lambda frame, state: chunk, Commanded(), 30.0) as planner:
+        until_raises(planner, PolicyError, match)
+
+
+def test_what_the_policy_raises():
+    def predict(frame, state):
+        raise ZeroDivisionError("by zero")
+
+    with Planner(Frames(), predict, Commanded(), 30.0) as planner:
+        until_raises(planner, PolicyError, "ZeroDivisionError: by zero")
+
+
+def test_what_the_camera_raises():
+    with Planner(Frames(fails_after=3), lambda frame, state: CHUNK, Commanded(), 30.0) as planner:
+        until_raises(planner, CameraError, "unplugged")
+
+
+def test_how_long_it_has_been_asked():
+    hanging = time.monotonic() + 0.3
+    with Planner(
+        Frames(), lambda frame, state: time.sleep(max(0, hanging - time.monotonic())) or CHUNK, Commanded(), 30.0
+    ) as planner:
+        time.sleep(0.1)
+        assert 0.05 < planner.asking_s < 0.3
+        planner.wait(2.0)
+        assert planner.asking_s < 0.05
+
+
+def test_late_is_late():
+    start = time.monotonic()
+    assert late(lambda frame, state: CHUNK, 0.05)(FRAME, None) is CHUNK
+    assert time.monotonic() - start >= 0.05
+
+
+@pytest.fixture(scope="module")
+def process(artifacts):
+    with PolicyProcess(artifacts["static"], threads=1) as process:
+        yield process
+
+
+def test_the_process_computes_what_the_policy_does(process, artifacts):
+    policy = load_policy(artifacts["static"])
+    state = np.array([0.1, 0.02], np.float32)
+    assert process.predict(FRAME, state).tolist() == policy.predict_unclipped(FRAME, state).tolist()
+    assert (process.rate_hz, process.chunk, process.manifest["mode"]) == (policy.rate_hz, policy.chunk, "static")
+    with PolicyThread(artifacts["static"], threads=1) as here:
+        assert here.predict(FRAME, state).tolist() == process.predict(FRAME, state).tolist()
+
+
+def test_a_bad_state_is_a_sentence_and_the_process_goes_on(process):
+    with pytest.raises(PolicyError, match="state is not finite"):
+        process.predict(FRAME, np.array([np.nan, 0.0]))
+    assert process.predict(FRAME, np.zeros(2)).shape == (process.chunk, 2)
+
+
+def test_an_artifact_that_cannot_be_used(tmp_path, artifacts):
+    with pytest.raises(PolicyError, match="not found"), PolicyProcess(tmp_path / "policy.pt"):
+        pass
+    (tmp_path / "policy.pt").write_bytes(artifacts["static"].read_bytes()[:-5000])
+    with pytest.raises(PolicyError, match="cut short"), PolicyProcess(tmp_path / "policy.pt"):
+        pass
+
+
+def test_a_process_that_is_killed(artifacts):
+    with PolicyProcess(artifacts["static"], threads=1) as process:
+        os.kill(*process.pids, signal.SIGKILL)
+        with pytest.raises(PolicyError, match="SIGKILL"):
+            for _ in range(100):
+                process.predict(FRAME, np.zeros(2))
+
+
+def test_a_process_that_hangs_is_ended(artifacts):
+    with PolicyProcess(artifacts["static"], threads=1) as process:
+        os.kill(*process.pids, signal.SIGSTOP)
+        start = time.monotonic()
+    assert time.monotonic() - start < 3
+    assert process._process.poll() is not None
+
+
+def test_it_ends_with_its_parent(artifacts):
+    code = (
+        "import os, sys; from rover_lib.onboard.inference import PolicyProcess; "
+        f"p = PolicyProcess({str(artifacts['static'])!r}).__enter__(); print(*p.pids, flush=True); "
+        "os.kill(os.getpid(), 9)"
+    )
+    pid = int(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout)
+    end = time.monotonic() + 5
+    while time.monotonic() < end:
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.02)
+    raise AssertionError("the policy's process outlived its parent")
+
+
+def test_the_side_that_drives_does_not_load_torch():
+    code = (
+        "import sys, rover_lib.onboard.drive, rover_lib.onboard.camera, rover_lib.onboard.inference; "
+        "sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
