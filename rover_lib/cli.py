@@ -306,6 +306,148 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
     click.echo(f"trained: {train_policy(episodes, output, progress=progress(), **options)}")
 
 
+@main.command()
+@click.argument("artifact", type=FILE, required=False)
+@click.option("--camera", default="0", show_default=True, help="Number, /dev/videoN, video, folder or FIFO of JPEGs.")
+@click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
+@click.option("--hz", type=click.FloatRange(10, 100), default=30.0, show_default=True, help="Commands a second.")
+@click.option("--dry-run", is_flag=True, help="No Arduino, no motor: logs what would be sent.")
+@click.option("--record", type=FILE, help="Write the drive as an episode into this folder.")
+@click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="End after so many.")
+@click.option("--ticks", type=click.IntRange(min=1), help="End after so many commands.")
+@click.option("--throttle-limit", type=click.FloatRange(0, 1), help="[default: params.yml; with --replay: none]")
+@click.option("--blend-ticks", type=click.IntRange(min=0), help="Of a fresh plan taking over [default: params.yml].")
+@click.option("--ensemble", type=float, help="LeRobot's temporal ensembling with this coefficient, say 0.01.")
+@click.option("--threads", type=click.IntRange(min=1), help="The policy's [default: all cores but one].")
+@click.option("--log", "log_file", type=FILE, help="Flight log [default: rover/flight.log in the user's state folder].")
+@click.option(
+    "--json", "json_file", type=click.File("w", lazy=True), help="Write what the drive was there; - prints it."
+)
+@click.option("--replay", type=FILE, help="Send this episode's pulses; no policy, no camera.")
+@click.option("--world", "in_world", is_flag=True, help="The balloon world instead of a car, in real time.")
+@click.option("--firmware", is_flag=True, help="With --world: the real firmware on an emulated Arduino.")
+@click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="With --world: a plan takes so long.")
+@click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="With --world: its first.")
+@click.option("--in-thread", is_flag=True, help="With --world: the policy in a thread of the loop's, to compare.")
+@click.pass_context
+def drive(ctx: click.Context, artifact: Path | None, replay: Path | None, json_file: Any, **options: Any) -> None:
+    """Drive ARTIFACT: arms the car once camera, plan and Arduino are ready, and stops it whatever fails.
+
+    Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP); 1 could not begin;
+    2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start.
+    """
+    from rover_lib.onboard.drive import DriveFault, Report, TakenOver
+
+    if bool(artifact) == bool(replay):
+        raise click.UsageError("give an ARTIFACT, or --replay EPISODE")
+    if not options["in_world"] and (options["firmware"] or options["latency_ms"] or options["in_thread"]):
+        raise click.UsageError("--firmware, --latency-ms and --in-thread belong to --world")
+    report, more, code = Report(), {}, 0
+    try:
+        _drive(artifact, replay, report, more, **options)
+    except (DriveFault, TakenOver) as e:
+        click.echo(f"rover: {e}", err=True)
+        code = 4 if isinstance(e, TakenOver) else 3
+    result = {**report.summary(), **more}
+    if json_file:
+        json_file.write(json.dumps(result, indent=2) + "\n")
+    else:
+        show(result, False)
+    ctx.exit(code)
+
+
+def _drive(
+    artifact: Path | None,
+    replay: Path | None,
+    report: Any,
+    more: dict[str, Any],
+    *,
+    camera: str,
+    port: str,
+    hz: float,
+    dry_run: bool,
+    record: Path | None,
+    throttle_limit: float | None,
+    blend_ticks: int | None,
+    ensemble: float | None,
+    threads: int | None,
+    log_file: Path | None,
+    in_world: bool,
+    firmware: bool,
+    latency_ms: float,
+    seed: int,
+    in_thread: bool,
+    **ends: Any,
+) -> None:
+    """The drive command's devices, opened in order and closed in reverse; more: what a world adds to the report."""
+    import logging
+    import threading
+    from contextlib import ExitStack
+
+    from rover_lib.onboard import drive as d
+    from rover_lib.onboard.camera import Camera
+    from rover_lib.onboard.params import params
+    from rover_lib.onboard.plan import Settings
+    from rover_lib.onboard.recording import read_controls
+    from rover_lib.onboard.servo_link import ServoLink
+    from rover_lib.onboard.telemetry import FlightLog, StatusLine
+
+    p = params()
+    settings = Settings.of(p["drive"], throttle_limit=throttle_limit, blend_ticks=blend_ticks, ensemble=ensemble)
+    controls = read_controls(replay) if replay else None
+    stop = threading.Event()
+    with ExitStack() as stack:
+        header = {"artifact": str(artifact or replay), "hz": hz, **vars(settings)}
+        status = stack.enter_context(StatusLine(lambda: report.status, sys.stderr))
+        logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status.handler], force=True)
+        limits = {"max_bytes": int(p["flight_log"]["max_mb"] * 1e6), "keep": p["flight_log"]["keep"]}
+        log = stack.enter_context(FlightLog(log_file or d.default_log(), header=header, **limits))
+        stack.enter_context(d.ended_by_signals(stop, log))
+        if in_world:
+            from rover_lib.playground.car import VirtualCar
+
+            car = stack.enter_context(VirtualCar(seed=seed, firmware=firmware))
+            camera, port = car.camera, car.port
+            stack.callback(lambda: more.update(hits=(r := car.report()).hits, trials=r.trials, camera_late=r.late))
+        link = None if dry_run else stack.enter_context(ServoLink(port))
+        common = {"rate_hz": hz, "log": log, "stop": stop, "report": report, **ends}
+        if controls:
+            limit = 1.0 if throttle_limit is None else throttle_limit
+            d.drive(d.ReplayPilot(controls, throttle_limit=limit), link, **common)
+            return
+        frames = stack.enter_context(Camera(camera))
+        how = {"threads": threads, "in_thread": in_thread, "latency_s": latency_ms / 1e3, "record": record}
+        d.drive_artifact(artifact, frames, link, settings=settings, **how, **common)
+
+
+@main.command("record")
+@click.argument("out_dir", type=FILE)
+@click.option("--camera", default="0", show_default=True, help="Number, /dev/videoN, video, folder or FIFO of JPEGs.")
+@click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
+@click.option(
+    "--hz", type=click.FloatRange(5, 50), default=30.0, show_default=True, help="Controls and frames a second."
+)
+@click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="End an episode after so many.")
+@click.option("--label", default="", help='What is done, say "hit red balloon".')
+@click.option("--episodes", type=click.IntRange(min=1), default=1, show_default=True, help="One after another.")
+@click.pass_context
+def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -> None:
+    """Record a human who drives with the transmitter: episode folders in OUT_DIR, to train and calibrate with.
+
+    Ctrl-C, SIGTERM and SIGHUP end an episode, and it is kept. Exit code 1 if a fault ended it; what was recorded until
+    then is kept too.
+    """
+    from rover_lib.onboard.recorder import record_episodes
+
+    fault = None
+    for report in record_episodes(
+        folder=out_dir, rate_hz=hz, status=sys.stderr, say=lambda text: click.echo(text, err=True), **options
+    ):
+        click.echo(str(report))
+        fault = report.fault
+    ctx.exit(1 if fault else 0)
+
+
 @main.command("leave-out")
 @click.argument("run_dir", type=FILE)
 @click.option("--frames", type=click.IntRange(min=1), default=100, show_default=True, help="Held-out frames.")
