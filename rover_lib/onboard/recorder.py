@@ -1,0 +1,343 @@
+"""Recording on the car: an episode beside a running loop, and the loop for a human who drives.
+
+A recorder of its own thread takes frames and writes everything to disk; whoever drives only hands over controls. All
+times are of the monotonic clock, mapped to the system's once, at the start: a clock that NTP sets meanwhile changes
+nothing. What fails here never stops a drive: it is said once, and what was recorded until then is kept.
+"""
+
+import contextlib
+import logging
+import os
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+from rover_lib.onboard.camera import Camera
+from rover_lib.onboard.errors import EpisodeError, RoverError
+from rover_lib.onboard.recording import EpisodeExists, EpisodeWriter
+from rover_lib.onboard.servo_link import ServoLink
+from rover_lib.onboard.telemetry import StatusLine
+
+SPARE_BYTES = 16_000_000  # of the disk are left alone; finishing an episode needs some, and so does the rest of a Pi
+ROW_BYTES = 1000  # of a control or frame in both of its files, at the end
+QUEUE_MOST = 20_000  # controls that wait for the disk: minutes, and a few megabytes
+SILENT_S = 2.0  # without a frame, or a status of the Arduino, nothing is recorded any more
+CLOSE_S = 60.0  # a slow card may have much to catch up with
+PAUSE_S = 5.0  # between two episodes
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+_log = logging.getLogger("rover")
+
+
+class Recorder:
+    """An episode beside a running loop: controls are handed over, frames are taken from the camera in its own thread.
+
+    folder: in which the episode appears on close(), as episode_YYYYMMDD_HHMMSS of the start in local time (a second
+    later if that is taken). label: what was done. rate_hz: frames a second at most. source, arduino_port: who drove and
+    through what, for the metadata. Raises EpisodeError if there is no room to record; later faults are in `failure`.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        camera: Camera,
+        *,
+        label: str = "",
+        rate_hz: float = 30.0,
+        arduino_port: str = "",
+        source: str = "",
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._camera, self._clock = camera, clock
+        self.start_s = clock()
+        self._to_system_s = time.time() - self.start_s
+        self._frame_s = 0.75 / rate_hz  # a frame sooner after the last one is of a faster camera, and left out
+        self._writer = _new_episode(
+            Path(folder),
+            self.start_s + self._to_system_s,
+            label=label,
+            fps=min(rate_hz, camera.wanted_hz),
+            resolution=None,
+            arduino_port=arduino_port,
+            flags=True,
+        )
+        self._writer.metadata["source"] = source
+        self.folder = self._writer.folder
+        self.path: Path | None = None  # the episode's, once it is there
+        self.failure: str | None = None
+        self._queue: deque[tuple] = deque()
+        self._lost = 0
+        self._closing = threading.Event()
+        try:
+            self._check_room()
+            self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+            self._thread.start()
+        except BaseException:
+            self._writer.discard()
+            raise
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self.close(_sentence(error) if error else None)
+
+    def control(
+        self,
+        host_s: float,
+        arduino_ms: int,
+        steering_us: int | None,
+        throttle_us: int | None,
+        steering_period_us: int | None,
+        throttle_period_us: int | None,
+        **extra: Any,
+    ) -> None:
+        """Hands over one control at `host_s` of the clock; None is "no pulse". Never blocks, never raises.
+
+        extra: further columns of the episode, numbers or text.
+        """
+        if self.failure is not None or self._closing.is_set():
+            return
+        if len(self._queue) >= QUEUE_MOST:
+            self._lost += 1
+            return
+        self._queue.append(
+            (host_s, arduino_ms, steering_us, throttle_us, steering_period_us, throttle_period_us, extra)
+        )
+
+    def close(self, fault: str | None = None) -> Path | None:
+        """Ends the episode and returns its folder; None if it is none, and then `failure` says why.
+
+        fault: what ended it, if it was one. An episode that ended by a fault is kept as far as it goes; the fault is in
+        its metadata, and in `failure`.
+        """
+        if fault and not self._closing.is_set():
+            self._fail(fault)
+        self._closing.set()
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            self._fail(f"{self.folder}: the disk has not taken the episode for {CLOSE_S:g} s: check it")
+        return self.path
+
+    @property
+    def controls(self) -> int:
+        """So many were written."""
+        return self._writer.controls
+
+    @property
+    def frames(self) -> int:
+        """So many were written."""
+        return self._writer.frames
+
+    def _fail(self, sentence: str) -> None:
+        if self.failure is None:
+            self.failure = sentence
+            _log.error("recording ended: %s", sentence)
+
+    def _check_room(self) -> None:
+        needed = SPARE_BYTES + ROW_BYTES * (self._writer.controls + self._writer.frames)
+        disk = os.statvfs(self.folder.parent)
+        if (free := disk.f_bavail * disk.f_frsize) < needed:
+            raise EpisodeError(
+                f"{self.folder.parent}: the disk is full ({free / 1e6:.0f} MB free, {needed / 1e6:.0f} are needed): "
+                "make room, or name a folder on another one"
+            )
+
+    def _run(self) -> None:
+        try:
+            self._collect()
+        except Exception as error:  # whatever it is: the car drives on, and what was recorded is an episode
+            self._fail(_sentence(error))
+        if self.failure:
+            self._writer.metadata["fault"] = self.failure
+        if self._lost:
+            self._writer.metadata["controls_lost"] = self._lost
+        try:
+            path = self._writer.finish()
+            os.sync()  # "it is there" has to hold for a car that is switched off right after
+            self.path = path
+        except Exception as error:
+            self._fail(_sentence(error))
+
+    def _collect(self) -> None:
+        newest = self._camera.latest()
+        seen = newest.number if newest else 0  # that one is from before
+        last_s, captured_s = self._clock(), -1e9
+        while True:
+            frame = self._camera.wait(seen, 0.1)
+            closing = (
+                self._closing.is_set()
+            )  # asked before the queue is emptied: nothing that came before close() is lost
+            self._write_controls()
+            if closing:
+                return
+            now = self._clock()
+            if frame is None:
+                if now - last_s > SILENT_S:
+                    raise EpisodeError(f"{self._camera.source}: no frame for {SILENT_S:g} s: is the camera plugged in?")
+                continue
+            seen, last_s = frame.number, now
+            if frame.captured_s - captured_s < self._frame_s:
+                continue
+            captured_s = frame.captured_s
+            self._check_room()
+            self._writer.frame(captured_s + self._to_system_s, frame.image)
+
+    def _write_controls(self) -> None:
+        for _ in range(len(self._queue)):
+            host_s, *control, extra = self._queue.popleft()
+            self._writer.control(host_s + self._to_system_s, *control, **extra)
+
+
+def _sentence(error: BaseException) -> str:
+    return str(error) if isinstance(error, RoverError) else f"{type(error).__name__}: {error}"
+
+
+def _new_episode(folder: Path, start_s: float, **options: Any) -> EpisodeWriter:
+    """An open episode in `folder`, named by its start, or the next second that is free."""
+    while True:
+        writer = EpisodeWriter(folder / time.strftime("episode_%Y%m%d_%H%M%S", time.localtime(start_s)), **options)
+        try:
+            writer.open()
+            return writer
+        except EpisodeExists:
+            start_s += 1
+
+
+@dataclass(frozen=True)
+class RecordReport:
+    """What was recorded. folder: the episode's, None if it became none. seconds: from its start. not_measured: so many
+    controls without a pulse of steering, of throttle. fault: what ended it, None if it was asked to.
+    """
+
+    folder: Path | None
+    controls: int
+    frames: int
+    seconds: float
+    not_measured: tuple[int, int]
+    fault: str | None
+
+    def __str__(self) -> str:
+        where = self.folder or "nothing"
+        text = f"recorded: {where} ({self.controls} controls and {self.frames} frames in {self.seconds:.1f} s)"
+        for channel, lost in zip(("steering", "throttle"), self.not_measured, strict=True):
+            if lost > self.controls / 10:
+                text += f"; {channel} was not measured in {lost} of them: is the transmitter on?"
+        return text
+
+
+def record(
+    camera: Camera,
+    link: ServoLink,
+    folder: Path | str,
+    *,
+    rate_hz: float = 30.0,
+    max_seconds: float | None = None,
+    stop: threading.Event | None = None,
+    label: str = "",
+    status: TextIO | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> RecordReport:
+    """Records one episode of a human who drives, until `stop` is set or max_seconds are over.
+
+    A control is the newest status of the Arduino at a tick of rate_hz, at the time at which it came, once. What ends it
+    otherwise is the report's `fault`; what was recorded until then is kept. status: a stream for a line for people.
+    Raises EpisodeError if it cannot be begun.
+    """
+    stop = stop or threading.Event()
+    lost = [0, 0]
+    with contextlib.ExitStack() as stack:
+        recorder = stack.enter_context(
+            Recorder(folder, camera, label=label, rate_hz=rate_hz, arduino_port=link.port, source="human", clock=clock)
+        )
+        start = heard_s = recorder.start_s  # what was said before is not of this episode
+        if status:
+            line = stack.enter_context(
+                StatusLine(
+                    lambda: f"{clock() - start:.0f} s, {recorder.controls} controls, {recorder.frames} frames", status
+                )
+            )
+            _log.addHandler(line.handler)
+            stack.callback(_log.removeHandler, line.handler)
+        tick = 0
+        while not stop.is_set() and recorder.failure is None:
+            now = clock()
+            if max_seconds is not None and now - start >= max_seconds:
+                break
+            try:
+                said = link.latest()
+                if now - heard_s > SILENT_S:
+                    raise EpisodeError(f"{link.port}: no status for {SILENT_S:g} s: is the Arduino plugged in?")
+            except RoverError as error:
+                recorder.close(str(error))
+                break
+            if said is not None and said.host_s > heard_s:
+                heard_s = said.host_s
+                steering, throttle = said.receiver_steering_us, said.receiver_throttle_us
+                periods = said.receiver_steering_period_us, said.receiver_throttle_period_us
+                recorder.control(heard_s, said.uptime_ms, steering, throttle, *periods)
+                lost[0] += steering is None
+                lost[1] += throttle is None
+            tick = max(tick + 1, int((now - start) * rate_hz))
+            stop.wait(max(0.0, start + tick / rate_hz - clock()))
+        seconds = clock() - start
+    return RecordReport(
+        recorder.path, recorder.controls, recorder.frames, seconds, (lost[0], lost[1]), recorder.failure
+    )
+
+
+def record_episodes(
+    camera: str,
+    port: str,
+    folder: Path | str,
+    *,
+    rate_hz: float = 30.0,
+    max_seconds: float | None = None,
+    label: str = "",
+    episodes: int = 1,
+    status: TextIO | None = None,
+    say: Callable[[str], None] = _log.info,
+) -> Iterator[RecordReport]:
+    """Opens camera and Arduino and records so many episodes; for the main thread, because signals end them.
+
+    SIGINT ends an episode; a second one, or one in the pause before the next episode, ends it all, and so do SIGTERM,
+    SIGHUP and a fault. Raises RoverError if it cannot be begun.
+    """
+    stop, leave = threading.Event(), threading.Event()
+
+    def on_signal(number: int, _: object) -> None:
+        if number != signal.SIGINT or stop.is_set():
+            leave.set()
+        stop.set()
+
+    with Camera(camera, rate_hz=rate_hz) as frames, ServoLink(port) as link:
+        before = {number: signal.signal(number, on_signal) for number in SIGNALS}
+        try:
+            for i in range(episodes):
+                if i:
+                    say(f"episode {i + 1} of {episodes} begins in {PAUSE_S:g} s; Ctrl-C now is the end of it all")
+                    if stop.wait(PAUSE_S):
+                        return
+                say("recording; Ctrl-C ends the episode")
+                report = record(
+                    frames,
+                    link,
+                    folder,
+                    rate_hz=rate_hz,
+                    max_seconds=max_seconds,
+                    stop=stop,
+                    label=label,
+                    status=status,
+                )
+                yield report
+                if report.fault or leave.is_set():
+                    return
+                stop.clear()
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)

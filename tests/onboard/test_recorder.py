@@ -1,0 +1,515 @@
+"""The recorder beside a loop, and the loop for a human: what is recorded, and what is left when something fails."""
+
+import csv
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections import namedtuple
+from contextlib import contextmanager
+from itertools import pairwise
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from rover_lib.onboard import recorder as module
+from rover_lib.onboard.camera import Camera, CameraError, Frame
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.recorder import Recorder, record
+from rover_lib.onboard.recording import EpisodeWriter, read_controls
+from rover_lib.onboard.servo_link import LinkError, ServoLink, State, Telemetry, frame
+from rover_lib.workshop.episodes import load_recordings
+
+PICTURE = np.full((36, 64, 3), (30, 90, 200), np.uint8)
+
+
+class FakeCamera:
+    """Frames when they are pushed; or, from start() on, 100 a second."""
+
+    source = "fake camera"
+    wanted_hz = 100.0
+
+    def __init__(self):
+        self._changed = threading.Condition()
+        self._frame = self._failure = None
+        self.running = False
+
+    def push(self, image=PICTURE):
+        with self._changed:
+            number = self._frame.number + 1 if self._frame else 1
+            self._frame = Frame(image, time.monotonic(), number, 0, 100.0)
+            self._changed.notify_all()
+
+    def fail(self):
+        with self._changed:
+            self._failure = CameraError("fake camera: it ended; is the camera unplugged?")
+            self._changed.notify_all()
+
+    def latest(self):
+        with self._changed:
+            if self._failure:
+                raise self._failure
+            return self._frame
+
+    def wait(self, after, timeout_s):
+        with self._changed:
+            self._changed.wait_for(lambda: self._failure or (self._frame and self._frame.number > after), timeout_s)
+            if self._failure:
+                raise self._failure
+            return self._frame if self._frame and self._frame.number > after else None
+
+    @contextmanager
+    def filming(self):
+        done = threading.Event()
+
+        def run():
+            while not done.wait(0.01):
+                self.push()
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            yield self
+        finally:
+            done.set()
+            thread.join()
+
+
+class FakeLink:
+    """An Arduino with a status every 20 ms of the clock; every fourth throttle pulse is lost."""
+
+    port = "fake port"
+
+    def __init__(self):
+        self.start = time.monotonic()
+        self.dies_s = self.silent_s = 1e9
+
+    def latest(self):
+        now = time.monotonic() - self.start
+        if now > self.dies_s:
+            raise LinkError("fake port: reading failed; is it still plugged in?")
+        n = int(min(now, self.silent_s) / 0.02)
+        return status_of(n, self.start + 0.02 * n)
+
+
+def status_of(n, host_s=0.0):
+    throttle = (None, None) if n % 4 == 3 else (120 + n % 5 * 4, 1016)
+    steering = 1456 + n % 50 * 4, 21316
+    return Telemetry(host_s, 7, 20 * n, 0, "-", State.MANUAL, "r", 1456, 120, *steering, *throttle, 0, 0, 0, 0)
+
+
+def until(condition, seconds=5.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.002)
+
+
+def content_of(folder):
+    return json.loads((folder / "episode_data.json").read_text())
+
+
+def left_in(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+# ---- beside a loop ---------------------------------------------------------------------------------------
+
+
+def test_an_episode_beside_a_loop(tmp_path):
+    camera = FakeCamera()
+    camera.push()
+    before_s = time.time()
+    recorder = Recorder(
+        tmp_path / "new", camera, label="driven", rate_hz=50, arduino_port="/dev/x", source="rover drive"
+    )
+    for i in range(5):
+        time.sleep(0.025)
+        camera.push()
+        recorder.control(
+            time.monotonic(), 20 * i, 1500, 136, 21316, 1016, mode="static", plan_age_ms=None if i < 2 else 80.5
+        )
+        until(lambda n=i: recorder.frames == n + 1)
+    folder = recorder.close()
+    assert folder == recorder.folder == recorder.path
+    assert recorder.failure is None
+    assert recorder.close() == folder
+    assert left_in(tmp_path / "new") == [folder.name]
+    assert abs(time.mktime(time.strptime(folder.name, "episode_%Y%m%d_%H%M%S")) - before_s) <= 2
+    content = content_of(folder)
+    assert content["action_label"] == "driven"
+    assert (
+        content["metadata"]
+        | {
+            "camera_fps": 50,
+            "camera_resolution": [64, 36],
+            "arduino_port": "/dev/x",
+            "total_control_samples": 5,
+            "total_frames": 5,  # not the one from before the start
+            "source": "rover drive",
+        }
+        == content["metadata"]
+    )
+    assert "fault" not in content["metadata"]
+    assert [c["plan_age_ms"] for c in content["control_samples"]] == [None, None, 80.5, 80.5, 80.5]
+    assert {c["mode"] for c in content["control_samples"]} == {"static"}
+    assert all(c["throttle_measured"] is True for c in content["control_samples"])
+    times = [c["system_timestamp"] for c in content["control_samples"]]
+    times += [f["timestamp"] for f in content["frame_samples"]]
+    assert before_s <= min(times) <= max(times) <= time.time()
+    with (folder / "control_data.csv").open(newline="") as f:
+        rows = list(csv.DictReader(f))
+    assert [r["plan_age_ms"] for r in rows] == ["", "", "80.5", "80.5", "80.5"]
+    assert len(load_recordings(folder, chunk=2).samples) == 5
+    assert read_controls(folder).throttle_us.tolist() == [136] * 5
+
+
+def test_a_faster_camera_is_thinned(tmp_path):
+    camera = FakeCamera()
+    with camera.filming(), Recorder(tmp_path, camera, rate_hz=20) as recorder:
+        recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
+        time.sleep(0.6)
+    times = [f["timestamp"] for f in content_of(recorder.path)["frame_samples"]]
+    assert 8 <= len(times) <= 17
+    assert min(b - a for a, b in pairwise(times)) > 0.037
+
+
+def test_a_clock_that_is_set_meanwhile_changes_nothing(tmp_path, monkeypatch):
+    camera = FakeCamera()
+    now = time.time()
+    with Recorder(tmp_path, camera) as recorder:
+        for hours in (0, 1, -1):
+            monkeypatch.setattr(time, "time", lambda h=hours: now + 3600 * h)
+            recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
+            camera.push()
+            time.sleep(0.03)
+    content = content_of(recorder.path)
+    times = [c["system_timestamp"] for c in content["control_samples"]]
+    assert len(times) == 3
+    assert times == sorted(times)
+    assert all(abs(t - now) < 5 for t in times + [f["timestamp"] for f in content["frame_samples"]])
+
+
+def test_two_in_one_second(tmp_path, monkeypatch):
+    monkeypatch.setattr(time, "time", lambda: 1_760_000_000.0)
+    camera = FakeCamera()
+    with Recorder(tmp_path, camera) as a, Recorder(tmp_path, camera) as b:  # the second while the first is recording
+        for r in (a, b):
+            r.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
+        camera.push()
+        until(lambda: a.frames and b.frames)
+    with Recorder(tmp_path, camera) as c:  # and after both are done
+        c.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
+        camera.push()
+        until(lambda: c.frames)
+    assert sorted([a.path.name, b.path.name, c.path.name]) == left_in(tmp_path)
+    assert len(left_in(tmp_path)) == 3
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_an_unplugged_camera_keeps_what_there_is(tmp_path, recorded, caplog):
+    camera = FakeCamera()
+    recorder = Recorder(tmp_path, camera)
+    if recorded:
+        recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
+        camera.push()
+        until(lambda: recorder.frames)
+    camera.fail()
+    until(lambda: recorder.failure)
+    recorder.control(time.monotonic(), 20, 1500, 136, 21316, 1016)  # the loop goes on
+    folder = recorder.close()
+    assert "unplugged" in recorder.failure
+    assert [r.message for r in caplog.records] == [f"recording ended: {recorder.failure}"]  # once
+    if recorded:
+        assert content_of(folder)["metadata"]["fault"] == recorder.failure
+        assert left_in(tmp_path) == [folder.name]
+    else:
+        assert folder is None
+        assert left_in(tmp_path) == []
+
+
+def test_a_camera_that_hangs_ends_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "SILENT_S", 0.15)
+    recorder = Recorder(tmp_path, FakeCamera())
+    until(lambda: recorder.failure)
+    assert "no frame" in recorder.failure
+    assert recorder.close() is None
+
+
+def test_an_exception_of_the_loop_keeps_what_there_is(tmp_path):
+    camera = FakeCamera()
+    with pytest.raises(ZeroDivisionError), Recorder(tmp_path, camera) as recorder:
+        recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
+        camera.push()
+        until(lambda: recorder.frames)
+        raise ZeroDivisionError("in the loop")
+    assert content_of(recorder.path)["metadata"]["fault"] == "ZeroDivisionError: in the loop"
+
+
+def test_what_cannot_be_written_stops_the_recording_only(tmp_path):
+    camera = FakeCamera()
+    recorder = Recorder(tmp_path, camera)
+    recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
+    camera.push()
+    until(lambda: recorder.frames)
+    recorder.control(time.monotonic(), "soon", 1500, 136, 21316, 1016)
+    until(lambda: recorder.failure)
+    assert "arduino_timestamp" in recorder.failure
+    assert content_of(recorder.close())["metadata"]["total_control_samples"] == 1
+
+
+def disk_with(free):
+    return lambda path: SimpleNamespace(f_bavail=free, f_frsize=1)
+
+
+def test_a_full_disk_is_seen_before_it_is_full(tmp_path, monkeypatch):
+    camera = FakeCamera()
+    monkeypatch.setattr(os, "statvfs", disk_with(1_000_000))
+    with pytest.raises(EpisodeError, match=r"disk is full.*1 MB free"):
+        Recorder(tmp_path, camera)
+    assert left_in(tmp_path) == []
+    monkeypatch.setattr(os, "statvfs", disk_with(1e9))
+    recorder = Recorder(tmp_path, camera)
+    recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
+    camera.push()
+    until(lambda: recorder.frames)
+    monkeypatch.setattr(os, "statvfs", disk_with(1_000_000))
+    camera.push()
+    time.sleep(0.05)
+    camera.push()
+    until(lambda: recorder.failure)
+    folder = recorder.close()
+    assert "disk is full" in recorder.failure
+    assert len(load_recordings(folder, chunk=2).samples) == 1
+
+
+def test_a_disk_that_takes_nothing_leaves_nothing(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    camera = FakeCamera()
+    recorder = Recorder(tmp_path, camera)
+    recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
+    camera.push()
+    until(lambda: recorder.frames)
+    monkeypatch.setattr(EpisodeWriter, "_write", full)
+    for i in range(1000):
+        recorder.control(time.monotonic(), i, 1500, 136, 21316, 1016)
+    assert recorder.close() is None
+    assert "No space left on device" in recorder.failure
+    assert "\n" not in recorder.failure
+    assert left_in(tmp_path) == []
+
+
+def test_a_disk_that_hangs_holds_up_nothing(tmp_path, monkeypatch):
+    hanging = threading.Event()
+    monkeypatch.setattr(EpisodeWriter, "frame", lambda *_: hanging.wait(20))
+    monkeypatch.setattr(module, "QUEUE_MOST", 50)
+    monkeypatch.setattr(module, "CLOSE_S", 0.1)
+    camera = FakeCamera()
+    recorder = Recorder(tmp_path, camera)
+    camera.push()
+    time.sleep(0.05)
+    start = time.monotonic()
+    for i in range(1000):
+        recorder.control(time.monotonic(), i, 1500, 136, 21316, 1016)
+    assert recorder.close() is None
+    assert time.monotonic() - start < 2
+    assert "has not taken" in recorder.failure
+    assert len(recorder._queue) <= 50
+    hanging.set()
+    recorder._thread.join(5)
+
+
+# ---- a human drives --------------------------------------------------------------------------------------
+
+
+def test_a_human_is_recorded(tmp_path):
+    link = FakeLink()
+    with FakeCamera().filming() as camera:
+        report = record(camera, link, tmp_path, rate_hz=100, max_seconds=0.8, label="left")
+    assert report.fault is None
+    assert 0.75 < report.seconds < 2
+    content = content_of(report.folder)
+    controls = content["control_samples"]
+    assert len(controls) == report.controls
+    assert 15 < len(controls) <= 42  # each status once, though the loop ran twice as often
+    stamps = [c["arduino_timestamp"] for c in controls]
+    assert stamps == sorted(set(stamps))
+    steps = {round(1000 * (b["system_timestamp"] - a["system_timestamp"])) for a, b in pairwise(controls)}
+    assert min(steps) >= 19  # and no burst
+    for c in controls:
+        lost = c["arduino_timestamp"] // 20 % 4 == 3
+        assert c["throttle_measured"] is not lost
+        assert c["steering_measured"] is True
+        assert [c[f"throttle_{k}"] is None for k in ("normalized", "raw_us", "period_us")] == [lost] * 3
+    assert report.not_measured == (0, sum(not c["throttle_measured"] for c in controls))
+    assert "throttle was not measured" in str(report)
+    recordings = load_recordings(report.folder, chunk=4)
+    assert {f.kind for f in recordings.faults} == {"throttle_no_pulse"}
+    assert min(s.chunk[:, 0].min() for s in recordings.samples) > 0
+    again = read_controls(report.folder)
+    assert again.left_out == report.not_measured[1]
+    assert again.steering_us.tolist() == [c["steering_raw_us"] for c in controls if c["throttle_measured"]]
+    assert again.throttle_us.tolist() == [c["throttle_raw_us"] for c in controls if c["throttle_measured"]]
+
+
+@pytest.mark.parametrize(("how", "says"), [("dies_s", "unplugged|plugged in"), ("silent_s", "no status for 0.3 s")])
+def test_an_unplugged_arduino_keeps_what_there_is(tmp_path, monkeypatch, how, says):
+    monkeypatch.setattr(module, "SILENT_S", 0.3)
+    link = FakeLink()
+    setattr(link, how, 0.3)
+    with FakeCamera().filming() as camera:
+        report = record(camera, link, tmp_path, max_seconds=5)
+    assert report.seconds < 3
+    assert report.controls > 3
+    metadata = content_of(report.folder)["metadata"]
+    assert metadata["fault"] == report.fault
+    with pytest.raises(AssertionError, match=says):
+        raise AssertionError(report.fault)
+
+
+def test_stop_ends_it(tmp_path):
+    stop = threading.Event()
+    threading.Timer(0.3, stop.set).start()
+    with FakeCamera().filming() as camera:
+        report = record(camera, FakeLink(), tmp_path, stop=stop)
+        assert report.fault is None
+        assert 0.25 < report.seconds < 2
+        nothing = record(camera, FakeLink(), tmp_path, stop=stop)  # set already
+    assert nothing.folder is None
+    assert "no episode" in nothing.fault
+    assert left_in(tmp_path) == [report.folder.name]
+
+
+Arduino = namedtuple("Arduino", "port unplug")
+
+
+@pytest.fixture
+def arduino():
+    """A pty that talks as the firmware does, every 20 ms, and had been talking for a second before anyone listened."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    done = threading.Event()
+
+    def status(n):
+        throttle = "- -" if n % 10 == 9 else f"{120 + n % 5 * 4} 1016"
+        return frame(f"<S 7 {20 * n} 0 - M r 1456 120 {1456 + n % 50 * 4} 21316 {throttle} 0 0 0 0")
+
+    def run():
+        os.write(master, b"".join(status(n) for n in range(40)))  # what waits in the buffer
+        n, said = 40, False
+        while not done.wait(0.02):
+            if n % 25 == 0 or not said:
+                os.write(master, frame("<H 1 1.0.0 7 0 e"))
+                said = True
+            os.write(master, status(n))
+            n += 1
+        os.close(master)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    yield Arduino(os.ttyname(slave), done.set)
+    done.set()
+    thread.join()
+    os.close(slave)
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    ok, jpeg = cv2.imencode(".jpg", PICTURE)
+    assert ok
+    for i in range(300):
+        (folder / f"{i:04d}.jpg").write_bytes(jpeg)
+    return folder
+
+
+def test_a_real_link_has_no_burst(tmp_path, arduino, pictures):
+    with Camera(pictures) as camera, ServoLink(arduino.port) as link:
+        report = record(camera, link, tmp_path / "out", max_seconds=0.7)
+    assert report.fault is None
+    recordings = load_recordings(report.folder, chunk=4)
+    found = {f.kind for f in recordings.faults}
+    assert "throttle_no_pulse" in found
+    assert not any("burst" in kind for kind in found)
+    assert len(recordings.samples) > 5
+
+
+def rover_record(out, arduino, pictures, *options):
+    command = [sys.executable, "-m", "rover_lib.cli", "record", "--camera", str(pictures), "--port", arduino.port]
+    return subprocess.Popen(
+        [*command, *options, str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def recording_in(out):
+    """A second of an episode is on the disk."""
+    return len(list(out.glob(".episode_*/frames/*.jpg"))) > 10
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_end_an_episode_properly(tmp_path, arduino, pictures, number):
+    out = tmp_path / "out"
+    run = rover_record(out, arduino, pictures, "--label", "to the left")
+    until(lambda: recording_in(out), 20)
+    run.send_signal(number)
+    said, errors = run.communicate(timeout=20)
+    assert run.returncode == 0, errors
+    (folder,) = out.iterdir()
+    assert str(folder) in said
+    assert content_of(folder)["action_label"] == "to the left"
+    assert len(load_recordings(out, chunk=4).samples) > 5
+
+
+def test_a_fault_is_an_exit_code_and_a_sentence(tmp_path, arduino, pictures):
+    out = tmp_path / "out"
+    run = rover_record(out, arduino, pictures)
+    until(lambda: recording_in(out), 20)
+    arduino.unplug()
+    said, errors = run.communicate(timeout=20)
+    assert run.returncode == 1
+    assert "still plugged in?" in errors
+    assert "Traceback" not in errors
+    (folder,) = out.iterdir()
+    assert str(folder) in said
+    assert content_of(folder)["metadata"]["fault"] in errors
+
+
+def test_several_episodes(tmp_path, arduino, pictures):
+    out = tmp_path / "out"
+    run = rover_record(out, arduino, pictures, "--episodes", "3", "--max-seconds", "0.5")
+    until(lambda: len(list(out.glob("episode_*"))) == 1, 20)
+    time.sleep(0.3)  # in the pause
+    run.send_signal(signal.SIGINT)
+    said, errors = run.communicate(timeout=20)
+    assert run.returncode == 0
+    assert "episode 2 of 3" in errors
+    assert said.count("recorded: ") == 1
+    assert len(list(out.iterdir())) == 1
+
+
+def test_nothing_to_record_from_is_a_sentence(tmp_path, arduino):
+    run = rover_record(tmp_path / "out", arduino, tmp_path / "no_camera")
+    _, errors = run.communicate(timeout=20)
+    assert run.returncode == 1
+    assert errors.startswith("rover: ")
+    assert errors.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_loads_no_torch():
+    code = "import sys, rover_lib.onboard.recorder; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
