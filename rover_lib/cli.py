@@ -448,6 +448,40 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -
     ctx.exit(1 if fault else 0)
 
 
+@main.command()
+@click.argument("file", type=FILE)
+@click.option("-o", "--output", type=FILE, help="The figure to write [default: FILE.png].")
+@click.option(
+    "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")
+def log(file: Path, output: Path | None, drive: int, as_json: bool) -> None:
+    """Sum up the flight log FILE of `rover drive`, and draw it.
+
+    Missed ticks, jitter, ages and latencies of plans, who drove, temperature, and what happened. Older parts of the
+    same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation, the summary does not.
+    """
+    from rover_lib.onboard.stage import atomic_path
+    from rover_lib.onboard.telemetry import read_log
+
+    flight = read_log(file, drive)
+    summary = flight.summary()
+    if as_json:
+        show(summary, as_json)
+    else:
+        show({k: v for k, v in summary.items() if k != "events"}, as_json)
+        for event in flight.events:
+            click.echo(f"{event.t_s:9.2f} s  {event}")
+    if output or not as_json:
+        from rover_lib.workshop.flight import flight_figure
+
+        output = output or file.with_name(f"{file.name}.png")
+        figure = flight_figure(flight)
+        with atomic_path(output) as temporary:
+            figure.savefig(temporary)
+        click.echo(f"drawn: {output}", err=as_json)
+
+
 @main.command("leave-out")
 @click.argument("run_dir", type=FILE)
 @click.option("--frames", type=click.IntRange(min=1), default=100, show_default=True, help="Held-out frames.")

@@ -101,6 +101,9 @@ class Event(NamedTuple):
     text: str
     fields: dict[str, Any]
 
+    def __str__(self) -> str:
+        return "; ".join([self.text, *(f"{name} {value}" for name, value in self.fields.items())])
+
 
 def _sealed(row: dict[str, Any]) -> bytes:
     """A line of JSON with its checksum as the last member."""
@@ -167,7 +170,7 @@ class FlightLog:
         self._ticked = 0
         self._ticks: deque[tuple[int, Tick]] = deque(maxlen=QUEUE_TICKS if self.path else 0)
         self._events: deque[Event] = deque(maxlen=QUEUE_EVENTS if self.path else 0)
-        self._sayings: deque[tuple[int, str, dict[str, Any]]] = deque(maxlen=QUEUE_EVENTS)
+        self._sayings: deque[tuple[int, Event | str]] = deque(maxlen=QUEUE_EVENTS)
         self._say_now = threading.Event()
         self._spoken = False  # nothing more will be said
         self._closing = threading.Event()
@@ -199,8 +202,9 @@ class FlightLog:
 
     def event(self, text: str, *, level: int = logging.INFO, **fields: Any) -> None:
         """Note that something happened, with what belongs to it, in the file and in `logging`. As harmless as tick."""
-        self._events.append(Event(self._clock() - self.start_s, text, fields))
-        self._say(level, text, fields)
+        event = Event(self._clock() - self.start_s, text, fields)
+        self._events.append(event)
+        self._say(level, event)
 
     def close(self) -> None:
         """Write what is left. Waits 2 s at most: a disk or a terminal that is stuck is left behind."""
@@ -211,8 +215,8 @@ class FlightLog:
             self._say_now.set()
             thread.join(max(0.0, end - time.monotonic()))
 
-    def _say(self, level: int, text: str, fields: dict[str, Any]) -> None:
-        self._sayings.append((level, text, fields))
+    def _say(self, level: int, event: Event | str) -> None:
+        self._sayings.append((level, event))
         self._say_now.set()
 
     def _run_speaker(self) -> None:
@@ -222,9 +226,9 @@ class FlightLog:
             self._say_now.clear()
             closing = self._spoken
             while self._sayings:
-                level, text, fields = self._sayings.popleft()
+                level, event = self._sayings.popleft()
                 with contextlib.suppress(Exception):  # a handler that fails must not end this thread
-                    _log.log(level, "%s", "; ".join([text, *(f"{k} {v}" for k, v in fields.items())]))
+                    _log.log(level, "%s", event)
             if closing:
                 return
 
@@ -272,7 +276,7 @@ class FlightLog:
                 self.last_error = f"{type(error).__name__}: {error}"
                 if not self._bad_row_said:
                     self._bad_row_said = True
-                    self._say(logging.WARNING, f"a row is not in the flight log: {self.last_error}", {})
+                    self._say(logging.WARNING, f"a row is not in the flight log: {self.last_error}")
 
     def _tick_lines(self, row: tuple[int, Tick]) -> bytes:
         number, tick = row
@@ -342,7 +346,7 @@ class FlightLog:
         if self._failed_since is None:
             self._failed_since = time.monotonic()
             text = f"{self.path}: the flight log cannot be written ({self.last_error}); driving goes on without"
-            self._say(logging.WARNING, text, {})
+            self._say(logging.WARNING, text)
         self._release()
 
     def _release(self) -> None:
