@@ -502,7 +502,7 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
         path=path,
         header=chosen.header,
         ticks={n: np.array(c, str if n in _TEXTS else float) for n, c in zip(Tick._fields, columns, strict=True)},
-        events=chosen.events,
+        events=sorted(chosen.events, key=lambda e: e.t_s),
         machine={
             "t_s": np.array([m["t_s"] for m in chosen.machine], float),
             "temperature_c": np.array([m["temperature_c"] for m in chosen.machine], float),  # None becomes NaN

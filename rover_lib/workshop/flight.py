@@ -33,7 +33,7 @@ DIGIT_SPACE = "\u2007"  # as wide as a digit
 def flight_figure(flight: Flight) -> Figure:
     """Draw one drive, all panels over the same seconds."""
     ticks, summary = flight.ticks, flight.summary()
-    listed = flight.events[:EVENTS_LISTED]
+    listed = list(enumerate(flight.events, 1))[-EVENTS_LISTED:]  # the last ones say why it ended
     rows = ("who", "steering", "throttle", "plan", "late", "temperature")
     heights = [0.35, 1.6, 1.6, 1.6, 1.3, 0.9]
     fig, axes = _axes(len(rows), height_in=sum(heights) + 3.4 + 0.19 * len(listed), height_ratios=heights, sharex=True)
@@ -66,7 +66,7 @@ def flight_figure(flight: Flight) -> Figure:
     fig.align_ylabels(axes[:, 0])
     fig.suptitle(_title(flight, summary), fontsize=11)
     if listed:
-        fig.supxlabel(_event_list(listed, len(flight.events)), fontsize=9, x=0.01, ha="left", linespacing=1.4)
+        fig.supxlabel(_event_list(listed), fontsize=9, x=0.01, ha="left", linespacing=1.4)
     return fig
 
 
@@ -160,28 +160,28 @@ def _temperature(ax: Axes, machine: Mapping[str, Any], summary: Mapping[str, Any
     ax.set_ylabel("processor\n(°C)", fontsize=10)
 
 
-def _event_numbers(ax: Axes, events: Sequence[Event], end_s: float) -> None:
+def _event_numbers(ax: Axes, events: Sequence[tuple[int, Event]], end_s: float) -> None:
     """The events' numbers over their lines; neighbours share one label."""
-    groups: list[list[int]] = []
-    for i in sorted(range(len(events)), key=lambda i: events[i].t_s):
-        if groups and events[i].t_s - events[groups[-1][0]].t_s < LABEL_SHARE * end_s:
-            groups[-1].append(i)
+    groups: list[list[tuple[int, Event]]] = []
+    for number, event in events:
+        if groups and event.t_s - groups[-1][0][1].t_s < LABEL_SHARE * end_s:
+            groups[-1].append((number, event))
         else:
-            groups.append([i])
+            groups.append([(number, event)])
     for group in groups:
-        first, last = min(group) + 1, max(group) + 1
+        (first, event), (last, _) = group[0], group[-1]
         text = f"{first}" if first == last else f"{first}-{last}"
-        ax.annotate(text, (events[group[0]].t_s, 1.0), (0, 2), xycoords=("data", "axes fraction"),
-                    textcoords="offset points", ha="center", va="bottom", fontsize=9)  # fmt: skip
+        ax.annotate(text, (event.t_s, 1.0), (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points",
+                    ha="center", va="bottom", fontsize=9)  # fmt: skip
 
 
-def _event_list(events: Sequence[Event], many: int) -> str:
+def _event_list(events: Sequence[tuple[int, Event]]) -> str:
     lines = []
-    for i, event in enumerate(events, 1):
+    if (before := events[0][0] - 1) > 0:
+        lines.append(f"{before} earlier events: rover log --json lists them")
+    for number, event in events:
         at = f"{event.t_s:.2f}".rjust(7, DIGIT_SPACE)
         text = str(event)
         text = text if len(text) <= TEXT_LENGTH else f"{text[:TEXT_LENGTH]} ..."
-        lines.append(f"{str(i).rjust(2, DIGIT_SPACE)}  {at} s   {text}".replace("$", r"\$"))  # no formula
-    if many > len(events):
-        lines.append(f"and {many - len(events)} more events: rover log --json lists them")
+        lines.append(f"{str(number).rjust(2, DIGIT_SPACE)}  {at} s   {text}".replace("$", r"\$"))  # no formula
     return "\n".join(lines)

@@ -95,7 +95,9 @@ def test_nothing_is_cut_off(path):
     for text in texts:
         box = text.get_window_extent()
         assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= width and box.y1 <= height, text.get_text()[:50]
-    assert "and 26 more events" in figure._supxlabel.get_text()
+    listed = figure._supxlabel.get_text()
+    assert "26 earlier events" in listed and "event 39" in listed and "event 25 " not in listed
+    assert [t.get_text() for t in figure.axes[0].texts] == ["27-40"]
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.03, 0.5])
