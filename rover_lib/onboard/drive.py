@@ -43,6 +43,7 @@ RESEND_S = 0.012  # a command takes 3 ms on the wire, its status 7
 SPARE_S = 0.004  # before a deadline nothing is sent again
 SWITCH_S = 0.0005  # other threads give the interpreter back to the loop after at most so long, not Python's 5 ms
 MOVING = 0.004  # throttle above which a car moves, and no two pictures are the same
+SLACK_S = 0.002  # a control of this much later is of the same tick: recordings have the ticks' rate, or close to it
 SETTLED_S = 60.0  # memory is watched from here on
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -175,7 +176,7 @@ class ReplayPilot:
     def order(self, now_s: float) -> Order | None:
         if self._start_s is None:
             self._start_s = now_s
-        i = int(np.searchsorted(self._times, now_s - self._start_s, side="right")) - 1
+        i = int(np.searchsorted(self._times, now_s - self._start_s + SLACK_S, side="right")) - 1
         if i >= len(self._times) - 1 and now_s - self._start_s > self._times[-1] + 1 / RATES_HZ[0]:
             return None
         steering_us, throttle_us = int(self._steering[max(i, 0)]), int(self._throttle[max(i, 0)])

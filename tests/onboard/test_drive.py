@@ -1,0 +1,457 @@
+"""The loop: absolute deadlines in a clock of its own, what ends it, and that neutral is the first that follows."""
+
+import json
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rover_lib.onboard.camera import CameraError, Frame
+from rover_lib.onboard.drive import (
+    DriveFault,
+    Order,
+    PolicyPilot,
+    ReplayPilot,
+    Report,
+    TakenOver,
+    artifact_watch,
+    drive,
+    ended_by_signals,
+    memory_mb,
+)
+from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.plan import Commanded, Plan, Settings
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.recording import Controls
+from rover_lib.onboard.servo_link import Hello, LinkError, State, Telemetry
+
+PERIOD = 1 / 30
+STATUS = Telemetry(0.0, 7, 0, 0, "k", State.AUTONOMOUS, "a", 1456, 120, None, None, None, None, 0, 0, 0, 0)
+
+
+class Clock:
+    """Time that passes only while somebody sleeps, or when work says that it took some."""
+
+    def __init__(self):
+        self.now, self.slept = 1000.0, []
+
+    def __call__(self):
+        return self.now
+
+    def sleep(self, seconds):
+        assert seconds >= 0
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+class Link:
+    """Acknowledges at once what it is told to, and writes down everything."""
+
+    port, calibration = "fake", PwmCalibration()
+
+    def __init__(self, clock, acknowledge=lambda n: True):
+        self.clock, self.acknowledge = clock, acknowledge
+        self.said, self.sent_at, self.status, self.sequence = [], [], STATUS, 0
+        self.hello = Hello(1, "1.0.0", 7, 0, "reset pin")
+        self.fails = None
+
+    def arm(self):
+        self.said.append("arm")
+        return self.latest()
+
+    def neutral(self):
+        self.said.append("neutral")
+        self.status = replace(self.status, state=State.STOPPED, reason="n")
+        return self.status
+
+    def send(self, steering_us, throttle_us):
+        if self.fails:
+            raise LinkError(self.fails)
+        self.sequence += 1
+        self.said.append((steering_us, throttle_us))
+        self.sent_at.append(self.clock())
+        if self.acknowledge(self.sequence):
+            self.status = replace(self.status, sequence=self.sequence)
+        return self.sequence
+
+    def latest(self):
+        return replace(self.status, host_s=self.clock())
+
+    @property
+    def drives(self):
+        return [s for s in self.said if isinstance(s, tuple)]
+
+
+class Log:
+    start_s = 1000.0
+
+    def __init__(self):
+        self.ticks, self.events = [], []
+
+    def tick(self, row):
+        self.ticks.append(row)
+
+    def event(self, text, **_):
+        self.events.append(text)
+
+
+class Always:
+    """A pilot with one order; `at` maps ticks to what happens in them."""
+
+    def __init__(self, at=None):
+        self.at, self.n, self.told = at or {}, 0, []
+
+    def ready(self, stop):
+        pass
+
+    def order(self, now_s):
+        self.n += 1
+        what = self.at.get(self.n)
+        if isinstance(what, BaseException):
+            raise what
+        if callable(what):
+            what()
+        return None if what == "done" else Order(0.0, 0.05, 1456, 150, self.n, 0.1, 0.05, 1.0, self.n)
+
+    def sent(self, at_s, order):
+        self.told.append(at_s)
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def link(clock):
+    return Link(clock)
+
+
+def go(pilot, link, clock, log=None, **options):
+    options = {"rate_hz": 30, "clock": clock, "sleep": clock.sleep, **options}
+    return drive(pilot, link, log=log or Log(), **options)
+
+
+def test_a_command_at_each_absolute_deadline(link, clock):
+    log = Log()
+    report = go(Always(), link, clock, log, ticks=90)
+    assert link.said[0] == "arm"
+    assert link.said[-1] == "neutral"
+    assert np.diff(link.sent_at) == pytest.approx(PERIOD)
+    assert link.sent_at[-1] - link.sent_at[0] == pytest.approx(89 * PERIOD, abs=1e-6)  # nothing adds up
+    assert (report.ticks, report.missed, report.resent) == (90, 0, 0)
+    assert report.ended == "90 ticks"
+    assert len(log.ticks) == 90
+    assert log.ticks[0].pins_throttle_us == 120
+    assert set(report.summary()) > {
+        *("ticks", "missed", "jitter_p50_ms", "jitter_p99_ms", "jitter_max_ms", "plan_age_p95_ms"),
+    }
+    assert json.dumps(report.summary())
+
+
+def test_work_does_not_shift_the_deadlines(link, clock):
+    busy = {n: lambda: clock.sleep(0.02) for n in range(1, 30)}
+    report = go(Always(busy), link, clock, ticks=30)
+    assert np.diff(link.sent_at)[:-1] == pytest.approx(PERIOD)
+    assert report.missed == 0
+    assert report.summary()["jitter_p50_ms"] == pytest.approx(20, abs=0.1)  # as late as its work took
+
+
+def test_ticks_that_were_missed_are_counted_and_left_out(link, clock):
+    log = Log()
+    report = go(Always({10: lambda: clock.sleep(3.4 * PERIOD)}), link, clock, log, ticks=20)
+    assert report.missed == 2  # the third deadline in that time is only late
+    assert (link.sent_at[-1] - link.sent_at[0]) / PERIOD == pytest.approx(21, abs=0.01)
+    assert any("missed 2 ticks" in e for e in log.events)
+
+
+@pytest.mark.parametrize("rate_hz", [9.9, 101, float("nan")])
+def test_rates_of_no_car(link, clock, rate_hz):
+    with pytest.raises(ParamsError, match="10 to 100 Hz"):
+        go(Always(), link, clock, rate_hz=rate_hz)
+    assert link.said == []
+
+
+@pytest.mark.parametrize("rate_hz", [10, 50, 100])
+def test_rates_of_a_car(link, clock, rate_hz):
+    go(Always(), link, clock, rate_hz=rate_hz, ticks=10)
+    assert np.diff(link.sent_at) == pytest.approx(1 / rate_hz)
+
+
+def test_ends_as_asked(link, clock):
+    assert go(Always({5: "done"}), link, clock).ended == "done"
+    assert link.said[-1] == "neutral"
+    report = go(Always(), Link(clock), clock, max_seconds=1.0)
+    assert report.ticks == 31
+    stop = threading.Event()
+    report = go(Always({7: stop.set}), link := Link(clock), clock, stop=stop)
+    assert (report.ticks, report.ended, link.said[-1]) == (7, "told to stop", "neutral")
+
+
+def test_told_to_stop_before_it_began(link, clock):
+    stop = threading.Event()
+    stop.set()
+    assert go(Always(), link, clock, stop=stop).ticks == 0
+    assert "arm" not in link.said
+
+
+@pytest.mark.parametrize(
+    ("what", "raised"),
+    [
+        (CameraError("unplugged"), DriveFault),
+        (PolicyError("NaN"), DriveFault),
+        (LinkError("gone"), DriveFault),
+        (ZeroDivisionError("a bug"), ZeroDivisionError),
+        (KeyboardInterrupt(), KeyboardInterrupt),
+        (SystemExit(), SystemExit),
+    ],
+)
+def test_whatever_ends_it_neutral_is_the_first_that_follows(link, clock, what, raised):
+    log, report = Log(), Report()
+    with pytest.raises(raised):
+        go(Always({4: what}), link, clock, log, report=report)
+    assert link.said == ["arm", (1456, 150), (1456, 150), (1456, 150), "neutral"]
+    assert report.ticks == 3
+    assert report.ended in log.events  # no fault without its line
+    assert report.ended.startswith(str(what) if raised is DriveFault else type(what).__name__)
+
+
+def test_what_happens_before_it_is_armed_is_no_fault_of_a_drive(link, clock):
+    link.arm = lambda: (_ for _ in ()).throw(LinkError("no transmitter"))
+    with pytest.raises(LinkError, match="no transmitter"):
+        go(Always(), link, clock)
+
+
+@pytest.mark.parametrize(
+    ("change", "raised", "match"),
+    [
+        ({"state": State.MANUAL, "reason": "h"}, TakenOver, "human took over"),
+        ({"state": State.STOPPED, "reason": "t"}, DriveFault, "no valid command for 150 ms"),
+        ({"state": State.STOPPED, "reason": "s"}, DriveFault, "transmitter's signal was lost"),
+        ({"state": State.MANUAL, "reason": "r", "boot": 8}, DriveFault, "was reset"),
+    ],
+)
+def test_the_arduino_has_the_last_word(link, clock, change, raised, match):
+    def happens():
+        link.status = replace(link.status, **change)
+
+    with pytest.raises(raised, match=match):
+        go(Always({3: happens}), link, clock)
+    assert len(link.drives) == 3
+    assert link.said[-1] == "neutral"
+
+
+def test_what_was_not_acknowledged_is_sent_again(clock):
+    link = Link(clock, acknowledge=lambda n: n % 3 == 0)  # two of three get lost
+    report = go(Always(), link, clock, ticks=30)
+    assert report.resent > 25
+    assert report.missed == 0
+    assert len(link.drives) == 30 + report.resent
+    assert max(np.diff(link.sent_at)) < PERIOD
+
+
+def test_a_port_that_is_stuck_for_a_moment(link, clock):
+    def stuck():
+        link.fails = "the port took no data for 10 ms"
+
+    def free():
+        link.fails = None
+
+    log = Log()
+    report = go(Always({5: stuck, 8: free}), link, clock, log, ticks=10)
+    assert report.ticks == 10
+    assert sum("not sent" in e for e in log.events) == 1
+
+
+def test_a_dry_run_drives_no_motor(clock):
+    log = Log()
+    report = go(Always(), None, clock, log, ticks=5)
+    assert report.ticks == len(log.ticks) == 5
+    assert log.ticks[0].state == ""
+
+
+def test_each_second_is_watched(link, clock):
+    log = Log()
+    said = iter([["first"], [], ["third"]])
+    go(Always(), link, clock, log, max_seconds=2.5, watch=lambda: next(said))
+    assert [e for e in log.events if e in ("first", "third")] == ["first", "third"]
+
+
+def test_a_recorder_gets_what_was_commanded(link, clock):
+    class Recorder:
+        def __init__(self):
+            self.rows = []
+
+        def control(self, *row, **extra):
+            self.rows.append((row, extra))
+
+    go(Always(), link, clock, ticks=3, recorder=(recorder := Recorder()), mode="static")
+    (_, arduino_ms, *pulses), extra = recorder.rows[0]
+    assert (arduino_ms, pulses) == (0, [1456, 150, 21316, 1016])
+    assert extra == {"mode": "static", "plan_age_ms": 100.0}
+
+
+# ---- the pilot of a policy
+
+
+class Eyes:
+    wanted_hz = 30.0
+
+    def __init__(self):
+        self.frame = Frame(np.zeros((4, 4, 3), np.uint8), 0.0, 1, 0, 100.0)
+
+    def see(self, now_s, repeats=0, mean=100.0):
+        self.frame = Frame(self.frame.image, now_s, self.frame.number + 1, repeats, mean)
+
+    def latest(self):
+        return self.frame
+
+
+class Plans:
+    asking_s = 0.0
+
+    def __init__(self):
+        self.plan = None
+
+    def make(self, now_s, throttle=0.1):
+        number = self.plan.number + 1 if self.plan else 1
+        self.plan = Plan(number, now_s, now_s, np.tile([0.2, throttle], (32, 1)))
+
+    def newest(self):
+        return self.plan
+
+    def wait(self, timeout_s):
+        return self.plan
+
+
+@pytest.fixture
+def pilot():
+    pilot = PolicyPilot(Eyes(), Plans(), Commanded(), Settings(blend_ticks=0), 30.0)
+    pilot.eyes, pilot.plans = pilot._camera, pilot._planner
+    return pilot
+
+
+def drives(pilot, seconds, start_s=0.0, throttle=0.1, **seen):
+    """Ticks with a fresh plan in each."""
+    for i in range(round(seconds / PERIOD)):
+        now = start_s + i * PERIOD
+        pilot.eyes.see(now, **{k: v(i) if callable(v) else v for k, v in seen.items()})
+        pilot.plans.make(now, throttle)
+        order = pilot.order(now)
+        pilot.sent(now, order)
+    return order
+
+
+def test_orders_are_pulses(pilot):
+    order = drives(pilot, 0.5)
+    pulses = PwmCalibration().pulses(0.2, 0.1)
+    assert (order.steering_us, order.throttle_us) == (pulses.steering_us, pulses.throttle_us)
+    assert (order.age_s, order.fade, order.plan) == (0.0, 1.0, 15)
+
+
+def test_a_plan_that_is_too_old(pilot):
+    drives(pilot, 0.5)
+    pilot.order(1.4)
+    with pytest.raises(DriveFault, match=r"too old to drive by \(1 s\): no new frame came"):
+        pilot.order(1.5)
+    pilot.plans.asking_s = 0.8
+    with pytest.raises(DriveFault, match=r"policy has not answered for 0\.8 s"):
+        pilot.order(1.6)
+
+
+def test_a_frozen_camera(pilot):
+    drives(pilot, 0.5)
+    with pytest.raises(DriveFault, match="frozen: 5 frames were the same"):
+        drives(pilot, 0.5, start_s=0.5, repeats=lambda i: i)
+
+
+def test_a_car_that_stands_may_see_the_same_again(pilot):
+    drives(pilot, 1.0, throttle=0.0, repeats=lambda i: i)
+    drives(pilot, 0.15, start_s=1.0, throttle=0.1, repeats=lambda i: 30 + i)  # it has only just been told to go
+    drives(pilot, 0.5, start_s=1.15, throttle=0.1)
+
+
+def test_a_black_camera(pilot):
+    drives(pilot, 0.5)
+    drives(pilot, 0.08, start_s=0.5, mean=2.0)
+    drives(pilot, 0.1, start_s=0.6)  # light again: the count begins anew
+    with pytest.raises(DriveFault, match="black"):
+        drives(pilot, 0.2, start_s=0.7, mean=2.0)
+
+
+def test_faults_come_through(pilot):
+    drives(pilot, 0.1)
+
+    def fails():
+        raise CameraError("unplugged")
+
+    pilot.eyes.latest = fails
+    with pytest.raises(CameraError):
+        pilot.order(0.2)
+
+
+def test_no_plan_in_time(pilot, monkeypatch):
+    monkeypatch.setattr("rover_lib.onboard.drive.FIRST_PLAN_S", 0.0)
+    with pytest.raises(DriveFault, match="no plan within"):
+        pilot.ready(threading.Event())
+
+
+# ---- replay
+
+
+def controls(times_s, steering_us, throttle_us):
+    return Controls(np.array(times_s, float), np.array(steering_us), np.array(throttle_us), 0)
+
+
+def test_a_replay_sends_what_was_recorded_when_it_was(link, clock):
+    pulses = [(1456 + 4 * i, 120 + 4 * i) for i in range(30)]
+    recorded = controls(np.arange(30) * PERIOD, *zip(*pulses, strict=True))
+    report = go(ReplayPilot(recorded), link, clock)
+    sent = list(dict.fromkeys(link.drives))
+    assert set(sent) <= set(pulses)
+    assert len(sent) >= 29
+    assert sent == sorted(sent)
+    assert report.ended == "done"
+
+
+def test_a_replay_keeps_to_what_a_servo_may_get(link, clock):
+    recorded = controls([0, 0.1, 0.2], [500, 1456, 2400], [0, 120, 948])
+    go(ReplayPilot(recorded, throttle_limit=0.1), link, clock)
+    c = PwmCalibration()
+    assert {s for s, _ in link.drives} == {c.steering.pulse_us(-1), 1456, c.steering.pulse_us(1)}
+    assert {t for _, t in link.drives} == {120, c.throttle.pulse_us(0.1)}
+
+
+# ---- signals, files, memory
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_signals_ask_it_to_stop(number):
+    stop, log, before = threading.Event(), Log(), signal.getsignal(number)
+    with ended_by_signals(stop, log):
+        os.kill(os.getpid(), number)
+        time.sleep(0.01)
+        assert stop.is_set()
+    assert log.events == [f"{number.name}: stopping"]
+    assert signal.getsignal(number) is before
+
+
+def test_an_artifact_that_changes_is_noticed_once(tmp_path):
+    path = tmp_path / "policy.pt"
+    path.write_bytes(b"one")
+    watch = artifact_watch(path)
+    assert list(watch()) == []
+    path.write_bytes(b"another")
+    assert "changed on disk" in next(iter(watch()))
+    assert list(watch()) == []
+    path.unlink()
+    assert "gone on disk" in next(iter(watch()))
+
+
+def test_memory():
+    assert memory_mb([os.getpid()]) > 10
+    assert memory_mb([2**22 + 1]) is None
