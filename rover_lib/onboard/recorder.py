@@ -170,9 +170,7 @@ class Recorder:
         last_s, captured_s = self._clock(), -1e9
         while True:
             frame = self._camera.wait(seen, 0.1)
-            closing = (
-                self._closing.is_set()
-            )  # asked before the queue is emptied: nothing that came before close() is lost
+            closing = self._closing.is_set()  # asked before the queue is emptied, so that nothing is lost
             self._write_controls()
             if closing:
                 return

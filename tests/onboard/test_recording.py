@@ -1,19 +1,26 @@
-"""The recorder: the user's format to the byte, and whole or not at all."""
+"""An episode's files: the user's format to the byte, whole or not at all, and the controls that come back."""
 
 import csv
 import json
 import math
+import os
 import re
 import subprocess
 import sys
+import tracemalloc
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from recorded import real_episode
 
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording import CONTROL_FIELDS, FRAME_FIELDS, EpisodeWriter
+from rover_lib.onboard.pwm import ARDUINO_STEP_US, PwmCalibration
+from rover_lib.onboard.recording import CONTROL_FIELDS, FLAG_FIELDS, FRAME_FIELDS, EpisodeWriter, read_controls
+from rover_lib.workshop.episodes import load_recordings
 
 NAME = "episode_20260101_120000"
 FRAME = np.full((36, 64, 3), (30, 90, 200), np.uint8)
@@ -204,6 +211,317 @@ def test_the_same_drive_gives_the_same_bytes(tmp_path):
     a, b = write(tmp_path / "a" / NAME), write(tmp_path / "b" / NAME)
     for path in sorted(p for p in a.rglob("*") if p.is_file()):
         assert path.read_bytes() == (b / path.relative_to(a)).read_bytes()
+
+
+def test_what_is_written_a_row_at_a_time_is_json_as_a_whole(tmp_path):
+    text = (write(tmp_path / NAME) / "episode_data.json").read_text()
+    assert text == json.dumps(json.loads(text), indent=2)
+
+
+# ---- the flag --------------------------------------------------------------------------------------------
+
+
+def flagged(folder):
+    with EpisodeWriter(folder, label="x", resolution=None, flags=True) as writer:
+        writer.metadata |= {"source": "human", "at": np.float32(0.5)}
+        writer.control(1.0, 0, 1500, 136, 21308, 1016)
+        writer.control(1.02, 20, 1500, None, 21308, None, mode="static")
+        writer.control(1.04, 40, None, 136, None, 1016, mode="static", age_ms=np.float32(80.5))
+        writer.control(1.06, 60, 1500, 136, 42632, 0)  # two periods at once, and the old recorder's 0
+        writer.frame(1.0, FRAME)
+    return folder
+
+
+def test_no_pulse_is_a_flag_and_no_value(tmp_path):
+    folder = flagged(tmp_path / NAME)
+    content = json.loads((folder / "episode_data.json").read_text())
+    rows = content["control_samples"]
+    assert content["metadata"]["camera_resolution"] == [64, 36]
+    assert (content["metadata"]["source"], content["metadata"]["at"]) == ("human", 0.5)
+    assert [list(r) for r in rows] == [[*CONTROL_FIELDS, *FLAG_FIELDS, "mode", "age_ms"]] * 4
+    assert [r["steering_measured"] for r in rows] == [True, True, False, False]
+    assert [r["throttle_measured"] for r in rows] == [True, False, True, False]
+    for row in rows:
+        for name in ("steering", "throttle"):
+            values = [row[f"{name}_{part}"] for part in ("normalized", "raw_us", "period_us")]
+            assert [v is not None for v in values] == [row[f"{name}_measured"]] * 3
+    assert [r["age_ms"] for r in rows] == [None, None, 80.5, None]
+    with (folder / "control_data.csv").open(newline="") as f:
+        lines = list(csv.DictReader(f))
+    assert [{k: "" if v is None else str(v) for k, v in r.items()} for r in rows] == lines
+    controls = read_controls(folder)
+    assert (controls.steering_us.tolist(), controls.throttle_us.tolist(), controls.left_out) == ([1500], [136], 3)
+
+
+def test_further_columns_must_be_new_and_plain(tmp_path):
+    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+        for extra in ({"steering_measured": 1}, {"arduino_timestamp": 1}):
+            with pytest.raises(EpisodeError, match="no further column"):
+                writer.control(1.0, 0, 1500, 136, 21308, 1016, **extra)
+        with pytest.raises(EpisodeError, match="cannot be written"):
+            writer.control(1.0, 0, 1500, 136, 21308, 1016, mode=object())
+        writer.control(1.0, 0, 1500, 136, 21308, 1016)
+        writer.frame(1.0, FRAME)
+    assert len(json.loads((tmp_path / NAME / "episode_data.json").read_text())["control_samples"]) == 1
+
+
+# ---- the disk --------------------------------------------------------------------------------------------
+
+
+def test_one_name_is_recorded_once(tmp_path):
+    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+        with pytest.raises(EpisodeError, match="is being recorded"):
+            write(tmp_path / NAME)
+        writer.control(1.0, 0, 1500, 136, 21308, 1016)
+        writer.frame(1.0, FRAME)
+    assert [p.name for p in tmp_path.iterdir()] == [NAME]
+
+
+def test_a_place_that_cannot_be_written_is_a_sentence(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(EpisodeError, match="cannot be written") as e:
+        write(tmp_path / "file" / NAME)
+    assert "\n" not in str(e.value)
+
+
+def test_half_a_row_of_a_full_disk_is_taken_back(tmp_path):
+    class Full:
+        """A file that takes ten bytes of a row."""
+
+        def __init__(self, file):
+            self.file, self.full = file, False
+
+        def __getattr__(self, name):
+            return getattr(self.file, name)
+
+        def write(self, data):
+            return self.file.write(data[:10] if self.full else data)
+
+    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+        file = writer._rows["control"] = Full(writer._rows["control"])
+        writer.control(1.0, 0, 1500, 136, 21308, 1016)
+        file.full = True
+        with pytest.raises(EpisodeError, match="No space left"):
+            writer.control(1.1, 33, 1500, 136, 21308, 1016)
+        file.full = False
+        writer.control(1.2, 66, 1500, 136, 21308, 1016)
+        writer.frame(1.0, FRAME)
+    rows = json.loads((tmp_path / NAME / "episode_data.json").read_text())["control_samples"]
+    assert [r["arduino_timestamp"] for r in rows] == [0, 66]
+
+
+def test_half_a_picture_of_a_full_disk_is_taken_back(tmp_path, monkeypatch):
+    whole = Path.write_bytes
+
+    def half(path, data):
+        whole(path, bytes(data)[:50])
+        raise OSError(28, "No space left on device")
+
+    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+        writer.control(1.0, 0, 1500, 136, 21308, 1016)
+        writer.frame(1.0, FRAME)
+        with monkeypatch.context() as m:
+            m.setattr(Path, "write_bytes", half)
+            with pytest.raises(EpisodeError, match="No space left"):
+                writer.frame(1.1, FRAME)
+    assert [p.name for p in (tmp_path / NAME / "frames").iterdir()] == ["frame_000001.jpg"]
+
+
+def test_a_long_drive_stays_out_of_memory(tmp_path):
+    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36), flags=True) as writer:
+        writer.frame(1.0, FRAME)
+        tracemalloc.start()
+        for i in range(3000):
+            writer.control(1.0 + i / 30, 33 * i, 1500, 136, 21308, 1016, mode="static", plan_age_ms=80.5)
+        held, _ = tracemalloc.get_traced_memory()
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held < 100_000  # 3000 rows are a megabyte
+    assert most < 400_000
+
+
+# ---- controls that come back -----------------------------------------------------------------------------
+
+
+def csv_of(folder, rows):
+    folder.mkdir(exist_ok=True)
+    with (folder / "control_data.csv").open("w", newline="") as f:
+        table = csv.DictWriter(f, CONTROL_FIELDS)
+        table.writeheader()
+        table.writerows(rows)
+    return folder
+
+
+def row_of(system_s, arduino_ms, steering_us=1500, throttle_us=136, steering_period_us=21316, throttle_period_us=1016):
+    pulses = (0, 0, steering_us, throttle_us, steering_period_us, throttle_period_us)
+    return dict(zip(CONTROL_FIELDS, (arduino_ms, system_s, *pulses), strict=True))
+
+
+PULSES = st.tuples(st.integers(252, 478), st.integers(30, 177)).map(lambda p: (4 * p[0], 4 * p[1]))
+
+
+@given(
+    pulses=st.lists(st.one_of(PULSES, st.none()), max_size=30),
+    first=PULSES,
+    steps=st.lists(st.integers(10, 60), min_size=31, max_size=31),
+)
+@settings(max_examples=30, deadline=None)
+def test_pulses_come_back(tmp_path_factory, pulses, first, steps):
+    folder = tmp_path_factory.mktemp("round") / NAME
+    pulses = [first, *pulses]
+    times = [1.76e9 + sum(steps[:i]) / 1000 for i in range(len(pulses))]
+    with EpisodeWriter(folder, label="x", resolution=(64, 36), flags=True) as writer:
+        for i, (t_s, found) in enumerate(zip(times, pulses, strict=True)):
+            steering, throttle = found or (1500, None)
+            writer.control(t_s, sum(steps[:i]), steering, throttle, 21316, 1016 if throttle else None)
+            writer.frame(t_s, FRAME)
+    measured = [p for p in pulses if p]
+    expected = [t for t, p in zip(times, pulses, strict=True) if p]
+    for _ in range(2):
+        controls = read_controls(folder)
+        assert list(zip(controls.steering_us.tolist(), controls.throttle_us.tolist(), strict=True)) == measured
+        assert controls.left_out == len(pulses) - len(measured)
+        assert controls.times_s == pytest.approx(np.array(expected) - expected[0], abs=1e-6)
+        (folder / "control_data.csv").unlink(missing_ok=True)  # and again from the JSON
+    recordings = load_recordings(folder, chunk=1, sync_s=0.005)
+    assert recordings.samples
+    pwm = PwmCalibration()
+    known = {round(t - times[0], 3): p for t, p in zip(times, pulses, strict=True) if p}
+    for sample in recordings.samples:
+        again = pwm.pulses(*sample.chunk[0].tolist())
+        steering, throttle = known[round(sample.time_s, 3)]
+        assert abs(again.steering_us - steering) < ARDUINO_STEP_US
+        assert abs(again.throttle_us - throttle) < ARDUINO_STEP_US
+
+
+def times_of(folder, rows):
+    return read_controls(csv_of(folder, rows)).times_s
+
+
+def test_times_are_the_systems(tmp_path):
+    rows = [row_of(1.76e9 + t, ms) for t, ms in ((0, 0), (0.033, 20), (0.066, 60), (1.1, 1100))]
+    assert times_of(tmp_path, rows) == pytest.approx([0, 0.033, 0.066, 1.1], abs=1e-6)
+
+
+def test_times_of_a_burst_are_the_arduinos(tmp_path):
+    late = [row_of(1.76e9 + 0.0003 * i, 33 * i) for i in range(20)]
+    live = [row_of(1.76e9 + 0.006 + 0.033 * i, 33 * (20 + i)) for i in range(20)]
+    assert times_of(tmp_path, late + live) == pytest.approx(0.033 * np.arange(40), abs=1e-6)
+
+
+@pytest.mark.parametrize("hour_s", [3600, -3600])
+def test_times_over_a_clock_that_was_set_are_the_arduinos(tmp_path, hour_s):
+    rows = [row_of(1.76e9 + 0.033 * i + (hour_s if i > 5 else 0), 33 * i) for i in range(12)]
+    assert times_of(tmp_path, rows) == pytest.approx(0.033 * np.arange(12), abs=1e-6)
+
+
+def test_the_arduinos_clock_wraps_and_restarts(tmp_path):
+    stamps = [2**32 - 66, 2**32 - 33, 0, 33, 66, 5, 38, 38]  # and says one thing twice
+    rows = [row_of(1.76e9 + 0.0003 * i, ms) for i, ms in enumerate(stamps)]
+    expected = [0, 0.033, 0.066, 0.099, 0.132, 0.1323, 0.1653, 0.1656]
+    assert times_of(tmp_path, rows) == pytest.approx(expected, abs=2e-6)
+
+
+def test_a_hole_of_unmeasured_controls_is_a_long_step(tmp_path):
+    rows = [row_of(1.76e9 + 0.033 * i, 33 * i, throttle_us=0 if 3 <= i < 9 else 136) for i in range(12)]
+    controls = read_controls(csv_of(tmp_path, rows))
+    assert controls.left_out == 6
+    assert controls.times_s == pytest.approx([0.033 * i for i in (0, 1, 2, 9, 10, 11)], abs=1e-6)
+
+
+def test_controls_of_a_real_recording(tmp_path):
+    folder = real_episode()
+    rows = json.loads((folder / "episode_data.json").read_text())["control_samples"]
+    measured = [r for r in rows if r["throttle_raw_us"] and 762 < r["throttle_period_us"] < 1270]
+    controls = read_controls(folder)
+    assert controls.steering_us.tolist() == [r["steering_raw_us"] for r in measured]
+    assert controls.throttle_us.tolist() == [r["throttle_raw_us"] for r in measured]
+    stamps = np.array([r["arduino_timestamp"] for r in measured])
+    assert controls.times_s == pytest.approx((stamps - stamps[0]) / 1000, abs=1e-6)  # it begins with a burst
+    assert controls.left_out == len(rows) - len(measured)
+
+
+@pytest.mark.parametrize("make", ["nothing", "empty", "frames", "fifo", "unmeasured"])
+def test_no_controls_is_a_sentence(tmp_path, make):
+    folder = tmp_path / NAME
+    if make != "nothing":
+        folder.mkdir()
+    if make == "frames":
+        (folder / "frame_data.csv").write_text("frame_id,timestamp,image_path\n1,1.0,x.jpg\n")
+    if make == "fifo":
+        os.mkfifo(folder / "control_data.csv")
+    if make == "unmeasured":
+        csv_of(folder, [row_of(1.0, 0, throttle_us=0), row_of(1.1, 100, steering_period_us=42632)])
+    with pytest.raises(EpisodeError, match="no control with both pulses") as e:
+        read_controls(folder)
+    assert "\n" not in str(e.value)
+
+
+ODD = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just([]), st.just("nan"))
+FIELDS = {
+    "arduino_timestamp": st.integers(0, 2**32),
+    "system_timestamp": st.one_of(st.floats(0, 3), st.floats()),
+    "steering_raw_us": st.sampled_from([0, 1000, 1456, 1900.5]),
+    "throttle_raw_us": st.sampled_from([0, 120, 136, "136", None]),
+    "steering_period_us": st.sampled_from([21316, 42632]),
+    "throttle_period_us": st.sampled_from([0, 1016]),
+    "steering_normalized": st.just(0.1),
+    "throttle_normalized": st.just(0.1),
+    "throttle_measured": st.sampled_from([True, False, "False", "True", None]),
+}
+ROW = st.fixed_dictionaries({f: st.one_of(v, v, v, v, v, ODD) for f, v in FIELDS.items()})
+WILD = st.one_of(
+    ODD, st.fixed_dictionaries({"control_samples": st.one_of(st.lists(st.one_of(ROW, ROW, ODD), max_size=25), ODD)})
+)
+QUICK = settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+
+
+def check_sane(folder):
+    try:
+        controls = read_controls(folder)
+    except EpisodeError as e:
+        assert "\n" not in str(e)
+        return False
+    n = len(controls.times_s)
+    assert n == len(controls.steering_us) == len(controls.throttle_us) > 0
+    assert controls.times_s[0] == 0
+    assert np.isfinite(controls.times_s).all()
+    assert (np.diff(controls.times_s) >= 0).all()
+    assert (controls.steering_us > 0).all()
+    assert (controls.throttle_us > 0).all()
+    assert controls.steering_us.dtype == controls.throttle_us.dtype == np.int64
+    return True
+
+
+@QUICK
+@given(content=WILD)
+def test_wild_json(tmp_path_factory, content):
+    folder = tmp_path_factory.mktemp("json")
+    (folder / "episode_data.json").write_text(json.dumps(content))
+    check_sane(folder)
+
+
+@QUICK
+@given(rows=st.lists(ROW, max_size=25), tail=st.binary(max_size=40), cut=st.integers(0, 60))
+def test_wild_csv(tmp_path_factory, rows, tail, cut):
+    folder = tmp_path_factory.mktemp("csv")
+    with (folder / "control_data.csv").open("w", newline="") as f:
+        table = csv.DictWriter(f, list(FIELDS))
+        table.writeheader()
+        table.writerows(rows)
+    path = folder / "control_data.csv"
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) - cut] + tail)
+    check_sane(folder)
+
+
+@given(data=st.binary(max_size=200))
+@settings(max_examples=50, deadline=None)
+def test_wild_bytes(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("bytes")
+    for name in ("control_data.csv", "episode_data.json"):
+        (folder / name).write_bytes(data)
+    assert not check_sane(folder)
 
 
 def test_needs_no_workshop():

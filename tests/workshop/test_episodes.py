@@ -202,6 +202,36 @@ def test_throttle_without_a_measured_pulse_is_missing_not_zero(tmp_path, period)
     assert before[-1].is_pad.tolist() == [False] + [True] * (CHUNK - 1)  # the hole ends the chunks before it
 
 
+def test_a_channel_that_is_flagged_is_missing(tmp_path):
+    flagged = EpisodeWriter(tmp_path / "episode_20260101_120000", label="x", resolution=(32, 18), flags=True)
+    with flagged as writer:
+        for i in range(40):
+            t_s, lost = 1000 + 0.033 * i, 10 <= i < 20
+            pulses = PWM.pulses(steering_at(t_s), throttle_at(t_s))
+            throttle = (None, None) if lost else (pulses.throttle_us, 1016)
+            writer.control(t_s, 33 * i, pulses.steering_us, throttle[0], 21316, throttle[1], mode="human")
+            writer.frame(t_s, FRAME)
+    for _ in range(2):
+        recordings = load(tmp_path)
+        assert kinds(recordings) == {"throttle_no_pulse": 10, "frame_without_measurement": 8, "frame_without_state": 1}
+        assert len(recordings.samples) == 31
+        assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009  # the drive's least throttle, no 0
+        (flagged.folder / "episode_data.json").write_text("{}")  # and again from the CSVs
+
+
+def test_null_is_no_pulse_with_and_without_a_flag(tmp_path):
+    def change(content):
+        for i, control in enumerate(content["control_samples"][20:24]):
+            lost = dict.fromkeys(("throttle_normalized", "throttle_raw_us", "throttle_period_us"))
+            control.update([lost, lost | {"throttle_measured": False}, {"throttle_measured": False}, {}][i])
+            if i == 3:  # a program that left the fields out
+                for name in lost:
+                    del control[name]
+
+    edit(record(tmp_path), change)
+    assert kinds(load(tmp_path))["throttle_no_pulse"] == 4
+
+
 def test_two_periods_at_once_are_odd(tmp_path):
     def change(content):
         content["control_samples"][20].update(steering_period_us=42632, steering_normalized=0.0)
@@ -236,6 +266,23 @@ def test_serial_burst_is_placed_by_the_arduinos_clock(tmp_path):
     recordings = load(tmp_path)
     assert kinds(recordings) == {"serial_burst": 20}
     assert "0.65 s" in recordings.faults[0].note
+    assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
+
+
+def test_serial_burst_over_the_wrap_of_the_arduinos_clock(tmp_path):
+    folder = record(tmp_path)
+    whole = load(tmp_path).samples
+
+    def change(content):
+        controls = content["control_samples"]
+        for k, control in enumerate(controls):
+            control["arduino_timestamp"] = (2**32 - 330 + 33 * k) % 2**32
+            if k < 20:
+                control["system_timestamp"] = controls[20]["system_timestamp"] - 0.0003 * (20 - k)
+
+    edit(folder, change)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"serial_burst": 20}
     assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
 
 
