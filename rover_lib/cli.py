@@ -482,6 +482,35 @@ def log(file: Path, output: Path | None, drive: int, as_json: bool) -> None:
         click.echo(f"drawn: {output}", err=as_json)
 
 
+@main.command()
+@click.argument("artifact", type=FILE, required=False)
+@click.option("--camera", default="0", show_default=True, help="Number, /dev/videoN, video, folder or FIFO of JPEGs.")
+@click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
+@click.option("--hz", type=click.FloatRange(1, 120), default=30.0, show_default=True, help="Frames a second wanted.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.pass_context
+def doctor(ctx: click.Context, artifact: Path | None, camera: str, port: str, hz: float, as_json: bool) -> None:
+    """Look at all that driving needs: camera, Arduino, ARTIFACT, power, disk. Say what to do.
+
+    Nothing is armed and no servo is moved, but opening the port resets the Arduino. Exit code 1 if anything fails that
+    driving cannot do without; warnings do not count.
+    """
+    from rover_lib.onboard.doctor import examine
+    from rover_lib.onboard.drive import default_log
+
+    checks = []
+    for check in examine(artifact, camera=camera, port=port, rate_hz=hz, log_folder=default_log().parent):
+        checks.append(check)
+        if not as_json:
+            click.echo(str(check))
+    failed = [c.name for c in checks if c.verdict == "fail"]
+    if as_json:
+        show({"drives": not failed, "checks": [vars(c) for c in checks]}, as_json)
+    elif failed:
+        click.echo(f"rover: this car would not drive: {', '.join(failed)}", err=True)
+    ctx.exit(1 if failed else 0)
+
+
 @main.command("leave-out")
 @click.argument("run_dir", type=FILE)
 @click.option("--frames", type=click.IntRange(min=1), default=100, show_default=True, help="Held-out frames.")

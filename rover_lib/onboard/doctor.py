@@ -1,0 +1,464 @@
+"""Look at everything that driving needs, one line each: what was found, and what to do about it.
+
+    for check in examine("policy_static.pt", camera="0", port="/dev/ttyUSB0"):
+        print(check)
+
+A fail means that the car would not drive; a warning, that it would drive worse or stop more often than it could. Every
+check stands alone: one that breaks is its own fail, and the others go on.
+"""
+
+import fcntl
+import getpass
+import grp
+import os
+import shutil
+import statistics
+import struct
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from rover_lib.onboard.camera import Camera
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.host import Host, throttled_means
+from rover_lib.onboard.params import params
+from rover_lib.onboard.servo_link import BOOT_S, PROTOCOL_VERSION, ServoLink
+
+NAME_WIDTH = 15
+RATE_SHARE = 0.9  # of the wanted frame rate
+SETTLE_S, MEASURE_S = 0.5, 1.0  # a camera's first frames come when its exposure is found
+ROUND_TRIPS = 20
+SLOW_MS = 20.0  # an answer takes 3 to 8 ms: 40 bytes at 115200 baud and the USB adapter's 1 ms
+SIGNAL_S = 1.0
+REST_US = 32  # the firmware arms with the throttle stick so near to neutral
+HOT_C = 75.0  # a Pi 5 slows down from 80
+MEMORY_MB = 700  # the real policy has 436 resident while predicting, the loop's process 100
+RECORDINGS_MB = 1000  # a quarter of an hour at 30 Hz
+EARLIEST_S = 1_735_689_600  # 2025: a Pi without a network starts in its past
+
+# Of linux/videodev2.h
+VIDIOC_QUERYCAP, CAPABILITY = 0x80685600, struct.Struct("<16s32s32sIII12x")
+VIDIOC_ENUM_FMT, FORMAT = 0xC0405602, struct.Struct("<III32sI16x")
+VIDIOC_ENUM_FRAMESIZES, FRAME_SIZE = 0xC02C564A, struct.Struct("<III6I8x")
+CAPTURE, CAPTURE_PLANES = 0x1, 0x1000
+BUFFER_CAPTURE, BUFFER_CAPTURE_PLANES = 1, 9
+DISCRETE = 1
+MOST_SIZES = 64
+
+Verdict = Literal["ok", "warning", "fail"]
+Ioctl = Callable[[int, int, bytearray], int]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line: what was looked at, the verdict, what was found, what to do (empty if nothing)."""
+
+    name: str
+    verdict: Verdict
+    found: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        line = f"{self.verdict:<8} {self.name:<{NAME_WIDTH}} {self.found}"
+        return f"{line}\n{'':{9 + NAME_WIDTH}} {self.remedy}" if self.remedy else line
+
+
+def examine(
+    artifact: Path | str | None = None,
+    *,
+    camera: str = "0",
+    port: str = "/dev/ttyUSB0",
+    rate_hz: float = 30.0,
+    log_folder: Path | None = None,
+    host: Host | None = None,
+    dev: Path = Path("/dev"),
+    boot_s: float = BOOT_S,
+) -> Iterator[Check]:
+    """All checks, one after another, each as soon as it is known; some seconds in all. Raises nothing.
+
+    artifact: the policy to look at. camera, port: as `rover drive` takes them. log_folder: where flight logs go. host,
+    dev and boot_s: for the tests' sake.
+    """
+    host = host or Host()
+    device = dev / f"video{camera}" if str(camera).isdigit() else Path(camera)
+    checks: dict[str, Callable[[], Iterable[Check]]] = {}
+    if device.is_relative_to(dev):  # else a file or a pipe, for which no camera need be there
+        checks["group video"] = lambda: access("group video", device, "video")
+        checks["cameras"] = lambda: cameras(dev)
+    checks |= {
+        "camera": lambda: camera_rate(device, rate_hz=rate_hz, proc_root=host.proc_root),
+        "group dialout": lambda: access("group dialout", Path(port), "dialout"),
+        "Arduino": lambda: arduino(port, dev=dev, proc_root=host.proc_root, boot_s=boot_s),
+        "ModemManager": lambda: modem_manager(host.proc_root),
+        "torch": lambda: torch_here(),
+        "artifact": lambda: policy(artifact),
+        "temperature": lambda: temperature(host),
+        "power": lambda: power(host),
+        "governor": lambda: governor(host.sys_root),
+        "disk": lambda: disk(log_folder or Path.cwd(), Path.cwd()),
+        "memory": lambda: memory(host.proc_root),
+        "clock": lambda: clock(),
+    }
+    for name, check in checks.items():
+        try:
+            yield from check()
+        except RoverError as error:
+            found, _, remedy = str(error).rpartition("; ")
+            yield Check(name, "fail", found or remedy, remedy if found else "")
+        except Exception as error:
+            yield Check(name, "fail", f"could not be checked: {type(error).__name__}: {error}", "report this, please")
+
+
+def access(name: str, device: Path, group: str) -> Iterator[Check]:
+    """Whether this user may use the device: by the device's own group; by the usual one if it is not there."""
+    user = getpass.getuser()
+    if device.exists():
+        if os.access(device, os.R_OK | os.W_OK):
+            yield Check(name, "ok", f"{user} may use {device}")
+            return
+        try:
+            group = grp.getgrgid(device.stat().st_gid).gr_name
+        except KeyError:
+            group = str(device.stat().st_gid)
+        what, verdict = f"{user} may not use {device}, which belongs to group {group}", "fail"
+    else:
+        if os.geteuid() == 0 or group in _groups():
+            yield Check(name, "ok", f"{user} is in it" if os.geteuid() else f"{user} needs no group")
+            return
+        what, verdict = f"{user} is not in it", "warning"  # and what is not there is another check's fail
+    if _listed(group, user):
+        yield Check(name, verdict, f"{what}; {user} was added to it", "log in again (or restart the service)")
+    else:
+        yield Check(name, verdict, what, f"sudo usermod -aG {group} {user}, then log in again")
+
+
+def _groups() -> set[str]:
+    """Names of the groups that this process has."""
+    names = set()
+    for number in {*os.getgroups(), os.getegid()}:
+        try:
+            names.add(grp.getgrgid(number).gr_name)
+        except KeyError:
+            names.add(str(number))
+    return names
+
+
+def _listed(group: str, user: str) -> bool:
+    """Whether the user is a member by /etc/group: from the next login on."""
+    try:
+        return user in grp.getgrnam(group).gr_mem and group not in _groups()
+    except KeyError:
+        return False
+
+
+def cameras(dev: Path = Path("/dev"), ioctl: Ioctl = fcntl.ioctl) -> Iterator[Check]:
+    """Each V4L2 node that gives pictures, with its driver, formats and sizes."""
+    nodes = sorted((n for n in dev.glob("video*") if n.name[5:].isdecimal()), key=lambda n: int(n.name[5:]))
+    seen = 0
+    for node in nodes:
+        try:
+            file = os.open(node, os.O_RDWR | os.O_NONBLOCK)
+        except OSError as error:
+            seen += 1
+            yield Check("cameras", "warning", f"{node}: cannot be opened ({error.strerror})", "see group video above")
+            continue
+        try:
+            found = _capture_node(file, ioctl)
+        except OSError as error:
+            seen += 1
+            yield Check("cameras", "warning", f"{node}: does not say what it is ({error.strerror})", "plug it in again")
+            continue
+        finally:
+            os.close(file)
+        if found:
+            seen += 1
+            yield Check("cameras", "ok", f"{node}: {found}")
+    if not seen:
+        there = f"none of {len(nodes)} video nodes gives pictures" if nodes else f"no {dev / 'video*'}"
+        yield Check("cameras", "fail", there, "plug the camera in; dmesg | tail says whether the kernel saw it")
+
+
+def _capture_node(file: int, ioctl: Ioctl) -> str | None:
+    """Driver, card, formats and sizes of an open node; None if it gives no pictures (metadata, a decoder, ...)."""
+    data = bytearray(CAPABILITY.size)
+    ioctl(file, VIDIOC_QUERYCAP, data)
+    driver, card, _, _, capabilities, device_caps = CAPABILITY.unpack(data)
+    caps = device_caps or capabilities
+    if not caps & (CAPTURE | CAPTURE_PLANES):
+        return None
+    kind = BUFFER_CAPTURE if caps & CAPTURE else BUFFER_CAPTURE_PLANES
+    formats = []
+    for index in range(MOST_SIZES):
+        data = bytearray(FORMAT.pack(index, kind, 0, b"", 0))
+        try:
+            ioctl(file, VIDIOC_ENUM_FMT, data)
+        except OSError:  # the end of the list
+            break
+        pixels = FORMAT.unpack(data)[4]
+        name = pixels.to_bytes(4, "little").decode("ascii", "replace").strip()
+        formats.append(" ".join([name, *_sizes(file, pixels, ioctl)]))
+    return f"{_text(driver)}, {_text(card)}: {'; '.join(formats) or 'no formats'}"
+
+
+def _sizes(file: int, pixels: int, ioctl: Ioctl) -> list[str]:
+    sizes: list[str] = []
+    for index in range(MOST_SIZES):
+        data = bytearray(FRAME_SIZE.pack(index, pixels, 0, *[0] * 6))
+        try:
+            ioctl(file, VIDIOC_ENUM_FRAMESIZES, data)
+        except OSError:
+            break
+        _, _, kind, *numbers = FRAME_SIZE.unpack(data)
+        if kind != DISCRETE:
+            return [f"{numbers[0]}x{numbers[3]} to {numbers[1]}x{numbers[4]}"]
+        sizes.append(f"{numbers[0]}x{numbers[1]}")
+    return sizes
+
+
+def _text(data: bytes) -> str:
+    return data.partition(b"\0")[0].decode(errors="replace")
+
+
+def camera_rate(
+    source: Path | str,
+    *,
+    rate_hz: float = 30.0,
+    proc_root: Path = Path("/proc"),
+    open_camera: Callable[..., Any] = Camera,
+) -> Iterator[Check]:
+    """The frames that this camera really gives, over a second: how many, of which size, whether anything is on them."""
+    if not Path(source).exists():
+        yield Check("camera", "fail", f"no {source}", "plug it in, or name another with --camera")
+        return
+    users = users_of(source, proc_root)
+    try:
+        with open_camera(source, rate_hz=rate_hz) as camera:
+            end = time.monotonic() + SETTLE_S
+            first = camera.latest()
+            while (left := end - time.monotonic()) > 0 and (frame := camera.wait(first.number, left)):
+                first = frame
+            end, last = time.monotonic() + MEASURE_S, first
+            while (left := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, left)):
+                last = frame
+    except RoverError as error:
+        found, _, remedy = str(error).rpartition("; ")
+        used = f"; used by {', '.join(users)}" if users else ""
+        yield Check("camera", "fail", f"{found}{used}", f"end {users[0]}" if users else remedy)
+        return
+    number = last.number - first.number
+    measured_hz = number / (last.captured_s - first.captured_s) if number and last.captured_s > first.captured_s else 0
+    height, width = last.image.shape[:2]
+    found = f"{source}: {width}x{height}, {measured_hz:.1f} frames a second"
+    if not measured_hz:
+        yield Check("camera", "fail", f"{source}: no new frame within {MEASURE_S:g} s", "plug it in again")
+    elif measured_hz < RATE_SHARE * rate_hz:
+        light = "more light (long exposures halve the rate), a USB 3 port, or --hz of what it gives"
+        yield Check("camera", "warning", f"{found}, wanted {rate_hz:g}", light)
+    elif last.mean < float(params()["drive"]["black_level"]):
+        yield Check(
+            "camera", "warning", f"{found}, but black (mean {last.mean:.1f} of 255)", "take the cap off the lens"
+        )
+    else:
+        yield Check("camera", "ok", found)
+
+
+def users_of(path: Path | str, proc_root: Path = Path("/proc")) -> list[str]:
+    """Other processes that have the file open, as "name (process id)"; only one's own without root."""
+    target = Path(path).resolve()
+    found = []
+    for process in proc_root.glob("[0-9]*"):
+        if process.name == str(os.getpid()):
+            continue
+        try:
+            if any(fd.readlink() == target for fd in (process / "fd").iterdir()):
+                found.append(f"{(process / 'comm').read_text().strip()} ({process.name})")
+        except OSError:  # another user's, or it has ended meanwhile
+            continue
+    return found
+
+
+def arduino(
+    port: str, *, dev: Path = Path("/dev"), proc_root: Path = Path("/proc"), boot_s: float = BOOT_S
+) -> Iterator[Check]:
+    """The port, who has it, what answers there and how fast, and whether the transmitter is on."""
+    if not Path(port).exists():
+        others = sorted(str(p) for pattern in ("ttyUSB*", "ttyACM*") for p in dev.glob(pattern))
+        remedy = f"--port {others[0]}" if others else "plug it in; dmesg | tail says whether the kernel saw it"
+        yield Check("Arduino", "fail", f"no {port}; there is {', '.join(others) or 'no other serial port'}", remedy)
+        return
+    if users := users_of(port, proc_root):
+        # To open it would reset the Arduino under somebody who may be driving.
+        yield Check("Arduino", "fail", f"{port}: used by {', '.join(users)}", f"end {users[0]}")
+        return
+    with ServoLink(port, boot_s=boot_s) as link:
+        hello = link.hello
+        yield Check("Arduino", "ok", f"{port}: firmware {hello.firmware}, protocol {PROTOCOL_VERSION}")
+        times_ms = [link.round_trip_s() * 1000 for _ in range(ROUND_TRIPS)]
+        median_ms, most_ms = statistics.median(times_ms), max(times_ms)
+        found = f"round trip {median_ms:.1f} ms median, {most_ms:.1f} ms at most of {ROUND_TRIPS}"
+        if link.garbled:
+            yield Check(
+                "link", "warning", f"{found}; {link.garbled} lines were garbled", "a shorter or better USB cable"
+            )
+        elif median_ms > SLOW_MS:
+            yield Check("link", "warning", found, "plug it into the Pi itself, not a hub")
+        else:
+            yield Check("link", "ok", found)
+        yield _transmitter(link)
+
+
+def _transmitter(link: ServoLink) -> Check:
+    end, silent = time.monotonic() + SIGNAL_S, ["steering", "throttle"]
+    while time.monotonic() < end and silent:
+        if telemetry := link.latest():
+            pulses = {"steering": telemetry.receiver_steering_us, "throttle": telemetry.receiver_throttle_us}
+            silent = [name for name, pulse_us in pulses.items() if pulse_us is None]
+        time.sleep(0.02)
+    if silent:
+        found = f"no signal on {' and '.join(silent)}: arming will be refused"
+        return Check(
+            "transmitter", "fail", found, "switch it on, then look at the receiver's wires (firmware/README.md)"
+        )
+    found = f"steering {pulses['steering']} us, throttle {pulses['throttle']} us"
+    if abs(pulses["throttle"] - link.calibration.throttle.pulse_us(0.0)) > REST_US:
+        return Check("transmitter", "warning", f"{found}: arming will be refused", "let go of the throttle stick")
+    return Check("transmitter", "ok", found)
+
+
+def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:
+    """Whether the one program runs that writes to every new serial port."""
+    for process in proc_root.glob("[0-9]*"):
+        try:
+            if (process / "comm").read_text().strip() == "ModemManager":
+                remedy = "sudo systemctl disable --now ModemManager"
+                yield Check("ModemManager", "warning", "runs: it writes to serial ports that appear", remedy)
+                return
+        except OSError:
+            continue
+    yield Check("ModemManager", "ok", "does not run")
+
+
+def torch_here() -> Iterator[Check]:
+    """torch and its quantization engines."""
+    try:
+        import torch
+    except ImportError as error:
+        yield Check("torch", "fail", f"cannot be imported ({error})", "pip install -r requirements_pi.txt")
+        return
+    engines = [e for e in torch.backends.quantized.supported_engines if e != "none"]
+    found = f"{torch.__version__}, engines {', '.join(engines) or 'none'}, {torch.get_num_threads()} threads"
+    if "qnnpack" in engines:
+        yield Check("torch", "ok", found)
+    else:
+        yield Check("torch", "fail", found, "INT8 artifacts need qnnpack: install PyPI's build of torch")
+
+
+def policy(artifact: Path | str | None) -> Iterator[Check]:
+    """The artifact's checksums, manifest and parity vectors, and how long one inference takes."""
+    if artifact is None:
+        yield Check("artifact", "warning", "none was named, so none was looked at", "name it: rover doctor ARTIFACT")
+        return
+    from rover_lib.onboard.policy import load_policy
+
+    loaded = load_policy(artifact)
+    cameras = loaded.manifest["cameras"]
+    sizes = ", ".join(f"{c['name']} {c['width']}x{c['height']}" for c in cameras)
+    about = f"{loaded.manifest['mode']}, {loaded.chunk} actions at {loaded.rate_hz:g} Hz, camera {sizes}"
+    yield Check("artifact", "ok", f"{artifact}: whole, computes what it should; {about}")
+    frames = {c["name"]: np.zeros((c["height"], c["width"], 3), np.uint8) for c in cameras}
+    times_s = []
+    for _ in range(3):
+        start = time.perf_counter()
+        loaded.predict_chunk(frames, np.zeros(len(loaded.state_names), np.float32))
+        times_s.append(time.perf_counter() - start)
+    median_s, fade_s = statistics.median(times_s), float(params()["drive"]["fade_s"])
+    found = f"{1000 * median_s:.0f} ms"
+    if median_s < fade_s / 2:  # a plan is as old as two inferences before the next one is there
+        yield Check("inference", "ok", found)
+    else:
+        remedy = "choose a static artifact or a smaller image, cool the processor, end what else runs"
+        yield Check("inference", "warning", f"{found}: the throttle fades from {1000 * fade_s:g} ms of age on", remedy)
+
+
+def temperature(host: Host) -> Iterator[Check]:
+    """The processor's, now."""
+    celsius = host.temperature_c()
+    if celsius is None:
+        yield Check("temperature", "ok", "this machine does not tell")
+    elif celsius < HOT_C:
+        yield Check("temperature", "ok", f"{celsius:.0f} C")
+    else:
+        yield Check("temperature", "warning", f"{celsius:.0f} C", "a fan, or air: a Raspberry Pi slows down from 80 C")
+
+
+def power(host: Host) -> Iterator[Check]:
+    """What get_throttled says of now and of the time since the machine's start."""
+    value = host.throttled()
+    means = throttled_means(value)
+    if means is None:
+        yield Check("power", "ok", "no vcgencmd here: not a Raspberry Pi, or not its system")
+    elif not means:
+        yield Check("power", "ok", f"get_throttled {value}: supply and clock were as they should be")
+    elif any("voltage" in m for m in means):
+        remedy = "a supply of 5 V and 5 A with a short thick cable; a battery that is charged"
+        yield Check("power", "warning", f"get_throttled {value}: {', '.join(means)}", remedy)
+    else:
+        yield Check("power", "warning", f"get_throttled {value}: {', '.join(means)}", "a fan, or air")
+
+
+def governor(sys_root: Path = Path("/sys")) -> Iterator[Check]:
+    """How the cores' clock is chosen."""
+    files = sorted(sys_root.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"))
+    found = sorted({f.read_text().strip() for f in files})
+    if not found:
+        yield Check("governor", "ok", "this machine does not tell")
+    elif found == ["performance"]:
+        yield Check("governor", "ok", "performance")
+    else:
+        remedy = "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"
+        yield Check("governor", "warning", f"{', '.join(found)}: the clock rises only after the work has come", remedy)
+
+
+def disk(log_folder: Path, recordings: Path, usage: Callable[[Path], Any] = shutil.disk_usage) -> Iterator[Check]:
+    """Room for flight logs and recordings."""
+    limits = params()["flight_log"]
+    log_mb = limits["max_mb"] * (limits["keep"] + 1)
+    for what, folder, need_mb in (("flight logs", log_folder, log_mb), ("recordings", recordings, RECORDINGS_MB)):
+        there = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+        free_mb = usage(there).free / 1e6
+        found = f"{free_mb:.0f} MB free for {what} in {folder}"
+        if not os.access(there, os.W_OK | os.X_OK):
+            yield Check(
+                "disk", "warning", f"{folder}: not writable, for {what}", f"sudo chown {getpass.getuser()} {there}"
+            )
+        elif free_mb < need_mb:
+            yield Check("disk", "warning", f"{found}, {need_mb:.0f} are wanted", "delete what is old")
+        else:
+            yield Check("disk", "ok", found)
+
+
+def memory(proc_root: Path = Path("/proc")) -> Iterator[Check]:
+    """What is left for the policy."""
+    rows = dict(line.split(":", 1) for line in (proc_root / "meminfo").read_text().splitlines() if ":" in line)
+    free_mb = int(rows["MemAvailable"].split()[0]) * 1024 / 1e6
+    if free_mb >= MEMORY_MB:
+        yield Check("memory", "ok", f"{free_mb:.0f} MB free")
+    else:
+        remedy = "end other programs (a desktop needs 500 MB: sudo systemctl set-default multi-user.target)"
+        yield Check("memory", "warning", f"{free_mb:.0f} MB free, {MEMORY_MB} are wanted", remedy)
+
+
+def clock(now_s: float | None = None, built_s: float | None = None) -> Iterator[Check]:
+    """Whether the date can be true: recordings and logs are named after it."""
+    now_s = time.time() if now_s is None else now_s
+    built_s = Path(__file__).stat().st_mtime if built_s is None else built_s
+    found = time.strftime("%Y-%m-%d %H:%M", time.localtime(now_s))
+    if now_s >= max(EARLIEST_S, built_s) - 86_400:
+        yield Check("clock", "ok", found)
+    else:
+        remedy = "connect it to a network (timedatectl shows the rest), or sudo date -s '...'"
+        yield Check("clock", "warning", f"{found}, which is before this program was installed", remedy)
