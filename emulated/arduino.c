@@ -203,9 +203,6 @@ struct uno *uno_new(const char *elf) {
         }
     }
 
-    /* INT1, which nobody uses, sees the throttle's pin low, and simavr would look at it in every second cycle. */
-    avr_extint_set_strict_lvl_trig(avr, 1, 0);
-
     static const struct { char out, out_bit, in, in_bit; } PINS[CHANNELS] = {{'B', 2, 'D', 2}, {'D', 3, 'B', 0}};
     for (int i = 0; i < CHANNELS; i++) {
         struct channel *channel = &uno->channels[i];
@@ -259,6 +256,9 @@ void uno_hang(struct uno *uno, uint32_t address) {
 /* 0: fine. Otherwise simavr's state: the program stopped or crashed. */
 int uno_run_us(struct uno *uno, double microseconds) {
     avr_cycle_count_t end = uno->avr->cycle + cycles(microseconds);
+    /* INT1, which nobody uses, is on the throttle's pin. While that is low, simavr looks at it in every second cycle, ten
+     * times the work of all the rest, unless told not to; a reset forgets that. */
+    avr_extint_set_strict_lvl_trig(uno->avr, 1, 0);
     while (uno->avr->cycle < end) {
         int state = avr_run(uno->avr);
         if (state == cpu_Done || state == cpu_Crashed) return state;

@@ -4,6 +4,7 @@ Both are a serial port that a ServoLink opens, and both say what their servo pin
 """
 
 import contextlib
+import fcntl
 import functools
 import os
 import pty
@@ -40,6 +41,7 @@ PACKAGES = {  # Debian's, and what shows that each is there
 CC = ("gcc", "-O2", "-g", "-Wall", "-Wextra", "-Werror")
 WITH_SIMAVR = ("-I/usr/include/simavr", str(EMULATOR), "-lsimavr", "-lelf", "-lutil", "-lm")
 BOOT_S = 0.2  # of the boot loader; a board's takes 1 to 2 s
+LOG_BYTES = 1 << 20  # of the pins that wait to be read: 20 s of every pulse
 START_S = 10.0
 STOP_S = 3.0
 REST_US = (1456.0, 120.0)  # a transmitter whose sticks nobody touches
@@ -161,6 +163,7 @@ class Arduino:
         )
         self.pid = self._process.pid
         os.set_blocking(self._process.stdout.fileno(), False)
+        fcntl.fcntl(self._process.stdout.fileno(), fcntl.F_SETPIPE_SZ, LOG_BYTES)
         try:
             with contextlib.suppress(PermissionError):
                 os.setpriority(os.PRIO_PROCESS, self.pid, nice)
@@ -198,7 +201,7 @@ class Arduino:
     def pulses(self) -> list[PinEvent]:
         """What happened since the last call, in the order of its end.
 
-        With every_pulse call it at least every second: what the pipe does not hold is lost, and then says 'lost'.
+        With every_pulse call it every 10 s at least: what does not fit the pipe is lost, and 'lost' then says how much.
         Raises ArduinoError if the process has ended.
         """
         with self._reading:
@@ -338,6 +341,7 @@ class StandIn:
                 self._reset()
                 self._closing.wait(self._boot_s)
                 self._read()  # the boot loader has it
+                self._started = time.monotonic()
                 self._say("")  # ends a line that the reset cut
                 self._hello("e")
             self._judge_time()

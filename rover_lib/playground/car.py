@@ -43,6 +43,7 @@ STEPS_PER_S = 100  # of the physics, at least
 KEEP_DRIVES = 8
 KEEP_OUTCOMES = 1000
 STANDSTILL_S = 0.5  # a machine that stopped for longer has stopped the world too
+NOISE = 3  # grey levels of the camera's noise: two frames of a car that stands still are never the same
 PIPE_BYTES = 1 << 20  # a frame fits in whole
 NICE = 5  # what drives goes first; a camera may be late
 EMULATOR_NICE = -10
@@ -452,7 +453,7 @@ class _Car:
         self.finished = self.trials == self._worlds
         if not self.finished:
             self.world = World(world.seed + 1)
-            self._release_s = time.monotonic() + self._hold_s
+            self._release_s = self._now + self._hold_s
 
     def report(self) -> dict[str, Any]:
         distance_m, bearing_rad = self.world.balloon_seen()
@@ -470,9 +471,23 @@ class _Car:
         }
 
 
+class _Sensor:
+    """The noise of a camera's sensor: crops of one larger picture of it, which is cheap."""
+
+    def __init__(self) -> None:
+        self._rng = np.random.default_rng()
+        shape = (FRAME_HEIGHT + 64, FRAME_WIDTH + 64, 3)
+        self._noise = self._rng.integers(0, NOISE, shape, np.uint8)
+
+    def see(self, frame: np.ndarray) -> np.ndarray:
+        row, column = self._rng.integers(0, 64, 2)
+        return cv2.add(frame, self._noise[row : row + FRAME_HEIGHT, column : column + FRAME_WIDTH])
+
+
 def _run(car: _Car, pipe: FramePipe, rate_hz: float, parent: int) -> None:
     """Frames at absolute deadlines, until the parent has had enough or is gone."""
     frames = dropped = late = 0
+    sensor = _Sensor()
     asked = b""
     due = time.monotonic()
     while os.getppid() == parent:  # another child of it may hold the other end of standard input open
@@ -487,7 +502,7 @@ def _run(car: _Car, pipe: FramePipe, rate_hz: float, parent: int) -> None:
         car.move(due)
         if pipe.read:
             # Nothing is drawn that nobody would see.
-            if pipe.empty and pipe.write(jpeg_of(car.world.render())):
+            if pipe.empty and pipe.write(jpeg_of(sensor.see(car.world.render()))):
                 frames += 1
             else:
                 dropped += 1
