@@ -1,0 +1,471 @@
+"""The doctor on machines that are made up: a healthy rover, and one with each thing wrong."""
+
+import errno
+import json
+import os
+import re
+import struct
+import subprocess
+import sys
+import time
+from collections import namedtuple
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from test_servo_link import board_of
+
+from rover_lib.cli import main
+from rover_lib.onboard import doctor
+from rover_lib.onboard.camera import CameraError, Frame
+from rover_lib.onboard.doctor import Check, examine
+from rover_lib.onboard.host import Host
+
+USB = (b"uvcvideo", b"HD Camera", 0x85200001, 0x04200001)
+METADATA = (b"uvcvideo", b"HD Camera", 0x85200001, 0x04A00000)
+FORMATS = {b"MJPG": [(640, 360), (1280, 720)], b"YUYV": [(640, 480)]}
+
+
+def only(checks):
+    (check,) = checks
+    return check
+
+
+def verdicts(checks):
+    return {c.name: c.verdict for c in checks}
+
+
+@pytest.fixture
+def proc(tmp_path):
+    """A process table of its own: nobody runs."""
+    folder = tmp_path / "no processes"
+    folder.mkdir()
+    return folder
+
+
+# ---- groups
+
+
+def test_access_by_the_devices_own_group(tmp_path, monkeypatch):
+    device = tmp_path / "video0"
+    device.touch()
+    assert only(doctor.access("group video", device, "video")).verdict == "ok"
+    group, user = namedtuple("G", "gr_name gr_mem"), "somebody"
+    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    monkeypatch.setattr(doctor.getpass, "getuser", lambda: user)
+    monkeypatch.setattr(doctor.grp, "getgrgid", lambda gid: group("plugdev", []))
+    monkeypatch.setattr(doctor.grp, "getgrnam", lambda name: group(name, []))
+    check = only(doctor.access("group video", device, "video"))
+    assert check.verdict == "fail"
+    assert check.found.endswith("which belongs to group plugdev")
+    assert check.remedy == "sudo usermod -aG plugdev somebody, then log in again"
+    # added since the login: /etc/group has it, this process not
+    monkeypatch.setattr(doctor.grp, "getgrnam", lambda name: group(name, [user]))
+    monkeypatch.setattr(doctor, "_groups", lambda: {"users"})
+    check = only(doctor.access("group video", device, "video"))
+    assert (check.verdict, check.remedy) == ("fail", "log in again (or restart the service)")
+
+
+def test_access_to_a_device_that_is_not_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(doctor.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(doctor, "_groups", lambda: {"dialout"})
+    assert only(doctor.access("g", tmp_path / "ttyUSB0", "dialout")).verdict == "ok"
+    check = only(doctor.access("g", tmp_path / "video0", "a group of another name"))
+    assert check.verdict == "warning"
+    assert check.remedy.startswith("sudo usermod -aG a group of another name")
+
+
+# ---- cameras
+
+
+class Kernel:
+    """V4L2's answers for nodes by path; a node without one refuses."""
+
+    def __init__(self, nodes):
+        self.nodes = nodes
+
+    def __call__(self, file, request, data):
+        node = Path(f"/proc/self/fd/{file}").readlink().name
+        if self.nodes[node] is None:
+            raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
+        driver, card, capabilities, device_caps = self.nodes[node]
+        if request == doctor.VIDIOC_QUERYCAP:
+            data[:] = struct.pack("<16s32s32sIII12x", driver, card, b"usb", 0, capabilities, device_caps)
+            return 0
+        index = struct.unpack_from("<I", data)[0]
+        if request == doctor.VIDIOC_ENUM_FMT:
+            assert struct.unpack_from("<I", data, 4)[0] == 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
+            answers = [b.ljust(4) for b in FORMATS]
+            where, size = 44, "4s"
+        else:
+            assert request == doctor.VIDIOC_ENUM_FRAMESIZES
+            answers = FORMATS[bytes(data[4:8])]
+            where, size = 8, "III"
+        if index >= len(answers):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        answer = answers[index]
+        struct.pack_into(size, data, where, *((answer,) if size == "4s" else (1, *answer)))
+        return 0
+
+
+def make_nodes(folder, *names):
+    for name in names:
+        (folder / name).touch()
+    return folder
+
+
+def test_cameras_are_listed_with_formats_and_sizes(tmp_path):
+    kernel = Kernel({"video0": USB, "video1": METADATA, "video10": None})
+    checks = list(doctor.cameras(make_nodes(tmp_path, *kernel.nodes, "video-dec"), kernel))
+    assert [c.verdict for c in checks] == ["ok", "warning"]
+    assert checks[0].found.endswith("video0: uvcvideo, HD Camera: MJPG 640x360 1280x720; YUYV 640x480")
+    assert "video10: does not say what it is" in checks[1].found
+
+
+def test_sizes_in_steps(tmp_path):
+    def ioctl(file, request, data):
+        if struct.unpack_from("<I", data)[0] and request != doctor.VIDIOC_QUERYCAP:
+            raise OSError(errno.EINVAL, "")
+        if request == doctor.VIDIOC_QUERYCAP:
+            data[:] = struct.pack("<16s32s32sIII12x", b"rp1-cfe", b"rp1", b"", 0, 0x1000, 0)
+        elif request == doctor.VIDIOC_ENUM_FMT:
+            assert struct.unpack_from("<I", data, 4)[0] == 9  # several planes
+            data[44:48] = b"pGAA"
+        else:
+            struct.pack_into("<I6I", data, 8, 3, 16, 16384, 1, 16, 8192, 1)
+        return 0
+
+    check = only(doctor.cameras(make_nodes(tmp_path, "video0"), ioctl))
+    assert check.found.endswith("rp1-cfe, rp1: pGAA 16x16 to 16384x8192")
+
+
+def test_no_camera(tmp_path):
+    check = only(doctor.cameras(tmp_path))
+    assert check.verdict == "fail" and check.found.startswith("no /") and "dmesg" in check.remedy
+    check = only(doctor.cameras(make_nodes(tmp_path, "video0"), Kernel({"video0": METADATA})))
+    assert (check.verdict, check.found) == ("fail", "none of 1 video nodes gives pictures")
+
+
+class FakeCamera:
+    """Frames that come at a rate, on a clock of their own."""
+
+    def __init__(self, hz=30.0, level=100, stops=False):
+        self.hz, self.level, self.stops, self.number = hz, level, stops, 1
+
+    def __call__(self, source, rate_hz):
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        pass
+
+    def latest(self):
+        image = np.full((360, 640, 3), self.level, np.uint8)
+        return Frame(image, 100 + self.number / self.hz, self.number, 0, float(self.level))
+
+    def wait(self, after, timeout_s):
+        time.sleep(0.02)
+        if self.stops:
+            return None
+        self.number += 1
+        return self.latest()
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(doctor, "SETTLE_S", 0.05)
+    monkeypatch.setattr(doctor, "MEASURE_S", 0.1)
+
+
+@pytest.mark.parametrize(
+    ("camera", "verdict", "found"),
+    [
+        (FakeCamera(), "ok", "640x360, 30.0 frames a second"),
+        (FakeCamera(hz=27.5), "ok", "27.5"),
+        (FakeCamera(hz=15), "warning", "15.0 frames a second, wanted 30"),
+        (FakeCamera(level=3), "warning", "black (mean 3.0 of 255)"),
+        (FakeCamera(stops=True), "fail", "no new frame within"),
+    ],
+)
+def test_the_real_frame_rate(tmp_path, proc, quick, camera, verdict, found):
+    source = tmp_path / "video0"
+    source.touch()
+    check = only(doctor.camera_rate(source, proc_root=proc, open_camera=camera))
+    assert check.verdict == verdict and found in check.found
+    assert bool(check.remedy) == (verdict != "ok")
+
+
+def test_a_camera_that_somebody_else_has(tmp_path):
+    source = tmp_path / "video0"
+    source.touch()
+
+    def refuse(source, rate_hz):
+        raise CameraError(f"{source}: cannot be opened; do something")
+
+    check = only(doctor.camera_rate(source, proc_root=tmp_path, open_camera=refuse))
+    assert (check.verdict, check.found, check.remedy) == ("fail", f"{source}: cannot be opened", "do something")
+    with holding(source) as process:
+        check = only(doctor.camera_rate(source, open_camera=refuse))
+        assert re.search(rf"cannot be opened; used by \S+ \({process.pid}\)$", check.found)
+        assert check.remedy.startswith("end ")
+
+
+def test_frames_are_measured_through_the_cameras_own_reader(tmp_path, proc, quick):
+    for k in range(40):
+        cv2.imwrite(str(tmp_path / f"{k:03d}.jpg"), np.full((90, 160, 3), 100 + k, np.uint8))
+    check = only(doctor.camera_rate(tmp_path, rate_hz=50, proc_root=proc))
+    assert check.verdict in ("ok", "warning")  # a busy machine paces late
+    assert re.search(r"160x90, [2-6]\d\.\d frames a second", check.found)
+
+
+# ---- the Arduino
+
+
+class holding:
+    """Another process that has a file open."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __enter__(self):
+        code = "import sys; f = open(sys.argv[1], 'rb', buffering=0); print('open', flush=True); sys.stdin.read()"
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code, str(self.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert self.process.stdout.readline() == b"open\n"
+        return self.process
+
+    def __exit__(self, *exc):
+        self.process.communicate()
+
+
+def talking(receiver):
+    """A board that says its status, with the receiver's pulses, at each question."""
+
+    def answer(board, body):
+        board.say(f"<S 7 99 {board.sequence} k M r 1456 120 {receiver} 0 0 0 0")
+
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("receiver", "verdict", "found"),
+    [
+        ("1460 21316 124 1016", "ok", "steering 1460 us, throttle 124 us"),
+        ("1460 21316 200 1016", "warning", "arming will be refused"),
+        ("1460 21316 - -", "fail", "no signal on throttle: arming will be refused"),
+        ("- - - -", "fail", "no signal on steering and throttle"),
+    ],
+)
+def test_an_arduino(proc, monkeypatch, receiver, verdict, found):
+    monkeypatch.setattr(doctor, "SIGNAL_S", 0.1)
+    with board_of(answer=talking(receiver)) as board:
+        checks = {c.name: c for c in doctor.arduino(board.port, proc_root=proc, boot_s=2)}
+    assert checks["Arduino"].found == f"{board.port}: firmware 1.0.0, protocol 1"
+    assert re.search(r"round trip \d+\.\d ms median, \d+\.\d ms at most of 20", checks["link"].found)
+    assert checks["transmitter"].verdict == verdict and found in checks["transmitter"].found
+    assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven
+    assert board.heard.count(">Q") >= 20
+
+
+def test_an_arduino_of_another_protocol(proc):
+    with board_of(hello="<H 2 3.0.0 something else") as board:
+        check = only(c for c in examine(port=board.port, boot_s=2, host=Host(proc_root=proc)) if c.name == "Arduino")
+    assert check.verdict == "fail"
+    assert "speaks protocol 2" in check.found and "make flash" in check.remedy
+
+
+def test_nothing_answers(proc):
+    with board_of(hello=None) as board, pytest.raises(doctor.RoverError, match="no hello"):
+        list(doctor.arduino(board.port, proc_root=proc, boot_s=0.2))
+
+
+def test_a_port_that_is_not_there(tmp_path, proc):
+    check = only(doctor.arduino(str(tmp_path / "ttyUSB0"), dev=tmp_path, proc_root=proc))
+    assert check.verdict == "fail" and "no other serial port" in check.found
+    (tmp_path / "ttyACM0").touch()
+    check = only(doctor.arduino(str(tmp_path / "ttyUSB0"), dev=tmp_path, proc_root=proc))
+    assert check.remedy == f"--port {tmp_path / 'ttyACM0'}"
+
+
+def test_a_port_that_somebody_else_has_is_left_alone(tmp_path):
+    with board_of() as board, holding(board.port) as process:
+        link = tmp_path / "serial by id"
+        link.symlink_to(board.port)
+        before = list(board.heard)
+        check = only(doctor.arduino(str(link)))
+        assert check.verdict == "fail"
+        assert re.search(rf"used by \S+ \({process.pid}\)$", check.found)
+        assert board.heard == before
+        assert doctor.users_of(tmp_path / "other") == []
+
+
+def test_modem_manager(proc):
+    assert only(doctor.modem_manager(proc)).verdict == "ok"
+    (proc / "7").mkdir()  # ended meanwhile
+    for number, name in (("8", "sh"), ("9", "ModemManager")):
+        (proc / number).mkdir()
+        (proc / number / "comm").write_text(f"{name}\n")
+    check = only(doctor.modem_manager(proc))
+    assert check.verdict == "warning" and "systemctl disable" in check.remedy
+
+
+# ---- torch and the artifact
+
+
+def test_torch():
+    check = only(doctor.torch_here())
+    assert check.verdict == "ok" and "qnnpack" in check.found
+
+
+def test_torch_that_is_not_there(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    check = only(doctor.torch_here())
+    assert check.verdict == "fail" and "pip install" in check.remedy
+
+
+def test_a_good_artifact(artifacts):
+    checks = list(doctor.policy(artifacts["static"]))
+    assert verdicts(checks) == {"artifact": "ok", "inference": "ok"}
+    assert re.search(r"static, \d+ actions at 30 Hz, camera \S+ \d+x\d+", checks[0].found)
+    assert re.fullmatch(r"\d+ ms", checks[1].found)
+
+
+def test_a_slow_one(artifacts, monkeypatch):
+    now = iter(np.arange(0, 100, 0.3))
+    monkeypatch.setattr(doctor.time, "perf_counter", lambda: next(now))
+    check = list(doctor.policy(artifacts["fp32"]))[1]
+    assert check.verdict == "warning" and check.found == "300 ms: the throttle fades from 500 ms of age on"
+
+
+def test_a_damaged_artifact(artifacts, tmp_path, proc):
+    data = bytearray(artifacts["static"].read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    broken = tmp_path / "policy.pt"
+    broken.write_bytes(data)
+    checks = examine(broken, port=str(tmp_path / "none"), dev=tmp_path, host=Host(proc_root=proc))
+    check = only(c for c in checks if c.name == "artifact")
+    assert check.verdict == "fail" and check.found.startswith(f"{broken}: ") and check.remedy
+    (missing,) = [c for c in examine(tmp_path / "no.pt", dev=tmp_path) if c.name == "artifact"]
+    assert missing.verdict == "fail"
+
+
+def test_no_artifact_is_said():
+    assert only(doctor.policy(None)).verdict == "warning"
+
+
+# ---- the machine
+
+
+def test_a_pi_that_was_short_of_power(pi_host):
+    check = only(doctor.power(pi_host))
+    assert check.verdict == "warning" and "supply" in check.remedy
+    assert check.found == "get_throttled 0x50000: under-voltage since the start, throttled since the start"
+    for value, verdict, remedy in (("0x0", "ok", ""), ("0x80000", "warning", "a fan, or air")):
+        Path(pi_host.vcgencmd).write_text(f"#!/bin/sh\necho throttled={value}\n")
+        check = only(doctor.power(pi_host))
+        assert (check.verdict, check.remedy) == (verdict, remedy)
+
+
+def test_temperature(pi_host, bare_host):
+    assert only(doctor.temperature(pi_host)) == Check("temperature", "ok", "61 C")
+    (pi_host.sys_root / "class/thermal/thermal_zone0/temp").write_text("81000")
+    assert only(doctor.temperature(pi_host)).verdict == "warning"
+    assert "does not tell" in only(doctor.temperature(bare_host)).found
+    assert "no vcgencmd" in only(doctor.power(bare_host)).found
+
+
+def test_governor(pi_host, tmp_path):
+    assert "does not tell" in only(doctor.governor(tmp_path / "none")).found
+    for core, name in enumerate(("performance", "ondemand")):
+        file = pi_host.sys_root / f"devices/system/cpu/cpu{core}/cpufreq/scaling_governor"
+        file.write_text(f"{name}\n")
+        check = only(doctor.governor(pi_host.sys_root))
+        assert check.verdict == ("warning" if core else "ok")
+    assert "performance | sudo tee" in check.remedy
+
+
+def test_disk(tmp_path):
+    Usage = namedtuple("Usage", "free")
+    asked = []
+
+    def usage(path):
+        asked.append(path)
+        return Usage(500e6)
+
+    logs, recordings = doctor.disk(tmp_path / "not/made/yet", tmp_path, usage)
+    assert asked == [tmp_path, tmp_path]
+    assert (logs.verdict, recordings.verdict) == ("ok", "warning")
+    assert recordings.found == f"500 MB free for recordings in {tmp_path}, 1000 are wanted"
+    logs, _ = doctor.disk(tmp_path, tmp_path, lambda path: Usage(1e6))
+    assert logs.verdict == "warning"
+
+
+def test_a_folder_that_is_not_writable(tmp_path, monkeypatch):
+    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    assert all("not writable" in c.found for c in doctor.disk(tmp_path, tmp_path))
+
+
+@pytest.mark.parametrize(("kb", "verdict"), [(4_000_000, "ok"), (300_000, "warning")])
+def test_memory(proc, kb, verdict):
+    (proc / "meminfo").write_text(f"MemTotal:  8000000 kB\nMemAvailable:   {kb} kB\n")
+    assert only(doctor.memory(proc)).verdict == verdict
+
+
+def test_clock():
+    assert only(doctor.clock()).verdict == "ok"
+    for now_s, built_s in ((0, 0), (1.75e9, 1.76e9)):
+        assert only(doctor.clock(now_s, built_s)).verdict == "warning"
+    assert only(doctor.clock(1.76e9, 1.75e9)).verdict == "ok"
+
+
+# ---- all together
+
+
+def test_a_check_that_breaks_is_its_own_fail(tmp_path, proc, monkeypatch):
+    def broken(*args):
+        yield Check("memory", "ok", "half of it")
+        raise ZeroDivisionError("oh")
+
+    monkeypatch.setattr(doctor, "memory", broken)
+    monkeypatch.setattr(doctor, "governor", lambda *args: 1 / 0)
+    checks = list(examine(port=str(tmp_path / "none"), dev=tmp_path, host=Host(proc_root=proc)))
+    assert (
+        only(c for c in checks if c.name == "governor").found
+        == "could not be checked: ZeroDivisionError: division by zero"
+    )
+    assert [c.verdict for c in checks if c.name == "memory"] == ["ok", "fail"]
+    assert checks[-1].name == "clock"
+
+
+def rover(*args):
+    return CliRunner().invoke(main, [str(a) for a in args])
+
+
+def test_a_desktop_cannot_drive(tmp_path):
+    result = rover("doctor", "--camera", tmp_path / "video0", "--port", tmp_path / "ttyUSB0")
+    assert result.exit_code == 1
+    assert "rover: this car would not drive: camera, Arduino" in result.stderr
+    lines = result.stdout.splitlines()
+    assert all(re.match(r"(ok {7}|warning {2}|fail {5}|        )\S* *", line) for line in lines)
+    starts = {re.match(r"\w+ +(group \w+|\S+) +", line).end() for line in lines if not line.startswith(" ")}
+    assert starts == {9 + doctor.NAME_WIDTH + 1}  # what was found stands in one column
+    found = json.loads(rover("doctor", "--json", "--camera", tmp_path / "video0", "--port", tmp_path / "none").stdout)
+    assert found["drives"] is False
+    assert {"name", "verdict", "found", "remedy"} == set(found["checks"][0])
+
+
+def test_a_rover_that_drives(tmp_path, artifacts, quick):
+    for k in range(60):
+        cv2.imwrite(str(tmp_path / f"{k:03d}.jpg"), np.full((90, 160, 3), 100 + k, np.uint8))
+    with board_of(answer=talking("1460 21316 124 1016")) as board:
+        result = rover("doctor", artifacts["static"], "--camera", tmp_path, "--port", board.port, "--json")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["drives"] is True
+    assert {"camera", "Arduino", "link", "transmitter", "artifact", "inference"} <= {c["name"] for c in found["checks"]}
+    assert not [c for c in found["checks"] if c["verdict"] == "fail"]
