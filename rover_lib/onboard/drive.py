@@ -28,7 +28,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rover_lib.onboard.camera import Camera
-from rover_lib.onboard.errors import ParamsError, RoverError
+from rover_lib.onboard.errors import ParamsError, PolicyError, RoverError
 from rover_lib.onboard.inference import Planner, PolicyProcess, PolicyThread, late
 from rover_lib.onboard.plan import Commanded, Follower, Settings
 from rover_lib.onboard.pwm import PwmCalibration
@@ -42,6 +42,7 @@ FIRST_PLAN_S = 10.0
 RESEND_S = 0.012  # a command takes 3 ms on the wire, its status 7
 SPARE_S = 0.004  # before a deadline nothing is sent again
 SWITCH_S = 0.0005  # other threads give the interpreter back to the loop after at most so long, not Python's 5 ms
+PRIORITY = 1  # the lowest of real time
 MOVING = 0.004  # throttle above which a car moves, and no two pictures are the same
 SLACK_S = 0.002  # a control of this much later is of the same tick: recordings have the ticks' rate, or close to it
 SETTLED_S = 60.0  # memory is watched from here on
@@ -107,7 +108,7 @@ class PolicyPilot:
         end = time.monotonic() + FIRST_PLAN_S
         while self._planner.wait(0.1) is None and not stop.is_set():
             if time.monotonic() > end:
-                raise DriveFault(f"no plan within {FIRST_PLAN_S:g} s; does 'rover benchmark' run on this artifact?")
+                raise PolicyError(f"no plan within {FIRST_PLAN_S:g} s; does 'rover benchmark' run on this artifact?")
 
     def order(self, now_s: float) -> Order | None:
         frame = self._camera.latest()
@@ -260,23 +261,24 @@ def drive(
     if stop.is_set():
         report.ended = "stopped before it began"
         return report
-    try:
-        loop.arm()
-        report.ended = loop.run(stop, ticks, max_seconds, watch)
-    except BaseException as error:
-        said = loop.neutral()  # first of all, and before anything that may take long
-        report.ended = f"{error}" if isinstance(error, RoverError) else f"{type(error).__name__}: {error}"
-        log.event(report.ended, level=logging.ERROR)
+    with _going_first() as said:
         log.event(said)
-        if isinstance(error, RoverError) and not isinstance(error, (DriveFault, TakenOver)) and loop.armed:
-            raise DriveFault(report.ended) from error
-        raise
-    else:
-        said = loop.neutral()
-        log.event(f"ended: {report.ended}")
-    finally:
-        report.seconds = clock() - loop.start_s if loop.start_s else 0.0
-    log.event(said)
+        try:
+            loop.arm()
+            report.ended = loop.run(stop, ticks, max_seconds, watch)
+        except BaseException as error:
+            said = loop.neutral()  # first of all, and before anything that may take long
+            report.ended = f"{error}" if isinstance(error, RoverError) else f"{type(error).__name__}: {error}"
+            log.event(report.ended, level=logging.ERROR)
+            if isinstance(error, RoverError) and not isinstance(error, (DriveFault, TakenOver)) and loop.armed:
+                raise DriveFault(report.ended) from error
+            raise
+        else:
+            said = loop.neutral()
+            log.event(f"ended: {report.ended}")
+        finally:
+            log.event(said)
+            report.seconds = clock() - loop.start_s if loop.start_s else 0.0
     return report
 
 
@@ -323,9 +325,6 @@ class _Loop:
         watch: Callable[[], Iterable[str]],
     ) -> str:
         report, n = self.report, 0
-        gc.collect()
-        gc.freeze()  # what is here now need not be looked through again while driving
-        sys.setswitchinterval(SWITCH_S)
         self.start_s = start = self.clock()
         seconds, first_mb = 0, None
         while True:
@@ -454,6 +453,37 @@ class _Loop:
                 mode=self.mode,
                 plan_age_ms=None if order.age_s is None else round(order.age_s * 1e3, 1),
             )
+
+
+@contextlib.contextmanager
+def _going_first() -> Iterator[str]:
+    """Inside, this process goes before all that is not as urgent; what there is to say about it.
+
+    All its threads, which sleep most of the time: one that was made to wait while it holds the interpreter would keep
+    the loop waiting too. With four busy processes on two cores the loop's lateness at p99 was 0.7 ms so, 4 to 9 with
+    the loop's thread alone at that priority, and 14 to 19 without (measured on an x86-64 workstation).
+    """
+    gc.collect()
+    gc.freeze()  # what is here now need not be looked through again while driving
+    before, said = sys.getswitchinterval(), "the loop runs at real-time priority"
+    sys.setswitchinterval(SWITCH_S)
+    try:
+        _schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, PRIORITY)
+    except (OSError, AttributeError):  # AttributeError: no Linux
+        said = "the loop runs at ordinary priority: this user may not ask for real time"
+    try:
+        yield said
+    finally:
+        with contextlib.suppress(OSError, AttributeError):
+            _schedule(os.SCHED_OTHER, 0)
+        sys.setswitchinterval(before)
+        gc.unfreeze()
+
+
+def _schedule(policy: int, priority: int) -> None:
+    for thread in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(ProcessLookupError):  # it has just ended
+            os.sched_setscheduler(int(thread.name), policy, os.sched_param(priority))
 
 
 @contextlib.contextmanager

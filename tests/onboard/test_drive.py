@@ -396,7 +396,7 @@ def test_faults_come_through(pilot):
 
 def test_no_plan_in_time(pilot, monkeypatch):
     monkeypatch.setattr("rover_lib.onboard.drive.FIRST_PLAN_S", 0.0)
-    with pytest.raises(DriveFault, match="no plan within"):
+    with pytest.raises(PolicyError, match="no plan within"):
         pilot.ready(threading.Event())
 
 
