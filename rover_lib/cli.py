@@ -413,7 +413,8 @@ def _drive(
         common = {"rate_hz": hz, "log": log, "stop": stop, "report": report, **ends}
         if controls:
             limit = 1.0 if throttle_limit is None else throttle_limit
-            d.drive(d.ReplayPilot(controls, throttle_limit=limit), link, **common)
+            with d.going_first(log):
+                d.drive(d.ReplayPilot(controls, throttle_limit=limit), link, **common)
             return
         frames = stack.enter_context(Camera(camera))
         how = {"threads": threads, "in_thread": in_thread, "latency_s": latency_ms / 1e3, "record": record}
