@@ -39,7 +39,7 @@ from rover_lib.onboard.telemetry import FlightLog, Tick
 
 RATES_HZ = (10.0, 100.0)
 FIRST_PLAN_S = 10.0
-RESEND_S = 0.012  # a command takes 3 ms on the wire, its status 7
+RESEND_S = 0.018  # a command takes 3 ms on the wire, a status that is under way 7, its own 7
 SPARE_S = 0.004  # before a deadline nothing is sent again
 SWITCH_S = 0.0005  # other threads give the interpreter back to the loop after at most so long, not Python's 5 ms
 PRIORITY = 1  # the lowest of real time
