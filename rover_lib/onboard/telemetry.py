@@ -22,7 +22,6 @@ import glob
 import json
 import logging
 import os
-import select
 import shutil
 import sys
 import threading
@@ -628,9 +627,6 @@ class StatusLine:
         # Not through the stream's buffer: its lock, held by a thread that is stuck, would hang the program's end.
         data = text.encode(errors="replace")
         while data:
-            # Nothing is written that would have to wait, as far as the kernel can tell beforehand.
-            if not select.select([], [self._fd], [], 0 if not self._closing else 0.1)[1]:
-                return
             data = data[os.write(self._fd, data) :]
 
 

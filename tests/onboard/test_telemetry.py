@@ -160,7 +160,7 @@ def test_files_are_bounded_and_each_can_be_read_alone(path):
     with FlightLog(path, header=HEADER, max_bytes=20_000, keep=2) as log:
         for k in range(1600):
             log.tick(tick(k))
-        log.event("x" * 10_000, y="z" * 10_000)
+        log.event("x" * 30_000, y="z" * 30_000)
     assert sorted(p.name for p in path.parent.iterdir()) == [
         "flight.log", "flight.log.1", "flight.log.2", "flight.log.old",
     ]  # fmt: skip
@@ -358,6 +358,20 @@ def test_a_long_failure_loses_the_oldest_and_marks_the_gap(path, monkeypatch):
     assert (found["ticks_not_logged"], found["missed"]) == (150, 0)
 
 
+def test_ticks_that_were_not_logged_are_not_missed(path, monkeypatch):
+    monkeypatch.setattr(telemetry, "QUEUE_TICKS", 50)
+    with FlightLog(path, header=HEADER, **LIMITS) as log:
+        log.tick(tick(0))
+        until(lambda: path.exists() and b",A,a," in path.read_bytes())
+        for k in range(1, 201):
+            log.tick(tick(k))
+    flight = read_log(path)
+    assert flight.ticks["frame"].tolist() == [0, *range(151, 201)]
+    assert [(e.text, e.t_s) for e in flight.events] == [(telemetry.MISSING, pytest.approx(151 / 30, abs=1e-3))]
+    found = flight.summary()
+    assert (found["ticks_not_logged"], found["missed"]) == (150, 0)
+
+
 def test_a_row_that_is_none_is_left_out(path, caplog):
     log = write(path, [tick(0), tick(1, throttle="full"), (1, 2), None, tick(4)])
     assert read_log(path).ticks["frame"].tolist() == [0, 4]
@@ -417,11 +431,17 @@ def test_a_logger_that_is_stuck_or_raises_does_not_matter(path, monkeypatch):
     monkeypatch.setattr(telemetry, "CLOSE_S", 0.5)
     logger, go_on = logging.getLogger("rover"), threading.Event()
 
+    said = []
+
     def fail(record):
+        said.append(record.getMessage())
         raise RuntimeError("a handler's fault")
 
     with handler_of(logger, fail), FlightLog(path, header=HEADER, **LIMITS) as log:
         log.event("one", level=logging.WARNING)
+        until(lambda: said == ["one"])
+        log.event("and another", level=logging.WARNING)
+    assert said == ["one", "and another"]
     with handler_of(logger, lambda record: go_on.wait(10)), FlightLog(path, header=HEADER, **LIMITS) as log:
         start = time.monotonic()
         for _ in range(1000):
@@ -431,7 +451,7 @@ def test_a_logger_that_is_stuck_or_raises_does_not_matter(path, monkeypatch):
         log.close()
         assert time.monotonic() - start < 2
         go_on.set()
-    assert [e.text for e in read_log(path, 0).events] == ["one"]
+    assert [e.text for e in read_log(path, 0).events] == ["one", "and another"]
     assert len(read_log(path).events) == telemetry.QUEUE_EVENTS
     assert len(read_log(path).ticks["t_s"]) == 1
 
