@@ -144,8 +144,8 @@ class Recorder:
         disk = os.statvfs(self.folder.parent)
         if (free := disk.f_bavail * disk.f_frsize) < needed:
             raise EpisodeError(
-                f"{self.folder.parent}: the disk is full ({free / 1e6:.0f} MB free, {needed / 1e6:.0f} are needed): "
-                "make room, or name a folder on another one"
+                f"{self.folder.parent}: the disk is as good as full ({free / 1e6:.1f} MB free, {needed / 1e6:.1f} are "
+                "kept in reserve): make room, or name a folder on another one"
             )
 
     def _run(self) -> None:

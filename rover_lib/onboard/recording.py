@@ -18,7 +18,6 @@ import math
 import os
 import shutil
 import stat
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from io import FileIO
@@ -298,7 +297,8 @@ class EpisodeWriter:
             for kind in columns:
                 f.write(f',\n  "{kind}_samples": [')
                 for i, row in enumerate(self._read_rows(kind, columns[kind])):
-                    f.write((",\n" if i else "\n") + textwrap.indent(json.dumps(row, indent=2), "    "))
+                    fields = json.dumps(row, separators=(",\n      ", ": "))[1:-1]
+                    f.write(f"{',' if i else ''}\n    {{\n      {fields}\n    }}")
                 f.write("\n  ]")
             f.write("\n}")
             _to_disk(f)
