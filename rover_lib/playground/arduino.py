@@ -9,6 +9,7 @@ import functools
 import os
 import pty
 import re
+import secrets
 import select
 import shutil
 import subprocess
@@ -146,9 +147,9 @@ class Arduino:
         Raises ArduinoError as build() does, and if the program does not start.
         """
         built = build()
-        self._folder = Path(tempfile.mkdtemp(prefix="rover-arduino-"))
-        self.port = str(self._folder / "port")
-        self._errors = (self._folder / "errors").open("w+b")
+        # A link that the program makes, and removes even where this process was killed.
+        self.port = str(Path(tempfile.gettempdir()) / f"rover-arduino-{secrets.token_hex(8)}")
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115, open as long as the process
         self._reading = threading.Lock()
         self._rest = b""
         log = "all" if every_pulse else "changes"
@@ -230,7 +231,7 @@ class Arduino:
         with self._reading:
             self._process.stdout.close()
         self._errors.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        Path(self.port).unlink(missing_ok=True)
 
     def _read(self) -> bytes:
         """b"" when it has ended; BlockingIOError while it has nothing to say."""

@@ -277,22 +277,25 @@ class TestFirmware:
         emulated.close()
         with pytest.raises(ArduinoError, match="was closed"):
             emulated.pulses()
-        assert not Path(emulated.port).parent.exists()
+        assert not os.path.lexists(emulated.port)
 
     def test_it_ends_with_its_parent(self):
         """Also where a sister that was forked keeps the pipe open."""
         program = (
             "import os, time; from rover_lib.playground.arduino import Arduino; board = Arduino()\n"
             "if os.fork() == 0: time.sleep(5); os._exit(0)\n"
-            "print(board.pid, flush=True); time.sleep(30)"
+            "print(board.pid, board.port, flush=True); time.sleep(30)"
         )
         parent = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, start_new_session=True)
         try:
-            pid = int(parent.stdout.readline())
+            pid, port = parent.stdout.readline().decode().split()
+            pid = int(pid)
             os.kill(pid, 0)
+            assert os.path.lexists(port)
             parent.kill()
             parent.wait()
             until(lambda: gone(pid), 2)
+            assert not os.path.lexists(port)
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(parent.pid, signal.SIGKILL)
