@@ -604,3 +604,24 @@ def test_a_status_that_raises_and_a_reader_that_leaves():
         status._thread.join(5)
         assert not status._thread.is_alive()
         status.say("nobody hears")
+
+
+def test_a_program_ends_though_its_terminal_is_stuck(tmp_path):
+    code = (
+        "import logging, sys, time\n"
+        "from rover_lib.onboard.telemetry import FlightLog, StatusLine\n"
+        "with StatusLine(lambda: 'x' * 3000, plain_every_s=0.001) as status:\n"
+        "    logging.getLogger('rover').addHandler(status.handler)\n"
+        f"    with FlightLog(sys.argv[1], header={{}}, **{LIMITS}) as log:\n"
+        "        for k in range(100):\n"
+        "            log.event('y' * 500, level=logging.WARNING)\n"
+        "        time.sleep(0.3)\n"
+        "        print('stuck', flush=True)\n"
+        "print('ended', time.monotonic(), flush=True)\n"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "flight.log")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"stuck\n"
+        start = time.monotonic()
+        assert process.wait(10) == 0  # nobody read its errors until now
+        assert time.monotonic() - start < 3
