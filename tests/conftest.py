@@ -64,7 +64,7 @@ def artifacts(tiny, calibration, tmp_path_factory) -> dict[str, Path]:
     return paths
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def demo_run() -> Path:
     """The folder of the demo's run, which `make test` makes before it calls pytest."""
     folder = Path(__file__).parents[1] / "runs" / "demo"

@@ -7,6 +7,7 @@ neutral, and what the Arduino says is known with the time at which it came.
 
 import contextlib
 import logging
+import os
 import re
 import termios
 import threading
@@ -32,7 +33,6 @@ HELLO_EVERY_S = 0.5
 REPEAT_S = 0.05
 ANSWER_S = 0.5
 STALE_S = 0.5  # the Arduino speaks every 20 ms
-WRITE_TIMEOUT_S = 0.01
 READ_TIMEOUT_S = 0.05
 
 # serial.SerialException is an OSError, termios.error is not; TypeError is pyserial's of a port just closed elsewhere.
@@ -222,9 +222,7 @@ class ServoLink:
         if self._serial:
             raise LinkError(f"{self.port}: the link is open already; close it first")
         try:
-            self._serial = serial.Serial(
-                self.port, BAUD, timeout=READ_TIMEOUT_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True
-            )
+            self._serial = serial.Serial(self.port, BAUD, timeout=READ_TIMEOUT_S, exclusive=True)
             self._serial.reset_input_buffer()  # what it said before this reset
         except (*PORT_ERRORS, ValueError) as error:
             self._release()
@@ -339,7 +337,7 @@ class ServoLink:
                     yield seen
 
     def send(self, steering_us: int, throttle_us: int) -> int:
-        """Sends two pulses, whole microseconds; returns the command's number. Waits at most 10 ms, for a full buffer.
+        """Sends two pulses, whole microseconds; returns the command's number. Waits for nothing.
 
         Raises LinkError for pulses outside the calibration's range, and if the port failed; nothing is sent then.
         """
@@ -406,16 +404,20 @@ class ServoLink:
             raise LinkError(f"{self.port}: the link is closed")
         try:
             with self._sending:
-                port.write(line)
-        except serial.SerialTimeoutException as error:
-            # What waits there is old by the time it gets through: the next command must be the newest.
-            with contextlib.suppress(*PORT_ERRORS):
-                port.reset_output_buffer()
-            raise LinkError(
-                f"{self.port}: the port took no data for {WRITE_TIMEOUT_S * 1e3:g} ms; the Arduino stops by itself"
-            ) from error
+                # Not pyserial's write: with a timeout it also gives up on a line that is wholly out, when this process
+                # had to wait for its turn meanwhile; without one it waits for ever. The port is non-blocking.
+                try:
+                    taken = os.write(port.fileno(), line)
+                except BlockingIOError:
+                    taken = 0
+                if taken == len(line):
+                    return
+                # What waits there is old by the time it gets through: the next command must be the newest.
+                with contextlib.suppress(*PORT_ERRORS):
+                    port.reset_output_buffer()
         except PORT_ERRORS as error:
             raise self._fail(f"{self.port}: writing failed ({error}); is it still plugged in?") from error
+        raise LinkError(f"{self.port}: the port took no data, its buffer is full; the Arduino stops by itself")
 
     def _fail(self, sentence: str) -> LinkError:
         with self._heard:
