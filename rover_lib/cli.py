@@ -401,8 +401,13 @@ def _drive(
         status = stack.enter_context(StatusLine(lambda: report.status, sys.stderr))
         logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status.handler], force=True)
         limits = {"max_bytes": int(p["flight_log"]["max_mb"] * 1e6), "keep": p["flight_log"]["keep"]}
-        log = stack.enter_context(FlightLog(log_file or d.default_log(), header=header, **limits))
+        path = log_file or d.default_log()
+        unended = d.unended(path)
+        log = stack.enter_context(FlightLog(path, header=header, **limits))
+        if unended:
+            log.event(unended, level=logging.WARNING)
         stack.enter_context(d.ended_by_signals(stop, log))
+        stack.enter_context(d.ended_if_hung(report, log))
         if in_world:
             from rover_lib.playground.car import VirtualCar
 
@@ -414,7 +419,7 @@ def _drive(
         if controls:
             limit = 1.0 if throttle_limit is None else throttle_limit
             with d.going_first(log):
-                d.drive(d.ReplayPilot(controls, throttle_limit=limit), link, **common)
+                d.drive(d.ReplayPilot(controls, throttle_limit=limit), link, watch=d.Troubles(report, link), **common)
             return
         frames = stack.enter_context(Camera(camera))
         how = {"threads": threads, "in_thread": in_thread, "latency_s": latency_ms / 1e3, "record": record}

@@ -45,6 +45,13 @@ SWITCH_S = 0.0005  # other threads give the interpreter back to the loop after a
 PRIORITY = 1  # the lowest of real time
 MOVING = 0.004  # throttle above which a car moves, and no two pictures are the same
 SLACK_S = 0.002  # a control of this much later is of the same tick: recordings have the ticks' rate, or close to it
+HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before
+LATE_FRAME_S = 0.2  # six frames of a camera
+LATE_COMMAND_MS = 5.0
+OFTEN = 5  # commands of a second that were sent again
+WAITED_S = 0.2  # of a second, for a processor
+CLOCK_SET_S = 1.0
+TAIL_BYTES = 1 << 16
 SETTLED_S = 60.0  # memory is watched from here on
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -103,6 +110,7 @@ class PolicyPilot:
         self._follower = Follower(settings, rate_hz)
         self._moving_s: float | None = None  # since when the car has been driving
         self._black_s: float | None = None  # since when the picture has been black
+        self._frame_age_s = self._asking_s = 0.0  # the most, since troubles()
 
     def ready(self, stop: threading.Event) -> None:
         end = time.monotonic() + FIRST_PLAN_S
@@ -114,6 +122,8 @@ class PolicyPilot:
         frame = self._camera.latest()
         if frame:
             self._watch(frame.captured_s, frame.repeats, frame.mean, now_s)
+            self._frame_age_s = max(self._frame_age_s, now_s - frame.captured_s)
+        self._asking_s = max(self._asking_s, self._planner.asking_s)
         plan = self._planner.newest()
         if plan is not None and plan is not self._follower.plan:
             self._follower.add(plan, now_s)
@@ -141,6 +151,15 @@ class PolicyPilot:
             self._moving_s = None
         elif self._moving_s is None:
             self._moving_s = at_s
+
+    def troubles(self) -> Iterator[str]:
+        """For drive's `watch`: of camera and policy, since it was asked last."""
+        age_s, asking_s, plan = self._frame_age_s, self._asking_s, self._follower.plan
+        self._frame_age_s = self._asking_s = 0.0
+        if age_s > LATE_FRAME_S:
+            yield f"no new frame for {age_s:.2f} s"
+        if plan and asking_s > LATE_FRAME_S + 1.5 * plan.latency_s:
+            yield f"the policy took {asking_s:.2f} s or more, for the plan before {plan.latency_s:.2f} s"
 
     def _watch(self, captured_s: float, repeats: int, mean: float, now_s: float) -> None:
         many, period_s = self._settings.frozen_frames, 1 / self._camera.wanted_hz
@@ -309,7 +328,7 @@ class _Loop:
     def neutral(self) -> str:
         """Stops the car; what there is to say about it."""
         if not self.link:
-            return ""
+            return "neutral: no motor was driven"
         try:
             return f"neutral: {self.link.neutral().why}"
         except LinkError as error:
@@ -502,6 +521,103 @@ def ended_by_signals(stop: threading.Event, log: FlightLog) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+@contextlib.contextmanager
+def ended_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
+    """Inside, this process ends (exit code 3) when its loop has begun, has not ended, and ticks no more.
+
+    Nobody else would end it, and camera, port and memory would stay taken. Counted in turns of its own, so that a
+    process that was stopped as a whole has its time to go on.
+    """
+
+    def look() -> None:
+        ticks, turns = 0, 0
+        while not done.wait(HUNG_S / 6):
+            turns = turns + 1 if ticks == report.ticks and not report.ended else 0
+            ticks = report.ticks
+            if ticks and turns >= 6:
+                text = f"the loop has not ticked for {HUNG_S:g} s; the Arduino has stopped the car, this program ends"
+                log.event(text, level=logging.ERROR)
+                log.close()
+                os._exit(3)
+
+    done = threading.Event()
+    threading.Thread(target=look, name="hung?", daemon=True).start()
+    try:
+        yield
+    finally:
+        done.set()
+
+
+def unended(log: Path | str) -> str | None:
+    """A sentence if the last drive in a flight log was armed, and never came to its end; to be asked before a new one.
+
+    A process that is killed, or has no power any more, cannot say so itself.
+    """
+    try:
+        with Path(log).open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
+            lines = file.read().splitlines()
+    except OSError:
+        return None
+    ticks = False
+    for line in reversed(lines):
+        if b'"event":"neutral' in line:
+            return None
+        if b'"event":"armed' in line:
+            ticks = True
+        elif b'"kind":"header"' not in line:
+            ticks |= line[:1].isdigit()
+            continue
+        break
+    return f"{log}: the drive before this one has no end: killed, or without power or disk" if ticks else None
+
+
+class Troubles:
+    """For drive's `watch`: what was out of the ordinary since it was asked last, a sentence for each.
+
+    link: None drives no motor. pids: of the policy.
+    """
+
+    def __init__(self, report: Report, link: ServoLink | None, pids: Iterable[int] = ()):
+        self._report, self._link, self._pids = report, link, tuple(pids)
+        self._ticks = 0
+        self._counted: tuple[int, ...] | None = None
+        self._waited_s = self._waited()
+        self._clock_s = time.time() - time.monotonic()
+
+    def __call__(self) -> Iterator[str]:
+        late_ms, self._ticks = max(self._report.late_ms[self._ticks :], default=0.0), len(self._report.late_ms)
+        if late_ms > LATE_COMMAND_MS:
+            yield f"commands were up to {late_ms:.1f} ms late"
+        with contextlib.suppress(LinkError):  # the next tick looks at it
+            if self._link and (telemetry := self._link.latest()):
+                yield from self._of_the_link(telemetry)
+        waited_s, before_s = self._waited(), self._waited_s
+        self._waited_s = waited_s
+        if waited_s is not None and before_s is not None and waited_s - before_s > WAITED_S:
+            yield f"the policy waited {waited_s - before_s:.2f} s for a processor: this machine is busy"
+        clock_s, before_s = time.time() - time.monotonic(), self._clock_s
+        self._clock_s = clock_s
+        if abs(clock_s - before_s) > CLOCK_SET_S:
+            yield f"the system's clock was set by {clock_s - before_s:+.0f} s; nothing that drives goes by it"
+
+    def _of_the_link(self, t: Telemetry) -> Iterator[str]:
+        counted = (self._report.resent, self._link.garbled, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
+        before, self._counted = self._counted or counted, counted
+        again, garbled, bad, old, beyond, lost = (now - then for now, then in zip(counted, before, strict=True))
+        if again > OFTEN or garbled or bad or old or beyond or lost:
+            yield (
+                f"the link: {again} commands were sent again, {garbled} lines came garbled; the Arduino had {bad} "
+                f"garbled, {old} old and {beyond} out of range, and lost {lost} bytes"
+            )
+
+    def _waited(self) -> float | None:
+        try:
+            return sum(int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) for pid in self._pids) / 1e9
+        except (OSError, ValueError, IndexError):
+            return None
+
+
 def artifact_watch(path: Path | str) -> Callable[[], Iterable[str]]:
     """For drive's `watch`: says once when the file that was loaded is another one, or gone."""
 
@@ -573,16 +689,19 @@ def drive_artifact(
                 record, camera, label=f"driven by {mode}", rate_hz=rate_hz, arduino_port=port, source="rover drive"
             )
             stack.callback(recorder.close)
+        report = ends.setdefault("report", Report())
+        pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz)
+        looks = (artifact_watch(artifact), pilot.troubles, Troubles(report, link, policy.pids))
         stack.enter_context(going_first(log))
         return drive(
-            PolicyPilot(camera, planner, commanded, settings, policy.rate_hz),
+            pilot,
             link,
             rate_hz=rate_hz,
             log=log,
             recorder=recorder,
             mode=mode,
             stop=stop,
-            watch=artifact_watch(artifact),
+            watch=lambda: (said for look in looks for said in look()),
             children=policy.pids,
             **ends,
         )
