@@ -463,7 +463,8 @@ def recording_in(out):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_an_episode_properly(tmp_path, arduino, pictures, number):
     out = tmp_path / "out"
-    run = rover_record(out, arduino, pictures, "--label", "to the left")
+    more = () if number == signal.SIGINT else ("--episodes", "2")  # they end all, and not one after the other
+    run = rover_record(out, arduino, pictures, "--label", "to the left", *more)
     until(lambda: recording_in(out), 20)
     run.send_signal(number)
     said, errors = run.communicate(timeout=20)

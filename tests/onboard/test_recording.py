@@ -409,9 +409,9 @@ def test_times_of_a_burst_are_the_arduinos(tmp_path):
     assert times_of(tmp_path, late + live) == pytest.approx(0.033 * np.arange(40), abs=1e-6)
 
 
-@pytest.mark.parametrize("hour_s", [3600, -3600])
-def test_times_over_a_clock_that_was_set_are_the_arduinos(tmp_path, hour_s):
-    rows = [row_of(1.76e9 + 0.033 * i + (hour_s if i > 5 else 0), 33 * i) for i in range(12)]
+@pytest.mark.parametrize("by_s", [3600, -3600, -0.2])
+def test_times_over_a_clock_that_was_set_are_the_arduinos(tmp_path, by_s):
+    rows = [row_of(1.76e9 + 0.033 * i + (by_s if i > 5 else 0), 33 * i) for i in range(12)]
     assert times_of(tmp_path, rows) == pytest.approx(0.033 * np.arange(12), abs=1e-6)
 
 
@@ -429,7 +429,17 @@ def test_a_hole_of_unmeasured_controls_is_a_long_step(tmp_path):
     assert controls.times_s == pytest.approx([0.033 * i for i in (0, 1, 2, 9, 10, 11)], abs=1e-6)
 
 
-def test_controls_of_a_real_recording(tmp_path):
+def test_what_no_recorder_measured_is_left_out(tmp_path):
+    rows = [row_of(1.76e9 + 0.033 * i, 33 * i) for i in range(4)]
+    rows[1]["throttle_measured"] = False  # whatever the values say
+    rows[2]["steering_raw_us"] = 1500.5
+    (tmp_path / "episode_data.json").write_text(json.dumps({"control_samples": rows}))
+    controls = read_controls(tmp_path)
+    assert controls.left_out == 2
+    assert controls.times_s == pytest.approx([0, 0.099], abs=1e-6)
+
+
+def test_controls_of_a_real_recording():
     folder = real_episode()
     rows = json.loads((folder / "episode_data.json").read_text())["control_samples"]
     measured = [r for r in rows if r["throttle_raw_us"] and 762 < r["throttle_period_us"] < 1270]
