@@ -25,7 +25,7 @@ STATES = {
 }
 NOW_BITS = sum(1 << bit for bit in THROTTLED_BITS)  # of get_throttled; the others are since the machine's start
 EVENTS_LISTED = 14
-LABEL_SHARE = 0.025  # of the width: events that are closer share one label
+LABEL_SHARE = 0.05  # of the width: events that are closer share one label
 TEXT_LENGTH = 105
 DIGIT_SPACE = "\u2007"  # as wide as a digit
 
@@ -41,6 +41,8 @@ def flight_figure(flight: Flight) -> Figure:
     t_s, calibration = ticks["t_s"], PwmCalibration()
     times_s = [t_s, flight.machine["t_s"], np.array([e.t_s for e in flight.events])]
     end_s = max((float(t.max()) for t in times_s if len(t)), default=1.0) or 1.0
+    start_s = float(t_s[0]) if len(t_s) else 0.0  # what was made ready before is listed, not drawn
+    start_s = max(0.0, start_s - 0.02 * (end_s - start_s))
 
     _who(panel["who"], ticks, (flight.period_ms or 0) / 1000)
     _pulses(panel["steering"], calibration.steering, ticks, BLUE)
@@ -60,8 +62,8 @@ def flight_figure(flight: Flight) -> Figure:
             ax.grid(axis="y", color="#EEEEEE", lw=0.8)
             ax.set_axisbelow(True)
             _legend_above(ax)
-    _event_numbers(panel["who"], listed, end_s)
-    axes[-1, 0].set_xlim(0, end_s)
+    _event_numbers(panel["who"], [(n, e) for n, e in listed if e.t_s >= start_s], end_s - start_s)
+    axes[-1, 0].set_xlim(start_s, end_s)
     axes[-1, 0].set_xlabel("time since the start (s)", fontsize=10)
     fig.align_ylabels(axes[:, 0])
     fig.suptitle(_title(flight, summary), fontsize=11)
@@ -160,11 +162,11 @@ def _temperature(ax: Axes, machine: Mapping[str, Any], summary: Mapping[str, Any
     ax.set_ylabel("processor\n(°C)", fontsize=10)
 
 
-def _event_numbers(ax: Axes, events: Sequence[tuple[int, Event]], end_s: float) -> None:
+def _event_numbers(ax: Axes, events: Sequence[tuple[int, Event]], seconds: float) -> None:
     """The events' numbers over their lines; neighbours share one label."""
     groups: list[list[tuple[int, Event]]] = []
     for number, event in events:
-        if groups and event.t_s - groups[-1][0][1].t_s < LABEL_SHARE * end_s:
+        if groups and event.t_s - groups[-1][0][1].t_s < LABEL_SHARE * seconds:
             groups[-1].append((number, event))
         else:
             groups.append([(number, event)])

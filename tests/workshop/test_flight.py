@@ -100,6 +100,17 @@ def test_nothing_is_cut_off(path):
     assert [t.get_text() for t in figure.axes[0].texts] == ["27-40"]
 
 
+def test_getting_ready_is_listed_but_not_drawn(path):
+    with FlightLog(path, header={"hz": 30}, max_bytes=1_000_000, keep=1) as log:
+        log.event("the policy is loaded")
+        for k in range(60):
+            log.tick(Tick(100 + k / 30, 0.2, "A", "a", 0, 0, 1456, 120, 1456, 120, 0, None, None, 1, k))
+    figure = flight_figure(read_log(path))
+    assert figure.axes[0].get_xlim() == pytest.approx((100 - 0.02 * 59 / 30, 100 + 59 / 30), abs=1e-3)
+    assert not figure.axes[0].texts
+    assert "the policy is loaded" in figure._supxlabel.get_text()
+
+
 @pytest.mark.parametrize("seconds", [0.0, 0.03, 0.5])
 def test_a_short_or_poor_log_is_drawn_too(path, seconds):
     figure = flight_figure(fly(path, seconds=seconds, events=0, header={}))
