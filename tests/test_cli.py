@@ -24,6 +24,8 @@ def rover(*args):
         ["benchmark"],
         ["arm"],
         ["leave-out"],
+        ["log"],
+        ["doctor"],
         ["world"],
         ["world", "record"],
         ["world", "train"],
