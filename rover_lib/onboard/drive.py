@@ -45,6 +45,7 @@ SWITCH_S = 0.0005  # other threads give the interpreter back to the loop after a
 PRIORITY = 1  # the lowest of real time
 MOVING = 0.004  # throttle above which a car moves, and no two pictures are the same
 SLACK_S = 0.002  # a control of this much later is of the same tick: recordings have the ticks' rate, or close to it
+HOLE_S = 0.3  # a recording without a measured pulse for so long does not go on driving
 HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before
 LATE_FRAME_S = 0.2  # six frames of a camera
 LATE_COMMAND_MS = 5.0
@@ -200,6 +201,8 @@ class ReplayPilot:
         if i >= len(self._times) - 1 and now_s - self._start_s > self._times[-1] + 1 / RATES_HZ[0]:
             return None
         steering_us, throttle_us = int(self._steering[max(i, 0)]), int(self._throttle[max(i, 0)])
+        if now_s - self._start_s - self._times[max(i, 0)] > HOLE_S:  # nobody knows what the human did meanwhile
+            throttle_us = self._calibration.throttle.neutral_us
         actions = self._calibration.actions_from_pulses(steering_us, throttle_us)
         return Order(actions.steering or 0.0, actions.throttle or 0.0, steering_us, throttle_us)
 
@@ -688,7 +691,8 @@ def drive_artifact(
             recorder = Recorder(
                 record, camera, label=f"driven by {mode}", rate_hz=rate_hz, arduino_port=port, source="rover drive"
             )
-            stack.callback(recorder.close)
+            stack.callback(lambda: log.event(f"recorded: {recorder.path or recorder.failure}"))
+            stack.enter_context(recorder)  # notes in the episode what ended the drive
         report = ends.setdefault("report", Report())
         pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz)
         looks = (artifact_watch(artifact), pilot.troubles, Troubles(report, link, policy.pids))

@@ -426,6 +426,15 @@ def test_a_replay_keeps_to_what_a_servo_may_get(link, clock):
     assert {t for _, t in link.drives} == {120, c.throttle.pulse_us(0.1)}
 
 
+def test_a_replay_stops_in_a_hole_of_the_recording(link, clock):
+    go(ReplayPilot(controls([0, 0.1, 1.0, 1.1], [1500] * 4, [200, 204, 208, 212])), link, clock)
+    throttle = [t for _, t in link.drives]
+    assert throttle.count(120) == pytest.approx(0.6 / PERIOD, abs=1)
+    assert throttle.index(120) * PERIOD == pytest.approx(0.4, abs=PERIOD)
+    assert throttle[-3:] == [212] * 3
+    assert {s for s, _ in link.drives} == {1500}
+
+
 # ---- signals, files, memory
 
 
