@@ -5,7 +5,7 @@ ROVER := $(VENV)/bin/rover
 READY := $(VENV)/.ready
 NAME ?= mine
 
-.PHONY: help demo run test lint lab arm firmware flash notebooks clean
+.PHONY: help demo run test lint lab arm faults firmware flash notebooks clean
 
 help:
 	@echo "make demo                                   record, train, quantize, compare and benchmark in the balloon world"
@@ -13,6 +13,7 @@ help:
 	@echo "make test                                   lint, unit, parity, notebook tests and one whole run"
 	@echo "make arm NAME=demo [PEERS=1]                count a run's instructions on an emulated Cortex-A76;"
 	@echo "                                            NAME=full makes a policy of the real car's size, PEERS=1 adds other runtimes"
+	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino: about 6 minutes"
 	@echo "make firmware; make flash PORT=/dev/ttyUSB0  build the Arduino's firmware, and put it on the board"
 	@echo "make lab                                    JupyterLab on the notebooks"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count, into the committed notebooks"
@@ -46,6 +47,9 @@ test: lint demo
 arm: $(READY)
 	@test '$(NAME)' != full -o -f runs/full/quantize.json || { echo $(ROVER) world full runs/full; $(ROVER) world full runs/full; }
 	$(ROVER) arm 'runs/$(NAME)' $(if $(PEERS),--peers) $(if $(filter full,$(NAME)),--details)
+
+faults: $(READY)
+	$(ROVER) faults runs/faults.json
 
 firmware:
 	$(MAKE) -C firmware

@@ -517,6 +517,27 @@ def doctor(ctx: click.Context, artifact: Path | None, camera: str, port: str, hz
     ctx.exit(1 if failed else 0)
 
 
+@main.command()
+@click.argument("output", type=FILE, required=False)
+@click.option("--only", metavar="NAME", multiple=True, help="Only this row, 'fuzz' or 'bytes'; several times for more.")
+@click.pass_context
+def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...]) -> None:
+    """Break what can break while the car drives, and see on the pins of an emulated Arduino whether it stops.
+
+    About 6 minutes for all. With OUTPUT, the rows are left there as JSON. Exit code 1 if anything is not as expected.
+    Needs Debian's packages for the Arduino's firmware and simavr, see README.
+    """
+    from rover_lib.playground.faults import run_faults
+
+    outcome = run_faults(only, say=click.echo)
+    if output:
+        outcome.write(output)
+    show(outcome.summary, False)
+    for sentence in outcome.wrong:
+        click.echo(f"rover: {sentence}", err=True)
+    ctx.exit(1 if outcome.wrong else 0)
+
+
 @main.command("leave-out")
 @click.argument("run_dir", type=FILE)
 @click.option("--frames", type=click.IntRange(min=1), default=100, show_default=True, help="Held-out frames.")

@@ -36,8 +36,8 @@ import threading
 import time
 import tty
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,13 +49,15 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.servo_link import frame
+from rover_lib.onboard.stage import write_stage
 from rover_lib.onboard.telemetry import LogError, read_log
-from rover_lib.playground.arduino import CC, REST_US, Arduino, PinEvent, call
+from rover_lib.playground.arduino import CC, REPOSITORY, REST_US, Arduino, PinEvent, build, call
 from rover_lib.playground.car import EMULATOR_NICE, CameraFeed
 
 STOPPED, HUMAN, CONTINUES = "stopped", "human", "continues"
 NEUTRAL_US = {"steering": 1456, "throttle": 120}
 PERIOD_US = {"steering": 21316, "throttle": 1016}
+TICK_US = {"steering": 0.5, "throttle": 4.0}  # of the pin's timer: all that its hardware can do
 EDGE_US = 0.5  # an edge in simavr is known to 0.25 us
 STEP_US = ARDUINO_STEP_US + EDGE_US  # of a pulse that the Arduino measured and made again
 COMMAND_US = {"steering": 1.0, "throttle": 2.5}  # half a step of its timer, and an edge
@@ -71,7 +73,7 @@ CHUNK, RATE_HZ = 32, 30.0
 PLAN, OTHER_PLAN = (0.2, 0.15), (-0.3, 0.08)  # steering, throttle
 DISK_BYTES = 512 * 1024
 FUZZ_LINES = 1_000_000
-PRIORITY = -10  # of the cable and the camera: real ones do not wait for this machine
+PRIORITY = 2  # of real time, before rover drive: a real Arduino and a real cable do not wait for this machine
 
 # What the picture's corner tells the policy: its red, green and blue are on or off.
 PLAIN, RAISE, HANG, NAN, BEYOND, SLOW, OTHER = range(7)
@@ -94,6 +96,11 @@ class Gates:
     rows: int
     stopped_rows: int
     bytes_us: float
+
+    @classmethod
+    def of_params(cls) -> "Gates":
+        """Those of params.yml."""
+        return cls(**params()["faults"])
 
     @property
     def stopped_s(self) -> float:
@@ -198,6 +205,8 @@ def _not_human(seen: Seen, gates: Gates, figures: dict[str, Any], human_us: tupl
 
 
 def _not_continued(seen: Seen, gates: Gates, figures: dict[str, Any], until_limit: bool) -> Iterator[str]:
+    if until_limit:
+        yield from _not_limited(seen, gates, figures)
     stopped_s = seen.at_s + figures["stopped_after_ms"] / 1e3 + 1e-4 if until_limit else seen.end_s
     if not until_limit:
         figures["stopped_after_ms"] = None
@@ -214,10 +223,10 @@ def _not_continued(seen: Seen, gates: Gates, figures: dict[str, Any], until_limi
                       f"was not commanded ({sorted(set(recent))})"  # fmt: skip
                 return
     if until_limit:
-        yield from _not_limited(seen, gates, figures)
-    elif not any(c.at_s > seen.end_s - LAST_S for c in seen.commands):
+        return
+    if not any(c.at_s > seen.end_s - LAST_S for c in seen.commands):
         yield "no commands any more at the end"
-    elif min((e.pulse_us for e in seen.pulses("throttle")), default=0) <= gates.throttle_max_us:
+    if min((e.pulse_us for e in seen.pulses("throttle")), default=0) <= gates.throttle_max_us:
         yield "the throttle went off"
 
 
@@ -384,8 +393,7 @@ class Cable:
         self._injected.append(data)
 
     def _run(self) -> None:
-        with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), PRIORITY)
+        _go_first(threading.get_native_id())
         poller, arduino = select.poll(), -1
         poller.register(self._master, select.POLLIN)
         while not self._closing.is_set():
@@ -422,6 +430,11 @@ class Cable:
             self.lines.append(line + b"\n")
             if (found := _DRIVE.fullmatch(line)) and frame(line.split(b"*")[0].decode()) == line + b"\n":
                 self.commands.append(Command(now, int(found[1]), int(found[2])))
+
+
+def _go_first(pid: int) -> None:
+    with contextlib.suppress(OSError):  # this user may not: then rows are repeated now and then
+        os.sched_setscheduler(pid, os.SCHED_RR, os.sched_param(PRIORITY))
 
 
 def _read(fd: int) -> bytes:
@@ -502,38 +515,23 @@ time_t time(time_t *t) {
 # ---- the bench
 
 
-class Drive:
-    """A `rover drive` process."""
+class Process:
+    """A `rover` command. arguments: its own. run: how it is started, `rover` itself if empty. env: more of that."""
 
-    def __init__(self, bench: "Bench", start: str):
-        """start: one of INSIDE; 'clock', bench.step_clock sets its clock; 'disk', its log is on bench.disk; '' none."""
-        self.start = start
-        self.log = bench.disk / "flight.log" if start == "disk" else bench.folder / "flight.log"
+    def __init__(
+        self, bench: "Bench", arguments: Sequence[Any], run: Sequence[str] = (), env: dict[str, str] | None = None
+    ):
         self._errors = (bench.folder / "errors").open("w+b")
-        run = [sys.executable, "-m", "rover_lib.cli"]
-        if start in INSIDE:
-            code = f"from {__name__} import on_signal; on_signal({start!r}); from rover_lib.cli import main; main()"
-            run = [sys.executable, "-c", code]
-        what = [*run, "drive", bench.artifact, "--camera", bench.camera, "--port", bench.cable.port, "--hz", RATE_HZ]
-        clock = {"LD_PRELOAD": str(bench.clock_library()), "CLOCK_STEP": str(bench.clock)} if start == "clock" else {}
+        run = run or (sys.executable, "-m", "rover_lib.cli")
         self.process = subprocess.Popen(
-            list(map(str, [*what, "--threads", 1, "--log", self.log])),
+            [*run, *map(str, arguments)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._errors,
-            env=os.environ | clock,
+            env=os.environ | (env or {}),
             start_new_session=True,
         )
         self.pid = self.process.pid
-
-    def children(self) -> list[int]:
-        """Its processes: the policy's."""
-        found = []
-        for status in Path("/proc").glob("[0-9]*/stat"):
-            with contextlib.suppress(OSError):
-                if int(status.read_text().rpartition(")")[2].split()[1]) == self.pid:
-                    found.append(int(status.parent.name))
-        return found
 
     @property
     def running(self) -> bool:
@@ -546,6 +544,14 @@ class Drive:
         except subprocess.TimeoutExpired:
             return None
 
+    def until(self, says: str) -> None:
+        """Waits until it says that on stderr. Raises FaultError if that does not come."""
+        end = time.monotonic() + START_S
+        while not any(says in line for line in self.stderr()):
+            if not self.running or time.monotonic() > end:
+                raise FaultError(f"{self.process.args[3:5]} did not say {says!r} but {self.stderr()[-2:]}; try by hand")
+            time.sleep(0.02)
+
     def end(self) -> None:
         """SIGTERM, and if that does not help, SIGKILL."""
         if self.running:
@@ -557,18 +563,52 @@ class Drive:
                 self.process.wait()
         self._errors.close()
 
+    def stderr(self) -> list[str]:
+        """The lines of its stderr."""
+        return Path(self._errors.name).read_text(errors="replace").splitlines()
+
+
+class Drive(Process):
+    """`rover drive` with the bench's artifact, camera and cable.
+
+    start: one of INSIDE; 'clock', bench.step_clock sets its clock; 'disk', its log is on bench.disk; '' none of them.
+    """
+
+    def __init__(self, bench: "Bench", start: str):
+        self.start = start
+        self._marked = 0
+        self.log = bench.disk / "flight.log" if start == "disk" else bench.folder / "flight.log"
+        run, env = [], {}
+        if start in INSIDE:
+            code = f"from {__name__} import on_signal; on_signal({start!r}); from rover_lib.cli import main; main()"
+            run = [sys.executable, "-c", code]
+        if start == "clock":
+            env = {"LD_PRELOAD": str(bench.clock_library()), "CLOCK_STEP": str(bench.clock)}
+        devices = ["--camera", bench.camera, "--port", bench.cable.port]
+        options = ["--hz", RATE_HZ, "--threads", 1, "--log", self.log]
+        super().__init__(bench, ["drive", bench.artifact, *devices, *options], run, env)
+
+    def children(self) -> list[int]:
+        """Its processes: the policy's."""
+        found = []
+        for status in Path("/proc").glob("[0-9]*/stat"):
+            with contextlib.suppress(OSError):
+                if int(status.read_text().rpartition(")")[2].split()[1]) == self.pid:
+                    found.append(int(status.parent.name))
+        return found
+
     def said(self, since_s: float | None = None) -> list[str]:
-        """What it says in its flight log since a time, [default: since its start], and then on stderr at any time."""
+        """What it says since a time [default: its start], in its flight log and then on stderr, as far as marked."""
         events = []
         with contextlib.suppress(LogError):
             flight = read_log(self.log)
             start_s = flight.header.get("start_monotonic_s", 0.0)
             events = [str(e) for e in flight.events if since_s is None or start_s + e.t_s >= since_s]
-        return events + self.stderr()
+        return events + self.stderr()[0 if since_s is None else self._marked :]
 
-    def stderr(self) -> list[str]:
-        """The lines of its stderr."""
-        return Path(self._errors.name).read_text(errors="replace").splitlines()
+    def mark(self) -> None:
+        """What it said on stderr until now is from before the fault."""
+        self._marked = len(self.stderr())
 
 
 class Bench:
@@ -593,6 +633,7 @@ class Bench:
         self.drive: Drive | None = None
         try:
             self.arduino = self._stack.enter_context(Arduino(transmitter=REST_US, nice=EMULATOR_NICE))
+            _go_first(self.arduino.pid)
             self.cable = Cable(self.arduino.port)
             self.feed = CameraFeed(self.camera, *self._pictures[PLAIN])
         except BaseException:
@@ -629,24 +670,33 @@ class Bench:
             self.wait(AT_SPEED_S)
         return self.drive
 
+    def calm(self) -> None:
+        """No more faults, as far as a drive that goes on notices."""
+        self.undo.close()
+        self.cable.to_arduino = self.cable.to_host = None
+        self.feed.late_s = 0.0
+        self.show(PLAIN)
+        self.arduino.transmitter(*REST_US)
+
     def restart(self, start: str = "") -> None:
         """A new drive, from the start until it has been driving for a while."""
         self.end_drive()
         self.repair()
         self.drive = Drive(self, start)
-        begin, self.events, moving_s = time.monotonic(), [], None
+        begin, moving_s = time.monotonic(), None
         while moving_s is None or time.monotonic() - moving_s < AT_SPEED_S:
             self.wait(0.02)
-            if moving_s is None:
-                moving_s = next((e.end_s for e in self.events if e.pin == "throttle" and e.pulse_us > 124), None)
+            if moving_s is None and self.cable.commands:
+                first_s = self.cable.commands[0].at_s
+                pulses = (e for e in self.events[-2000:] if e.pin == "throttle" and e.monotonic_s > first_s)
+                moving_s = next((e.end_s for e in pulses if e.pulse_us > 124), None)
             if not self.drive.running or time.monotonic() - begin > START_S:
                 said = " | ".join(self.drive.stderr()[-3:])
                 raise FaultError(f"rover drive did not start within {START_S:g} s (it said: {said}); drive it by hand")
 
     def repair(self) -> None:
         """Whatever was broken is as before."""
-        self.undo.close()
-        self.arduino.transmitter(*REST_US)
+        self.calm()
         self.feed.close()
         self.feed = CameraFeed(self.camera, *self._pictures[PLAIN])
         self.cable.unplug()
@@ -661,19 +711,21 @@ class Bench:
         self.drive.process.send_signal(number)
 
     def step_clock(self, seconds: int) -> None:
-        """Steps the system's clock as a drive that was started with 'clock' sees it."""
+        """Steps the system's clock, as a drive that was started with 'clock' sees it."""
         with self.clock.open("r+b") as file, mmap.mmap(file.fileno(), 8) as step:
-            struct.pack_into("q", step, 0, seconds)
+            struct.pack_into("q", step, 0, struct.unpack_from("q", step)[0] + seconds)
 
     def _make_disk(self) -> Callable[[], object]:
         """A small disk of its own at `disk`, where that is allowed; how to get rid of it."""
         mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(self.disk)]
-        self.own_disk = os.geteuid() == 0 and subprocess.run(mount, capture_output=True).returncode == 0
-        return lambda: self.own_disk and subprocess.run(["umount", "--lazy", self.disk], check=True)
+        own = os.geteuid() == 0 and subprocess.run(mount, capture_output=True).returncode == 0
+        self.disk_is = "a small tmpfs is filled" if own else "RLIMIT_FSIZE by prlimit, as this user may mount no disk"
+        self._own_disk = own
+        return lambda: own and subprocess.run(["umount", "--lazy", self.disk], check=True)
 
     def fill_disk(self) -> None:
         """Until undone, rover drive can write no more to its files on `disk`."""
-        if self.own_disk:
+        if self._own_disk:
             filling = self.disk / "filling"
             self.undo.callback(filling.unlink)
             with filling.open("wb", buffering=0) as file, contextlib.suppress(OSError):
@@ -1002,7 +1054,7 @@ def _intrude(bench: Bench) -> float:
 @_fault(
     "CPU starved",
     CONTINUES,
-    "for a processor|late",
+    "this machine is busy",
     "4 busy processes of ordinary priority",
     watch_s=3.0,
     limits="as 'inference hangs', when the policy gets so little that plans become too old",
@@ -1019,7 +1071,7 @@ def _starve(bench: Bench) -> None:
     "disk full while logging",
     CONTINUES,
     "the flight log cannot be written",
-    "see disk",
+    "",
     start="disk",
     watch_s=2.0,
     limits="none: it drives without a log, and says so once",
@@ -1032,7 +1084,7 @@ for hours in (1, -1):
     _fault(
         f"clock stepped by {hours:+d} h",
         CONTINUES,
-        "the system's clock was set",
+        re.escape(f"the system's clock was set by {hours * 3600:+d} s"),
         "a library under rover drive shifts the system's time; the machine's is left alone",
         start="clock",
         watch_s=1.6,
@@ -1083,11 +1135,17 @@ def _no_frames(bench: Bench) -> None:
 
 
 def run_fault(bench: Bench, fault: Fault, gates: Gates) -> dict[str, Any]:
-    """Injects a fault and judges it; a row of metrics.faults. What only the next start tells is filled in by then."""
-    for attempt in range(1, TRIES + 1):
-        drive = bench.at_speed(fault.start)
+    """Injects a fault into the drive that is at speed and judges it; a row of metrics.faults.
+
+    Its `recovered`, and its `log_line` if that comes later, are None where the next start of a drive tells them.
+    """
+    attempts = 0
+    while True:
+        attempts += 1
+        drive = bench.drive
         bench.rng.seed(fault.name)
         bench.events = bench.events[-2000:]
+        drive.mark()
         called_s = time.monotonic()
         at_s = fault.inject(bench) or called_s
         bench.wait(fault.watch_s)
@@ -1095,34 +1153,35 @@ def run_fault(bench: Bench, fault: Fault, gates: Gates) -> dict[str, Any]:
         bench.wait(0.05)  # a pulse is known when it ends
         commands = [c for c in bench.cable.commands if at_s - 1 < c.at_s <= end_s]
         seen = Seen(bench.events, commands, at_s, end_s)
-        code = drive.wait(END_S) if fault.exit_code is not None else drive.process.poll()
-        said = _find(fault.says, drive, at_s)
-        if (stalled_ms := seen.stalled_ms()) == 0:
+        code = drive.process.poll() if fault.exit_code is None else drive.wait(END_S)
+        said = None if fault.later else _find(fault.says, drive, at_s)
+        bench.calm()
+        if not (stalled_ms := seen.stalled_ms()) or attempts == TRIES:
             break
-        bench.restart(fault.start)
-    bench.undo.close()
+        bench.at_speed(fault.start)
     verdict = judge(fault.expected, seen, gates, human_us=fault.human_us, until_limit=fault.until_limit)
     if code != fault.exit_code:
         verdict.wrong.append(f"rover drive ended with {code}, expected {fault.exit_code}")
-    row = {
+    limits = fault.limits
+    if fault.until_limit:
+        fades, stops = verdict.figures["fades_after_ms"], verdict.figures["stopped_after_ms"]
+        limits = f"the plan's age: the throttle fades from {fades} ms on, is off at {stops} ms, and drive ends"
+    return {
         "fault": fault.name,
         "expected": fault.expected,
         **verdict.figures,
-        "recovered": None,
+        "recovered": not verdict.wrong if fault.exit_code is None else None,
         "log_line": said,
         "exit_code": code,
-        "injected": fault.how,
-        "limits": fault.limits,
-        "attempts": attempt,
+        "injected": fault.how if fault.start != "disk" else bench.disk_is,
+        "limits": limits,
+        "attempts": attempts,
         "stalled_ms": round(stalled_ms, 1),
         "wrong": verdict.wrong,
     }
-    if fault.expected == CONTINUES and not fault.until_limit:
-        row["recovered"] = drive.running and not verdict.wrong
-    return row
 
 
-def _find(says: str, drive: Drive, since_s: float | None, within_s: float = 1.5) -> str | None:
+def _find(says: str, drive: Drive, since_s: float | None = None, within_s: float = 1.5) -> str | None:
     """The first line that says so."""
     end = time.monotonic() + within_s
     while True:
@@ -1132,3 +1191,208 @@ def _find(says: str, drive: Drive, since_s: float | None, within_s: float = 1.5)
         if time.monotonic() > end:
             return None
         time.sleep(0.1)
+
+
+def fuzz(lines: int = FUZZ_LINES, seed: int = 1) -> dict[str, Any]:
+    """Random and mutated lines into the firmware's parser and state machine, natively: tests/firmware/fuzz.c.
+
+    unsafe_pulses: 0 or 1, it ends at the first.
+    """
+    firmware = REPOSITORY / "firmware" / "rover"
+    sources = REPOSITORY / "tests" / "firmware" / "fuzz.c", firmware / "protocol.c", firmware / "vehicle.c"
+    with tempfile.TemporaryDirectory(prefix="rover-fuzz-") as folder:
+        program = Path(folder) / "fuzz"
+        call(*CC, "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-I", firmware, "-o", program, *sources)
+        done = subprocess.run([program, str(lines), str(seed)], capture_output=True, text=True)
+    said = (done.stdout + done.stderr).strip()
+    return {"lines": lines, "seed": seed, "unsafe_pulses": int(done.returncode != 0), "said": said}
+
+
+def transmitted_and_replayed(bench: Bench, steps: int = 24, step_s: float = 0.2) -> dict[str, Any]:
+    """A transmitter's pulses, recorded by `rover record` and replayed by `rover drive --replay`, on the pins.
+
+    worst_us: of all pulses of the replay, against what was transmitted in their place; None if that is another
+    sequence. worst_ms: how far a step of the replay began from its time.
+    """
+    rng = random.Random(0)
+    sent = [REST_US]
+    while len(sent) < steps - 1:
+        pulses = float(rng.randint(1008, 1948)), float(rng.randint(140, 700))
+        if all(abs(a - b) > 40 for a, b in zip(pulses, sent[-1], strict=True)):
+            sent.append(pulses)
+    sent.append(REST_US)
+    bench.end_drive()
+    bench.repair()
+    folder = bench.folder / "episodes"
+    record = Process(bench, ["record", folder, "--camera", bench.camera, "--port", bench.cable.port])
+    try:
+        record.until("recording")
+        times_s = []
+        for pulses in sent:
+            times_s.append(time.monotonic())
+            bench.arduino.transmitter(*pulses)
+            bench.wait(step_s)
+        record.process.send_signal(signal.SIGINT)
+        if record.wait(START_S) != 0:
+            raise FaultError(
+                f"rover record ended with {record.process.poll()} ({record.stderr()[-2:]}); try it by hand"
+            )
+    finally:
+        record.end()
+    bench.wait(0.1)
+    bench.events = []
+    replay = Process(bench, ["drive", "--replay", next(folder.glob("episode_*")), "--port", bench.cable.port])
+    try:
+        end = time.monotonic() + START_S + steps * step_s
+        while replay.running and time.monotonic() < end:
+            bench.wait(0.1)
+        bench.wait(0.2)
+        since_s = bench.cable.commands[0].at_s + 2 * PERIOD_US["steering"] * 1e-6  # before, it is the transmitter's
+        if replay.wait(0) != 0:
+            raise FaultError(f"rover drive --replay ended with {replay.process.poll()} ({replay.stderr()[-2:]})")
+    finally:
+        replay.end()
+    return compare_steps([e for e in bench.events if e.monotonic_s > since_s], sent, times_s)
+
+
+def compare_steps(
+    events: Sequence[PinEvent], sent: Sequence[tuple[float, float]], times_s: Sequence[float]
+) -> dict[str, Any]:
+    """Steps of pulses (steering, throttle; us) that were sent at times, against those on the pins; see above."""
+    result: dict[str, Any] = {"steps": len(sent), "worst_us": 0.0, "worst_ms": 0.0, "pulses": 0}
+    for i, pin in enumerate(PERIOD_US):
+        found = [e for e in events if e.pin == pin and e.kind == "pulse"]
+        runs: list[list[PinEvent]] = []
+        for e in found:
+            if not runs or abs(e.pulse_us - runs[-1][0].pulse_us) > 2 * STEP_US:
+                runs.append([])
+            runs[-1].append(e)
+        result[f"{pin}_steps"] = len(runs)
+        if len(runs) != len(sent):
+            return result | {"worst_us": None}
+        for run, pulses in zip(runs, sent, strict=True):
+            # A pin does whole ticks; what simavr adds to an edge is its granularity, not the chip's.
+            widths = {TICK_US[pin] * round(e.pulse_us / TICK_US[pin]) for e in run}
+            result["worst_us"] = max(result["worst_us"], *(abs(us - pulses[i]) for us in widths))
+            result["pulses"] += len(run)
+        begun = np.array([run[0].monotonic_s for run in runs[1:]]) - np.array(times_s[1:])
+        result["worst_ms"] = max(result["worst_ms"], round(float(np.abs(begun - np.median(begun)).max()) * 1e3, 1))
+    return result
+
+
+@dataclass
+class Outcome:
+    """What a run found: the rows, the fuzz and the bytes (None: left out), and all that is not as expected."""
+
+    gates: Gates
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    fuzz: dict[str, Any] | None = None
+    bytes: dict[str, Any] | None = None
+    wrong: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """rows, stopped_rows, as_expected, worst_stopped_after_ms, takeover_ms, repeated, seconds."""
+        stopped = [r for r in self.rows if r["expected"] == STOPPED]
+        takeovers = [r["takeover_ms"] for r in self.rows if r.get("takeover_ms") is not None]
+        return {
+            "rows": len(self.rows),
+            "stopped_rows": len(stopped),
+            "as_expected": sum(not r["wrong"] for r in self.rows),
+            "worst_stopped_after_ms": max((r["stopped_after_ms"] for r in stopped), default=None),
+            "takeover_ms": max(takeovers, default=None),
+            "repeated": sum(r["attempts"] > 1 for r in self.rows),
+            "seconds": round(self.seconds, 1),
+        }
+
+    def write(self, path: Path | str) -> dict[str, Any]:
+        """Writes the stage `faults`, and returns it."""
+        metrics = {"faults": self.rows, "fuzz": self.fuzz, "bytes": self.bytes, "summary": self.summary}
+        return write_stage(path, "faults", params=vars(self.gates), metrics=metrics | {"wrong": self.wrong})
+
+
+def run_faults(
+    only: Iterable[str] = (),
+    *,
+    gates: Gates | None = None,
+    fuzz_lines: int = FUZZ_LINES,
+    say: Callable[[str], None] = lambda text: None,
+) -> Outcome:
+    """Injects all faults, or those of `only`, where 'fuzz' and 'bytes' are names too; about 5 minutes for all.
+
+    say: is told a line as each is done. Raises FaultError for names that are none and for a bench that does not drive,
+    ArduinoError if there is no emulated Arduino here.
+    """
+    gates, only, begin = gates or Gates.of_params(), list(only), time.monotonic()
+    if unknown := sorted(set(only) - {f.name for f in FAULTS} - {"fuzz", "bytes"}):
+        raise FaultError(f"no fault {unknown}: choose from {[f.name for f in FAULTS]}, 'fuzz' and 'bytes'")
+    build()  # here, where its errors are seen
+    outcome = Outcome(gates)
+    chosen = [f for f in FAULTS if not only or f.name in only]
+    if not only or "fuzz" in only:
+        outcome.fuzz = fuzz(fuzz_lines)
+        say(f"fuzz: {outcome.fuzz['said']}")
+        if outcome.fuzz["unsafe_pulses"]:
+            outcome.wrong.append(f"fuzz: {outcome.fuzz['said']}")
+    with Bench() as bench:
+        if not only or "bytes" in only:
+            outcome.bytes = transmitted_and_replayed(bench)
+            say(f"bytes: {outcome.bytes}")
+            if outcome.bytes["worst_us"] is None or outcome.bytes["worst_us"] > gates.bytes_us:
+                outcome.wrong.append(f"bytes: {outcome.bytes}, {gates.bytes_us:g} us are allowed")
+        for fault, row in _rows(bench, chosen, gates):
+            _complete(fault, row)
+            say(row_text(row))
+            outcome.rows.append(row)
+            outcome.wrong += [f"{row['fault']}: {sentence}" for sentence in row["wrong"]]
+    outcome.seconds = time.monotonic() - begin
+    for name in ("rows", "stopped_rows"):
+        if not only and outcome.summary[name] < getattr(gates, name):
+            outcome.wrong.append(f"{outcome.summary[name]} {name}, {getattr(gates, name)} are wanted")
+    return outcome
+
+
+def _rows(bench: Bench, chosen: Sequence[Fault], gates: Gates) -> Iterator[tuple[Fault, dict[str, Any]]]:
+    """Each fault's row, once all that belongs to it is known: that it drives again only the next start tells."""
+    before: tuple[Fault, dict[str, Any]] | None = None
+    for fault in chosen:
+        if before:
+            _drive_again(bench, *before, fault.start)
+            yield before
+        elif bench.drive is None:
+            bench.at_speed(fault.start)
+        before = fault, run_fault(bench, fault, gates)
+    if before:
+        _drive_again(bench, *before, "")
+        yield before
+
+
+def _drive_again(bench: Bench, fault: Fault, row: dict[str, Any], start: str) -> None:
+    """The next drive; what it tells of a fault before it."""
+    try:
+        bench.at_speed(start)
+        again = True
+    except FaultError as error:
+        row["wrong"].append(str(error))
+        again = False
+        bench.at_speed(start)
+    if fault.exit_code is not None:
+        row["recovered"] = again
+    if fault.later:
+        row["log_line"] = _find(fault.says, bench.drive)
+
+
+def _complete(fault: Fault, row: dict[str, Any]) -> None:
+    if row["log_line"] is None:
+        row["wrong"].append(f"no line tells of it (wanted: {fault.says})")
+    row["found"] = fault.expected if not row["wrong"] else "not as expected"
+
+
+def row_text(row: dict[str, Any]) -> str:
+    """A line for people: fault, expected, found, after how many milliseconds, log line."""
+    ms = row.get("takeover_ms", row["stopped_after_ms"])
+    ms = "" if ms is None else f"{ms:.0f} ms"
+    line = " ".join((row["log_line"] or "no line").split())
+    again = f" ({row['attempts']} attempts)" if row["attempts"] > 1 else ""
+    return f"{row['fault']:<35} {row['expected']:<10} {row['found']:<16} {ms:>8}  {line[-70:]}{again}"
