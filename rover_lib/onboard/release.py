@@ -1,0 +1,567 @@
+"""Releases of the policy on the rover: what is in use changes at once or not at all, whenever the power goes.
+
+    releases = Releases("/var/lib/rover/models")
+    name = releases.stage("/var/lib/rover/incoming").name    # what pack() wrote, or an artifact
+    releases.switch(name)                                     # proven before, proven again after; rolls back by itself
+
+    models/current              a symbolic link to releases/<content hash>, and the only truth about what is in use
+    models/releases/<hash>/     policy.pt, policy.pt.sha256 (for sha256sum -c) and release.json: where it came from
+    models/history.json         what was in use, the newest last; for rollback and prune
+    models/.lock                held by whoever changes something
+
+A power cut may come between any two system calls, and takes with it what was not synced. So all that a release holds is
+synced before its folder gets its name, and all of that before `current` is renamed. What an interrupted command left
+(names that begin with a dot) the next one removes. No decision depends on the clock.
+"""
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import time
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from rover_lib.onboard.artifact import check_integrity, content_hash, read_manifest
+from rover_lib.onboard.errors import ArtifactError, RoverError
+from rover_lib.onboard.stage import sha256_of
+
+MODELS = Path("/var/lib/rover/models")
+POLICY, DIGEST, ORIGIN = "policy.pt", "policy.pt.sha256", "release.json"
+NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # the second whole copy of a release in use that was damaged is ...-2
+PART_BYTES = 8 << 20  # a transfer that was cut goes on at most so far back
+SPARE_BYTES = 64 << 20  # is left free for logs
+HISTORY = 100
+SANDBOX = "rover-check@{}.service"
+
+ENGINE = "qnnpack"  # of a Pi
+MAY_DIFFER = ("mode", "chunk", "camera")  # torch, engine and actions may not: this rover could not drive by them
+CODE_OF_MODE = {"static": b"ops.quantized.conv2d", "mixed": b"ops.quantized.conv2d", "dynamic": b"linear_dynamic"}
+
+Check = Callable[[str], None]  # takes a release's name or "current"; raises RoverError
+
+
+class ReleaseError(RoverError):
+    """A deployment that cannot be made; what was in use still is, unless the sentence says otherwise."""
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a rover takes. camera: its name in the manifest; aspect: of its frames, width to height."""
+
+    chunk: int = 32
+    camera: str = "cam_front"
+    aspect: float = 16 / 9
+    modes: tuple[str, ...] = ("static", "mixed")
+
+    def refusals(self, manifest: dict[str, Any]) -> dict[str, str]:
+        """Why not to take an artifact, by kind: "mode", "chunk", "camera", "torch", "engine", "actions"."""
+        found = {}
+        if manifest["mode"] not in self.modes:
+            found["mode"] = f"its mode is {manifest['mode']}, which is several times slower than {self.modes[0]}"
+        if manifest["chunk"] != self.chunk:
+            found["chunk"] = f"it plans {manifest['chunk']} actions, this rover takes {self.chunk}"
+        cameras = ", ".join(f"{c['name']} {c['width']}x{c['height']}" for c in manifest["cameras"])
+        shapes = [(c["name"], round(c["width"] / c["height"], 1)) for c in manifest["cameras"]]
+        if shapes != [(self.camera, round(self.aspect, 1))]:
+            found["camera"] = f"it looks through {cameras}, this rover has {self.camera} at {self.aspect:.2f} to 1"
+        made_with, here = str(manifest["versions"].get("torch", "?")), version("torch")
+        if made_with.split(".")[:2] != here.split(".")[:2]:
+            found["torch"] = f"it was made with torch {made_with}, rovers have {here}"
+        if manifest["engine"] != ENGINE:
+            found["engine"] = f"it needs the quantization engine '{manifest['engine']}', a Pi has '{ENGINE}'"
+        if manifest["action_names"] != ["steering", "throttle"] or manifest["state_names"] != ["steering", "throttle"]:
+            found["actions"] = f"it gives {manifest['action_names']}, this car has steering and throttle"
+        return found
+
+
+THIS_CAR = Expected()
+
+
+def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Iterable[str] = ()) -> dict[str, Any]:
+    """The manifest of an artifact that may be deployed; nothing in it is run.
+
+    allow: kinds of refusal that are none, of MAY_DIFFER. Raises ArtifactError for a damaged file or a manifest that
+    does not fit the code beside it, ReleaseError for one that this rover does not take.
+    """
+    allow = set(allow)
+    if unknown := allow - set(MAY_DIFFER):
+        raise ReleaseError(f"only {', '.join(MAY_DIFFER)} can be allowed, found {', '.join(sorted(unknown))}")
+    check_integrity(path)
+    manifest = read_manifest(path)
+    with zipfile.ZipFile(path) as z:
+        code = b"".join(z.read(n) for n in z.namelist() if "/code/" in n and n.endswith(".py"))
+    if (wanted := CODE_OF_MODE.get(manifest["mode"])) and wanted not in code:
+        raise ArtifactError(f"{path}: its manifest says {manifest['mode']}, its code is not; quantize again")
+    for kind, why in expected.refusals(manifest).items():
+        if kind not in allow:
+            remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
+            raise ReleaseError(f"{path}: {why}; {remedy}")
+    return manifest
+
+
+def pack(
+    artifact: Path | str, folder: Path | str, expected: Expected = THIS_CAR, allow: Iterable[str] = ()
+) -> dict[str, Any]:
+    """Cut an artifact into parts in an empty folder, with a release.json that says what they must make together.
+
+    Parts travel one by one, so that a transfer goes on where it was cut. Returns what release.json says: name (the
+    content hash), sha256, bytes, parts, mode, origin. Raises as inspect_artifact().
+    """
+    artifact, folder = Path(artifact), Path(folder)
+    manifest = inspect_artifact(artifact, expected, allow)
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.iterdir():
+        old.unlink()
+    count = 0
+    with artifact.open("rb") as f:
+        while part := f.read(PART_BYTES):
+            (folder / f"part-{count:04d}").write_bytes(part)
+            count += 1
+    about = {**_about(artifact, manifest), "parts": count}
+    (folder / ORIGIN).write_text(json.dumps(about, indent=1, sort_keys=True) + "\n")
+    return about
+
+
+def _about(artifact: Path, manifest: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "name": content_hash(artifact),
+        "sha256": sha256_of(artifact),
+        "bytes": artifact.stat().st_size,
+        "mode": manifest["mode"],
+        # Nothing of when: the same artifact from the same place must not look like another one to Ansible.
+        "origin": {"file": str(artifact.absolute()), "host": socket.gethostname()},
+        "checkpoint": manifest["checkpoint"].get("sha256", ""),
+    }
+
+
+@dataclass(frozen=True)
+class Staged:
+    """name: of the release. changed: it was not there before."""
+
+    name: str
+    changed: bool
+
+
+@dataclass(frozen=True)
+class Release:
+    """One release as found on the disk. wrong: what is wrong with it, empty if nothing."""
+
+    name: str
+    current: bool
+    mode: str
+    origin: str
+    megabytes: float
+    wrong: str
+
+
+class Releases:
+    """The models of a rover. check: proves that a release computes what it should; runs its parity vectors if None.
+
+    Every command that changes something holds the lock, and raises ReleaseError if another one does.
+    """
+
+    def __init__(self, models: Path | str = MODELS, *, check: Check | None = None, expected: Expected = THIS_CAR):
+        self.models = Path(models)
+        self.releases = self.models / "releases"
+        self.current_link = self.models / "current"
+        self.expected = expected
+        self._check = check or self.verify
+
+    # What there is
+
+    @property
+    def current(self) -> str | None:
+        """The name of the release in use; where `current` points to if that is no release."""
+        try:
+            target = str(self.current_link.readlink())
+        except OSError:
+            return None
+        name = target.removeprefix("releases/")
+        return name if NAME.fullmatch(name) else target
+
+    @property
+    def policy(self) -> Path:
+        """What the service loads."""
+        return self.current_link / POLICY
+
+    def path_of(self, name: str) -> Path:
+        """The policy of a release, or of "current". Raises ReleaseError for what is no name."""
+        if name == "current":
+            return self.policy
+        if not NAME.fullmatch(name):
+            raise ReleaseError(f"a release is named by 64 hexadecimal digits or 'current', found '{name}'; see status")
+        return self.releases / name / POLICY
+
+    def wrong_with(self, name: str) -> str:
+        """What is wrong with the bytes of a release, empty if nothing. Needs no torch."""
+        folder = self.releases / name
+        try:
+            json.loads((folder / ORIGIN).read_text())
+            if (folder / DIGEST).read_text().split()[:1] != [sha256_of(folder / POLICY)]:
+                return f"{POLICY} is not what {DIGEST} says"
+            found = content_hash(folder / POLICY)
+        except Exception as e:  # whatever hinders reading it is what is wrong with it
+            return f"not readable ({type(e).__name__}: {e})"
+        if found != NAME.fullmatch(name)[1]:
+            return f"tampered with: its content is {found[:12]}, not what its folder is named after"
+        return ""
+
+    def all(self) -> list[Release]:
+        """Every release, the one in use first, then those used last, then those never used."""
+        current, found = self.current, []
+        for name in self._by_use():
+            try:
+                about = json.loads((self.releases / name / ORIGIN).read_text())
+                mode, origin = str(about["mode"]), "{host}:{file}".format(**about["origin"])
+                megabytes = (self.releases / name / POLICY).stat().st_size / 1e6
+            except (OSError, ValueError, KeyError, TypeError):
+                mode, origin, megabytes = "?", "?", 0.0
+            found.append(Release(name, name == current, mode, origin, round(megabytes, 1), self.wrong_with(name)))
+        return found
+
+    def status(self) -> dict[str, Any]:
+        """What is: current, healthy (its bytes), since, releases, disk_free_mb, at_work (a command holds the lock)."""
+        releases = self.all()
+        mine = next((r for r in releases if r.current), None)
+        if self.current is None:
+            trouble = "no model: deploy one"
+        elif mine is None:
+            trouble = f"current points to {self.current}, which is no release: deploy or roll back"
+        else:
+            trouble = mine.wrong
+        return {
+            "current": self.current,
+            "mode": mine.mode if mine else None,
+            "since": self._since(),
+            "healthy": not trouble,
+            "trouble": trouble,
+            "can_roll_back_to": next((n for n in self._before() if not self.wrong_with(n)), None),
+            "releases": [asdict(r) for r in releases],
+            "disk_free_mb": round(shutil.disk_usage(self._there()).free / 1e6),
+            "at_work": self._locked_by_another(),
+        }
+
+    def verify(self, name: str = "current") -> None:
+        """Prove that a release's bytes are whole and that it computes here what it should (parity vectors).
+
+        Raises ReleaseError or ArtifactError.
+        """
+        path = self.path_of(name)
+        if not path.exists():
+            raise ReleaseError(f"{path}: not there; {'deploy one' if name == 'current' else 'stage it again'}")
+        real = path.parent.resolve().name
+        if wrong := self.wrong_with(real):
+            raise ReleaseError(f"{path}: {wrong}; deploy it again")
+        from rover_lib.onboard.policy import load_policy  # here, because it loads torch
+
+        load_policy(path)
+
+    # What changes something
+
+    def stage(self, source: Path | str, *, sha256: str | None = None, allow: Iterable[str] = ()) -> Staged:
+        """Make a release of an artifact, or of the folder that pack() wrote; what is in use stays in use.
+
+        sha256: what the artifact's must be, if it is known. A release that is there and whole is left as it is; one
+        that is not whole is replaced, the one in use by a second copy beside it. Raises ReleaseError, ArtifactError.
+        """
+        source = Path(source)
+        with _disk_full_in_a_sentence(), self._at_work():
+            about = self._packed(source) if source.is_dir() else None
+            if about and (there := self._whole(about["name"])):
+                return Staged(there, False)
+            self._make_sure_of_room(about["bytes"] if about else source.stat().st_size)
+            new = self.releases / ".new"
+            new.mkdir()
+            new.chmod(0o755)  # whatever the umask: the service's user reads it
+            parts = [source / f"part-{i:04d}" for i in range(about["parts"])] if about else [source]
+            found, wanted = _join(parts, new / POLICY), sha256 or (about or {}).get("sha256")
+            if wanted and found != wanted:
+                raise ReleaseError(f"{source}: arrived damaged (sha256 {found[:12]}, not {wanted[:12]}); send it again")
+            try:
+                here = _about(new / POLICY, inspect_artifact(new / POLICY, self.expected, allow))
+            except RoverError as e:
+                raise type(e)(str(e).replace(str(new / POLICY), str(source))) from None
+            if about and about["name"] != here["name"]:
+                raise ReleaseError(f"{source}: contains {here['name'][:12]}, not {about['name'][:12]}; pack it again")
+            here["origin"] = about["origin"] if about else {**here["origin"], "file": str(source.absolute())}
+            if there := self._whole(here["name"]):
+                return Staged(there, False)
+            _write(new / DIGEST, f"{found}  {POLICY}\n")
+            _write(new / ORIGIN, json.dumps(here, indent=1, sort_keys=True) + "\n")
+            _sync(new)
+            name = self._free(here["name"])
+            new.rename(self.releases / name)
+            _sync(self.releases)
+            return Staged(name, True)
+
+    def switch(self, name: str) -> bool:
+        """Use a release, after it was proven; prove it again through `current`, and go back if that fails.
+
+        Returns whether anything changed. Raises ReleaseError, with what is in use now.
+        """
+        with _disk_full_in_a_sentence(), self._at_work():
+            before = self.current
+            if name == "current":
+                raise ReleaseError("'current' is in use already; name the release to switch to")
+            self.path_of(name)
+            self._check(name)
+            if before == name:
+                return False
+            self._point(name)
+            try:
+                self._check("current")
+            except BaseException as error:
+                self._point(before)
+                now = f"{before[:12]} is in use again" if before else "no model is in use, as before"
+                if isinstance(error, RoverError):
+                    raise ReleaseError(f"{name[:12]} failed after the switch, {now}: {error}") from error
+                raise
+            self._remember([*self._history(), name])
+            return True
+
+    def rollback(self) -> str:
+        """Use the release before the one in use, the newest that can be proven. Returns its name."""
+        with _disk_full_in_a_sentence(), self._at_work():
+            refused = []
+            for name in self._before():
+                try:
+                    self._check(name)
+                except RoverError as error:
+                    refused.append(f"{name[:12]}: {error}")
+                    continue
+                history = self._history()
+                # Before the switch: cut here, the next rollback begins where this one did.
+                self._remember(history[: len(history) - history[::-1].index(name)])
+                self._point(name)
+                return name
+            why = f" ({'; '.join(refused)})" if refused else ""
+            raise ReleaseError(f"there is no release to roll back to{why}; {self._in_use()}; deploy one instead")
+
+    def prune(self, keep: int = 3) -> list[str]:
+        """Remove all but the `keep` releases used last; never the one in use. Returns the names of those removed.
+
+        One that was never in use counts as older than one that was, and one that is damaged is removed.
+        """
+        if keep < 1:
+            raise ReleaseError(f"at least 1 release is kept, found {keep}")
+        with _disk_full_in_a_sentence(), self._at_work():
+            whole = [name for name in self._by_use() if not self.wrong_with(name)]
+            gone = [name for name in self._by_use() if name not in whole[:keep] and name != self.current]
+            for name in gone:
+                self._remove(self.releases / name)
+            if gone:
+                self._remember([name for name in self._history() if name not in gone])
+            return gone
+
+    # How
+
+    @contextlib.contextmanager
+    def _at_work(self) -> Iterator[None]:
+        """Holds the lock, and removes what an interrupted command left."""
+        self.releases.mkdir(parents=True, exist_ok=True)
+        file = os.open(self.models / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ReleaseError(
+                    f"{self.models}: another deployment is at work; wait for it (status says at_work)"
+                ) from None
+            self._tidy()
+            try:
+                yield
+            finally:
+                with contextlib.suppress(OSError):  # what is left now is removed by the next command
+                    self._tidy()
+        finally:
+            os.close(file)
+
+    def _tidy(self) -> None:
+        for left in (*self.releases.glob(".*"), *self.models.glob(".new-*")):
+            shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
+        history = self._history()
+        if (current := self.current) in self._by_use() and history[-1:] != [current]:
+            self._remember([*history, current])  # a switch was cut before it was written down
+
+    def _locked_by_another(self) -> bool:
+        try:
+            file = os.open(self.models / ".lock", os.O_RDONLY)
+        except OSError:
+            return False
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(file)
+        return False
+
+    def _packed(self, folder: Path) -> dict[str, Any]:
+        try:
+            about = json.loads((folder / ORIGIN).read_text())
+            if not (NAME.fullmatch(about["name"]) and NAME.fullmatch(about["sha256"]) and about["origin"]):
+                raise ValueError("its hashes are none")
+            return {**about, "bytes": int(about["bytes"]), "parts": int(about["parts"])}
+        except (OSError, ValueError, KeyError, TypeError) as e:
+            raise ReleaseError(
+                f"{folder / ORIGIN}: not what 'rover release pack' writes ({e}); send it again"
+            ) from None
+
+    def _make_sure_of_room(self, needed: int) -> None:
+        free = shutil.disk_usage(self.models).free
+        if free < needed + SPARE_BYTES:
+            wanted_mb = (needed + SPARE_BYTES) / 1e6
+            raise ReleaseError(f"{self.models}: {free / 1e6:.0f} MB free, {wanted_mb:.0f} are needed; prune releases")
+
+    def _whole(self, content: str) -> str | None:
+        """A release of that content which is whole, the one in use first."""
+        return next((n for n in self._by_use() if n.startswith(content) and not self.wrong_with(n)), None)
+
+    def _free(self, content: str) -> str:
+        """A name for a new release of that content; what has it and is not in use goes."""
+        name, number = content, 1
+        while (self.releases / name).exists():
+            if name != self.current:
+                self._remove(self.releases / name)
+                break
+            number += 1
+            name = f"{content}-{number}"
+        return name
+
+    def _is_there(self, name: str) -> bool:
+        return (self.releases / name / POLICY).exists()
+
+    def _in_use(self) -> str:
+        return f"{self.current[:12]} stays in use" if self.current else "no model is in use"
+
+    def _since(self) -> str | None:
+        """When `current` was switched, by the clock of then."""
+        try:
+            return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.current_link.lstat().st_mtime))
+        except (OSError, ValueError, OverflowError):
+            return None
+
+    def _there(self) -> Path:
+        return next(p for p in (self.models, *self.models.absolute().parents) if p.exists())
+
+    def _point(self, name: str | None) -> None:
+        """`current` at a release, atomically and lastingly; at none if None."""
+        if name is None:
+            self.current_link.unlink()
+        else:
+            new = self.models / ".new-current"
+            new.symlink_to(Path("releases", name))
+            new.replace(self.current_link)
+        _sync(self.models)
+
+    def _history(self) -> list[str]:
+        try:
+            names = json.loads((self.models / "history.json").read_text())
+            return [n for n in names if isinstance(n, str) and NAME.fullmatch(n)]
+        except (OSError, ValueError, TypeError):
+            return []
+
+    def _remember(self, names: list[str]) -> None:
+        new = self.models / ".new-history"
+        _write(new, json.dumps(names[-HISTORY:]) + "\n")
+        new.replace(self.models / "history.json")
+        _sync(self.models)
+
+    def _before(self) -> list[str]:
+        """What was in use before the release that is, newest first, each once, and still there."""
+        history, current = self._history(), self.current
+        if current in history:
+            history = history[: len(history) - history[::-1].index(current)]
+        return [n for n in dict.fromkeys(reversed(history)) if n != current and self._is_there(n)]
+
+    def _by_use(self) -> list[str]:
+        names = sorted(p.name for p in self.releases.glob("*") if NAME.fullmatch(p.name))
+        used = dict.fromkeys([self.current, *reversed(self._history())])
+        return [n for n in used if n in names] + [n for n in names if n not in used]
+
+    def _remove(self, folder: Path) -> None:
+        """A folder of releases/, which is gone at once or there."""
+        away = self.releases / f".gone-{folder.name}"
+        folder.rename(away)
+        _sync(self.releases)
+        shutil.rmtree(away)
+
+
+def sandboxed(name: str) -> None:
+    """A check: `rover release verify NAME` in the service's sandbox, as the unit that provision.yml installed."""
+    unit = SANDBOX.format(name)
+    found = subprocess.run(["systemctl", "start", unit], capture_output=True, text=True)
+    if found.returncode:
+        said = subprocess.run(
+            ["journalctl", "--unit", unit, "--output=cat", "--grep=^rover: ", "--lines=1"],
+            capture_output=True,
+            text=True,
+        )
+        why = said.stdout.strip().removeprefix("rover: ") or found.stderr.strip() or f"exit code {found.returncode}"
+        raise ReleaseError(f"{unit}: {why}")
+
+
+@contextlib.contextmanager
+def _disk_full_in_a_sentence() -> Iterator[None]:
+    try:
+        yield
+    except OSError as e:
+        if e.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise ReleaseError("the disk is full; what was in use still is; prune releases or old recordings") from e
+        raise
+
+
+def _join(parts: list[Path], target: Path) -> str:
+    """One file from parts, synced; its SHA-256."""
+    digest = hashlib.sha256()
+    file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+    try:
+        os.fchmod(file, 0o644)
+        for part in parts:
+            try:
+                content = part.read_bytes()
+            except FileNotFoundError:
+                raise ReleaseError(f"{part}: not arrived; send it again") from None
+            digest.update(content)
+            _write_all(file, content)
+        os.fsync(file)
+    finally:
+        os.close(file)
+    return digest.hexdigest()
+
+
+def _write(path: Path, text: str) -> None:
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    try:
+        os.fchmod(file, 0o644)
+        _write_all(file, text.encode())
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+def _write_all(file: int, content: bytes) -> None:
+    left = memoryview(content)
+    while left:
+        left = left[os.write(file, left) :]
+
+
+def _sync(folder: Path) -> None:
+    """A rename lasts once its folder is on the disk."""
+    file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)

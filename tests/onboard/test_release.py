@@ -1,0 +1,630 @@
+"""Deployments on the rover: every power cut, every broken artifact; after each there is a model that computes."""
+
+import fcntl
+import json
+import os
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.errors import ArtifactError, RoverError
+from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.release import Expected, ReleaseError, Releases, inspect_artifact, pack
+from rover_lib.onboard.stage import sha256_of
+
+
+def changed_manifest(artifact: Path, target: Path, **changes) -> Path:
+    """The artifact with another manifest, and all checksums right."""
+    with zipfile.ZipFile(artifact) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as new:
+        for item in old.infolist():
+            content = old.read(item)
+            if item.filename.endswith("/extra/manifest.json"):
+                content = json.dumps({**json.loads(content), **changes}).encode()
+            new.writestr(item.filename, content)
+    return target
+
+
+@pytest.fixture(scope="session")
+def two(artifacts) -> tuple[Path, Path]:
+    """Two artifacts that differ and are fit to deploy, their parity vectors run."""
+    found = artifacts["static"], artifacts["mixed"]
+    for artifact in found:
+        load_policy(artifact)
+    return found
+
+
+def quick(models: Path) -> Releases:
+    """Releases that look at bytes only when they switch, for the tests' speed."""
+
+    def check(name: str) -> None:
+        if not r.path_of(name).exists() or r.wrong_with(r.path_of(name).parent.resolve().name):
+            raise ReleaseError(f"{name}: not whole")
+
+    r = Releases(models, check=check)
+    return r
+
+
+@pytest.fixture
+def releases(tmp_path, two) -> Releases:
+    """A rover that drives by the first of the two."""
+    r = quick(tmp_path / "models")
+    r.switch(r.stage(two[0]).name)
+    return r
+
+
+@pytest.fixture
+def full(releases, artifacts) -> Releases:
+    """It, with a release that the next deployment will remove."""
+    releases.stage(artifacts["fp32"], allow=["mode"])
+    return releases
+
+
+def deploy(r: Releases, source: Path) -> str:
+    """What deploy.yml does on a rover."""
+    name = r.stage(source).name
+    r.switch(name)
+    r.prune(2)
+    return name
+
+
+def assert_drives(r: Releases, names: set[str]) -> None:
+    """What the service would load is one of these, to the byte, and status says so.
+
+    What acts in an artifact is what its content hash is of, so that bytes which have one of `two`'s, whose parity
+    vectors hold here, compute what they should.
+    """
+    status = r.status()
+    assert status["healthy"] and status["trouble"] == "" and status["current"] in names, status
+    assert content_hash(r.policy) == status["current"][:64]
+
+
+# Power cuts
+
+
+def hooked(name: str, call: Callable, hook: Callable[[str, Callable, tuple], None]) -> Callable:
+    return lambda *args, **kwargs: hook(name, lambda: call(*args, **kwargs), args)
+
+
+def in_child(task: Callable[[], None], hook: Callable[[str, Callable, tuple], None]) -> int:
+    """Runs a task in a child process in which each call that changes the disk goes through hook; its wait status."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            for call in ("write", "fsync", "mkdir", "symlink", "rename", "replace", "unlink", "rmdir"):
+                setattr(os, call, hooked(call, getattr(os, call), hook))
+            task()
+        except BaseException as error:
+            print(repr(error), file=sys.stderr)
+            os._exit(1)
+        os._exit(0)
+    return os.waitpid(pid, 0)[1]
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def steps_of(task: Callable[[], None]) -> list[str]:
+    """The calls that a task makes, by name."""
+    read, write = os.pipe()
+    put = os.write
+
+    def hook(name, call, args):
+        put(write, f"{name}\n".encode())
+        return call()
+
+    assert in_child(task, hook) == 0
+    os.close(write)
+    with os.fdopen(read) as f:
+        return f.read().split()
+
+
+def cut_after(task: Callable[[], None], n: int) -> set[int]:
+    """Runs a task whose power is cut after its n-th call; the inodes of files that were written and not synced."""
+    read, write = os.pipe()
+    put, count = os.write, 0
+
+    def hook(name, call, args):
+        nonlocal count
+        count += 1
+        try:
+            result = call()
+            if name in ("write", "fsync") and stat.S_ISREG(os.fstat(args[0]).st_mode):
+                put(write, f"{name} {os.fstat(args[0]).st_ino}\n".encode())
+            return result
+        finally:
+            if count == n:
+                die()
+
+    status = in_child(task, hook)
+    assert os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL, f"it has fewer than {n} steps"
+    os.close(write)
+    dirty = set()
+    with os.fdopen(read) as f:
+        for line in f:
+            name, inode = line.split()
+            (dirty.add if name == "write" else dirty.discard)(int(inode))
+    return dirty
+
+
+def lose(folder: Path, inodes: set[int]) -> None:
+    """What was not synced is empty after a power cut."""
+    for path in folder.rglob("*"):
+        if path.is_file() and not path.is_symlink() and path.stat().st_ino in inodes:
+            path.write_bytes(b"")
+
+
+STEPS = 30  # of a deployment; test_cuts_are_all_of_a_deployment holds it to what is
+
+
+def test_cuts_are_all_of_a_deployment(full, two):
+    steps = steps_of(lambda: deploy(full, two[1]))
+    assert len(steps) == STEPS, steps
+    assert {"write", "fsync", "mkdir", "symlink", "replace", "rename", "unlink", "rmdir"} <= set(steps)
+
+
+@pytest.mark.parametrize("n", range(1, STEPS + 1))
+def test_power_cut_at_each_step_of_a_deployment(full, two, n):
+    old = full.current
+    lose(full.models, cut_after(lambda: deploy(full, two[1]), n))
+    assert_drives(full, {old, content_hash(two[1])})
+    load_policy(full.policy)
+    new = deploy(full, two[1])  # running it again heals it
+    assert new == content_hash(two[1]) == full.current
+    assert_drives(full, {new})
+    assert not [p for p in full.models.rglob(".*") if p.name != ".lock"]
+    assert full.rollback() == old
+    assert_drives(full, {old})
+
+
+@pytest.mark.parametrize("n", range(1, 9))
+def test_power_cut_at_each_step_of_a_rollback(full, two, n):
+    old, new = full.current, deploy(full, two[1])
+    try:
+        lost = cut_after(lambda: full.rollback(), n)
+    except AssertionError as error:
+        assert n > 6, error  # it has at least so many steps, all of which are here
+        return
+    lose(full.models, lost)
+    assert_drives(full, {old, new})
+    deploy(full, two[1])
+    assert_drives(full, {new})
+
+
+def test_power_cut_in_the_health_check(releases, two):
+    old, new = releases.current, releases.stage(two[1]).name
+
+    def check(name: str) -> None:
+        if name == "current":
+            die()
+
+    status = in_child(lambda: Releases(releases.models, check=check).switch(new), lambda name, call, args: call())
+    assert os.WIFSIGNALED(status)
+    assert releases.current == new  # it was proven before the switch
+    assert_drives(releases, {new})
+    assert not releases.switch(new)
+    assert releases.rollback() == old
+
+
+def test_nothing_unsynced_when_current_is_switched(releases, two):
+    """What a kill cannot show: a power cut loses what was not synced, and that must not be what current points to."""
+    put, (read, write) = os.write, os.pipe()
+    dirty: set[tuple[int, int]] = set()
+
+    def key(file: int) -> tuple[int, int]:
+        s = os.fstat(file)
+        return s.st_dev, s.st_ino
+
+    def of(path) -> tuple[int, int]:
+        s = Path(path).parent.stat()
+        return s.st_dev, s.st_ino
+
+    def hook(name, call, args):
+        if name == "replace" and Path(args[1]).name == "current":
+            put(write, f"{len(dirty - {of(args[0])})} {len(dirty)}\n".encode())  # models/ has just got the new link
+        if name == "write":
+            dirty.add(key(args[0]))
+        elif name == "fsync":
+            dirty.discard(key(args[0]))
+        elif name in ("mkdir", "rename", "replace", "symlink"):
+            dirty.add(of(args[0] if name == "mkdir" else args[1]))
+        return call()
+
+    assert in_child(lambda: deploy(releases, two[1]), hook) == 0
+    os.close(write)
+    with os.fdopen(read) as f:
+        assert f.read() == "0 1\n"
+
+
+# Transfers
+
+
+@pytest.fixture
+def packed(two, tmp_path, monkeypatch) -> Path:
+    """The second of the two, in parts."""
+    monkeypatch.setattr("rover_lib.onboard.release.PART_BYTES", 100_000)
+    folder = tmp_path / "packed"
+    assert pack(two[1], folder)["parts"] == len(list(folder.glob("part-*"))) > 3
+    return folder
+
+
+def test_parts_make_the_artifact_again(releases, packed, two):
+    staged = releases.stage(packed)
+    assert staged.changed and staged.name == content_hash(two[1])
+    assert releases.path_of(staged.name).read_bytes() == two[1].read_bytes()
+    assert not releases.stage(packed).changed
+    origin = next(r for r in releases.all() if r.name == staged.name).origin
+    assert str(two[1].absolute()) in origin
+
+
+def test_packing_again_changes_nothing(packed, two):
+    def content():
+        return {p.name: (p.read_bytes()) for p in packed.iterdir()}
+
+    before = content()
+    pack(two[1], packed)
+    assert content() == before
+
+
+def test_a_flipped_byte_on_the_way_is_found_and_the_same_transfer_repeated_heals(releases, packed, two):
+    old, part = releases.current, packed / "part-0002"
+    good = part.read_bytes()
+    part.write_bytes(bytes([good[0] ^ 1]) + good[1:])
+    with pytest.raises(ReleaseError, match=r"arrived damaged .* send it again"):
+        releases.stage(packed)
+    assert_drives(releases, {old})
+    part.write_bytes(good)
+    assert_drives(releases, {deploy(releases, packed)} - {old})
+
+
+def test_a_transfer_that_was_cut_goes_on(releases, packed):
+    old, last = releases.current, max(packed.glob("part-*"))
+    good = last.read_bytes()
+    last.unlink()
+    with pytest.raises(ReleaseError, match="not arrived"):
+        releases.stage(packed)
+    last.write_bytes(good[: len(good) // 2])
+    with pytest.raises(ReleaseError, match="arrived damaged"):
+        releases.stage(packed)
+    assert_drives(releases, {old})
+    last.write_bytes(good)
+    assert_drives(releases, {deploy(releases, packed)} - {old})
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"name": "../../etc", "sha256": "0", "origin": 1}'])
+def test_a_description_that_is_none(releases, packed, content):
+    (packed / "release.json").unlink()
+    if content is not None:
+        (packed / "release.json").write_text(content)
+    with pytest.raises(ReleaseError, match="send it again"):
+        releases.stage(packed)
+
+
+def test_a_description_of_another_artifact(releases, packed):
+    about = json.loads((packed / "release.json").read_text())
+    (packed / "release.json").write_text(json.dumps({**about, "name": "0" * 64}))
+    with pytest.raises(ReleaseError, match=r"contains .* not 000000000000; pack it again"):
+        releases.stage(packed)
+
+
+def test_a_wrong_hash(releases, two):
+    old = releases.current
+    with pytest.raises(ReleaseError, match=r"arrived damaged \(sha256 "):
+        releases.stage(two[1], sha256="0" * 64)
+    assert_drives(releases, {old})
+    assert releases.stage(two[1], sha256=sha256_of(two[1])).changed
+
+
+# Artifacts that must not drive
+
+
+@pytest.mark.parametrize(
+    "changes, sentence",
+    [
+        ({"versions": {"torch": "2.9.1"}}, "made with torch 2.9.1, rovers have 2.8.0.*; deploy another$"),
+        ({"engine": "x86"}, "needs the quantization engine 'x86', a Pi has 'qnnpack'; deploy another$"),
+        ({"chunk": 16}, "plans 16 actions, this rover takes 32; deploy another, or allow it: chunk"),
+        ({"mode": "dynamic"}, "its manifest says dynamic, its code is not"),
+        ({"mode": "fp32"}, "its mode is fp32.*allow it: mode"),
+        ({"state_names": ["speed", "heading"]}, "this car has steering and throttle; deploy another$"),
+        ({"schema": 2}, "manifest schema 2"),
+        (
+            {"cameras": [{"name": "cam_rear", "width": 128, "height": 72}]},
+            "looks through cam_rear 128x72, this rover has cam_front at 1.78 to 1; deploy another, or allow it: camera",
+        ),
+        ({"cameras": [{"name": "cam_front", "width": 96, "height": 96}]}, "cam_front 96x96.*allow it: camera"),
+    ],
+)
+def test_refused_by_its_manifest_before_it_travels_and_on_arrival(releases, two, tmp_path, changes, sentence):
+    old, bad = releases.current, changed_manifest(two[1], tmp_path / "bad.pt", **changes)
+    with pytest.raises(RoverError, match=sentence):
+        pack(bad, tmp_path / "packed")
+    assert not (tmp_path / "packed").exists()
+    with pytest.raises(RoverError, match=sentence) as refused:
+        releases.stage(bad)
+    assert ".new" not in str(refused.value)
+    assert_drives(releases, {old})
+    assert len(releases.all()) == 1
+
+
+@pytest.mark.parametrize("mode", ["fp32", "dynamic"])
+def test_a_slow_artifact_only_if_it_is_allowed(releases, artifacts, mode):
+    with pytest.raises(ReleaseError, match=f"its mode is {mode}.*; deploy another, or allow it: mode"):
+        releases.stage(artifacts[mode])
+    name = releases.stage(artifacts[mode], allow=["mode"]).name
+    assert releases.switch(name)
+    assert_drives(releases, {name})
+
+
+def test_what_cannot_drive_cannot_be_allowed(two):
+    with pytest.raises(ReleaseError, match="only mode, chunk, camera can be allowed, found torch"):
+        inspect_artifact(two[0], allow=["torch"])
+
+
+def test_a_rover_with_another_chunk_or_camera(two, tmp_path):
+    with pytest.raises(ReleaseError, match=r"plans 32 actions, this rover takes 50"):
+        inspect_artifact(two[0], Expected(chunk=50))
+    with pytest.raises(ReleaseError, match=r"this rover has cam_front at 1\.33 to 1"):
+        inspect_artifact(two[0], Expected(aspect=4 / 3))
+
+
+def test_fp32_that_says_it_is_static(releases, artifacts, tmp_path):
+    lie = changed_manifest(artifacts["fp32"], tmp_path / "lie.pt", mode="static")
+    with pytest.raises(ArtifactError, match="its manifest says static, its code is not"):
+        releases.stage(lie)
+
+
+def test_parity_vectors_that_fail_keep_it_from_being_used(releases, two, tmp_path):
+    tolerance = {"steering": 0.0, "throttle": -1.0}
+    bad = changed_manifest(two[1], tmp_path / "bad.pt", parity={"tolerance": tolerance, "reason": "test"})
+    proving = Releases(releases.models)
+    old, name = releases.current, proving.stage(bad).name
+    with pytest.raises(ArtifactError, match="computes something else here"):
+        proving.switch(name)
+    assert_drives(releases, {old})
+    assert_drives(releases, {deploy(proving, two[1])} - {name})
+
+
+@pytest.mark.parametrize("content", [b"", b"no artifact", None])
+def test_no_artifact(releases, two, tmp_path, content):
+    bad = tmp_path / "bad.pt"
+    bad.write_bytes(two[1].read_bytes()[:-50_000] if content is None else content)
+    with pytest.raises(ArtifactError):
+        releases.stage(bad)
+
+
+# The switch
+
+
+def failing(models: Path, when: Callable[[str], bool]) -> Releases:
+    def check(name: str) -> None:
+        if when(name):
+            raise ArtifactError("the card gives other bytes than a minute ago")
+
+    r = Releases(models, check=check)
+    return r
+
+
+def test_a_failed_health_check_rolls_back_by_itself(releases, two):
+    old, new = releases.current, releases.stage(two[1]).name
+    sick = failing(releases.models, lambda name: name == "current")
+    with pytest.raises(ReleaseError, match=f"{old[:12]} is in use again: the card gives other bytes"):
+        sick.switch(new)
+    assert_drives(releases, {old})
+    assert releases.status()["can_roll_back_to"] is None  # what failed was never in use
+    assert releases.switch(new)
+
+
+def test_a_failed_health_check_of_the_first_model_leaves_none(two, tmp_path):
+    r = failing(tmp_path / "models", lambda name: name == "current")
+    with pytest.raises(ReleaseError, match="no model is in use, as before"):
+        r.switch(r.stage(two[0]).name)
+    status = r.status()
+    assert status["current"] is None and not status["healthy"] and status["trouble"] == "no model: deploy one"
+
+
+@pytest.mark.parametrize("name", ["current", "..", "policy", "0" * 63, "/etc/passwd", "0" * 64])
+def test_what_is_no_release_is_not_switched_to(releases, name):
+    with pytest.raises(ReleaseError):
+        releases.switch(name)
+    assert_drives(releases, {releases.current})
+
+
+def test_back_and_back_again(releases, two, artifacts):
+    first = releases.current
+    second = deploy(releases, two[1])
+    third = releases.stage(artifacts["fp32"], allow=["mode"]).name
+    releases.switch(third)
+    assert releases.status()["can_roll_back_to"] == second
+    assert [releases.rollback(), releases.rollback()] == [second, first]
+    with pytest.raises(ReleaseError, match=f"no release to roll back to; {first[:12]} stays in use"):
+        releases.rollback()
+    assert_drives(releases, {first})
+    releases.switch(second)
+    assert releases.rollback() == first
+
+
+def test_rollback_with_nothing_to_roll_back_to(releases, tmp_path):
+    with pytest.raises(ReleaseError, match=r"no release to roll back to; .* stays in use; deploy one instead"):
+        releases.rollback()
+    assert_drives(releases, {releases.current})
+    with pytest.raises(ReleaseError, match="no model is in use"):
+        Releases(tmp_path / "empty").rollback()
+
+
+def test_rollback_passes_over_what_is_damaged(releases, two, artifacts):
+    first = releases.current
+    second = deploy(releases, two[1])
+    releases.switch(releases.stage(artifacts["fp32"], allow=["mode"]).name)
+    damage(releases.path_of(second))
+    assert releases.status()["can_roll_back_to"] == first == releases.rollback()
+
+
+def test_prune_keeps_those_used_last_and_the_one_in_use(releases, two, artifacts):
+    first = releases.current
+    second = deploy(releases, two[1])
+    never = releases.stage(artifacts["fp32"], allow=["mode"]).name
+    assert releases.prune(3) == []
+    assert releases.prune(2) == [never]
+    releases.rollback()
+    assert releases.current == first and releases.prune(1) == [second]
+    assert_drives(releases, {first})
+    with pytest.raises(ReleaseError, match="at least 1"):
+        releases.prune(0)
+
+
+# What happens to a disk
+
+
+def damage(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(bytes(content))
+
+
+def test_a_damaged_release_in_use_is_told_and_healed(releases, two):
+    name = releases.current
+    damage(releases.policy)
+    status = releases.status()
+    assert not status["healthy"] and "is not what policy.pt.sha256 says" in status["trouble"]
+    new = releases.stage(two[0]).name
+    assert new == f"{name}-2"  # beside it: what is in use is never taken away
+    releases.switch(new)
+    assert_drives(releases, {new})
+    assert releases.prune(3) == [name]
+    assert not releases.stage(two[0]).changed
+
+
+def test_tampering_with_the_checksum_too_is_found(releases, two):
+    folder = releases.policy.parent
+    shutil.copy(two[1], releases.policy)
+    (folder / "policy.pt.sha256").write_text(f"{sha256_of(releases.policy)}  policy.pt\n")
+    status = releases.status()
+    assert not status["healthy"] and "tampered with: its content is" in status["trouble"]
+    with pytest.raises(ReleaseError, match="tampered with"):
+        releases.verify()
+
+
+@pytest.mark.parametrize("what", ["policy.pt", "policy.pt.sha256", "release.json"])
+def test_a_file_of_a_release_that_is_gone(releases, two, what):
+    deploy(releases, two[1])
+    (releases.policy.parent / what).unlink()
+    assert not releases.status()["healthy"]
+    releases.rollback()
+    assert_drives(releases, {content_hash(two[0])})
+
+
+@pytest.mark.parametrize("target", ["releases/" + "0" * 64, "/etc", "releases", "nowhere"])
+def test_a_link_that_points_elsewhere(releases, two, target):
+    releases.current_link.unlink()
+    releases.current_link.symlink_to(target)
+    status = releases.status()
+    assert not status["healthy"] and status["trouble"]
+    assert_drives(releases, {deploy(releases, two[0])})
+
+
+def test_sha256sum_agrees(releases):
+    folder = releases.policy.parent
+    assert subprocess.run(["sha256sum", "--check", "--quiet", "policy.pt.sha256"], cwd=folder).returncode == 0
+
+
+def test_a_history_that_is_no_history(releases, two):
+    for content in ("", "{", "[1, null]", '{"a": 1}', '["../.."]'):
+        (releases.models / "history.json").write_text(content)
+        assert_drives(releases, {deploy(releases, two[1]), deploy(releases, two[0])})
+
+
+@pytest.mark.parametrize("n", range(1, 8))
+def test_a_disk_that_is_full_at_some_step(releases, two, n):
+    old, count = releases.current, 0
+
+    def hook(name, call, args):
+        nonlocal count
+        count += name in ("write", "mkdir", "symlink")
+        if count >= n and name in ("write", "mkdir", "symlink"):
+            raise OSError(28, "No space left on device")
+        return call()
+
+    def task():
+        try:
+            deploy(releases, two[1])
+        except ReleaseError as error:
+            os._exit(7 if "the disk is full; what was in use still is" in str(error) else 8)
+
+    status = in_child(task, hook)
+    assert os.waitstatus_to_exitcode(status) == 7
+    assert_drives(releases, {old, content_hash(two[1])})
+    assert_drives(releases, {deploy(releases, two[1])} - {old})
+
+
+def test_too_little_room_is_said_before_it_is_used_up(releases, two, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**9, 10**9, 10**6))
+    with pytest.raises(ReleaseError, match=r"1 MB free, .* are needed; prune releases"):
+        releases.stage(two[1])
+    monkeypatch.undo()
+    assert_drives(releases, {content_hash(two[0])})
+
+
+@pytest.mark.parametrize("year", [1970, 2005, 2099])
+def test_a_clock_that_is_wrong_by_years(releases, two, year, monkeypatch):
+    old, wrong = releases.current, time.mktime((year, 1, 2, 0, 0, 0, 0, 0, 0))
+    monkeypatch.setattr(time, "time", lambda: wrong)
+    new = deploy(releases, two[1])
+    os.utime(releases.current_link, (wrong, wrong), follow_symlinks=False)
+    for path in (releases.releases / new).iterdir():
+        os.utime(path, (wrong, wrong))
+    assert releases.status()["since"].startswith(str(year))
+    assert_drives(releases, {new})
+    assert releases.rollback() == old and releases.prune(1) == [new]
+
+
+def test_two_at_once_one_is_refused(releases, two):
+    with (releases.models / ".lock").open() as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        for command in (lambda: releases.stage(two[1]), releases.rollback, lambda: releases.prune(1)):
+            with pytest.raises(ReleaseError, match="another deployment is at work; wait for it"):
+                command()
+        assert releases.status()["at_work"]
+    assert not releases.status()["at_work"]
+    assert_drives(releases, {deploy(releases, two[1])})
+
+
+def test_one_that_is_refused_does_not_tidy_up_after_the_other(releases, two):
+    half = releases.releases / ".new"
+    half.mkdir()
+    with (releases.models / ".lock").open() as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(ReleaseError):
+            releases.stage(two[1])
+        assert half.exists()
+    releases.prune(3)
+    assert not half.exists()
+
+
+def test_a_rover_without_anything(tmp_path):
+    r = Releases(tmp_path / "models")
+    status = r.status()
+    assert status["current"] is None and not status["healthy"] and status["releases"] == [] and not status["at_work"]
+    with pytest.raises(ReleaseError, match="not there; deploy one"):
+        r.verify()
+    assert not (tmp_path / "models").exists()  # looking changes nothing
+
+
+def test_a_strict_umask_does_not_hide_the_model_from_the_service(two, tmp_path):
+    r, before = Releases(tmp_path / "models"), os.umask(0o077)
+    try:
+        name = r.stage(two[0]).name
+    finally:
+        os.umask(before)
+    folder = r.releases / name
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o755
+    assert {stat.S_IMODE(p.stat().st_mode) for p in folder.iterdir()} == {0o644}
