@@ -8,7 +8,7 @@ NAME ?= mine
 .PHONY: help demo run test lint lab arm faults firmware flash notebooks clean
 
 help:
-	@echo "make demo                                   record, train, quantize, compare and benchmark in the balloon world"
+	@echo "make demo                                   record, train, quantize, compare, benchmark and drive in the balloon world"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make test                                   lint, unit, parity, notebook tests and one whole run"
 	@echo "make arm NAME=demo [PEERS=1]                count a run's instructions on an emulated Cortex-A76;"
@@ -30,6 +30,7 @@ demo: $(READY)
 	$(ROVER) world record runs/demo/episodes
 	$(ROVER) world train runs/demo/episodes runs/demo/best_model.pth
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
+	$(ROVER) world latency runs/demo
 
 run: $(READY)
 	@test -n '$(CHECKPOINT)' -a -n '$(EPISODES)' || { echo 'make run needs CHECKPOINT=best_model.pth EPISODES=folder [NAME=mine]' >&2; exit 2; }
@@ -61,7 +62,7 @@ lab: $(READY)
 	$(VENV)/bin/jupyter lab notebooks
 
 notebooks: demo
-	$(VENV)/bin/python -c "from rover_lib.workshop.run import publish; publish('runs/demo', 'notebooks')"
+	$(VENV)/bin/python -c "from rover_lib.workshop.run import NAMES, publish; publish('runs/demo', 'notebooks', (*NAMES, '07_drive'))"
 	test ! -f runs/full/06_arm.ipynb || $(VENV)/bin/python -c "from rover_lib.workshop.run import publish; publish('runs/full', 'notebooks', ('06_arm',))"
 
 clean:

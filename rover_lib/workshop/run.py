@@ -31,7 +31,7 @@ from rover_lib.workshop.session import TTY_VARIABLE
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
-AFTERWARDS = ("06_arm",)  # of a run that is there, and of what `rover arm` found in it
+AFTERWARDS = ("06_arm", "07_drive")  # of a run that is there: what `rover arm` and `rover world latency` execute
 KERNEL_ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",  # rover_lib/__init__.py says why; a cell may import torch before it
     # Both are known, and noise in a stored output: QNNPACK ignores reduce_range, tqdm misses widgets.
@@ -127,7 +127,7 @@ def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS
 
 def _clear(folder: Path) -> None:
     """Remove what an earlier run left, so that no file of it can be taken for this one's."""
-    stages = ("load", "calibrate", "quantize", "compare", "arm", "parts", f"benchmark-{socket.gethostname()}")
+    stages = ("load", "calibrate", "quantize", "compare", "arm", "parts", "drive", f"benchmark-{socket.gethostname()}")
     old = [folder / f"{s}.json" for s in stages] + [folder / "calibration.pt", *folder.glob("policy_*.pt")]
     for path in [*old, *(folder / f"{n}.ipynb" for n in NAMES + AFTERWARDS)]:
         path.unlink(missing_ok=True)
