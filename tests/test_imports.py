@@ -12,7 +12,7 @@ MAY = {
     "workshop": {"onboard", "workshop"},
     "playground": {"onboard", "workshop", "playground"},
 }
-ONBOARD_NEEDS = {"torch", "numpy", "cv2", "serial", "yaml", "rover_lib"}
+ONBOARD_NEEDS = {"torch", "numpy", "cv2", "serial", "yaml", "systemd_watchdog", "rover_lib"}
 
 
 def imported(path: Path) -> set[str]:

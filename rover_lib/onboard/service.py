@@ -1,0 +1,197 @@
+"""A drive as a systemd service: ready once it could drive, disarmed until a human arms it, watched by its ticks.
+
+How a human arms: `sudo rover arm-car` on the rover, or `ansible-playbook ansible/drive.yml -e rover_arm=true`. Either
+sends SIGUSR1 to the service, and a signal is all there is to it: only root and the service's own user can send one, it
+leaves nothing behind that could arm the car later (no file, no port), and one that comes while the car is not ready is
+forgotten. The Arduino has the last word, as always: it refuses without the transmitter's signal, and when the throttle
+stick is not at rest. Moving a stick takes the car back; the service then ends, is started again and is disarmed.
+
+What the service says of itself (systemctl show --property=StatusText) begins with one of STATES; deploy.yml restarts it
+only while that is "disarmed".
+
+systemd's watchdog hears of ticks that happened and of nothing else: while the car drives, those of the control loop;
+while it is disarmed, the looks at camera and Arduino. A loop that hangs, or a process that does, is killed after
+WatchdogSec; the Arduino has stopped the car 150 ms after the last command.
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from systemd_watchdog import WatchDog
+
+from rover_lib.onboard.drive import Report
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.servo_link import LinkError, ServoLink, Telemetry
+
+UNIT = "rover-drive.service"
+ARM = signal.SIGUSR1
+LOOK_S = 0.1  # between looks while disarmed
+FEED_S = 0.25  # WatchdogSec is 2 s
+STATUS_S = 1.0
+ARMED_S = 5.0  # the Arduino answers within 0.5
+DISARMED, DRIVING, STOPPING = STATES = ("disarmed", "driving", "stopping")
+
+
+class NotArmed(RoverError):
+    """The service was told to stop before a human armed the car."""
+
+
+class ServiceError(RoverError):
+    """What cannot be asked of the service now."""
+
+
+class Service:
+    """systemd's side of a drive; a context manager, for the main thread.
+
+    report: of the drive, whose ticks feed the watchdog. stop: ends the waiting. Without systemd (no NOTIFY_SOCKET)
+    nothing is told to anybody, and all else is the same.
+    """
+
+    def __init__(self, report: Report, stop: threading.Event, say: Callable[[str], None] = lambda text: None):
+        self._report, self._stop, self._say = report, stop, say
+        # One that never waits: systemd may be busy, and the loop must not be.
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self._systemd = WatchDog(sock=self._socket)
+        self._looks = 0
+        self._state = ""
+        self._asked = threading.Event()
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._feed, name="watchdog", daemon=True)
+
+    def __enter__(self) -> "Service":
+        self._before = signal.signal(ARM, lambda number, frame: self._asked.set())
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._done.set()
+        self._thread.join()
+        # A notification is lines, and the library has no word for this one. It ends the watchdog's time: files may
+        # still have to be written.
+        self._tell(f"{STOPPING}: {self._report.ended or exc[1] or 'ended'}", "STOPPING=1")
+        signal.signal(ARM, self._before)
+        self._socket.close()
+
+    def wait(self, arm: Callable[[], Telemetry], looks: Iterable[Callable[[], object]] = ()) -> Telemetry:
+        """Ready: waits until a human arms the car and the Arduino agrees; what arm() returned.
+
+        looks: what must go on working meanwhile; each raises if it does not. Raises NotArmed when told to stop, and
+        what a look raises.
+        """
+        looks = tuple(looks)
+        self._asked.clear()  # whoever asked before could not know what the car would do
+        self._tell(f"{DISARMED}: waiting for a human to arm it")
+        with contextlib.suppress(OSError):
+            self._systemd.ready()
+        while not self._stop.is_set():
+            for look in looks:
+                look()
+            self._looks += 1
+            if not self._asked.wait(LOOK_S):
+                continue
+            self._asked.clear()
+            try:
+                telemetry = arm()
+            except LinkError as error:
+                self._say(f"not armed: {error}")
+                self._tell(f"{DISARMED}: {error}")
+                continue
+            self._state = DRIVING
+            self._tell(f"{DRIVING}: armed by a human")
+            return telemetry
+        raise NotArmed("told to stop before a human armed the car")
+
+    def _feed(self) -> None:
+        seen, told_s = -1, 0.0
+        while not self._done.wait(FEED_S):
+            happened = self._looks + self._report.ticks
+            if happened == seen or not self._looks:
+                continue
+            seen = happened
+            with contextlib.suppress(OSError):
+                self._systemd.notify()
+            if self._state == DRIVING and time.monotonic() - told_s > STATUS_S and self._report.ticks:
+                told_s = time.monotonic()
+                self._tell(f"{DRIVING}: {self._report.status}")
+
+    def _tell(self, text: str, *more: str) -> None:
+        with contextlib.suppress(OSError):
+            self._systemd.status("\n".join([" ".join(text.split()), *more]))
+
+
+class GatedLink(ServoLink):
+    """A link whose arm() waits for a human: what drives through it need not know.
+
+    service: asked before the Arduino is. looks: as Service.wait() takes them, beside the link itself.
+    """
+
+    def __init__(self, port: str, service: Service, looks: Iterable[Callable[[], object]] = (), **options: Any):
+        super().__init__(port, **options)
+        self._service, self._more_looks = service, tuple(looks)
+
+    def arm(self) -> Telemetry:
+        """Hands the car to the host once a human has said so. Raises as Service.wait()."""
+        return self._service.wait(super().arm, (self.latest, *self._more_looks))
+
+
+def state_of(unit: str = UNIT) -> dict[str, Any]:
+    """What systemd knows of the service: active, state (one of STATES, or ""), text, since, restarts, result.
+
+    Raises ServiceError where there is no systemd.
+    """
+    names = ("LoadState", "ActiveState", "StatusText", "ActiveEnterTimestamp", "NRestarts", "Result", "UnitFileState")
+    try:
+        found = subprocess.run(
+            ["systemctl", "show", f"--property={','.join(names)}", unit], capture_output=True, text=True, timeout=30
+        )
+    except (OSError, subprocess.SubprocessError) as error:
+        raise ServiceError(f"systemctl cannot be asked about {unit} ({error}); is this a rover?") from None
+    if found.returncode:
+        raise ServiceError(f"systemctl does not know about {unit}: {found.stderr.strip()}; is this a rover?")
+    told = dict(line.partition("=")[::2] for line in found.stdout.splitlines())
+    text = told.get("StatusText", "")
+    return {
+        "installed": told.get("LoadState") == "loaded",
+        "active": told.get("ActiveState", "unknown"),
+        "state": next((s for s in STATES if text.startswith(s)), ""),
+        "text": text,
+        "since": told.get("ActiveEnterTimestamp", ""),
+        "restarts": int(told.get("NRestarts") or 0),
+        "result": told.get("Result", ""),
+        "at_boot": told.get("UnitFileState") == "enabled",
+    }
+
+
+def arm_car(unit: str = UNIT, *, timeout_s: float = ARMED_S) -> str:
+    """Arm the car whose service waits for it; what the service says then. Raises ServiceError if it does not drive."""
+    found = state_of(unit)
+    if found["active"] != "active" or found["state"] != DISARMED:
+        says = found["text"] or "it says nothing"
+        remedy = "it drives already" if found["state"] == DRIVING else f"sudo systemctl start {unit}"
+        raise ServiceError(f"{unit} is {found['active']}, not waiting to be armed ({says}); {remedy}")
+    sent = subprocess.run(
+        ["systemctl", "kill", "--kill-whom=main", f"--signal={ARM.name}", unit], capture_output=True, text=True
+    )
+    if sent.returncode:
+        raise ServiceError(f"{unit} cannot be told to arm ({sent.stderr.strip()}); use sudo")
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        time.sleep(LOOK_S)
+        now = state_of(unit)
+        if now["active"] != "active" or now["state"] == DRIVING or now["text"] != found["text"]:
+            break
+    if now["active"] != "active" or now["state"] != DRIVING:
+        raise ServiceError(f"{unit} did not arm: {now['text'] or now['active']}; 'rover doctor' says what it needs")
+    return now["text"]
+
+
+def told_by_systemd() -> bool:
+    """Whether systemd started this process and wants to hear of it."""
+    return bool(os.environ.get("NOTIFY_SOCKET"))

@@ -1,0 +1,256 @@
+"""The drive as a service: what systemd hears, and who arms."""
+
+import os
+import signal
+import socket
+import stat
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from rover_lib.onboard import service as s
+from rover_lib.onboard.drive import Report
+from rover_lib.onboard.servo_link import LinkError
+
+
+class Systemd:
+    """The other end of NOTIFY_SOCKET."""
+
+    def __init__(self, path: Path):
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(str(path))
+        self.socket.settimeout(0.01)
+        self.lines: list[str] = []
+
+    def hear(self, seconds: float = 0.0) -> list[str]:
+        """What has come, after so long."""
+        end, new = time.monotonic() + seconds, []
+        while True:
+            try:
+                new += self.socket.recv(4096).decode().split("\n")
+            except TimeoutError:
+                if time.monotonic() >= end:
+                    break
+        new = [line for line in new if line]
+        self.lines += new
+        return new
+
+    def hear_until(self, text: str) -> None:
+        end = time.monotonic() + 10
+        while not any(text in line for line in self.lines):
+            assert time.monotonic() < end, self.lines
+            self.hear(0.05)
+
+
+@pytest.fixture
+def systemd(tmp_path, monkeypatch):
+    found = Systemd(tmp_path / "notify")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    yield found
+    found.socket.close()
+
+
+def waiting(systemd: Systemd, then) -> threading.Thread:
+    """Does something once the service says that it is ready, beside the test."""
+
+    def run() -> None:
+        systemd.hear_until("READY=1")
+        then()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread
+
+
+def human() -> None:
+    """Arms: a signal to the process's main thread."""
+    os.kill(os.getpid(), s.ARM)
+
+
+def test_ready_and_disarmed_until_a_human_arms(systemd):
+    armed = []
+    with s.Service(Report(), threading.Event()) as service:
+        thread = waiting(systemd, human)
+        assert service.wait(lambda: armed.append("now") or "telemetry") == "telemetry"
+        thread.join()
+    systemd.hear()
+    assert armed == ["now"]
+    ready = systemd.lines.index("READY=1")
+    assert systemd.lines[ready - 1] == "STATUS=disarmed: waiting for a human to arm it"
+    assert "STATUS=driving: armed by a human" in systemd.lines[ready:]
+    assert systemd.lines[-1] == "STOPPING=1" and systemd.lines[-2].startswith("STATUS=stopping: ")
+
+
+def test_nothing_arms_by_itself(systemd):
+    """A human who asked before the car was ready could not know what it would do."""
+    stop, armed = threading.Event(), []
+    with s.Service(Report(), stop) as service:
+        human()
+        thread = waiting(systemd, lambda: (time.sleep(0.3), stop.set()))
+        with pytest.raises(s.NotArmed, match="told to stop before a human armed"):
+            service.wait(lambda: armed.append(1))
+        thread.join()
+    assert not armed
+
+
+def test_an_arduino_that_refuses_leaves_it_waiting(systemd):
+    answers = [LinkError("no transmitter; switch it on"), "telemetry"]
+
+    def arm():
+        answer = answers.pop(0)
+        if isinstance(answer, LinkError):
+            raise answer
+        return answer
+
+    said = []
+
+    def ask_twice() -> None:
+        human()
+        systemd.hear_until("switch it on")
+        human()
+
+    with s.Service(Report(), threading.Event(), said.append) as service:
+        thread = waiting(systemd, ask_twice)
+        assert service.wait(arm) == "telemetry"
+        thread.join()
+    assert "STATUS=disarmed: no transmitter; switch it on" in systemd.lines
+    assert said == ["not armed: no transmitter; switch it on"]
+
+
+def test_what_breaks_while_it_waits_ends_it(systemd):
+    def look() -> None:
+        raise LinkError("the Arduino said nothing for 0.6 s; is it still plugged in?")
+
+    with s.Service(Report(), threading.Event()) as service, pytest.raises(LinkError, match="plugged in"):
+        service.wait(lambda: pytest.fail("armed"), [look])
+
+
+def feeds(lines: list[str]) -> int:
+    return lines.count("WATCHDOG=1")
+
+
+def test_the_watchdog_hears_of_ticks_that_happened_only(systemd):
+    report = Report()
+    with s.Service(report, threading.Event()) as service:
+        assert feeds(systemd.hear(0.6)) == 0  # nothing before it is ready: loading takes what it takes
+        thread = waiting(systemd, lambda: (time.sleep(0.8), human()))
+        service.wait(lambda: None)
+        thread.join()
+        systemd.hear()
+        assert feeds(systemd.lines) >= 2  # the looks while it waits
+        systemd.hear(2 * s.FEED_S)
+        assert feeds(systemd.hear(0.8)) == 0  # armed, and the loop hangs
+        report.status = "steering +0.10\nREADY=0"
+        for _ in range(16):
+            report.ticks += 1
+            systemd.hear(0.05)
+        assert feeds(systemd.lines[-20:]) >= 2
+        systemd.hear(2 * s.FEED_S)
+        assert feeds(systemd.hear(0.8)) == 0
+    assert "STATUS=driving: steering +0.10 READY=0" in systemd.lines and "READY=0" not in systemd.lines
+
+
+def test_without_systemd_it_works_the_same(monkeypatch):
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    assert not s.told_by_systemd()
+    threading.Timer(0.3, human).start()
+    with s.Service(Report(), threading.Event()) as service:
+        assert service.wait(lambda: 7) == 7
+
+
+def test_a_systemd_that_takes_nothing_holds_nobody_up(systemd, monkeypatch):
+    with s.Service(Report(), threading.Event()) as service:
+        systemd.socket.close()
+        threading.Timer(0.2, human).start()
+        assert service.wait(lambda: 7) == 7
+
+
+def test_the_signal_means_what_it_meant_before(systemd):
+    before = signal.getsignal(s.ARM)
+    with s.Service(Report(), threading.Event()):
+        assert signal.getsignal(s.ARM) != before
+    assert signal.getsignal(s.ARM) == before
+
+
+def test_a_gated_link_asks_the_human_first(monkeypatch):
+    order = []
+    service = SimpleNamespace(wait=lambda arm, looks: (order.append(len(looks)), arm())[1])
+    monkeypatch.setattr(s.ServoLink, "arm", lambda self: order.append("arduino") or "telemetry")
+    link = s.GatedLink("/dev/none", service, [lambda: None])
+    assert link.arm() == "telemetry" and order == [2, "arduino"]
+
+
+# rover arm-car
+
+SYSTEMCTL = """#!/bin/sh
+cd {folder}
+case $1 in
+  show) cat show ;;
+  kill) echo "$*" > killed; cp after show; exit $(cat code) ;;
+esac
+"""
+
+
+@pytest.fixture
+def systemctl(tmp_path, monkeypatch):
+    """Writes what systemctl says of the service, before it is told to arm and after."""
+    script = tmp_path / "systemctl"
+    script.write_text(SYSTEMCTL.format(folder=tmp_path))
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+
+    def tell(before: str, after: str = "", active: str = "active", code: int = 0) -> Path:
+        for name, text in (("show", before), ("after", after)):
+            (tmp_path / name).write_text(
+                f"LoadState=loaded\nActiveState={active}\nStatusText={text}\nNRestarts=2\nUnitFileState=disabled\n"
+            )
+        (tmp_path / "code").write_text(f"{code}\n")
+        return tmp_path / "killed"
+
+    return tell
+
+
+def test_arms_a_car_that_waits(systemctl):
+    killed = systemctl("disarmed: waiting for a human to arm it", "driving: armed by a human")
+    assert s.arm_car() == "driving: armed by a human"
+    assert killed.read_text() == "kill --kill-whom=main --signal=SIGUSR1 rover-drive.service\n"
+
+
+@pytest.mark.parametrize(
+    "text, active, sentence",
+    [
+        ("driving: steering +0.10", "active", "it drives already"),
+        ("", "inactive", "is inactive, not waiting to be armed .*; sudo systemctl start rover-drive"),
+        ("disarmed: waiting", "deactivating", "is deactivating, not waiting"),
+        ("", "activating", "is activating, not waiting"),
+    ],
+)
+def test_arms_no_other(systemctl, text, active, sentence):
+    killed = systemctl(text, active=active)
+    with pytest.raises(s.ServiceError, match=sentence):
+        s.arm_car()
+    assert not killed.exists()
+
+
+def test_says_why_it_did_not_arm(systemctl):
+    systemctl("disarmed: waiting for a human to arm it", "disarmed: no transmitter; switch it on")
+    with pytest.raises(s.ServiceError, match="did not arm: disarmed: no transmitter; switch it on"):
+        s.arm_car()
+    systemctl("disarmed: waiting for a human to arm it", "disarmed: waiting for a human to arm it")
+    with pytest.raises(s.ServiceError, match="did not arm"):
+        s.arm_car(timeout_s=0.3)
+    systemctl("disarmed: waiting for a human to arm it", code=1)
+    with pytest.raises(s.ServiceError, match=r"cannot be told to arm .* use sudo"):
+        s.arm_car()
+
+
+def test_the_services_state(systemctl, monkeypatch):
+    systemctl("driving: steering +0.10")
+    found = s.state_of()
+    assert found["state"] == "driving" and found["restarts"] == 2 and found["installed"] and not found["at_boot"]
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(s.ServiceError, match="is this a rover"):
+        s.state_of()
