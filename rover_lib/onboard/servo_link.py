@@ -32,6 +32,7 @@ SILENT_S = 0.3  # nothing may be asked before: an Arduino that is being reset ha
 HELLO_EVERY_S = 0.5
 REPEAT_S = 0.05
 ANSWER_S = 0.5
+SIGNALS_MS = 250  # from the Arduino's start; it knows the transmitter's signals after two pulses of each
 STALE_S = 0.5  # the Arduino speaks every 20 ms
 READ_TIMEOUT_S = 0.05
 
@@ -302,6 +303,8 @@ class ServoLink:
         for telemetry in self._ask(">A"):
             if telemetry.state is State.AUTONOMOUS:
                 return telemetry
+            if telemetry.result == "s" and telemetry.uptime_ms < SIGNALS_MS:
+                continue  # it has just started, and nothing can have come yet
             if telemetry.result in "st":
                 remedy = "switch the transmitter on" if telemetry.result == "s" else "let go of the throttle stick"
                 raise LinkError(f"{self.port}: arming was {RESULTS[telemetry.result]}; {remedy} and try again")

@@ -86,9 +86,11 @@ class Board:
         if not self._closing:
             os.write(self.master, line(body))
 
-    def status(self, state="M", reason="r", result="k", sequence=None, boot=7, steering_us=1456, throttle_us=120):
+    def status(
+        self, state="M", reason="r", result="k", sequence=None, boot=7, steering_us=1456, throttle_us=120, ms=999
+    ):
         sequence = self.sequence if sequence is None else sequence
-        self.say(f"<S {boot} 99 {sequence} {result} {state} {reason} {steering_us} {throttle_us} - - - - 0 0 0 0")
+        self.say(f"<S {boot} {ms} {sequence} {result} {state} {reason} {steering_us} {throttle_us} - - - - 0 0 0 0")
 
     @property
     def sequence(self):
@@ -236,6 +238,15 @@ def test_arming_refused(result, sentence):
         with ServoLink(board.port) as link, pytest.raises(LinkError, match=sentence):
             link.arm()
         assert sum(b.startswith(">A") for b in board.heard) == 1
+
+
+def test_an_arduino_that_has_just_started_may_not_know_the_signals_yet():
+    def answer(board, body):
+        asked = sum(b.startswith(">A") for b in board.heard)
+        board.status(*(("A", "a") if asked == 3 else ("M", "r", "s")), ms=50 * asked)
+
+    with board_of(answer=answer) as board, ServoLink(board.port) as link:
+        assert link.arm().state is State.AUTONOMOUS
 
 
 def test_arming_without_an_answer():
