@@ -5,8 +5,9 @@ from policies import stage_of
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.params import params
+from rover_lib.workshop.run import NAMES
 
-STAGES = ("load", "calibrate", "quantize", "compare")
+STAGES = ("load", "calibrate", "quantize", "compare", "drive")
 
 
 def test_left_everything_that_a_run_leaves(demo_run):
@@ -15,7 +16,7 @@ def test_left_everything_that_a_run_leaves(demo_run):
         assert content["schema"] == 1 and content["stage"] == stage and content["inputs"]
     for mode in ("fp32", "dynamic", "static", "mixed"):
         assert load_policy(demo_run / f"policy_{mode}.pt").manifest["mode"] == mode
-    assert len(list(demo_run.glob("0[1-5]_*.ipynb"))) == 5
+    assert {p.stem for p in demo_run.glob("*.ipynb")} >= {*NAMES, "07_drive"}
     assert len(list((demo_run / "figures").glob("*.png"))) >= 5
     assert list(demo_run.glob("benchmark-*.json"))
 
@@ -39,3 +40,14 @@ def test_int8_is_faithful(demo_run, mode):
 def test_sizes_are_weights_with_weights(demo_run):
     metrics = stage_of(demo_run, "compare")["metrics"]
     assert 0.2 < metrics["modes"]["static"]["size_mb"] / metrics["fp32"]["size_mb"] < 0.35
+
+
+def test_drives_by_plans_that_are_150_ms_late_as_by_fresh_ones(demo_run):
+    metrics = stage_of(demo_run, "drive")["metrics"]
+    rows = {r["latency_ms"]: r for r in metrics["rows"] if r["compensate"] and not r["pushes"] and not r["ensemble"]}
+    fresh, late = rows[0], rows[150]
+    assert fresh["trials"] == late["trials"] == 40
+    assert fresh["hits"] >= params()["gates"]["fp32_hits"]
+    assert late["hits"] >= fresh["hits"] - params()["gates"]["hits_lost_at_150_ms"]
+    assert fresh["plan_age_max_ms"] == 0 and late["plan_age_min_ms"] >= 150  # the loop really drove by late plans
+    assert all(g["passed"] for g in metrics["gates"])

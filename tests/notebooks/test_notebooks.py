@@ -6,10 +6,12 @@ import sys
 from types import SimpleNamespace
 
 import nbformat
+import numpy as np
 import pytest
 
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import write_stage
+from rover_lib.playground import latency
 from rover_lib.workshop import arm, session
 from rover_lib.workshop import run as runs
 from rover_lib.workshop.run import AFTERWARDS, NAMES, NOTEBOOK_LIMIT, NOTEBOOKS, parameters_of
@@ -63,7 +65,7 @@ def test_cells_call_check_and_show(notebook):
 def test_every_notebook_writes_a_figure_and_what_it_found(notebook, path):
     text = "\n".join(c.source for c in code(notebook))
     assert "plots.save(" in text
-    assert ("write_stage(" in text) == (path.stem in NAMES)  # afterwards there is nothing to find, only to show
+    assert ("write_stage(" in text) == (path.stem in NAMES)  # afterwards the library writes what is found
 
 
 def test_committed_outputs_are_clean(notebook, path):
@@ -137,6 +139,27 @@ def test_nothing_counted_is_a_sentence(tmp_path):
         runs.execute("06_arm", tmp_path / "nothing")
 
 
+# --- late plans ---
+
+
+def test_drives_are_drawn(tmp_path, monkeypatch):
+    class Straight:
+        rate_hz, chunk = 30.0, 32
+
+        def predict_unclipped(self, frame_bgr, state):
+            return np.tile(np.float32([0.0, 0.06]), (self.chunk, 1))
+
+    monkeypatch.setattr(latency, "load_policy", lambda path, threads: Straight())
+    (tmp_path / "policy_static.pt").write_bytes(b"a policy that only this process knows")
+    chosen = {"worlds": 2, "latencies_ms": [0, 150, 600], "pushes": 2, "pushed_latencies_ms": [150], "shown_ms": 150}
+    found = latency.measured(tmp_path, **chosen)
+    text = shown(runs.execute("07_drive", tmp_path, **chosen))
+    assert latency.table(found) in text and "ensembling, 0.01" in text
+    assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {
+        f"07_{figure}" for figure in ("age", "hits", "path", "above", "gates")
+    }
+
+
 # --- executing and publishing ---
 
 
@@ -196,7 +219,15 @@ def test_what_a_run_was_not_asked_to_know_is_refused(one_notebook, tmp_path):
 
 
 def test_an_old_run_is_cleared_but_for_other_hosts(tmp_path):
-    for name in ("load.json", "arm.json", "parts.json", "06_arm.ipynb", "policy_static.pt"):
+    for name in (
+        "load.json",
+        "arm.json",
+        "parts.json",
+        "drive.json",
+        "06_arm.ipynb",
+        "07_drive.ipynb",
+        "policy_static.pt",
+    ):
         (tmp_path / name).touch()
     for name in ("benchmark-pi.json", "best_model.pth"):
         (tmp_path / name).touch()
