@@ -324,6 +324,7 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
     "--json", "json_file", type=click.File("w", lazy=True), help="Write what the drive was there; - prints it."
 )
 @click.option("--replay", type=FILE, help="Send this episode's pulses; no policy, no camera.")
+@click.option("--service", is_flag=True, help="As a systemd service: disarmed until `rover arm-car`.")
 @click.option("--world", "in_world", is_flag=True, help="The balloon world instead of a car, in real time.")
 @click.option("--firmware", is_flag=True, help="With --world: the real firmware on an emulated Arduino.")
 @click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="With --world: a plan takes so long.")
@@ -337,14 +338,19 @@ def drive(ctx: click.Context, artifact: Path | None, replay: Path | None, json_f
     2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start.
     """
     from rover_lib.onboard.drive import DriveFault, Report, TakenOver
+    from rover_lib.onboard.service import NotArmed
 
     if bool(artifact) == bool(replay):
         raise click.UsageError("give an ARTIFACT, or --replay EPISODE")
+    if options["service"] and (replay or options["dry_run"]):
+        raise click.UsageError("--service drives a car by an artifact: no --replay, no --dry-run")
     if not options["in_world"] and (options["firmware"] or options["latency_ms"] or options["in_thread"]):
         raise click.UsageError("--firmware, --latency-ms and --in-thread belong to --world")
     report, more, code = Report(), {}, 0
     try:
         _drive(artifact, replay, report, more, **options)
+    except NotArmed as e:
+        click.echo(f"rover: {e}", err=True)
     except (DriveFault, TakenOver) as e:
         click.echo(f"rover: {e}", err=True)
         code = 4 if isinstance(e, TakenOver) else 3
@@ -377,6 +383,7 @@ def _drive(
     latency_ms: float,
     seed: int,
     in_thread: bool,
+    service: bool,
     **ends: Any,
 ) -> None:
     """The drive command's devices, opened in order and closed in reverse; more: what a world adds to the report."""
@@ -389,6 +396,7 @@ def _drive(
     from rover_lib.onboard.params import params
     from rover_lib.onboard.plan import Settings
     from rover_lib.onboard.recording import read_controls
+    from rover_lib.onboard.service import GatedLink, Service
     from rover_lib.onboard.servo_link import ServoLink
     from rover_lib.onboard.telemetry import FlightLog, StatusLine
 
@@ -414,14 +422,20 @@ def _drive(
             car = stack.enter_context(VirtualCar(seed=seed, firmware=firmware))
             camera, port = car.camera, car.port
             stack.callback(lambda: more.update(hits=(r := car.report()).hits, trials=r.trials, camera_late=r.late))
-        link = None if dry_run else stack.enter_context(ServoLink(port))
+        if service:
+            frames = stack.enter_context(Camera(camera))
+            human = stack.enter_context(Service(report, stop, log.event))
+            link = stack.enter_context(GatedLink(port, human, [frames.latest]))
+        else:
+            link = None if dry_run else stack.enter_context(ServoLink(port))
         common = {"rate_hz": hz, "log": log, "stop": stop, "report": report, **ends}
         if controls:
             limit = 1.0 if throttle_limit is None else throttle_limit
             with d.going_first(log):
                 d.drive(d.ReplayPilot(controls, throttle_limit=limit), link, watch=d.Troubles(report, link), **common)
             return
-        frames = stack.enter_context(Camera(camera))
+        if not service:
+            frames = stack.enter_context(Camera(camera))
         how = {"threads": threads, "in_thread": in_thread, "latency_s": latency_ms / 1e3, "record": record}
         d.drive_artifact(artifact, frames, link, settings=settings, **how, **common)
 
@@ -536,6 +550,137 @@ def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...]) -> No
     for sentence in outcome.wrong:
         click.echo(f"rover: {sentence}", err=True)
     ctx.exit(1 if outcome.wrong else 0)
+
+
+@main.command("arm-car")
+@click.option("--yes", is_flag=True, help="Do not ask.")
+def arm_car(yes: bool) -> None:
+    """Arm the car whose service waits for it (rover-drive.service): it drives at once. Needs root.
+
+    The Arduino refuses without the transmitter, and unless its throttle stick is at rest. Moving a stick takes the car
+    back; `sudo systemctl restart rover-drive` stops and disarms it.
+    """
+    from rover_lib.onboard.service import arm_car as arm
+
+    if not yes:
+        click.confirm("The car will drive now. Is the way free, and the transmitter in your hand?", abort=True)
+    click.echo(arm())
+
+
+@main.group()
+@click.option("--models", type=FILE, default="/var/lib/rover/models", show_default=True, help="The rover's models.")
+@click.option("--chunk", type=click.IntRange(min=1), default=32, show_default=True, help="Actions of a plan.")
+@click.option("--camera", default="cam_front", show_default=True, help="The policy's name for this rover's camera.")
+@click.option("--aspect", type=float, default=1.78, show_default=True, help="Of its pictures, width to height.")
+@click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
+@click.pass_context
+def release(ctx: click.Context, models: Path, chunk: int, camera: str, aspect: float, sandboxed: bool) -> None:
+    """Models on the rover: staged, proven, used; what is in use changes at once or not at all.
+
+    `ansible-playbook ansible/deploy.yml` does all of it over a network.
+    """
+    from rover_lib.onboard import release as r
+
+    expected = r.Expected(chunk=chunk, camera=camera, aspect=aspect)
+    ctx.obj = r.Releases(models, check=r.sandboxed if sandboxed else None, expected=expected)
+
+
+ALLOW = click.option(
+    "--allow", multiple=True, type=click.Choice(["mode", "chunk", "camera"]), help="Take one that differs in this."
+)
+
+
+@release.command()
+@click.argument("artifact", type=FILE)
+@click.argument("folder", type=FILE)
+@ALLOW
+@click.pass_obj
+def pack(releases: Any, artifact: Path, folder: Path, allow: tuple[str, ...]) -> None:
+    """Cut ARTIFACT into parts that travel one by one, in FOLDER. Refuses what the rover would refuse."""
+    from rover_lib.onboard.release import pack as pack_parts
+
+    show(pack_parts(artifact, folder, releases.expected, allow), True)
+
+
+@release.command()
+@click.argument("source", type=FILE)
+@click.option("--sha256", help="What the artifact's must be.")
+@ALLOW
+@click.pass_obj
+def stage(releases: Any, source: Path, sha256: str | None, allow: tuple[str, ...]) -> None:
+    """Make a release of SOURCE, an artifact or what `pack` wrote. What is in use stays in use."""
+    show(vars(releases.stage(source, sha256=sha256, allow=allow)), True)
+
+
+@release.command()
+@click.argument("name", default="current")
+@click.pass_obj
+def verify(releases: Any, name: str) -> None:
+    """Prove that a release is whole and computes here what it should: checksums and parity vectors."""
+    releases.verify(name)
+    click.echo(f"{name}: whole, and computes what it should")
+
+
+@release.command()
+@click.argument("name")
+@click.pass_obj
+def switch(releases: Any, name: str) -> None:
+    """Use the release NAME from now on: proven before and after, and back by itself if that fails."""
+    show({"name": name, "changed": releases.switch(name)}, True)
+
+
+@release.command()
+@click.pass_obj
+def rollback(releases: Any) -> None:
+    """Use the release before the one in use, the newest that can be proven."""
+    show({"name": releases.rollback(), "changed": True}, True)
+
+
+@release.command()
+@click.option("--keep", type=click.IntRange(min=1), default=3, show_default=True)
+@click.pass_obj
+def prune(releases: Any, keep: int) -> None:
+    """Remove all but the releases used last; never the one in use."""
+    gone = releases.prune(keep)
+    show({"removed": gone, "changed": bool(gone)}, True)
+
+
+@release.command()
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, with the machine's and the service's state.")
+@click.pass_obj
+def status(releases: Any, as_json: bool) -> None:
+    """What is in use, whether it is whole, what else is there. Exit code 1 if what is in use is not whole."""
+    found = releases.status()
+    if as_json:
+        import socket
+
+        from rover_lib.onboard.drive import default_log
+        from rover_lib.onboard.host import Host
+        from rover_lib.onboard.service import ServiceError, state_of
+
+        try:
+            found["service"] = state_of()
+        except ServiceError as e:
+            found["service"] = {"installed": False, "active": "unknown", "state": "", "text": str(e)}
+        log = next((p for p in (Path("/var/lib/rover-drive/flight.log"), default_log()) if p.exists()), None)
+        found |= {"rover": socket.gethostname(), **Host().reading(), "last_drive_s": log and log.stat().st_mtime}
+        return show(found, True)
+    for r in found["releases"]:
+        mark = "*" if r["current"] else " "
+        click.echo(f"{mark} {r['name'][:12]}  {r['mode']:<7} {r['megabytes']:6.1f} MB  {r['wrong'] or r['origin']}")
+    if not found["healthy"]:
+        raise RoverError(found["trouble"])
+
+
+@main.command()
+@click.argument("folder", type=FILE, default="wheels")
+@click.option("--python", "pythons", multiple=True, help="A Pi's Python [default: 3.11 and 3.13].")
+@click.option("--only-rover", is_flag=True, help="Only rover_lib's own wheel: Pis with internet fetch the others.")
+def wheelhouse(folder: Path, pythons: tuple[str, ...], only_rover: bool) -> None:
+    """Put all that a Pi installs into FOLDER, for a rover without internet (300 MB for each Python)."""
+    from rover_lib.workshop.wheelhouse import PYTHONS, make
+
+    show(vars(make(folder, pythons=pythons or PYTHONS, only_rover=only_rover)), True)
 
 
 @main.command("leave-out")

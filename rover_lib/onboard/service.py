@@ -154,7 +154,7 @@ def state_of(unit: str = UNIT) -> dict[str, Any]:
     except (OSError, subprocess.SubprocessError) as error:
         raise ServiceError(f"systemctl cannot be asked about {unit} ({error}); is this a rover?") from None
     if found.returncode:
-        raise ServiceError(f"systemctl does not know about {unit}: {found.stderr.strip()}; is this a rover?")
+        raise ServiceError(f"systemctl does not know about {unit}: {' '.join(found.stderr.split())}; is this a rover?")
     told = dict(line.partition("=")[::2] for line in found.stdout.splitlines())
     text = told.get("StatusText", "")
     return {
