@@ -1,0 +1,219 @@
+"""The playbooks as far as one machine can tell: syntax, lint, arguments, units. Nothing outside a temporary folder."""
+
+import importlib.util
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jinja2
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+ANSIBLE = ROOT / "ansible"
+ROLE = ANSIBLE / "roles" / "rover"
+PLAYBOOKS = ["provision", "deploy", "rollback", "status", "benchmark", "drive"]
+SPECS = yaml.safe_load((ROLE / "meta" / "argument_specs.yml").read_text())["argument_specs"]
+DEFAULTS = yaml.safe_load((ROLE / "defaults" / "main.yml").read_text())
+
+
+def program(name: str) -> str:
+    """Beside this Python, or skip."""
+    path = Path(sys.executable).with_name(name)
+    if not path.exists():
+        pytest.skip(f"no {name}: pip install -e '.[dev]'")
+    return str(path)
+
+
+def run(*command: object, cwd: Path = ROOT, tmp: Path | None = None) -> subprocess.CompletedProcess:
+    home = {"ANSIBLE_HOME": str(tmp), "ANSIBLE_LOCAL_TEMP": f"{tmp}/local"} if tmp else {}
+    env = {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin", "HOME": str(Path.home()), "LANG": "C.UTF-8", **home}
+    return subprocess.run(
+        list(map(str, command)), cwd=cwd, capture_output=True, text=True, env={**env, "ANSIBLE_NOCOLOR": "1"}
+    )
+
+
+def play(tmp_path: Path, tasks: list[dict], **variables: object) -> subprocess.CompletedProcess:
+    """Tasks of the role on this machine, without becoming root."""
+    book = tmp_path / "play.yml"
+    book.write_text(
+        yaml.safe_dump([{"name": "Test", "hosts": "localhost", "connection": "local", "gather_facts": False,
+                         "tasks": tasks}])
+    )  # fmt: skip
+    (tmp_path / "roles").mkdir(exist_ok=True)
+    if not (tmp_path / "roles" / "rover").exists():
+        (tmp_path / "roles" / "rover").symlink_to(ROLE)
+    given = {"ansible_python_interpreter": sys.executable, **variables}
+    return run(program("ansible-playbook"), "-i", "localhost,", book, "-e", json.dumps(given), tmp=tmp_path)
+
+
+def entry(name: str) -> dict:
+    return {"name": "Use the role", "ansible.builtin.include_role": {"name": "rover", "tasks_from": name}}
+
+
+@pytest.mark.parametrize("name", PLAYBOOKS)
+def test_syntax(name, tmp_path):
+    found = run(
+        program("ansible-playbook"), "-i", "inventory.ini", "--syntax-check", ANSIBLE / f"{name}.yml", tmp=tmp_path
+    )
+    assert found.returncode == 0, found.stderr
+
+
+def test_lint_finds_nothing(tmp_path):
+    found = run(program("ansible-lint"), "--offline", "--profile=production", "--strict", "-q", ANSIBLE, tmp=tmp_path)
+    assert found.returncode == 0, found.stdout + found.stderr
+
+
+def test_the_lint_would_find_something(tmp_path):
+    (tmp_path / "bad.yml").write_text("- hosts: all\n  tasks:\n    - shell: ls\n")
+    found = run(program("ansible-lint"), "--offline", "--profile=production", "bad.yml", cwd=tmp_path, tmp=tmp_path)
+    assert found.returncode == 2 and "fqcn" in found.stdout
+
+
+# Arguments
+
+
+def test_the_readme_has_the_variables_of_today():
+    spec = importlib.util.spec_from_file_location("variables", ANSIBLE / "variables.py")
+    variables = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(variables)
+    readme = (ANSIBLE / "README.md").read_text()
+    assert variables.filled(readme) == readme, "python ansible/variables.py"
+    assert readme.count("| `rover_") == len({name for s in SPECS.values() for name in s["options"]}) > 25
+
+
+def test_each_default_is_said_once_more_and_the_same():
+    options = {name: option for s in SPECS.values() for name, option in s["options"].items()}
+    assert {n: o["default"] for n, o in options.items() if not o.get("required")} == DEFAULTS
+
+
+def test_each_task_file_has_its_arguments_and_uses_no_others():
+    files = {p.stem: p.read_text() for p in (ROLE / "tasks").glob("*.yml")}
+    parts = {"not_driving", "restart"}  # of others
+    assert set(files) - parts == set(SPECS)
+    known = {name for s in SPECS.values() for name in s["options"]}
+    for name in set(files) - parts:
+        used = set(re.findall(r"\brover_[a-z_]+", files[name])) & known
+        assert used <= set(SPECS[name]["options"]), name
+    for name in known:
+        text = "".join(files.values()) + "".join(p.read_text() for p in ANSIBLE.glob("*.yml"))
+        text += "".join(p.read_text() for p in (ROLE / "templates").glob("*.j2"))
+        assert re.search(rf"\b{name}\b", text), f"{name} is used nowhere"
+
+
+@pytest.mark.parametrize(
+    "name, given, sentence",
+    [
+        ("pack", {}, "missing required arguments: rover_artifact"),
+        ("deploy", {"rover_keep": "many"}, "argument 'rover_keep' is of type str and we were unable to convert to int"),
+        ("deploy", {"rover_while_driving": "yes please"}, "value of rover_while_driving must be one of: refuse, stop"),
+        ("deploy", {"rover_allow": ["torch"]}, "value of rover_allow must be one or more of: mode, chunk, camera"),
+        ("service", {"rover_start_at_boot": "perhaps"}, "'rover_start_at_boot' is of type str and we were unable to"),
+        ("benchmark", {"rover_soak_minutes": "long"}, "'rover_soak_minutes' is of type str and we were unable to"),
+        ("drive", {"rover_arm": "maybe"}, "'rover_arm' is of type str and we were unable to convert to bool"),
+    ],
+)
+def test_wrong_arguments_end_in_a_sentence_before_anything_is_done(tmp_path, name, given, sentence):
+    found = play(tmp_path, [entry(name)], **given)
+    assert found.returncode == 2 and sentence in found.stdout, found.stdout + found.stderr
+    assert "changed=0" in found.stdout and "failed=1" in found.stdout
+
+
+def test_a_laptop_is_no_rover(tmp_path):
+    found = play(
+        tmp_path, [{"name": "Look", "ansible.builtin.include_role": {"name": "rover"}}], rover_architecture="z80"
+    )
+    assert found.returncode == 2 and "a rover is z80: flash the 64-bit Raspberry Pi OS" in found.stdout.replace(
+        "\n", " "
+    )
+
+
+def test_an_artifact_that_is_not_there_or_not_fit_does_not_travel(tmp_path, artifacts):
+    rover = {"rover_command": program("rover"), "rover_packed": str(tmp_path / "packed")}
+    found = play(tmp_path, [entry("pack")], rover_artifact="nowhere.pt", **rover)
+    assert found.returncode == 2 and "nowhere.pt: not found" in found.stdout
+    found = play(tmp_path, [entry("pack")], rover_artifact=str(artifacts["fp32"]), **rover)
+    assert found.returncode == 2 and "its mode is fp32" in found.stdout and "allow it: mode" in found.stdout
+    assert not (tmp_path / "packed").exists()
+    found = play(tmp_path, [entry("pack")], rover_artifact=str(artifacts["fp32"]), rover_allow=["mode"], **rover)
+    assert found.returncode == 0, found.stdout
+    assert (tmp_path / "packed" / "release.json").exists()
+
+
+# The units, as they are on a rover
+
+
+@pytest.fixture
+def units(tmp_path) -> Path:
+    """The service's units with the defaults, and a rover_home that has something to execute."""
+    (tmp_path / "venv" / "bin").mkdir(parents=True)
+    (tmp_path / "venv" / "bin" / "rover").symlink_to("/bin/true")
+    given = {**DEFAULTS, "rover_home": str(tmp_path), "ansible_managed": "Ansible"}
+    jinja = jinja2.Environment(loader=jinja2.FileSystemLoader(ROLE / "templates"), trim_blocks=True, autoescape=False)
+    for name in ("rover-drive.service", "rover-check@.service"):
+        (tmp_path / name).write_text(jinja.get_template(f"{name}.j2").render(given))
+    return tmp_path
+
+
+def analyze(*arguments: object) -> subprocess.CompletedProcess:
+    if not shutil.which("systemd-analyze"):
+        pytest.skip("no systemd-analyze: apt install systemd")
+    return run("systemd-analyze", *arguments)
+
+
+@pytest.mark.parametrize("name", ["rover-drive.service", "rover-check@.service"])
+def test_systemd_understands_the_units(units, name):
+    found = analyze("verify", "--man=no", "--recursive-errors=no", units / name)
+    assert found.returncode == 0 and str(units) not in found.stderr, found.stderr
+
+
+def test_systemd_would_not_understand_nonsense(units):
+    unit = units / "rover-drive.service"
+    unit.write_text(unit.read_text().replace("WatchdogSec=2", "WatchdogSec=soon"))
+    assert "rover-drive.service" in analyze("verify", "--man=no", "--recursive-errors=no", unit).stderr
+
+
+@pytest.mark.parametrize("name", ["rover-drive.service", "rover-check@.service"])
+def test_the_sandbox_is_closed_enough(units, name):
+    found = analyze("security", "--offline=true", "--threshold=20", "--no-pager", units / name)
+    assert found.returncode == 0, found.stdout[-3000:]
+
+
+def test_both_units_have_the_same_sandbox(units):
+    """What passes its parity vectors in one must not fail in the other."""
+
+    def settings(name: str) -> set[str]:
+        return {line for line in (units / name).read_text().splitlines() if re.match(r"[A-Z]\w+=", line)}
+
+    differ = settings("rover-drive.service") ^ settings("rover-check@.service")
+    kinds = {line.partition("=")[0] for line in differ}
+    assert kinds <= {
+        *("Description", "Type", "ExecStart", "NotifyAccess", "ConditionPathExists", "StartLimitIntervalSec"),
+        *("StartLimitBurst", "StateDirectory", "StateDirectoryMode", "WatchdogSec", "WatchdogSignal", "Restart"),
+        *("RestartSec", "KillMode", "TimeoutStopSec", "OOMPolicy", "WantedBy"),
+        *("LimitRTPRIO", "RestrictRealtime", "SupplementaryGroups", "DeviceAllow", "PrivateDevices"),
+    }, kinds
+
+
+def test_the_service_says_what_the_command_line_takes(units):
+    from click.testing import CliRunner
+
+    from rover_lib.cli import main
+
+    line = next(x for x in (units / "rover-drive.service").read_text().splitlines() if x.startswith("ExecStart="))
+    arguments = line.split()[1:]
+    assert arguments[:2] == ["drive", "--service"]
+    found = CliRunner().invoke(main, [*arguments, "--help"])
+    assert found.exit_code == 0, found.output
+    drive = main.commands["drive"]
+    assert {a for a in arguments if a.startswith("--")} <= {o for p in drive.params for o in p.opts}
+    check = next(x for x in (units / "rover-check@.service").read_text().splitlines() if x.startswith("ExecStart="))
+    assert check.split()[1:] == ["release", "--models", "/var/lib/rover/models", "verify", "%i"]
+
+
+def test_the_car_does_not_start_by_itself():
+    assert DEFAULTS["rover_start_at_boot"] is False and DEFAULTS["rover_arm"] is False
+    assert DEFAULTS["rover_while_driving"] == "refuse"
