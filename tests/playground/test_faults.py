@@ -180,7 +180,7 @@ def test_continues_until_a_limit():
 @pytest.mark.parametrize(
     ("what", "sentence"),
     [
-        (fading(0.2), "the throttle fades after"),
+        (fading(0.1), "the throttle fades after"),
         (then((0.98, 1456, 120)), "the throttle fades after"),
         (fading(end=1.4), "throttle off after"),
         (then(), "the car was never stopped"),
