@@ -2,6 +2,7 @@
 
 import json
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -337,7 +338,8 @@ def drive(ctx: click.Context, artifact: Path | None, replay: Path | None, json_f
     Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP); 1 could not begin;
     2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start.
     """
-    from rover_lib.onboard.drive import DriveFault, Report, TakenOver
+    from rover_lib.onboard.drive import Report
+    from rover_lib.onboard.errors import DriveFault, TakenOver
     from rover_lib.onboard.service import NotArmed
 
     if bool(artifact) == bool(replay):
@@ -354,6 +356,11 @@ def drive(ctx: click.Context, artifact: Path | None, replay: Path | None, json_f
     except (DriveFault, TakenOver) as e:
         click.echo(f"rover: {e}", err=True)
         code = 4 if isinstance(e, TakenOver) else 3
+    except Exception:
+        if not report.ticks:
+            raise
+        traceback.print_exc()  # a defect of this program, which has stopped the car too
+        code = 3
     result = {**report.summary(), **more}
     if json_file:
         json_file.write(json.dumps(result, indent=2) + "\n")
@@ -392,8 +399,10 @@ def _drive(
     from contextlib import ExitStack
 
     from rover_lib.onboard import drive as d
+    from rover_lib.onboard import watch as w
     from rover_lib.onboard.camera import Camera
     from rover_lib.onboard.params import params
+    from rover_lib.onboard.pilot import ReplayPilot
     from rover_lib.onboard.plan import Settings
     from rover_lib.onboard.recording import read_controls
     from rover_lib.onboard.service import GatedLink, Service
@@ -410,12 +419,12 @@ def _drive(
         logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status.handler], force=True)
         limits = {"max_bytes": int(p["flight_log"]["max_mb"] * 1e6), "keep": p["flight_log"]["keep"]}
         path = log_file or d.default_log()
-        unended = d.unended(path)
+        unended = w.unended(path)
         log = stack.enter_context(FlightLog(path, header=header, **limits))
         if unended:
             log.event(unended, level=logging.WARNING)
-        stack.enter_context(d.ended_by_signals(stop, log))
-        stack.enter_context(d.ended_if_hung(report, log))
+        stack.enter_context(w.ended_by_signals(stop, log))
+        stack.enter_context(w.ended_if_hung(report, log))
         if in_world:
             from rover_lib.playground.car import VirtualCar
 
@@ -431,8 +440,8 @@ def _drive(
         common = {"rate_hz": hz, "log": log, "stop": stop, "report": report, **ends}
         if controls:
             limit = 1.0 if throttle_limit is None else throttle_limit
-            with d.going_first(log):
-                d.drive(d.ReplayPilot(controls, throttle_limit=limit), link, watch=d.Troubles(report, link), **common)
+            with w.going_first(log):
+                d.drive(ReplayPilot(controls, throttle_limit=limit), link, watch=w.Troubles(report, link), **common)
             return
         if not service:
             frames = stack.enter_context(Camera(camera))

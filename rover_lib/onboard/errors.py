@@ -42,3 +42,11 @@ class ParamsError(RoverError):
 
 class WorldError(RoverError):
     """A playground run that cannot be made."""
+
+
+class DriveFault(RoverError):
+    """What stopped the car."""
+
+
+class TakenOver(RoverError):
+    """The human moved a stick."""

@@ -20,9 +20,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from rover_lib.onboard.camera import Frame
-from rover_lib.onboard.drive import DriveFault, Order, PolicyPilot, drive
-from rover_lib.onboard.errors import RoverError, WorldError
+from rover_lib.onboard.drive import drive
+from rover_lib.onboard.errors import DriveFault, RoverError, WorldError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.pilot import Order, PolicyPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.stage import plain, read_stage, sha256_of, write_stage

@@ -3,6 +3,8 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -11,23 +13,15 @@ import numpy as np
 import pytest
 
 from rover_lib.onboard.camera import CameraError, Frame
-from rover_lib.onboard.drive import (
-    DriveFault,
-    Order,
-    PolicyPilot,
-    ReplayPilot,
-    Report,
-    TakenOver,
-    artifact_watch,
-    drive,
-    ended_by_signals,
-    memory_mb,
-)
-from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.drive import Report, drive
+from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
+from rover_lib.onboard.pilot import Order, PolicyPilot, ReplayPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import Controls
 from rover_lib.onboard.servo_link import Hello, LinkError, State, Telemetry
+from rover_lib.onboard.telemetry import FlightLog
+from rover_lib.onboard.watch import OFTEN, Troubles, _processors, artifact_watch, ended_by_signals, memory_mb, unended
 
 PERIOD = 1 / 30
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.AUTONOMOUS, "a", 1456, 120, None, None, None, None, 0, 0, 0, 0)
@@ -395,7 +389,7 @@ def test_faults_come_through(pilot):
 
 
 def test_no_plan_in_time(pilot, monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.drive.FIRST_PLAN_S", 0.0)
+    monkeypatch.setattr("rover_lib.onboard.pilot.FIRST_PLAN_S", 0.0)
     with pytest.raises(PolicyError, match="no plan within"):
         pilot.ready(threading.Event())
 
@@ -459,6 +453,138 @@ def test_an_artifact_that_changes_is_noticed_once(tmp_path):
     assert list(watch()) == []
     path.unlink()
     assert "gone on disk" in next(iter(watch()))
+
+
+def test_what_is_ridden_through_is_said(link, clock, monkeypatch):
+    report, spent, system_s = Report(), [100, 1000], [0.0]
+    link.garbled = 3
+    link.status = replace(STATUS, bad_lines=4)
+    monkeypatch.setattr("rover_lib.onboard.watch._processors", lambda: tuple(spent))
+    monkeypatch.setattr("rover_lib.onboard.watch.time", Time(system_s))
+    look = Troubles(report, link)
+    assert list(look()) == []  # what was before it is not its own
+
+    report.late_ms.extend([0.1, 6.5, 0.2])
+    assert list(look()) == ["commands were up to 6.5 ms late"]
+
+    link.status = replace(STATUS, bad_lines=6, old_commands=1)
+    link.garbled = 4
+    (said,) = look()
+    assert "0 commands were sent again, 1 lines came garbled; the Arduino had 2 garbled, 1 old and 0 out" in said
+    report.resent = OFTEN
+    assert list(look()) == []  # now and then one is late
+    report.resent += OFTEN + 1
+    assert "6 commands were sent again" in next(look())
+
+    spent[:] = [104, 1100]
+    assert "idle for 4% of the time" in next(look())
+    spent[:] = [110, 1200]
+    assert list(look()) == []
+
+    system_s[0] = -3600.0
+    assert "the system's clock was set by -3600 s" in next(look())
+    assert list(look()) == []
+
+
+class Time:
+    """The module, with a system's clock that is set."""
+
+    monotonic = staticmethod(lambda: 50.0)
+
+    def __init__(self, set_s):
+        self._set_s = set_s
+
+    def time(self):
+        return 1e9 + self._set_s[0]
+
+
+def test_this_machines_processors():
+    idle, spent = _processors()
+    assert 0 < idle < spent
+
+
+def test_frames_and_plans_that_are_late_are_said(pilot):
+    drives(pilot, 0.5)
+    assert list(pilot.troubles()) == []
+    last_s = 0.5 - PERIOD
+    pilot.order(last_s + 0.19)
+    assert list(pilot.troubles()) == []
+    pilot.plans.asking_s = 0.35
+    pilot.order(last_s + 0.35)
+    pilot.plans.asking_s = 0.0
+    drives(pilot, 0.2, start_s=1.0)
+    frames, policy = pilot.troubles()
+    assert frames == "no new frame for 0.35 s"
+    assert policy.startswith("the policy took 0.35 s or more")
+    assert list(pilot.troubles()) == []
+
+
+HEADER = '{"kind":"header","schema":1}'
+ARMED, ENDED = (
+    '{"kind":"event","event":"armed"}',
+    '{"kind":"event","event":"neutral: stopped: the host asked for neutral"}',
+)
+TICK, MACHINE = "0.0333,0.1,A,a", '{"kind":"machine"}'
+
+
+@pytest.mark.parametrize(
+    ("lines", "ended"),
+    [
+        ([HEADER, ARMED, TICK, MACHINE, TICK], False),
+        ([HEADER, TICK, ARMED], False),
+        ([HEADER, MACHINE, TICK, "0.0666,0.1"], False),  # the log went on in another file, and was cut
+        ([HEADER, ARMED, TICK, ENDED], True),
+        ([HEADER, ARMED, TICK, ENDED, MACHINE], True),
+        ([HEADER, ARMED, TICK, ENDED, HEADER, MACHINE], True),  # could not begin
+        ([HEADER, MACHINE], True),
+        ([], True),
+    ],
+)
+def test_a_drive_before_that_has_no_end_is_noticed(tmp_path, lines, ended):
+    path = tmp_path / "flight.log"
+    path.write_text("".join(f"{line}\n" for line in lines))
+    said = unended(path)
+    assert (said is None) == ended
+    assert ended or "the drive before this one has no end" in said
+    assert unended(tmp_path / "none.log") is None
+
+
+def test_a_real_log_ends(tmp_path, link, clock):
+    path = tmp_path / "flight.log"
+    with FlightLog(path, header={}, max_bytes=100_000, keep=1) as log:
+        go(Always(), link, clock, log, ticks=5)
+        log_cut = path.with_name("cut.log")
+    assert unended(path) is None
+    log_cut.write_bytes(path.read_bytes().partition(b'"event":"ended')[0].rpartition(b"\n")[0])
+    assert unended(log_cut)
+
+
+def test_a_loop_that_is_dead_ends_the_process():
+    """In a process, since it ends that; a loop that ticks, or has ended, does not."""
+    code = """
+import sys, threading, time
+from rover_lib.onboard import drive, watch
+watch.HUNG_S = 0.3
+class Log:
+    def event(self, text, **_): print(text, flush=True)
+    def close(self): print("closed", flush=True)
+report = drive.Report(ticks=0)
+with watch.ended_if_hung(report, Log()):
+    time.sleep(0.6)  # not begun
+    for _ in range(30):
+        report.ticks += 1
+        time.sleep(0.03)
+    if sys.argv[1] == "ended":
+        report.ended = "done"
+    time.sleep(1.5)
+print("alive")
+"""
+    done = subprocess.run([sys.executable, "-c", code, "dead"], capture_output=True, text=True)
+    assert done.returncode == 3
+    assert "the loop has not ticked" in done.stdout
+    assert done.stdout.endswith("closed\n")
+    done = subprocess.run([sys.executable, "-c", code, "ended"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "alive\n")
 
 
 def test_memory():

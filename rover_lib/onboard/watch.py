@@ -1,0 +1,215 @@
+"""What stands around the control loop: its priority, its signals, its end when it hangs, what is out of the ordinary.
+
+The loop knows none of these.
+"""
+
+import contextlib
+import gc
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from rover_lib.onboard.servo_link import LinkError, ServoLink, Telemetry
+from rover_lib.onboard.telemetry import FlightLog
+
+if TYPE_CHECKING:
+    from rover_lib.onboard.drive import Report
+
+SWITCH_S = 0.0005  # other threads give the interpreter back to the loop after at most so long, not Python's 5 ms
+PRIORITY = 1  # the lowest of real time
+HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before
+LATE_COMMAND_MS = 5.0
+OFTEN = 5  # commands of a second that were sent again
+IDLE = 0.05  # of the processors' time; with less, somebody waits
+CLOCK_SET_S = 1.0
+TAIL_BYTES = 1 << 16
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+
+
+@contextlib.contextmanager
+def going_first(log: FlightLog) -> Iterator[None]:
+    """Inside, this process goes before all that is not as urgent, if its user may ask for that.
+
+    All its threads, which sleep most of the time: one that was made to wait while it holds the interpreter would keep
+    the loop waiting too. With four busy processes on two cores the loop's lateness at p99 was 0.7 ms so, 4 to 9 with
+    the loop's thread alone at that priority, and 14 to 19 without (measured on an x86-64 workstation).
+    """
+    gc.collect()
+    gc.freeze()  # what is here now need not be looked through again while driving
+    before, said = sys.getswitchinterval(), "the loop runs at real-time priority"
+    sys.setswitchinterval(SWITCH_S)
+    try:
+        _schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, PRIORITY)
+    except (OSError, AttributeError):  # AttributeError: no Linux
+        said = "the loop runs at ordinary priority: this user may not ask for real time"
+    log.event(said)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError, AttributeError):
+            _schedule(os.SCHED_OTHER, 0)
+        sys.setswitchinterval(before)
+        gc.unfreeze()
+
+
+def _schedule(policy: int, priority: int) -> None:
+    for thread in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(ProcessLookupError):  # it has just ended
+            os.sched_setscheduler(int(thread.name), policy, os.sched_param(priority))
+
+
+@contextlib.contextmanager
+def ended_by_signals(stop: threading.Event, log: FlightLog) -> Iterator[None]:
+    """SIGTERM, SIGINT and SIGHUP set `stop` inside; a second one does what it did before. For the main thread."""
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        log.event(f"{signal.Signals(number).name}: stopping")
+        stop.set()
+        signal.signal(number, before[number])
+
+    before = {number: signal.signal(number, on_signal) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def ended_if_hung(report: "Report", log: FlightLog) -> Iterator[None]:
+    """Inside, this process ends (exit code 3) when its loop has begun, has not ended, and ticks no more.
+
+    Nobody else would end it, and camera, port and memory would stay taken. Counted in turns of its own, so that a
+    process that was stopped as a whole has its time to go on.
+    """
+
+    def look() -> None:
+        ticks, turns = 0, 0
+        while not done.wait(HUNG_S / 6):
+            turns = turns + 1 if ticks == report.ticks and not report.ended else 0
+            ticks = report.ticks
+            if ticks and turns >= 6:
+                text = f"the loop has not ticked for {HUNG_S:g} s; the Arduino has stopped the car, this program ends"
+                log.event(text, level=logging.ERROR)
+                log.close()
+                os._exit(3)
+
+    done = threading.Event()
+    threading.Thread(target=look, name="hung?", daemon=True).start()
+    try:
+        yield
+    finally:
+        done.set()
+
+
+def unended(log: Path | str) -> str | None:
+    """A sentence if the last drive in a flight log was armed, and never came to its end; to be asked before a new one.
+
+    A process that is killed, or has no power any more, cannot say so itself.
+    """
+    try:
+        with Path(log).open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
+            lines = file.read().splitlines()
+    except OSError:
+        return None
+    ticks = False
+    for line in reversed(lines):
+        if b'"event":"neutral' in line:
+            return None
+        if b'"event":"armed' in line:
+            ticks = True
+        elif b'"kind":"header"' not in line:
+            ticks |= line[:1].isdigit()
+            continue
+        break
+    return f"{log}: the drive before this one has no end: killed, or without power or disk" if ticks else None
+
+
+class Troubles:
+    """For drive's `watch`: what was out of the ordinary since it was asked last, a sentence for each.
+
+    link: None drives no motor.
+    """
+
+    def __init__(self, report: "Report", link: ServoLink | None):
+        self._report, self._link = report, link
+        self._ticks = 0
+        self._counted: tuple[int, ...] | None = None
+        self._spent = _processors()
+        self._clock_s = time.time() - time.monotonic()
+
+    def __call__(self) -> Iterator[str]:
+        late_ms, self._ticks = max(self._report.late_ms[self._ticks :], default=0.0), len(self._report.late_ms)
+        if late_ms > LATE_COMMAND_MS:
+            yield f"commands were up to {late_ms:.1f} ms late"
+        with contextlib.suppress(LinkError):  # the next tick looks at it
+            if self._link and (telemetry := self._link.latest()):
+                yield from self._of_the_link(telemetry)
+        spent, before = _processors(), self._spent
+        self._spent = spent
+        if spent and before and spent[1] > before[1]:
+            idle = (spent[0] - before[0]) / (spent[1] - before[1])
+            if idle < IDLE:
+                yield f"this machine is busy: its processors were idle for {idle:.0%} of the time"
+        clock_s, before_s = time.time() - time.monotonic(), self._clock_s
+        self._clock_s = clock_s
+        if abs(clock_s - before_s) > CLOCK_SET_S:
+            yield f"the system's clock was set by {clock_s - before_s:+.0f} s; nothing that drives goes by it"
+
+    def _of_the_link(self, t: Telemetry) -> Iterator[str]:
+        counted = (self._report.resent, self._link.garbled, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
+        before, self._counted = self._counted or counted, counted
+        again, garbled, bad, old, beyond, lost = (now - then for now, then in zip(counted, before, strict=True))
+        if again > OFTEN or garbled or bad or old or beyond or lost:
+            yield (
+                f"the link: {again} commands were sent again, {garbled} lines came garbled; the Arduino had {bad} "
+                f"garbled, {old} old and {beyond} out of range, and lost {lost} bytes"
+            )
+
+
+def _processors() -> tuple[int, int] | None:
+    """Of all processors' time, in the kernel's ticks: idle, and all; None where it does not say."""
+    try:
+        with open("/proc/stat") as file:  # noqa: PTH123  # faster, once a second while driving
+            spent = [int(value) for value in file.readline().split()[1:9]]
+        return spent[3] + spent[4], sum(spent)
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def artifact_watch(path: Path | str) -> Callable[[], Iterable[str]]:
+    """For drive's `watch`: says once when the file that was loaded is another one, or gone."""
+
+    def look() -> tuple[int, ...] | None:
+        try:
+            s = os.stat(path)  # noqa: PTH116  # its fields are what is compared
+        except OSError:
+            return None
+        return s.st_ino, s.st_size, s.st_mtime_ns
+
+    last = look()
+
+    def watch() -> Iterator[str]:
+        nonlocal last
+        if (found := look()) != last:
+            last = found
+            yield f"{path}: {'changed' if found else 'gone'} on disk; the policy that was loaded goes on driving"
+
+    return watch
+
+
+def memory_mb(pids: Iterable[int]) -> float | None:
+    """Resident memory of processes together; None where /proc does not say."""
+    try:
+        pages = sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in pids)
+    except (OSError, ValueError, IndexError):
+        return None
+    return round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 2)
