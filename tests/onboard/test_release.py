@@ -14,7 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from rover_lib.cli import main
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.policy import load_policy
@@ -628,3 +630,68 @@ def test_a_strict_umask_does_not_hide_the_model_from_the_service(two, tmp_path):
     folder = r.releases / name
     assert stat.S_IMODE(folder.stat().st_mode) == 0o755
     assert {stat.S_IMODE(p.stat().st_mode) for p in folder.iterdir()} == {0o644}
+
+
+# The command line
+
+
+def rover(*args: object):
+    return CliRunner().invoke(main, ["release", *map(str, args)])
+
+
+def test_a_deployment_by_hand(two, tmp_path):
+    models = ["--models", tmp_path / "models"]
+    packed = json.loads(rover("pack", two[0], tmp_path / "packed").output)
+    staged = json.loads(rover(*models, "stage", tmp_path / "packed").output)
+    assert staged == {"name": packed["name"], "changed": True}
+    assert json.loads(rover(*models, "switch", staged["name"]).output)["changed"] is True
+    assert "computes what it should" in rover(*models, "verify").output
+    second = json.loads(rover(*models, "stage", two[1]).output)["name"]
+    assert rover(*models, "switch", second).exit_code == 0
+    assert json.loads(rover(*models, "rollback").output)["name"] == packed["name"]
+    shown = rover(*models, "status")
+    assert shown.exit_code == 0 and f"* {packed['name'][:12]}  static" in shown.output
+    assert json.loads(rover(*models, "prune", "--keep", 1).output)["removed"] == [second]
+    found = json.loads(rover(*models, "status", "--json").output)
+    assert found["healthy"] and found["current"] == packed["name"]
+    assert {"service", "temperature_c", "throttled", "disk_free_mb", "last_drive_s", "rover"} <= set(found)
+
+
+def test_bad_input_ends_in_a_sentence(two, artifacts, tmp_path):
+    models = ["--models", tmp_path / "models"]
+    for command, sentence in [
+        ([*models, "status"], "rover: no model: deploy one"),
+        ([*models, "switch", "latest"], "named by 64 hexadecimal digits or 'current', found 'latest'"),
+        ([*models, "rollback"], "no release to roll back to"),
+        ([*models, "stage", tmp_path / "nothing"], "nothing"),
+        (["pack", artifacts["fp32"], tmp_path / "packed"], "its mode is fp32"),
+        (["--chunk", "50", "pack", two[0], tmp_path / "packed"], "plans 32 actions, this rover takes 50"),
+    ]:
+        result = rover(*command)
+        assert result.exit_code == 1 and sentence in result.output and "Traceback" not in result.output, result.output
+
+
+UNIT = """#!/bin/sh
+echo "$@" >> {folder}/asked
+[ $(basename $0) = systemctl ] && exit {code}
+echo "rover: it computes something else here; do not drive with it"
+"""
+
+
+@pytest.mark.parametrize("code", [0, 1])
+def test_parity_in_the_services_sandbox(releases, two, tmp_path, monkeypatch, code):
+    for name in ("systemctl", "journalctl"):
+        script = tmp_path / name
+        script.write_text(UNIT.format(folder=tmp_path, code=code))
+        script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    old, name = releases.current, releases.stage(two[1]).name
+    result = rover("--models", releases.models, "--sandboxed", "switch", name)
+    asked = (tmp_path / "asked").read_text().splitlines()
+    assert asked[0] == f"start rover-check@{name}.service"
+    if code:
+        assert result.exit_code == 1 and "it computes something else here" in result.output
+        assert_drives(releases, {old})
+    else:
+        assert result.exit_code == 0 and asked[1:] == ["start rover-check@current.service"]
+        assert_drives(releases, {name})

@@ -4,16 +4,21 @@ import os
 import signal
 import socket
 import stat
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from click.testing import CliRunner
 
+from rover_lib.cli import main
 from rover_lib.onboard import service as s
 from rover_lib.onboard.drive import Report
 from rover_lib.onboard.servo_link import LinkError
+from rover_lib.onboard.telemetry import read_log
 
 
 class Systemd:
@@ -254,3 +259,72 @@ def test_the_services_state(systemctl, monkeypatch):
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(s.ServiceError, match="is this a rover"):
         s.state_of()
+
+
+# The whole: rover drive --service, as systemd starts it, in the balloon world
+
+
+def started(systemd: Systemd, tmp_path: Path, artifact: Path) -> subprocess.Popen:
+    command = [str(Path(sys.executable).with_name("rover")), "drive", str(artifact), "--world", "--service"]
+    process = subprocess.Popen(
+        [*command, "--log", str(tmp_path / "flight.log"), "--json", str(tmp_path / "drive.json")],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "WATCHDOG_USEC": "2000000"},
+    )
+    end = time.monotonic() + 120
+    while "READY=1" not in systemd.lines:
+        assert process.poll() is None and time.monotonic() < end, process.communicate()[1]
+        systemd.hear(0.1)
+    return process
+
+
+def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(systemd, tmp_path, demo_run):
+    process = started(systemd, tmp_path, demo_run / "policy_static.pt")
+    try:
+        assert feeds(systemd.hear(1.5)) >= 3
+        assert not any("driving" in line for line in systemd.lines)
+        process.send_signal(s.ARM)
+        systemd.hear_until("STATUS=driving: armed by a human")
+        assert feeds(systemd.hear(2.0)) >= 4
+        assert any(line.startswith("STATUS=driving: ") and "steering" in line for line in systemd.lines)
+        process.send_signal(signal.SIGSTOP)
+        systemd.hear(0.5)
+        assert feeds(systemd.hear(2.0)) == 0  # here systemd would kill it; the Arduino has stopped the car
+        process.send_signal(signal.SIGCONT)
+        _, said = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 3 and "stopped the car" in said, said  # and it does not drive on
+    systemd.hear()
+    assert "STOPPING=1" in systemd.lines
+    assert any(e.text == "armed" for e in read_log(tmp_path / "flight.log").events)
+
+
+def test_a_service_that_nobody_armed_ends_without_having_moved(systemd, tmp_path, demo_run):
+    process = started(systemd, tmp_path, demo_run / "policy_static.pt")
+    try:
+        systemd.hear(1.0)
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 0 and "told to stop before a human armed the car" in said, said
+    systemd.hear()
+    assert "STOPPING=1" in systemd.lines and not any("driving" in line for line in systemd.lines)
+    flight = read_log(tmp_path / "flight.log")
+    assert len(flight.ticks["t_s"]) == 0 and not any(e.text == "armed" for e in flight.events)
+
+
+@pytest.mark.parametrize("options", [["policy.pt", "--dry-run"], ["--replay", "episode"]])
+def test_a_service_drives_a_car_by_an_artifact(options):
+    result = CliRunner().invoke(main, ["drive", "--service", *options])
+    assert result.exit_code == 2 and "--service drives a car by an artifact" in result.output
+
+
+def test_arming_asks_first(systemctl):
+    killed = systemctl("disarmed: waiting for a human to arm it", "driving: armed by a human")
+    result = CliRunner().invoke(main, ["arm-car"], input="n\n")
+    assert result.exit_code == 1 and "Is the way free" in result.output and not killed.exists()
+    result = CliRunner().invoke(main, ["arm-car"], input="y\n")
+    assert result.exit_code == 0 and "driving: armed by a human" in result.output and killed.exists()
