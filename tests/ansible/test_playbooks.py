@@ -191,7 +191,16 @@ def test_both_units_have_the_same_sandbox(units):
     differ = settings("rover-drive.service") ^ settings("rover-check@.service")
     kinds = {line.partition("=")[0] for line in differ}
     assert kinds <= {
-        *("Description", "Type", "ExecStart", "NotifyAccess", "ConditionPathExists", "StartLimitIntervalSec"),
+        *(
+            "Description",
+            "Type",
+            "ExecStart",
+            "ExecStartPre",
+            "RuntimeDirectory",
+            "NotifyAccess",
+            "ConditionPathExists",
+            "StartLimitIntervalSec",
+        ),
         *("StartLimitBurst", "StateDirectory", "StateDirectoryMode", "WatchdogSec", "WatchdogSignal", "Restart"),
         *("RestartSec", "KillMode", "TimeoutStopSec", "OOMPolicy", "WantedBy"),
         *("LimitRTPRIO", "RestrictRealtime", "SupplementaryGroups", "DeviceAllow", "PrivateDevices"),
