@@ -205,6 +205,7 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_jso
 @click.option("--threads", type=click.IntRange(min=0), default=0, show_default=True, help="0: all cores.")
 @click.option("--duration", type=float, help="Soak for so many seconds instead, with a time series.")
 @click.option("--output", type=FILE, help="Write benchmark JSON there, for notebook 05.")
+@click.option("--gates", is_flag=True, help="Hold the first artifact against the original's gates in params.yml.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def benchmark(
     artifacts: tuple[Path, ...],
@@ -213,6 +214,7 @@ def benchmark(
     threads: int,
     duration: float | None,
     output: Path | None,
+    gates: bool,
     as_json: bool,
 ) -> None:
     """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors.
@@ -221,6 +223,8 @@ def benchmark(
     """
     from rover_lib.onboard.artifact import read_parity
     from rover_lib.onboard.benchmark import benchmark as measure
+    from rover_lib.onboard.benchmark import check_gates
+    from rover_lib.onboard.params import params
     from rover_lib.onboard.policy import load_policy
     from rover_lib.onboard.stage import sha256_of, write_stage
 
@@ -236,6 +240,8 @@ def benchmark(
         write_stage(
             output, "benchmark", params=options, metrics=metrics, inputs={a.name: sha256_of(a) for a in artifacts}
         )
+    if gates:
+        metrics["gates"] = check_gates(metrics, params()["gates"]["original"])
     show(metrics, as_json)
 
 
