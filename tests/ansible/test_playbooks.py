@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import platform
 import re
 import shutil
 import subprocess
@@ -129,6 +130,14 @@ def test_a_laptop_is_no_rover(tmp_path):
     assert found.returncode == 2 and "a rover is z80: flash the 64-bit Raspberry Pi OS" in found.stdout.replace(
         "\n", " "
     )
+
+
+def test_the_other_checks_of_a_machine_pass_here(tmp_path):
+    if not re.search(r'VERSION_ID="1[23]"', Path("/etc/os-release").read_text()):
+        pytest.skip("this is no Debian 12 or 13")
+    here = {"rover_architecture": platform.machine(), "rover_home": str(tmp_path)}
+    found = play(tmp_path, [{"name": "Look", "ansible.builtin.include_role": {"name": "rover"}}], **here)
+    assert found.returncode == 0 and "changed=0" in found.stdout, found.stdout
 
 
 def test_an_artifact_that_is_not_there_or_not_fit_does_not_travel(tmp_path, artifacts):
