@@ -42,6 +42,7 @@ NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # the second whole copy of a releas
 PART_BYTES = 8 << 20  # a transfer that was cut goes on at most so far back
 SPARE_BYTES = 64 << 20  # is left free for logs
 HISTORY = 100
+LOCK_TRIES, LOCK_S = 5, 0.05
 SANDBOX = "rover-check@{}.service"
 
 ENGINE = "qnnpack"  # of a Pi
@@ -206,7 +207,9 @@ class Releases:
 
     def wrong_with(self, name: str) -> str:
         """What is wrong with the bytes of a release, empty if nothing. Needs no torch."""
-        folder = self.releases / name
+        folder, named = self.releases / name, NAME.fullmatch(name)
+        if not named:
+            return f"'{name}' is no content hash"
         try:
             json.loads((folder / ORIGIN).read_text())
             if (folder / DIGEST).read_text().split()[:1] != [sha256_of(folder / POLICY)]:
@@ -214,7 +217,7 @@ class Releases:
             found = content_hash(folder / POLICY)
         except Exception as e:  # whatever hinders reading it is what is wrong with it
             return f"not readable ({type(e).__name__}: {e})"
-        if found != NAME.fullmatch(name)[1]:
+        if found != named[1]:
             return f"tampered with: its content is {found[:12]}, not what its folder is named after"
         return ""
 
@@ -278,6 +281,8 @@ class Releases:
         """
         source = Path(source)
         with _disk_full_in_a_sentence(), self._at_work():
+            if not source.exists():
+                raise ReleaseError(f"{source}: not found; stage takes an artifact, or the folder that pack wrote")
             about = self._packed(source) if source.is_dir() else None
             if about and (there := self._whole(about["name"])):
                 return Staged(there, False)
@@ -373,12 +378,7 @@ class Releases:
         self.releases.mkdir(parents=True, exist_ok=True)
         file = os.open(self.models / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ReleaseError(
-                    f"{self.models}: another deployment is at work; wait for it (status says at_work)"
-                ) from None
+            self._lock(file)
             self._tidy()
             try:
                 yield
@@ -387,6 +387,15 @@ class Releases:
                     self._tidy()
         finally:
             os.close(file)
+
+    def _lock(self, file: int) -> None:
+        for left in reversed(range(LOCK_TRIES)):  # status() holds it for a moment, to find out who else does
+            try:
+                return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if left:
+                    time.sleep(LOCK_S)
+        raise ReleaseError(f"{self.models}: another deployment is at work; wait for it (status says at_work)")
 
     def _tidy(self) -> None:
         for left in (*self.releases.glob(".*"), *self.models.glob(".new-*")):
@@ -474,10 +483,15 @@ class Releases:
             return []
 
     def _remember(self, names: list[str]) -> None:
+        """Writes the history, if there is room: a full disk must not keep a rover from going back, or from pruning.
+
+        What is missing in it then, the next command adds.
+        """
         new = self.models / ".new-history"
-        _write(new, json.dumps(names[-HISTORY:]) + "\n")
-        new.replace(self.models / "history.json")
-        _sync(self.models)
+        with contextlib.suppress(OSError):
+            _write(new, json.dumps(names[-HISTORY:]) + "\n")
+            new.replace(self.models / "history.json")
+            _sync(self.models)
 
     def _before(self) -> list[str]:
         """What was in use before the release that is, newest first, each once, and still there."""

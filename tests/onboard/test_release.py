@@ -8,6 +8,7 @@ import signal
 import stat
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from collections.abc import Callable
@@ -545,7 +546,7 @@ def test_a_history_that_is_no_history(releases, two):
         assert_drives(releases, {deploy(releases, two[1]), deploy(releases, two[0])})
 
 
-@pytest.mark.parametrize("n", range(1, 8))
+@pytest.mark.parametrize("n", range(1, 7))
 def test_a_disk_that_is_full_at_some_step(releases, two, n):
     old, count = releases.current, 0
 
@@ -566,6 +567,25 @@ def test_a_disk_that_is_full_at_some_step(releases, two, n):
     assert os.waitstatus_to_exitcode(status) == 7
     assert_drives(releases, {old, content_hash(two[1])})
     assert_drives(releases, {deploy(releases, two[1])} - {old})
+
+
+def test_on_a_full_disk_a_rover_can_go_back_and_prune(releases, two):
+    """What was switched is said to be, too, even when there is no room to write down that it was."""
+    old, new = releases.current, releases.stage(two[1]).name
+
+    def hook(name, call, args):
+        if name == "write":
+            raise OSError(28, "No space left on device")
+        return call()
+
+    assert in_child(lambda: releases.switch(new), hook) == 0
+    assert_drives(releases, {new})
+    assert in_child(lambda: releases.prune(2), hook) == 0
+    assert releases.rollback() == old  # the command after it wrote it down
+    assert releases.switch(new) and in_child(lambda: releases.rollback(), hook) == 0
+    assert_drives(releases, {old})
+    assert in_child(lambda: releases.prune(1), hook) == 0
+    assert [r.name for r in releases.all()] == [old]
 
 
 def test_too_little_room_is_said_before_it_is_used_up(releases, two, monkeypatch):
@@ -597,6 +617,10 @@ def test_two_at_once_one_is_refused(releases, two):
                 command()
         assert releases.status()["at_work"]
     assert not releases.status()["at_work"]
+    with (releases.models / ".lock").open() as other:  # status, which looks for a moment
+        fcntl.flock(other, fcntl.LOCK_SH)
+        threading.Timer(0.1, lambda: fcntl.flock(other, fcntl.LOCK_UN)).start()
+        releases.prune(3)
     assert_drives(releases, {deploy(releases, two[1])})
 
 
@@ -663,7 +687,7 @@ def test_bad_input_ends_in_a_sentence(two, artifacts, tmp_path):
         ([*models, "status"], "rover: no model: deploy one"),
         ([*models, "switch", "latest"], "named by 64 hexadecimal digits or 'current', found 'latest'"),
         ([*models, "rollback"], "no release to roll back to"),
-        ([*models, "stage", tmp_path / "nothing"], "nothing"),
+        ([*models, "stage", tmp_path / "nothing"], "nothing: not found; stage takes"),
         (["pack", artifacts["fp32"], tmp_path / "packed"], "its mode is fp32"),
         (["--chunk", "50", "pack", two[0], tmp_path / "packed"], "plans 32 actions, this rover takes 50"),
     ]:
