@@ -28,6 +28,8 @@ HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before
 LATE_COMMAND_MS = 5.0
 OFTEN = 5  # commands of a second that were sent again
 IDLE = 0.05  # of the processors' time; with less, somebody waits
+STOLEN = 0.03  # of the same
+SAY_AGAIN = 3  # looks after which what goes on is said again
 CLOCK_SET_S = 1.0
 TAIL_BYTES = 1 << 16
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -144,6 +146,7 @@ class Troubles:
         self._ticks = 0
         self._counted: tuple[int, ...] | None = None
         self._spent = _processors()
+        self._busy = 0  # looks in a row that found the machine so
         self._clock_s = time.time() - time.monotonic()
 
     def __call__(self) -> Iterator[str]:
@@ -156,9 +159,12 @@ class Troubles:
         spent, before = _processors(), self._spent
         self._spent = spent
         if spent and before and spent[1] > before[1]:
-            idle = (spent[0] - before[0]) / (spent[1] - before[1])
-            if idle < IDLE:
+            idle, _, stolen = ((now - then) / (spent[1] - before[1]) for now, then in zip(spent, before, strict=True))
+            if idle < IDLE and self._busy % SAY_AGAIN == 0:
                 yield f"this machine is busy: its processors were idle for {idle:.0%} of the time"
+            self._busy = self._busy + 1 if idle < IDLE else 0
+            if stolen > STOLEN:
+                yield f"this virtual machine was without its processors for {stolen:.0%} of the time"
         clock_s, before_s = time.time() - time.monotonic(), self._clock_s
         self._clock_s = clock_s
         if abs(clock_s - before_s) > CLOCK_SET_S:
@@ -175,12 +181,12 @@ class Troubles:
             )
 
 
-def _processors() -> tuple[int, int] | None:
-    """Of all processors' time, in the kernel's ticks: idle, and all; None where it does not say."""
+def _processors() -> tuple[int, int, int] | None:
+    """Of all processors' time, in the kernel's ticks: idle, all, and taken by a host; None where it does not say."""
     try:
         with open("/proc/stat") as file:  # noqa: PTH123  # faster, once a second while driving
             spent = [int(value) for value in file.readline().split()[1:9]]
-        return spent[3] + spent[4], sum(spent)
+        return spent[3] + spent[4], sum(spent), spent[7]
     except (OSError, ValueError, IndexError):
         return None
 

@@ -456,7 +456,7 @@ def test_an_artifact_that_changes_is_noticed_once(tmp_path):
 
 
 def test_what_is_ridden_through_is_said(link, clock, monkeypatch):
-    report, spent, system_s = Report(), [100, 1000], [0.0]
+    report, spent, system_s = Report(), [100, 1000, 7], [0.0]
     link.garbled = 3
     link.status = replace(STATUS, bad_lines=4)
     monkeypatch.setattr("rover_lib.onboard.watch._processors", lambda: tuple(spent))
@@ -476,10 +476,15 @@ def test_what_is_ridden_through_is_said(link, clock, monkeypatch):
     report.resent += OFTEN + 1
     assert "6 commands were sent again" in next(look())
 
-    spent[:] = [104, 1100]
-    assert "idle for 4% of the time" in next(look())
-    spent[:] = [110, 1200]
+    said = []
+    for second in range(1, 8):  # what goes on is said again, but not each time
+        spent[:] = [100 + 4 * second, 1000 + 100 * second, 7]
+        said.append([s for s in look() if "idle for 4% of the time" in s])
+    assert [len(s) for s in said] == [1, 0, 0, 1, 0, 0, 1]
+    spent[:] = [140, 1800, 7]
     assert list(look()) == []
+    spent[:] = [190, 1900, 12]
+    assert list(look()) == ["this virtual machine was without its processors for 5% of the time"]
 
     system_s[0] = -3600.0
     assert "the system's clock was set by -3600 s" in next(look())
@@ -499,8 +504,8 @@ class Time:
 
 
 def test_this_machines_processors():
-    idle, spent = _processors()
-    assert 0 < idle < spent
+    idle, spent, stolen = _processors()
+    assert 0 < idle + stolen < spent
 
 
 def test_frames_and_plans_that_are_late_are_said(pilot):
