@@ -140,18 +140,33 @@ ISR(INT0_vect) {
     edge(&captures[STEERING], PIND & _BV(PIND2), ticks_at(tick));
 }
 
-ISR(TIMER1_CAPT_vect) {
+/* A throttle edge has its time in ICR1 and can wait; INT0's has not. So this lets other interrupts in at once, but not
+ * itself. (In C, saving registers alone would keep INT0 waiting for 3 us.) */
+ISR(TIMER1_CAPT_vect, ISR_NAKED) {
+    asm volatile("push r24 \n ldi r24, %1 \n sts %0, r24 \n pop r24 \n sei \n jmp __vector_throttle_edge"
+                 :: "i"(_SFR_MEM_ADDR(TIMSK1)), "i"(_BV(TOIE1)));
+}
+
+extern "C" void __vector_throttle_edge(void) __attribute__((signal, used, externally_visible));
+extern "C" void __vector_throttle_edge(void) {
+    cli(); /* INT0 reads a 16-bit register too */
     bool high = TCCR1B & _BV(ICES1);
-    uint32_t now = ticks_at(ICR1);
+    uint16_t tick = ICR1, count = TCNT1;
+    bool overflow = (TIFR1 & _BV(TOV1)) && count < STEERING_TICKS / 2;
+    uint32_t start = period_start;
     TCCR1B ^= _BV(ICES1); /* wait for the other edge */
     TIFR1 = _BV(ICF1);    /* as the datasheet asks after a change of edge */
     bool missed = high != bool(PINB & _BV(PINB0)); /* the other edge is over already: wait for this one again */
     if (missed) TCCR1B ^= _BV(ICES1);
     sei();
+    if (overflow) start += STEERING_TICKS;     /* of the period now */
+    if (tick > count) start -= STEERING_TICKS; /* the edge was in the one before */
     if (missed)
         captures[THROTTLE].high = false;
     else
-        edge(&captures[THROTTLE], high, now);
+        edge(&captures[THROTTLE], high, start + tick);
+    cli(); /* until the return, or the next edge would begin inside of this one */
+    TIMSK1 = _BV(ICIE1) | _BV(TOIE1);
 }
 
 void receiver_begin() {
