@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rover_lib.onboard.drive import Report
 
 SWITCH_S = 0.0005  # other threads give the interpreter back to the loop after at most so long, not Python's 5 ms
-PRIORITY = 1  # the lowest of real time
+PRIORITY = 2  # of real time: above what stands in for a car in the balloon world
 HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before
 LATE_COMMAND_MS = 5.0
 OFTEN = 5  # commands of a second that were sent again

@@ -73,7 +73,7 @@ CHUNK, RATE_HZ = 32, 30.0
 PLAN, OTHER_PLAN = (0.2, 0.15), (-0.3, 0.08)  # steering, throttle
 DISK_BYTES = 512 * 1024
 FUZZ_LINES = 1_000_000
-PRIORITY = 2  # of real time, before rover drive: a real Arduino and a real cable do not wait for this machine
+PRIORITY = 3  # of real time, before rover drive: a real Arduino and a real cable do not wait for this machine
 
 # What the picture's corner tells the policy: its red, green and blue are on or off.
 PLAIN, RAISE, HANG, NAN, BEYOND, SLOW, OTHER = range(7)
