@@ -692,7 +692,7 @@ def status(releases: Any, as_json: bool) -> None:
 @click.option("--python", "pythons", multiple=True, help="A Pi's Python [default: 3.11 and 3.13].")
 @click.option("--only-rover", is_flag=True, help="Only rover_lib's own wheel: Pis with internet fetch the others.")
 def wheelhouse(folder: Path, pythons: tuple[str, ...], only_rover: bool) -> None:
-    """Put all that a Pi installs into FOLDER, for a rover without internet (300 MB for each Python)."""
+    """Put all that a Pi installs into FOLDER, for a rover without internet (154 MB for each Python)."""
     from rover_lib.workshop.wheelhouse import PYTHONS, make
 
     show(vars(make(folder, pythons=pythons or PYTHONS, only_rover=only_rover)), True)
