@@ -48,7 +48,7 @@ def going_first(log: FlightLog) -> Iterator[None]:
     before, said = sys.getswitchinterval(), "the loop runs at real-time priority"
     sys.setswitchinterval(SWITCH_S)
     try:
-        _schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, PRIORITY)
+        schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, PRIORITY)
     except (OSError, AttributeError):  # AttributeError: no Linux
         said = "the loop runs at ordinary priority: this user may not ask for real time"
     log.event(said)
@@ -56,12 +56,13 @@ def going_first(log: FlightLog) -> Iterator[None]:
         yield
     finally:
         with contextlib.suppress(OSError, AttributeError):
-            _schedule(os.SCHED_OTHER, 0)
+            schedule(os.SCHED_OTHER, 0)
         sys.setswitchinterval(before)
         gc.unfreeze()
 
 
-def _schedule(policy: int, priority: int) -> None:
+def schedule(policy: int, priority: int) -> None:
+    """Puts all threads that this process has now under a policy of the kernel's scheduler. OSError: not allowed."""
     for thread in Path("/proc/self/task").iterdir():
         with contextlib.suppress(ProcessLookupError):  # it has just ended
             os.sched_setscheduler(int(thread.name), policy, os.sched_param(priority))

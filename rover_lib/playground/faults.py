@@ -51,6 +51,7 @@ from rover_lib.onboard.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.servo_link import frame
 from rover_lib.onboard.stage import write_stage
 from rover_lib.onboard.telemetry import LogError, read_log
+from rover_lib.onboard.watch import SWITCH_S, schedule
 from rover_lib.playground.arduino import CC, REPOSITORY, REST_US, Arduino, PinEvent, build, call
 from rover_lib.playground.car import EMULATOR_NICE, CameraFeed
 
@@ -428,6 +429,21 @@ class Cable:
                 self.commands.append(Command(now, int(found[1]), int(found[2])))
 
 
+@contextlib.contextmanager
+def _going_first() -> Iterator[None]:
+    """This program's other threads too: the cable waits for whoever holds the interpreter."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_S)
+    with contextlib.suppress(OSError):
+        schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, PRIORITY)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            schedule(os.SCHED_OTHER, 0)
+        sys.setswitchinterval(before)
+
+
 def _go_first(pid: int) -> None:
     with contextlib.suppress(OSError):  # this user may not: then rows are repeated now and then
         os.sched_setscheduler(pid, os.SCHED_RR, os.sched_param(PRIORITY))
@@ -636,6 +652,7 @@ class Bench:
             _go_first(self.arduino.pid)
             self.cable = Cable(self.arduino.port)
             self.feed = CameraFeed(self.camera, *self._pictures[PLAIN])
+            self._stack.enter_context(_going_first())
         except BaseException:
             self._stack.close()
             raise
