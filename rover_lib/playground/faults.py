@@ -17,6 +17,7 @@ and this program share.
 
 import contextlib
 import ctypes
+import gc
 import mmap
 import os
 import platform
@@ -434,6 +435,8 @@ def _going_first() -> Iterator[None]:
     """This program's other threads too: the cable waits for whoever holds the interpreter."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
+    gc.collect()
+    gc.freeze()  # in a large program, as pytest's, looking through all would keep the cable waiting
     with contextlib.suppress(OSError):
         schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, PRIORITY)
     try:
@@ -441,6 +444,7 @@ def _going_first() -> Iterator[None]:
     finally:
         with contextlib.suppress(OSError):
             schedule(os.SCHED_OTHER, 0)
+        gc.unfreeze()
         sys.setswitchinterval(before)
 
 

@@ -295,7 +295,8 @@ def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(syst
         _, said = process.communicate(timeout=30)
     finally:
         process.kill()
-    assert process.returncode == 3 and "stopped the car" in said, said  # and it does not drive on
+    # Which of the two it finds first is a matter of threads; it does not drive on.
+    assert process.returncode == 3 and ("stopped the car" in said or "the Arduino said nothing" in said), said
     systemd.hear()
     assert "STOPPING=1" in systemd.lines
     assert any(e.text == "armed" for e in read_log(tmp_path / "flight.log").events)
