@@ -13,6 +13,11 @@ from rover_lib.onboard.errors import RoverError
 
 FILE = click.Path(path_type=Path)
 LONG_LIST = 12  # longer ones are for programs
+# Of every command that works with the car:
+CAMERA = click.option(
+    "--camera", default="0", show_default=True, help="Number, /dev/videoN, video, folder or FIFO of JPEGs."
+)
+PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
 
 
 class Rover(click.Group):
@@ -315,8 +320,8 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
 
 @main.command()
 @click.argument("artifact", type=FILE, required=False)
-@click.option("--camera", default="0", show_default=True, help="Number, /dev/videoN, video, folder or FIFO of JPEGs.")
-@click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
+@CAMERA
+@PORT
 @click.option("--hz", type=click.FloatRange(10, 100), default=30.0, show_default=True, help="Commands a second.")
 @click.option("--dry-run", is_flag=True, help="No Arduino, no motor: logs what would be sent.")
 @click.option("--record", type=FILE, help="Write the drive as an episode into this folder.")
@@ -457,8 +462,8 @@ def _drive(
 
 @main.command("record")
 @click.argument("out_dir", type=FILE)
-@click.option("--camera", default="0", show_default=True, help="Number, /dev/videoN, video, folder or FIFO of JPEGs.")
-@click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
+@CAMERA
+@PORT
 @click.option(
     "--hz", type=click.FloatRange(5, 50), default=30.0, show_default=True, help="Controls and frames a second."
 )
@@ -519,8 +524,8 @@ def log(file: Path, output: Path | None, drive: int, as_json: bool) -> None:
 
 @main.command()
 @click.argument("artifact", type=FILE, required=False)
-@click.option("--camera", default="0", show_default=True, help="Number, /dev/videoN, video, folder or FIFO of JPEGs.")
-@click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
+@CAMERA
+@PORT
 @click.option("--hz", type=click.FloatRange(1, 120), default=30.0, show_default=True, help="Frames a second wanted.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.pass_context

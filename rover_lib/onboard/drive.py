@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.camera import Camera
-from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, TakenOver
+from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, TakenOver, sentence_of
 from rover_lib.onboard.inference import Planner, PolicyProcess, PolicyThread, late
 from rover_lib.onboard.pilot import Order, Pilot, PolicyPilot
 from rover_lib.onboard.plan import Commanded, Settings
@@ -118,7 +118,7 @@ def drive(
         report.ended = loop.run(stop, ticks, max_seconds, watch)
     except BaseException as error:
         said = loop.neutral()  # first of all, and before anything that may take long
-        report.ended = f"{error}" if isinstance(error, RoverError) else f"{type(error).__name__}: {error}"
+        report.ended = sentence_of(error)
         log.event(report.ended, level=logging.ERROR)
         if isinstance(error, RoverError) and not isinstance(error, (DriveFault, TakenOver)) and loop.armed:
             raise DriveFault(report.ended) from error

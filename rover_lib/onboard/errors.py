@@ -8,6 +8,11 @@ class RoverError(Exception):
     """Base of every error that is the input's fault, not the program's."""
 
 
+def sentence_of(error: BaseException) -> str:
+    """What to say of any error: a RoverError's own words; of what the program did not foresee also its name."""
+    return str(error) if isinstance(error, RoverError) else f"{type(error).__name__}: {error}"
+
+
 class CheckpointError(RoverError):
     """A checkpoint that cannot be read, or whose config and weights do not agree."""
 

@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from rover_lib.onboard.camera import Camera
-from rover_lib.onboard.errors import EpisodeError, RoverError
+from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
 from rover_lib.onboard.recording import EpisodeExists, EpisodeWriter
 from rover_lib.onboard.servo_link import ServoLink
 from rover_lib.onboard.telemetry import StatusLine
+from rover_lib.onboard.watch import signals
 
 SPARE_BYTES = 16_000_000  # of the disk are left alone; finishing an episode needs some, and so does the rest of a Pi
 ROW_BYTES = 1000  # of a control or frame in both of its files, at the end
@@ -29,7 +30,6 @@ QUEUE_MOST = 20_000  # controls that wait for the disk: minutes, and a few megab
 SILENT_S = 2.0  # without a frame, or a status of the Arduino, nothing is recorded any more
 CLOSE_S = 60.0  # a slow card may have much to catch up with
 PAUSE_S = 5.0  # between two episodes
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _log = logging.getLogger("rover")
 
@@ -85,7 +85,7 @@ class Recorder:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        self.close(_sentence(error) if error else None)
+        self.close(sentence_of(error) if error else None)
 
     def control(
         self,
@@ -152,7 +152,7 @@ class Recorder:
         try:
             self._collect()
         except Exception as error:  # whatever it is: the car drives on, and what was recorded is an episode
-            self._fail(_sentence(error))
+            self._fail(sentence_of(error))
         if self.failure:
             self._writer.metadata["fault"] = self.failure
         if self._lost:
@@ -162,7 +162,7 @@ class Recorder:
             os.sync()  # "it is there" has to hold for a car that is switched off right after
             self.path = path
         except Exception as error:
-            self._fail(_sentence(error))
+            self._fail(sentence_of(error))
 
     def _collect(self) -> None:
         newest = self._camera.latest()
@@ -190,10 +190,6 @@ class Recorder:
         for _ in range(len(self._queue)):
             host_s, *control, extra = self._queue.popleft()
             self._writer.control(host_s + self._to_system_s, *control, **extra)
-
-
-def _sentence(error: BaseException) -> str:
-    return str(error) if isinstance(error, RoverError) else f"{type(error).__name__}: {error}"
 
 
 def _new_episode(folder: Path, start_s: float, **options: Any) -> EpisodeWriter:
@@ -295,14 +291,13 @@ def record_episodes(
     folder: Path | str,
     *,
     rate_hz: float = 30.0,
-    max_seconds: float | None = None,
-    label: str = "",
     episodes: int = 1,
-    status: TextIO | None = None,
     say: Callable[[str], None] = _log.info,
+    **options: Any,
 ) -> Iterator[RecordReport]:
     """Opens camera and Arduino and records so many episodes; for the main thread, because signals end them.
 
+    options: of record(), for each.
     SIGINT ends an episode; a second one, or one in the pause before the next episode, ends it all, and so do SIGTERM,
     SIGHUP and a fault. Raises RoverError if it cannot be begun.
     """
@@ -313,29 +308,15 @@ def record_episodes(
             leave.set()
         stop.set()
 
-    with Camera(camera, rate_hz=rate_hz) as frames, ServoLink(port) as link:
-        before = {number: signal.signal(number, on_signal) for number in SIGNALS}
-        try:
-            for i in range(episodes):
-                if i:
-                    say(f"episode {i + 1} of {episodes} begins in {PAUSE_S:g} s; Ctrl-C now is the end of it all")
-                    if stop.wait(PAUSE_S):
-                        return
-                say("recording; Ctrl-C ends the episode")
-                report = record(
-                    frames,
-                    link,
-                    folder,
-                    rate_hz=rate_hz,
-                    max_seconds=max_seconds,
-                    stop=stop,
-                    label=label,
-                    status=status,
-                )
-                yield report
-                if report.fault or leave.is_set():
+    with Camera(camera, rate_hz=rate_hz) as frames, ServoLink(port) as link, signals(on_signal):
+        for i in range(episodes):
+            if i:
+                say(f"episode {i + 1} of {episodes} begins in {PAUSE_S:g} s; Ctrl-C now is the end of it all")
+                if stop.wait(PAUSE_S):
                     return
-                stop.clear()
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+            say("recording; Ctrl-C ends the episode")
+            report = record(frames, link, folder, rate_hz=rate_hz, stop=stop, **options)
+            yield report
+            if report.fault or leave.is_set():
+                return
+            stop.clear()

@@ -15,7 +15,6 @@ WatchdogSec; the Arduino has stopped the car 150 ms after the last command.
 """
 
 import contextlib
-import os
 import signal
 import socket
 import subprocess
@@ -190,8 +189,3 @@ def arm_car(unit: str = UNIT, *, timeout_s: float = ARMED_S) -> str:
     if now["active"] != "active" or now["state"] != DRIVING:
         raise ServiceError(f"{unit} did not arm: {now['text'] or now['active']}; 'rover doctor' says what it needs")
     return now["text"]
-
-
-def told_by_systemd() -> bool:
-    """Whether systemd started this process and wants to hear of it."""
-    return bool(os.environ.get("NOTIFY_SOCKET"))

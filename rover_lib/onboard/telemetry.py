@@ -638,5 +638,5 @@ class _StatusHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         try:
             self._status.say(self.format(record))
-        except Exception:
+        except Exception:  # as logging asks of a handler: a record that cannot be formatted ends nothing
             self.handleError(record)

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rover_lib.onboard.servo_link import LinkError, ServoLink, Telemetry
 from rover_lib.onboard.telemetry import FlightLog
@@ -77,12 +77,19 @@ def ended_by_signals(stop: threading.Event, log: FlightLog) -> Iterator[None]:
         stop.set()
         signal.signal(number, before[number])
 
-    before = {number: signal.signal(number, on_signal) for number in SIGNALS}
-    try:
+    with signals(on_signal) as before:
         yield
+
+
+@contextlib.contextmanager
+def signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[dict[int, Any]]:
+    """SIGTERM, SIGINT and SIGHUP go to `handler` inside, and where they went before afterwards; gives the latter."""
+    before = {number: signal.signal(number, handler) for number in SIGNALS}
+    try:
+        yield before
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
 
 
 @contextlib.contextmanager
