@@ -12,7 +12,6 @@ from types import SimpleNamespace
 from rover_lib.playground import arduino
 
 REPOSITORY = arduino.REPOSITORY
-missing_packages = arduino.missing_packages
 symbol = arduino.symbol
 PULSE, CUT, LINE_IN, RESET = 1, 2, 3, 4
 PIN = {"steering": 0, "throttle": 1}

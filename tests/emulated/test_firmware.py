@@ -4,6 +4,7 @@ import json
 import random
 import subprocess
 
+import needs
 import pytest
 import uno
 from recorded import real_episode
@@ -11,10 +12,9 @@ from uno import CUT, LINE_IN, RESET, Uno, body_of, line, pulses, widths
 
 from rover_lib.onboard.pwm import ARDUINO_STEP_US, PwmCalibration
 
-MISSING = uno.missing_packages()
 pytestmark = [
     pytest.mark.emulated,
-    pytest.mark.skipif(bool(MISSING), reason=f"needs the Debian packages {' '.join(MISSING)}"),
+    needs.simavr,
 ]
 
 NEUTRAL = {"steering": 1456, "throttle": 120}

@@ -18,6 +18,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from needs import until
 
 from rover_lib.onboard import recorder as module
 from rover_lib.onboard.camera import Camera, CameraError, Frame
@@ -103,13 +104,6 @@ def status_of(n, host_s=0.0):
     throttle = (None, None) if n % 4 == 3 else (120 + n % 5 * 4, 1016)
     steering = 1456 + n % 50 * 4, 21316
     return Telemetry(host_s, 7, 20 * n, 0, "-", State.MANUAL, "r", 1456, 120, *steering, *throttle, 0, 0, 0, 0)
-
-
-def until(condition, seconds=5.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.002)
 
 
 def content_of(folder):

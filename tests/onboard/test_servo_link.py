@@ -1,5 +1,6 @@
 """The link: by its rules against an Arduino made of a pty and a thread, and for real against the emulated one."""
 
+import functools
 import os
 import pty
 import select
@@ -8,6 +9,7 @@ import time
 import tty
 from contextlib import contextmanager
 
+import needs
 import numpy as np
 import pytest
 import serial
@@ -17,8 +19,9 @@ from uno import body_of, line
 
 from rover_lib.onboard.errors import PwmError, RoverError
 from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
-from rover_lib.playground.arduino import Arduino, missing_packages
+from rover_lib.playground.arduino import Arduino
 
+until = functools.partial(needs.until, seconds=2.0)
 STATUS = "<S 7 1234 5 k M r 1456 120 1460 21316 - - 1 2 3 4"
 
 
@@ -135,13 +138,6 @@ def board_of(**options):
         yield board
     finally:
         board.close()
-
-
-def until(condition, seconds=2.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.002)
 
 
 def test_a_drive_ends_in_neutral():
@@ -363,8 +359,6 @@ class Emulated(Arduino):
 
 @pytest.fixture
 def emulated():
-    if missing := missing_packages():
-        pytest.skip(f"needs the Debian packages {' '.join(missing)}")
     with Emulated() as board:
         yield board
 
@@ -373,17 +367,11 @@ SLACK_S = 0.15  # this machine may be busy; what the firmware promises is judged
 
 
 def drive(link, seconds, steering_us=1800, throttle_us=600):
-    last = time.monotonic()
-    end = last + seconds
-    while last < end:
-        link.send(steering_us, throttle_us)
-        time.sleep(0.02)
-        if (now := time.monotonic()) - last > 0.1:
-            pytest.skip(f"this machine was too busy to send in time: {now - last:.2f} s between two commands")
-        last = now
+    needs.keep_sending(lambda: link.send(steering_us, throttle_us), seconds)
 
 
 @pytest.mark.emulated
+@needs.simavr
 def test_the_real_firmware_arms_drives_and_stops(emulated):
     emulated.transmitter(1460, 124)
     with ServoLink(emulated.port) as link:
@@ -414,6 +402,7 @@ def test_the_real_firmware_arms_drives_and_stops(emulated):
 
 
 @pytest.mark.emulated
+@needs.simavr
 def test_the_real_firmware_without_a_transmitter_refuses(emulated):
     with ServoLink(emulated.port) as link:
         with pytest.raises(LinkError, match="switch the transmitter on"):
@@ -422,6 +411,7 @@ def test_the_real_firmware_without_a_transmitter_refuses(emulated):
 
 
 @pytest.mark.emulated
+@needs.simavr
 def test_the_human_and_the_watchdog_are_seen_by_the_host(emulated):
     emulated.transmitter(1460, 124)
     with ServoLink(emulated.port) as link:

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from needs import until
 
 from rover_lib.onboard import telemetry
 from rover_lib.onboard.errors import ParamsError
@@ -41,13 +42,6 @@ def write(path, ticks=(), host=None, **options):
         for row in ticks:
             log.tick(row)
     return log
-
-
-def until(condition, seconds=5.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.005)
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Arduinos without a board: what goes for both, what only the real firmware does, and the rules of the stand-in."""
 
 import fcntl
+import functools
 import os
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
+import needs
 import pytest
 import serial
 from uno import body_of, line, status_of
@@ -19,11 +21,8 @@ from rover_lib.onboard.servo_link import ServoLink, State
 from rover_lib.playground import arduino
 from rover_lib.playground.arduino import REST_US, Arduino, ArduinoError, StandIn
 
-MISSING = arduino.missing_packages()
-with_firmware = [
-    pytest.mark.emulated,
-    pytest.mark.skipif(bool(MISSING), reason=f"needs the Debian packages {' '.join(MISSING)}"),
-]
+until = functools.partial(needs.until, seconds=3.0)
+with_firmware = [pytest.mark.emulated, needs.simavr]
 KINDS = ["stand-in", pytest.param("firmware", marks=with_firmware)]
 
 
@@ -40,27 +39,13 @@ def board(request):
         yield board
 
 
-def until(condition, seconds=3.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.005)
-
-
 def arm(link):
     until(lambda: link.latest() and link.latest().receiver_steering_us and link.latest().receiver_throttle_us)
     return link.arm()
 
 
 def drive(link, seconds, steering=0.4, throttle=0.3):
-    last = time.monotonic()
-    end = last + seconds
-    while (now := time.monotonic()) < end:
-        if now - last > 0.1:
-            pytest.skip(f"this machine was too busy to send in time: {now - last:.2f} s between two commands")
-        last = now
-        link.send_action(steering, throttle)
-        time.sleep(0.02)
+    needs.keep_sending(lambda: link.send_action(steering, throttle), seconds)
 
 
 def test_a_link_arms_drives_and_stops(board):
@@ -296,7 +281,7 @@ class TestFirmware:
             assert os.path.lexists(port)
             parent.kill()
             parent.wait()
-            until(lambda: gone(pid), 2)
+            until(lambda: gone(pid), seconds=2)
             assert not os.path.lexists(port)
         finally:
             with suppress(ProcessLookupError):

@@ -11,31 +11,23 @@ from contextlib import suppress
 from pathlib import Path
 
 import cv2
+import needs
 import numpy as np
 import pytest
+from needs import until
 
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.servo_link import ServoLink
-from rover_lib.playground import arduino
 from rover_lib.playground import car as car_module
 from rover_lib.playground.arduino import PinEvent
 from rover_lib.playground.car import KEEP_DRIVES, CameraFeed, VirtualCar, _Car, _Pins
 from rover_lib.playground.trial import wilson_interval
 from rover_lib.playground.world import World
 
-MISSING = arduino.missing_packages()
-with_firmware = pytest.mark.skipif(bool(MISSING), reason=f"needs the Debian packages {' '.join(MISSING)}")
-KINDS = [False, pytest.param(True, marks=[pytest.mark.emulated, with_firmware], id="firmware")]
+KINDS = [False, pytest.param(True, marks=[pytest.mark.emulated, needs.simavr], id="firmware")]
 AHEAD = 21783  # a world with its balloon 1.83 m straight ahead
 THROTTLE = 0.3
-
-
-def until(condition, seconds=5.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.005)
 
 
 class Eye:

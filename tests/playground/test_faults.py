@@ -10,6 +10,7 @@ import time
 import tty
 
 import cv2
+import needs
 import numpy as np
 import pytest
 import serial
@@ -19,14 +20,13 @@ from rover_lib.cli import main
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.servo_link import frame
-from rover_lib.playground import arduino, faults
+from rover_lib.playground import faults
 from rover_lib.playground.arduino import PinEvent
 from rover_lib.playground.faults import CONTINUES, HUMAN, PERIOD_US, STOPPED, Cable, Command, FaultError, Gates, Seen
 
 GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50, rows=25, stopped_rows=18, bytes_us=4)
 AT, START, END = 100.0, 99.5, 102.0
 DRIVEN = (1567, 209)
-MISSING = arduino.missing_packages()
 
 
 def pulses(what, start=START, end=END, pins=PERIOD_US):
@@ -370,7 +370,7 @@ def test_a_fault_that_is_none():
 
 
 @pytest.mark.emulated
-@pytest.mark.skipif(bool(MISSING), reason=f"needs the Debian packages {' '.join(MISSING)}")
+@needs.simavr
 def test_some_faults_on_the_pins(tmp_path):
     """One of each kind, and one whose line only the next start writes; `make faults` has all."""
     names = [
