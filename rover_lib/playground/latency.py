@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.camera import Frame
 from rover_lib.onboard.drive import drive
 from rover_lib.onboard.errors import DriveFault, RoverError, WorldError
@@ -26,7 +27,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Order, PolicyPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
 from rover_lib.onboard.policy import load_policy
-from rover_lib.onboard.stage import plain, read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import plain, read_stage, write_stage
 from rover_lib.playground.trial import Trajectory, wilson_interval
 from rover_lib.playground.world import RATE_HZ, CarState, World
 from rover_lib.workshop.compare import GATED, gate
@@ -336,7 +337,7 @@ def measured(
         "drive": p["drive"],
         "hits_lost_at_150_ms": limit,
     }
-    inputs = {artifact.name: sha256_of(artifact)}
+    inputs = {artifact.name: content_hash(artifact)}  # the same policy exported again is the same
     with suppress(RoverError):
         there = read_stage(path, "drive")
         if (there["params"], there["inputs"]) == (plain(given), inputs):

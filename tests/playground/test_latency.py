@@ -4,6 +4,7 @@ import copy
 import json
 import math
 import re
+import zipfile
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -204,9 +205,15 @@ def test_plans_from_above_lead_where_the_car_went():
 # --- a run's drive.json
 
 
+def write_policy(folder, acts, serial="1"):
+    with zipfile.ZipFile(folder / "policy_static.pt", "w") as z:
+        z.writestr("archive/code/policy.py", acts)
+        z.writestr("archive/.data/serialization_id", serial)
+
+
 @pytest.fixture
 def run_dir(tmp_path, monkeypatch):
-    (tmp_path / "policy_static.pt").write_bytes(b"a policy")
+    write_policy(tmp_path, "a policy")
     loaded = []
     monkeypatch.setattr(latency, "load_policy", lambda path, threads: loaded.append(path) or Foresees())
     return SimpleNamespace(path=tmp_path, loaded=loaded)
@@ -228,7 +235,10 @@ def test_a_run_is_measured_once_for_each_policy_and_question(run_dir):
     latency.measured(run_dir.path, **HOW | {"worlds": 1})
     assert run_dir.loaded
     run_dir.loaded.clear()
-    (run_dir.path / "policy_static.pt").write_bytes(b"another policy")
+    write_policy(run_dir.path, "a policy", serial="2")  # exported again: other bytes, the same policy
+    latency.measured(run_dir.path, **HOW | {"worlds": 1})
+    assert not run_dir.loaded
+    write_policy(run_dir.path, "another policy")
     latency.measured(run_dir.path, **HOW | {"worlds": 1})
     assert run_dir.loaded
 
