@@ -14,8 +14,8 @@ from rover_lib.cli import main
 from rover_lib.onboard.recording import read_controls
 from rover_lib.onboard.servo_link import ServoLink
 from rover_lib.onboard.telemetry import read_log
+from rover_lib.playground.bench import make_artifact, pictures
 from rover_lib.playground.car import VirtualCar
-from rover_lib.playground.faults import make_artifact, pictures
 from rover_lib.workshop.episodes import load_recordings
 
 ROVER = [str(Path(sys.executable).parent / "rover"), "drive"]

@@ -20,9 +20,10 @@ from rover_lib.cli import main
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.servo_link import frame
-from rover_lib.playground import faults
+from rover_lib.playground import bench, faults
 from rover_lib.playground.arduino import PinEvent
-from rover_lib.playground.faults import CONTINUES, HUMAN, PERIOD_US, STOPPED, Cable, Command, FaultError, Gates, Seen
+from rover_lib.playground.bench import Cable, FaultError
+from rover_lib.playground.pins import CONTINUES, HUMAN, PERIOD_US, STOPPED, Command, Gates, Seen, judge
 
 GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50, rows=25, stopped_rows=18, bytes_us=4)
 AT, START, END = 100.0, 99.5, 102.0
@@ -49,7 +50,7 @@ def commanded(what, start=START - 0.5, end=END):
 
 def verdict(expected, what, *, commands=None, end=END, **more):
     seen = Seen(pulses(what, end=end), commanded(what) if commands is None else commands, AT, end)
-    return faults.judge(expected, seen, GATES, **more)
+    return judge(expected, seen, GATES, **more)
 
 
 def then(*steps):
@@ -99,7 +100,7 @@ def test_not_stopped(what, sentence):
 def test_a_pulse_that_a_reset_cut_is_a_pulse():
     events = pulses(then((0.1, 1456, 120)))
     events.append(PinEvent(AT + 0.5, "cut", "throttle", 300.0, 0.0))
-    found = faults.judge(STOPPED, Seen(events, [], AT, END), GATES)
+    found = judge(STOPPED, Seen(events, [], AT, END), GATES)
     assert found.figures["max_throttle_us_after"] == 300
     assert found.wrong
 
@@ -239,12 +240,12 @@ def test_steps_that_come_out_as_they_went_in():
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     path = tmp_path_factory.mktemp("faults") / "policy.pt"
-    faults.make_artifact(path)
+    bench.make_artifact(path)
     return load_policy(path)
 
 
 def told(policy, what):
-    jpegs = faults.pictures(what)
+    jpegs = bench.pictures(what)
     assert len(set(jpegs)) == len(jpegs)
     found = [
         policy.predict_unclipped(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), np.zeros(2))
@@ -255,16 +256,16 @@ def told(policy, what):
 
 
 def test_the_policy_does_what_the_picture_tells_it_to(policy):
-    assert np.allclose(told(policy, faults.PLAIN), faults.PLAN)
-    assert np.allclose(told(policy, faults.OTHER), faults.OTHER_PLAN)
-    assert np.allclose(told(policy, faults.BEYOND), 5.0)
+    assert np.allclose(told(policy, bench.PLAIN), bench.PLAN)
+    assert np.allclose(told(policy, bench.OTHER), bench.OTHER_PLAN)
+    assert np.allclose(told(policy, bench.BEYOND), 5.0)
     start = time.monotonic()
-    assert np.allclose(told(policy, faults.SLOW), faults.PLAN)
+    assert np.allclose(told(policy, bench.SLOW), bench.PLAN)
     assert 0.85 < time.monotonic() - start < 3
     with pytest.raises(PolicyError, match="NaN"):
-        told(policy, faults.NAN)
+        told(policy, bench.NAN)
     with pytest.raises(Exception, match="told to fail by the picture"):
-        told(policy, faults.RAISE)
+        told(policy, bench.RAISE)
 
 
 # ---- the cable
@@ -347,12 +348,12 @@ def test_a_stuck_cable_blocks_and_an_unplugged_one_fails(ends):
 def test_spoiling():
     rng = random.Random(1)
     data = bytes(range(256)) * 100
-    changed = faults.flipping(rng, 0.01)(data)
+    changed = bench.flipping(rng, 0.01)(data)
     bits = [bin(a ^ b).count("1") for a, b in zip(data, changed, strict=True)]
     assert max(bits) == 1
     assert 0.008 < sum(bits) / len(data) < 0.012
     lines = [b"%d\n" % i for i in range(1000)]
-    drop = faults.dropping(rng, 0.3)
+    drop = bench.dropping(rng, 0.3)
     kept = b"".join(drop(line[:2]) + drop(line[2:]) for line in lines).splitlines(keepends=True)
     assert set(kept) < set(lines)
     assert 650 < len(kept) < 750
