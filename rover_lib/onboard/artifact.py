@@ -12,12 +12,11 @@ import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.stage import atomic_path
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # reading what an artifact says of itself needs neither
+    import numpy as np
     import torch
 
 SCHEMA = 1
@@ -43,14 +42,15 @@ MANIFEST_KEYS = {
 
 
 def save_artifact(
-    path: Path | str, module: "torch.jit.ScriptModule", manifest: dict[str, Any], parity: dict[str, np.ndarray]
+    path: Path | str, module: "torch.jit.ScriptModule", manifest: dict[str, Any], parity: "dict[str, np.ndarray]"
 ) -> str:
     """Write the artifact atomically; return its content hash.
 
     parity: `state` (n, S) float32, `frame_<camera>` (n, height, width, 3) uint8 RGB, `chunk` (n, C, A) float32.
     Raises ArtifactError if the manifest lacks something.
     """
-    import torch  # here, because reading what an artifact says of itself needs no torch
+    import numpy as np
+    import torch
 
     check_manifest(manifest, str(path))
     vectors = io.BytesIO()
@@ -92,8 +92,10 @@ def read_manifest(path: Path | str) -> dict[str, Any]:
         return _manifest_in(z, path)
 
 
-def read_parity(path: Path | str) -> dict[str, np.ndarray]:
+def read_parity(path: Path | str) -> "dict[str, np.ndarray]":
     """The parity vectors of an artifact. Raises ArtifactError."""
+    import numpy as np
+
     with _open(path) as z:
         try:
             content = np.load(io.BytesIO(z.read(_record(z, "parity.npz", path))), allow_pickle=False)
