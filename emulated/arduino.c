@@ -2,7 +2,7 @@
  *
  * As a library (cc -shared -fPIC): stepped from a test, no clock of this world in it.
  * As a program (cc -DPROGRAM): in real time, its serial line on a pty.
- *     arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N]
+ *     arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] [--slow N]
  *         --link           a symbolic link to the pty, for pyserial to open
  *         --log            on standard output, a line each: monotonic_s,event,pin,pulse_us,period_us
  *                          all: every pulse of a servo pin, every line of the host, every event
@@ -10,6 +10,8 @@
  *                          monotonic_s is when the pin rose; a log that nobody reads is lost, "lost" then has how many
  *         --reset-on-open  what DTR does to an Uno when its port is opened, and after it
  *         --boot-ms        the boot loader's time: nothing runs for so long
+ *         --slow           its clock runs N times slower than this world's, for an emulated Pi that needs so long too;
+ *                          pulses and periods are by its own clock
  *     Where this machine stalls for more than 20 ms, so does the Arduino; the log then has "stall" with microseconds.
  *     Standard input takes, a line each: transmitter STEERING_US THROTTLE_US (0: no signal), reset, hang ADDRESS, quit.
  *     It ends with whoever started it.
@@ -302,6 +304,7 @@ static struct {
     unsigned lost;
     struct uno_event last[CHANNELS];
 } pin_log;
+static double slow = 1; /* seconds of this world in a second of the Arduino's */
 
 /* The Arduino does not wait for who reads its log. */
 static void put_log(double at_s, const char *what, const char *pin, double pulse_us, double period_us) {
@@ -321,7 +324,7 @@ static void log_event(const struct uno_event *event, double start_s) {
             fabs(event->period_us - last.period_us) < CHANGE_US)
             return;
     }
-    put_log(start_s + event->at_us * 1e-6, EVENTS[event->kind], PINS[event->channel + 1], event->pulse_us,
+    put_log(start_s + event->at_us * 1e-6 * slow, EVENTS[event->kind], PINS[event->channel + 1], event->pulse_us,
             event->period_us);
 }
 
@@ -360,12 +363,13 @@ int main(int argc, char **argv) {
         if (!strcmp(argv[i], "--link") && more) link_path = argv[++i];
         else if (!strcmp(argv[i], "--log") && more) log = argv[++i];
         else if (!strcmp(argv[i], "--boot-ms") && more) boot_s = atof(argv[++i]) * 1e-3;
+        else if (!strcmp(argv[i], "--slow") && more) slow = atof(argv[++i]);
         else if (!strcmp(argv[i], "--reset-on-open")) reset_on_open = true;
         else elf = argv[i];
     }
     if (log) pin_log.what = !strcmp(log, "all") ? PINS_ALL : !strcmp(log, "changes") ? PINS_CHANGES : PINS_NONE;
-    if (!elf || !link_path || (log && !pin_log.what)) {
-        fprintf(stderr, "usage: arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N]\n");
+    if (!elf || !link_path || (log && !pin_log.what) || !(slow >= 1)) {
+        fprintf(stderr, "usage: arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] [--slow N]\n");
         return 2;
     }
     pid_t parent = getppid();
@@ -402,7 +406,7 @@ int main(int argc, char **argv) {
     while (running && !state && getppid() == parent) {
         state = uno_run_us(uno, 500);
         struct pollfd files[2] = {{master, POLLIN, 0}, {0, POLLIN, 0}};
-        double ahead = start + uno_now_us(uno) * 1e-6 - monotonic();
+        double ahead = start + uno_now_us(uno) * 1e-6 * slow - monotonic();
         poll(files, 2, 0);
         if (ahead < -0.02) { /* this machine had no time for us: the Arduino stood still too, rather than hurry now */
             put_log(monotonic(), "stall", "", -ahead * 1e6, 0);
@@ -415,8 +419,8 @@ int main(int argc, char **argv) {
             if (reset_on_open) {
                 uno_reset(uno);
                 log_events(uno, start);
-                start += boot_s; /* stands still for so long */
-                ahead += boot_s;
+                start += boot_s * slow; /* stands still for so long */
+                ahead += boot_s * slow;
             }
         }
         open = open_now;

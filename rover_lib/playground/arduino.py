@@ -139,11 +139,13 @@ class Arduino:
         transmitter: tuple[float, float] = (0.0, 0.0),
         boot_s: float = BOOT_S,
         nice: int = 0,
+        slow: float = 1.0,
     ):
         """every_pulse: pulses() has each pulse, a thousand a second; otherwise those that differ from the one before.
 
         transmitter: its pulses from the start on, see transmitter(). nice: scheduling priority; a real Arduino has a
-        processor of its own, -10 comes near that (below 0 only for root, silently left out for others).
+        processor of its own, -10 comes near that (below 0 only for root, silently left out for others). slow: its
+        clock runs so many times slower than this machine's: pulses are by its own, monotonic_s by this machine's.
         Raises ArduinoError as build() does, and if the program does not start.
         """
         built = build()
@@ -155,7 +157,7 @@ class Arduino:
         log = "all" if every_pulse else "changes"
         command = [built.program, built.firmware, "--link", self.port, "--log", log, "--reset-on-open"]
         self._process = subprocess.Popen(
-            [*command, "--boot-ms", f"{boot_s * 1000:.0f}"],
+            [*command, "--boot-ms", f"{boot_s * 1000:.0f}", "--slow", f"{slow:g}"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
