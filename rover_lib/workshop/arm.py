@@ -201,7 +201,8 @@ def _make_userland(root: Path) -> None:
         if not shutil.which(tool):
             raise ArmError(f"no {tool} to fetch an arm64 Python with: use Debian 12, in a container if need be")
     with tempfile.TemporaryDirectory(dir=root.parent, prefix=".apt.") as scratch:
-        _unpack_packages(root, Path(scratch))
+        for package in fetch_packages(Path(scratch), GUEST_PACKAGES):
+            _call(["dpkg", "--extract", package, root], f"dpkg cannot unpack {package.name}")
     uv = _uv()
     command = [uv, "pip", "install", "--quiet", "--require-hashes", "--only-binary", ":all:", "--no-deps"]
     command += ["--python-platform", PLATFORM, "--python-version", PYTHON, "--target", _site(root)]
@@ -218,8 +219,12 @@ def _make_userland(root: Path) -> None:
     _call(command, "the Pi's wheels do not work in the emulator", env=_environment(root, root))
 
 
-def _unpack_packages(root: Path, scratch: Path) -> None:
-    """arm64 packages by the host's apt sources and keys, with lists, cache and status of its own."""
+def fetch_packages(scratch: Path, packages: Sequence[str]) -> list[Path]:
+    """arm64 packages and what they depend on, as .deb files in a scratch folder; nothing of the host is changed.
+
+    By the host's apt sources and keys, with lists, cache and status of its own. packages: names, or apt's patterns.
+    Raises ArmError if they are not to be had.
+    """
     for folder in ("lists/partial", "archives/partial"):
         (scratch / folder).mkdir(parents=True)
     (scratch / "status").touch()  # nothing is installed: the dependencies come along
@@ -239,10 +244,9 @@ def _unpack_packages(root: Path, scratch: Path) -> None:
     }
     apt = ["apt-get", "--quiet", *(f"--option={key}={value}" for key, value in options.items())]
     _call([*apt, "update"], "apt-get cannot read the arm64 package lists of this machine's sources")
-    install = [*apt, "install", "--yes", "--download-only", "--no-install-recommends", *GUEST_PACKAGES]
-    _call(install, f"apt-get cannot fetch {' '.join(GUEST_PACKAGES)} for arm64 (Debian 12 has them)")
-    for package in sorted((scratch / "archives").glob("*.deb")):
-        _call(["dpkg", "--extract", package, root], f"dpkg cannot unpack {package.name}")
+    install = [*apt, "install", "--yes", "--download-only", "--no-install-recommends", *packages]
+    _call(install, f"apt-get cannot fetch {' '.join(packages)} for arm64 (Debian 12 has them)")
+    return sorted((scratch / "archives").glob("*.deb"))
 
 
 def _uv() -> str:
