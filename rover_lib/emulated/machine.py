@@ -5,13 +5,13 @@
         pi.ssh("uname -a")
         pi.plug(arduino.port)
 
-Nothing on the host is changed: ssh is on a port of the loopback, the machine reaches no network, and what it writes goes
-to a file of its own over the card, which stays as it was.
+Nothing on the host is changed: ssh is on a port of the loopback, the machine reaches no network, and what it writes
+goes to a file of its own over the card, which stays as it was.
 
-The machine is many times slower than a Pi. So its clock runs `slow` times slower than the host's: the device tree tells
-its kernel that the counter of all its clocks and timers counts `slow` times faster than it does. Then a rate of 30 Hz, a
-watchdog's 2 s and an Arduino's 150 ms (slowed down alike) stand in the same proportion to its speed as on a Pi, and
-nothing of the rover's has to be told other times. What takes a second for the machine takes `slow` seconds here.
+The machine is many times slower than a Pi. So its clock runs `slow` times slower than the host's: the device tree
+tells its kernel that the counter of all its clocks and timers counts `slow` times faster than it does. Then a rate of
+30 Hz, a watchdog's 2 s and an Arduino's 150 ms (slowed down alike) stand in a Pi's proportion to its speed, and nothing
+of the rover's has to be told other times. What takes a second for the machine takes `slow` seconds here.
 """
 
 import contextlib
@@ -26,12 +26,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rover_lib.emulated.system import USER, System, emulation, system
 from rover_lib.onboard.errors import RoverError
+from rover_lib.workshop.arm import fetch_packages, install
 from rover_lib.workshop.cache import cached_folder, key_of
 
 PACKAGES = {  # commands, and the Debian packages that have them
@@ -44,7 +46,6 @@ PACKAGES = {  # commands, and the Debian packages that have them
     "ssh": "openssh-client",
 }
 RECIPE = 1  # one more when the card is made in another way: older ones are then not used
-LOGIN, NAME = "pi", "rover-pi"
 CARD_GB = 6  # sparse: it takes what is in it
 MEMORY_MB, CORES, CPU = 3072, 4, "cortex-a76"
 TIMER_HZ = 62_500_000  # of QEMU's Cortex-A76
@@ -109,81 +110,48 @@ class Card:
     key = property(lambda self: self.folder / "id")
 
 
-def card(tree: Path | None = None) -> Card:
-    """The card of an arm64 Debian tree (system()'s), from the cache or made now (a minute).
+def card() -> Card:
+    """The card with system()'s Debian on it, from the cache or made now (a minute, and what system() takes).
 
-    Raises MachineError where this host cannot make one.
+    Debian packages that are missing are installed when this runs as root. Raises RoverError where no card can be made.
     """
-    if missing := missing_packages():
-        raise MachineError(
-            f"the emulated machine needs the Debian packages {' '.join(missing)}, which are not here: "
-            f"sudo apt-get install --no-install-recommends {' '.join(missing)}"
-        )
+    missing = missing_packages()
     if os.geteuid() != 0:
-        raise MachineError("a card is written by root, whose files most of it are: sudo make pi")
-    if tree is None:
-        from rover_lib.emulated.system import system
+        packages = f" (and of the Debian packages {' '.join(missing)})" if missing else ""
+        raise MachineError(
+            f"an emulated Pi's card is written with its owner's rights, which needs root{packages}: use sudo"
+        )
+    if missing:
+        install(missing, f"the emulated machine needs the Debian packages {' '.join(missing)}, which are not here")
+    with emulation():
+        flashed = system()
+    made = [RECIPE, CARD_GB, MODULES, FIRST_MODULES, INIT, NETWORK, MASKED, ROVER_PACKAGES, KERNEL_PACKAGES]
+    key = key_of({"system": str(flashed.root), "made": made})
+    return Card(cached_folder("pi-card", key, lambda folder: _make_card(flashed, folder)))
 
-        tree = system()
-    recipe = {
-        "tree": str(tree),
-        "made": [RECIPE, CARD_GB, MODULES, FIRST_MODULES, INIT, NETWORK, MASKED, ROVER_PACKAGES],
-    }
-    return Card(cached_folder("pi-card", key_of(recipe), lambda folder: _make_card(tree, folder)))
 
-
-def _make_card(tree: Path, folder: Path) -> None:
+def _make_card(flashed: System, folder: Path) -> None:
     made = Card(folder)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".pi-card.") as scratch:
         work, root = Path(scratch), Path(scratch) / "root"
-        _run(["cp", "-a", "--reflink=auto", f"{tree}/.", root])
+        _run(["cp", "-a", "--reflink=auto", flashed.root, root])
         kernel, debs = work / "kernel", root / DEBS.lstrip("/")
         debs.mkdir(parents=True)
-        apt = _private_apt(work, tree / "var/lib/dpkg/status")
-        _fetch(apt, ROVER_PACKAGES, work, debs)
-        fetched = work / "fetched"
-        fetched.mkdir()
-        _fetch(apt, KERNEL_PACKAGES, work, fetched)
-        for package in [*fetched.glob("linux-image-[0-9]*.deb"), *fetched.glob("busybox-static*.deb")]:
-            _run(["dpkg-deb", "--extract", package, kernel])
+        for package in fetch_packages(work / "rover", ROVER_PACKAGES, flashed.root):
+            shutil.move(package, debs)
+        for package in fetch_packages(work / "linux", KERNEL_PACKAGES, flashed.root):
+            if package.name.startswith(("linux-image-", "busybox-static_")):
+                _run(["dpkg-deb", "--extract", package, kernel])
         version = next((kernel / "lib/modules").iterdir()).name
         shutil.copy(kernel / f"boot/vmlinuz-{version}", made.kernel)
         _modules(kernel, root, version)
         _initramfs(kernel / "bin/busybox", root, version, made.initramfs, work)
-        _configure(root, made)
+        _configure(root)
+        shutil.copy(flashed.key, made.key)
+        made.key.chmod(0o600)
         # Without checksums of its own: the kernel would need modules for them before it has the card.
         options = ["-t", "ext4", "-E", "lazy_itable_init=1,lazy_journal_init=1", "-O", "^metadata_csum"]
         _run(["mke2fs", "-q", *options, "-d", root, made.disk, f"{CARD_GB}G"])
-
-
-def _private_apt(scratch: Path, status: Path) -> list[str]:
-    """apt for arm64 by the host's sources and keys, with lists and cache of its own; status: what is installed."""
-    for name in ("lists/partial", "archives/partial"):
-        (scratch / name).mkdir(parents=True)
-    options = {
-        "APT::Architecture": "arm64",
-        "APT::Architectures": "arm64",
-        "Dir::State": scratch,
-        "Dir::State::lists": scratch / "lists",
-        "Dir::State::status": status,
-        "Dir::Cache": scratch,
-        "Dir::Cache::archives": scratch / "archives",
-        "Dir::Cache::pkgcache": "",
-        "Dir::Cache::srcpkgcache": "",
-        "Dir::Log": scratch,
-        "APT::Sandbox::User": "root",
-        "Debug::NoLocking": "true",
-    }
-    apt = ["apt-get", "--quiet", *(f"--option={key}={value}" for key, value in options.items())]
-    _run([*apt, "update"])
-    return apt
-
-
-def _fetch(apt: list[str], packages: Sequence[str], scratch: Path, folder: Path) -> None:
-    """Packages and what they depend on, into a folder."""
-    _run([*apt, "install", "--yes", "--download-only", "--no-install-recommends", *packages])
-    for package in (scratch / "archives").glob("*.deb"):
-        package.rename(folder / package.name)
 
 
 def _modules(kernel: Path, root: Path, version: str) -> None:
@@ -230,10 +198,8 @@ def _initramfs(busybox: Path, root: Path, version: str, output: Path, scratch: P
     output.write_bytes(gzip.compress(archive.stdout, 1))
 
 
-def _configure(root: Path, made: Card) -> None:
-    """What this machine has and a container has not; and a key to log in with, made for this card."""
-    (root / "etc/hostname").write_text(f"{NAME}\n")
-    (root / "etc/hosts").write_text(f"127.0.0.1 localhost {NAME}\n")
+def _configure(root: Path) -> None:
+    """What this machine has and a container has not."""
     (root / "etc/fstab").write_text("/dev/vda / ext4 noatime 0 1\n")
     (root / "etc/systemd/network").mkdir(parents=True, exist_ok=True)
     (root / "etc/systemd/network/20-wired.network").write_text(NETWORK)
@@ -245,42 +211,10 @@ def _configure(root: Path, made: Card) -> None:
     ]:
         (units / name).unlink(missing_ok=True)
         (units / name).symlink_to(target)
-    (root / "etc/machine-id").write_text("")
     for kind in ("ed25519", "rsa"):
         host_key = root / f"etc/ssh/ssh_host_{kind}_key"
         if not host_key.exists():
-            _run(["ssh-keygen", "-q", "-t", kind, "-N", "", "-C", NAME, "-f", host_key])
-    _run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "rover pi whole", "-f", made.key])
-    _login(root)
-    home = root / "home" / LOGIN / ".ssh"
-    home.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with (home / "authorized_keys").open("a") as file:
-        file.write(made.key.with_suffix(".pub").read_text())
-    uid, gid = _ids(root)
-    for path in (home.parent, home, home / "authorized_keys"):
-        os.chown(path, uid, gid)
-    (home / "authorized_keys").chmod(0o600)
-
-
-def _ids(root: Path) -> tuple[int, int]:
-    rows = (line.split(":") for line in (root / "etc/passwd").read_text().splitlines())
-    return next(((int(row[2]), int(row[3])) for row in rows if row[0] == LOGIN), (0, 0))
-
-
-def _login(root: Path) -> None:
-    """The user that Raspberry Pi Imager makes, if the tree has none yet."""
-    if _ids(root) != (0, 0):
-        return
-    for name, line in [
-        ("passwd", f"{LOGIN}:x:1000:1000::/home/{LOGIN}:/bin/bash"),
-        ("shadow", f"{LOGIN}:*:19000:0:99999:7:::"),
-        ("group", f"{LOGIN}:x:1000:"),
-    ]:
-        with (root / "etc" / name).open("a") as file:
-            file.write(f"{line}\n")
-    sudo = root / "etc/sudoers.d" / LOGIN
-    sudo.write_text(f"{LOGIN} ALL=(ALL) NOPASSWD:ALL\n")
-    sudo.chmod(0o440)
+            _run(["ssh-keygen", "-q", "-t", kind, "-N", "", "-C", "emulated Pi", "-f", host_key])
 
 
 def _run(command: Sequence[object], **options: Any) -> str:
@@ -484,7 +418,7 @@ class Machine:
 
     def ssh(self, command: str, *, timeout_s: float = 600, check: bool = True, text: str | None = None) -> str:
         """Runs a shell command as the login user; its stdout, with stderr behind it. MachineError if it fails."""
-        words = ["ssh", *self.ssh_options, "-p", str(self.port), f"{LOGIN}@127.0.0.1", command]
+        words = ["ssh", *self.ssh_options, "-p", str(self.port), f"{USER}@127.0.0.1", command]
         try:
             done = subprocess.run(
                 words, capture_output=True, text=True, timeout=timeout_s, input=text or "", errors="replace"
@@ -535,7 +469,7 @@ class Machine:
         if self._qmp:
             self._qmp.close()
         with contextlib.suppress(OSError, subprocess.SubprocessError):
-            options = [*self.ssh_options, "-p", str(self.port), f"{LOGIN}@127.0.0.1"]
+            options = [*self.ssh_options, "-p", str(self.port), f"{USER}@127.0.0.1"]
             subprocess.run(["ssh", "-O", "exit", *options], capture_output=True, timeout=10)
         self._errors.close()
         self.disk.unlink(missing_ok=True)

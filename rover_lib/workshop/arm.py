@@ -219,15 +219,17 @@ def _make_userland(root: Path) -> None:
     _call(command, "the Pi's wheels do not work in the emulator", env=_environment(root, root))
 
 
-def fetch_packages(scratch: Path, packages: Sequence[str]) -> list[Path]:
+def fetch_packages(scratch: Path, packages: Sequence[str], installed: Path | None = None) -> list[Path]:
     """arm64 packages and what they depend on, as .deb files in a scratch folder; nothing of the host is changed.
 
     By the host's apt sources and keys, with lists, cache and status of its own. packages: names, or apt's patterns.
-    Raises ArmError if they are not to be had.
+    installed: the root of a system; what it has already is left out. Raises ArmError if they are not to be had.
     """
     for folder in ("lists/partial", "archives/partial"):
         (scratch / folder).mkdir(parents=True)
     (scratch / "status").touch()  # nothing is installed: the dependencies come along
+    if installed:
+        shutil.copy(installed / "var" / "lib" / "dpkg" / "status", scratch / "status")
     options = {
         "APT::Architecture": "arm64",
         "APT::Architectures": "arm64",
