@@ -226,12 +226,12 @@ def benchmark(
 
     The first artifact's figures stand at the top level. Needs nothing but the artifact: this is what runs on the Pi.
     """
-    from rover_lib.onboard.artifact import read_parity
+    from rover_lib.onboard.artifact import content_hash, read_parity
     from rover_lib.onboard.benchmark import benchmark as measure
     from rover_lib.onboard.benchmark import check_gates
     from rover_lib.onboard.params import params
     from rover_lib.onboard.policy import load_policy
-    from rover_lib.onboard.stage import sha256_of, write_stage
+    from rover_lib.onboard.stage import write_stage
 
     policies = {a.stem: load_policy(a) for a in artifacts}
     vectors = read_parity(artifacts[0])
@@ -243,7 +243,7 @@ def benchmark(
     metrics = measure(policies, frames, vectors["state"][0], **options, memory_alone=True)
     if output:
         write_stage(
-            output, "benchmark", params=options, metrics=metrics, inputs={a.name: sha256_of(a) for a in artifacts}
+            output, "benchmark", params=options, metrics=metrics, inputs={a.name: content_hash(a) for a in artifacts}
         )
     if gates:
         metrics["gates"] = check_gates(metrics, params()["gates"]["original"])

@@ -15,7 +15,7 @@ from rover_lib.onboard.host import THROTTLED_BITS
 from rover_lib.onboard.pwm import Channel, PwmCalibration
 from rover_lib.onboard.servo_link import State
 from rover_lib.onboard.telemetry import Event, Flight
-from rover_lib.workshop.plots import BLACK, BLUE, GREEN, GREY, ORANGE, RED, SKY, _axes
+from rover_lib.workshop.plots import BLACK, BLUE, GREEN, GREY, NOW_BITS, ORANGE, RED, SKY, _axes
 
 STATES = {
     State.MANUAL.value: ("human", GREY),
@@ -23,7 +23,6 @@ STATES = {
     State.STOPPED.value: ("nobody, stopped", RED),
     "": ("not known", "#F2F2F2"),
 }
-NOW_BITS = sum(1 << bit for bit in THROTTLED_BITS)  # of get_throttled; the others are since the machine's start
 EVENTS_LISTED = 14
 LABEL_SHARE = 0.05  # of the width: events that are closer share one label
 TEXT_LENGTH = 105

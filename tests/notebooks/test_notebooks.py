@@ -3,6 +3,7 @@
 import ast
 import re
 import sys
+import zipfile
 from types import SimpleNamespace
 
 import nbformat
@@ -150,7 +151,8 @@ def test_drives_are_drawn(tmp_path, monkeypatch):
             return np.tile(np.float32([0.0, 0.06]), (self.chunk, 1))
 
     monkeypatch.setattr(latency, "load_policy", lambda path, threads: Straight())
-    (tmp_path / "policy_static.pt").write_bytes(b"a policy that only this process knows")
+    with zipfile.ZipFile(tmp_path / "policy_static.pt", "w") as z:
+        z.writestr("archive/code/policy.py", "only this process knows it")
     chosen = {"worlds": 2, "latencies_ms": [0, 150, 600], "pushes": 2, "pushed_latencies_ms": [150], "shown_ms": 150}
     found = latency.measured(tmp_path, **chosen)
     text = shown(runs.execute("07_drive", tmp_path, **chosen))
@@ -158,6 +160,33 @@ def test_drives_are_drawn(tmp_path, monkeypatch):
     assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {
         f"07_{figure}" for figure in ("age", "hits", "path", "above", "gates")
     }
+
+
+# --- rovers beside this machine ---
+
+
+def test_rovers_are_drawn(tmp_path):
+    """The cells that draw, without those that measure here: nbval runs these."""
+    source, kept = (
+        nbformat.read(PATHS[4], as_version=4),
+        ("imports", "parameters", "derive", "latency", "rovers", "soak"),
+    )
+    source.cells = [c for c in source.cells if c.id in kept]
+    (derive,) = (c for c in source.cells if c.id == "derive")
+    folders = [line for line in derive.source.splitlines() if line.startswith(("p, run_dir", "fetched"))]
+    derive.source = "\n".join(folders)
+    (tmp_path / "notebooks").mkdir()
+    nbformat.write(source, tmp_path / "notebooks" / "05_benchmark.ipynb")
+    policy = {"latency_p50_ms": 60.0, "latency_p95_ms": 61.0, "latency_p99_ms": 62.0, "n": 16, "mode": "static"}
+    series = [{"t_s": t_s, "artifacts": {"policy": policy}} for t_s in (1.0, 2.0)]
+    metrics = {"artifacts": {"policy": policy}, "main": "policy", "series": series}
+    for folder in ("demo", "rovers"):
+        (tmp_path / folder).mkdir()
+        write_stage(tmp_path / folder / "benchmark-rover1.json", "benchmark", params={}, metrics=metrics)
+    (tmp_path / "rovers" / "benchmark-rover2.json").write_text("{")
+    text = shown(runs.execute("05_benchmark", tmp_path / "demo", notebooks=tmp_path / "notebooks"))
+    assert re.search(r"rover1 +static, another +60.0 ", text) and "1 file is left out:\nbenchmark-rover2.json: " in text
+    assert {p.stem for p in (tmp_path / "demo" / "figures").glob("*.png")} == {"05_latency", "05_soak"}
 
 
 # --- executing and publishing ---

@@ -1,0 +1,127 @@
+"""Benchmarks of several machines beside each other: this one's, and those that ansible/benchmark.yml fetched.
+
+benchmarks = read_benchmarks("runs/demo", "runs/rovers")
+print(benchmarks.table())
+plots.latency(benchmarks.found)
+"""
+
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.stage import read_stage
+
+THIS = "this machine"  # a committed figure need not name it
+NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
+NO_SOAK = "none of the rovers was soaked; -e rover_soak_minutes=30 shows temperature, clock and throttling over time"
+
+
+@dataclass(frozen=True)
+class Benchmarks:
+    """found: contents of benchmark-<host>.json by host, this machine first. unusable: a sentence for each other file.
+
+    Artifacts go by their mode; one of a rover that is not the run's, byte for byte, is called "static, another".
+    """
+
+    found: dict[str, dict[str, Any]]
+    unusable: list[str]
+
+    def soaks(self) -> dict[str, dict[str, Any]]:
+        """Those with a time series."""
+        return {host: b for host, b in self.found.items() if b["metrics"].get("series")}
+
+    def table(self) -> str:
+        """A line for each host and artifact, a dash where a host has no sensor; below what there is to say about it."""
+        rows = [("host", "artifact", "p50", "p95", "p99 ms", "n", "C, most", "MHz, least", "throttled")]
+        for host, b in self.found.items():
+            m = b["metrics"]
+            state = (_shown(m.get("temperature_c"), 1), _shown(m.get("clock_mhz"), 0), m.get("throttled") or "-")
+            for name, v in m["artifacts"].items():
+                times = [f"{v[f'latency_{p}_ms']:.1f}" for p in ("p50", "p95", "p99")]
+                rows.append((host, name, *times, str(v["n"]), *state))
+                host, state = "", ("", "", "")  # once for each host
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        sides = "<<" + ">" * len(widths)
+        lines = ["  ".join(f"{c:{s}{w}}" for c, s, w in zip(row, sides, widths, strict=False)).rstrip() for row in rows]
+        rovers = self.found.keys() - {THIS}
+        if not rovers:
+            lines.append(NO_ROVER)
+        elif not rovers & self.soaks().keys():
+            lines.append(NO_SOAK)
+        if self.unusable:
+            count = len(self.unusable)
+            lines += [f"{count} {'files are' if count > 1 else 'file is'} left out:", *self.unusable]
+        return "\n".join(lines)
+
+
+def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
+    """All benchmark-<host>.json of a run's folder, and of the folder where Ansible leaves those of the rovers.
+
+    A rover is called what the inventory calls it, which is in the file's name; of two with one name the fetched one
+    counts. A file that cannot be used is left out, and named.
+    """
+    found, unusable = {}, []
+    for folder in (Path(run_dir), Path(fetched)):
+        for path in sorted(folder.glob("benchmark-*.json")):
+            try:
+                content = read_stage(path, "benchmark")
+                _check(path, content)
+            except RoverError as error:
+                unusable.append(str(error).replace(str(path), path.name))
+                continue
+            here = folder == Path(run_dir) and content["env"]["host"] == socket.gethostname()
+            found[THIS if here else path.stem.removeprefix("benchmark-")] = content
+    ours = {sha: _mode(file) for file, sha in found.get(THIS, {"inputs": {}})["inputs"].items()}
+    found = {host: content if host == THIS else _named(content, ours) for host, content in found.items()}
+    return Benchmarks({h: found[h] for h in sorted(found, key=lambda h: (h != THIS, h))}, unusable)
+
+
+def _check(path: Path, content: Mapping[str, Any]) -> None:
+    """Raises RoverError unless there is in it what tables and figures read."""
+    try:
+        metrics, env = content["metrics"], content["env"]
+        series = metrics.get("series") or []
+        timed = [*metrics["artifacts"].values(), *(v for p in series for v in p["artifacts"].values())]
+        needed = [v[key] for v in timed for key in ("latency_p50_ms", "latency_p95_ms", "n")]
+        needed += [v["latency_p99_ms"] for v in metrics["artifacts"].values()]
+        needed += [env["cores"], *(p["t_s"] for p in series)]
+        told = [p.get(key) for p in (metrics, *series) for key in ("temperature_c", "clock_mhz")]
+        for p in (metrics, *series):
+            int(p.get("throttled") or "0x0", 16)
+        numbers = needed + [n for n in told if n is not None]
+        usable = metrics["main"] in metrics["artifacts"] and all(type(n) in (int, float) for n in numbers)
+        usable &= all(isinstance(v, str) for v in (env["host"], env["machine"], *content["inputs"].values()))
+    except (KeyError, TypeError, ValueError, AttributeError):
+        usable = False
+    if not usable:
+        raise RoverError(f"{path}: no figures of a benchmark in it; fetch it again")
+
+
+def _mode(name: str) -> str:
+    return Path(name).stem.removeprefix("policy_")
+
+
+def _named(content: Mapping[str, Any], ours: Mapping[str, str]) -> dict[str, Any]:
+    """With artifacts by mode; ours: {sha256: mode} of the run's. On a rover the file in use is always policy.pt."""
+    metrics = content["metrics"]
+    names = {}
+    for name, v in metrics["artifacts"].items():
+        sha = content["inputs"].get(f"{name}.pt")
+        called = ours[sha] if sha in ours else f"{v.get('mode') or _mode(name)}, another"
+        names[name] = name if called in names.values() else called
+    series = metrics.get("series") and [
+        {**p, "artifacts": {names.get(n, n): v for n, v in p["artifacts"].items()}} for p in metrics["series"]
+    ]
+    renamed = {
+        "artifacts": {names[n]: v for n, v in metrics["artifacts"].items()},
+        "main": names.get(metrics.get("main"), metrics.get("main")),
+        "series": series,
+    }
+    return {**content, "metrics": {**metrics, **renamed}}
+
+
+def _shown(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,175 @@
+"""Benchmarks beside each other, as rover_lib's own benchmark writes them; time and heat of the machines are made up."""
+
+import json
+import math
+import socket
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rover_lib.onboard.benchmark import benchmark
+from rover_lib.onboard.stage import write_stage
+from rover_lib.workshop import hosts, plots
+
+OURS = {"policy_static.pt": "5a", "policy_fp32.pt": "f3"}
+
+
+class Machine:
+    """A Host of its own clock, which gets warm while it computes and is held back from 80 degrees on."""
+
+    def __init__(self, latency_ms: float, hottest_c: float | None):
+        self.latency_ms, self.hottest_c, self.now_s = latency_ms, hottest_c, 0.0
+
+    def clock(self) -> float:
+        return self.now_s
+
+    def predict_chunk(self, frame, state) -> None:
+        self.now_s += self.latency_ms / 1e3 * (1.5 if self.is_hot else 1)
+
+    @property
+    def celsius(self) -> float | None:
+        return self.hottest_c and 45 + (self.hottest_c - 45) * (1 - math.exp(-self.now_s / 300))
+
+    @property
+    def is_hot(self) -> bool:
+        return (self.celsius or 0) > 80
+
+    def reading(self):
+        throttled = None if self.hottest_c is None else "0x80008" if self.is_hot else "0x80000"
+        clock_mhz = None if self.hottest_c is None else 1500.0 if self.is_hot else 2400.0
+        return {"temperature_c": self.celsius, "clock_mhz": clock_mhz, "throttled": throttled}
+
+    def process_peak_memory_mb(self) -> float:
+        return 400.0
+
+    def core_ticks(self) -> None:
+        return None
+
+
+def written(folder, name, latency_ms, *, hottest_c=None, soak_s=None, inputs=None, artifact="policy", host="rover"):
+    """benchmark-<name>.json, as `rover benchmark` leaves it."""
+    machine = Machine(latency_ms, hottest_c)
+    policy = SimpleNamespace(predict_chunk=machine.predict_chunk, manifest={"mode": "static", "gmac": 0.375})
+    times = {"clock": machine.clock, "cpu_clock": machine.clock, "host": machine}
+    metrics = benchmark(
+        {artifact: policy}, [np.zeros((2, 2, 3), np.uint8)], np.zeros(2), iterations=20, duration_s=soak_s, **times
+    )
+    path = folder / f"benchmark-{name}.json"
+    write_stage(path, "benchmark", params={}, metrics=metrics, inputs=inputs or {"policy.pt": "5a"})
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "env": {**content["env"], "host": host}}))
+    return path
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """A run's folder with this machine's benchmark, and one for those of rovers."""
+    run_dir, rovers = tmp_path / "demo", tmp_path / "rovers"
+    run_dir.mkdir()
+    rovers.mkdir()
+    written(run_dir, socket.gethostname(), 8.0, artifact="static", inputs=OURS, host=socket.gethostname())
+    return run_dir, rovers
+
+
+def test_this_machine_alone_is_a_sentence(folders):
+    benchmarks = hosts.read_benchmarks(*folders)
+    assert list(benchmarks.found) == [hosts.THIS] and not benchmarks.soaks() and not benchmarks.unusable
+    head, row, said = benchmarks.table().splitlines()
+    assert head.split()[:3] == ["host", "artifact", "p50"] and said == hosts.NO_ROVER
+    assert row.split() == ["this", "machine", "static", "8.0", "8.0", "8.0", "20", "-", "-", "-"]
+    assert socket.gethostname() not in benchmarks.table().split()
+
+
+def test_rovers_are_called_what_the_inventory_calls_them(folders):
+    """Two whose system is called the same, as every new card's is."""
+    for name in ("rover2", "rover1"):
+        written(folders[1], name, 60.0, host="raspberrypi")
+    benchmarks = hosts.read_benchmarks(*folders)
+    assert list(benchmarks.found) == [hosts.THIS, "rover1", "rover2"]
+    assert benchmarks.table().endswith(hosts.NO_SOAK)
+
+
+def test_an_artifact_goes_by_its_mode_and_another_one_is_called_that(folders):
+    written(folders[1], "rover1", 60.0)
+    written(folders[1], "rover2", 60.0, soak_s=20, inputs={"policy.pt": "0f"})
+    found = hosts.read_benchmarks(*folders).found
+    assert list(found["rover1"]["metrics"]["artifacts"]) == ["static"]
+    metrics = found["rover2"]["metrics"]
+    assert list(metrics["artifacts"]) == ["static, another"] == list(metrics["series"][3]["artifacts"])
+    assert metrics["main"] == "static, another"
+
+
+def test_the_table_says_how_hot_and_how_fast(folders):
+    written(folders[1], "rover1", 60.0, hottest_c=88, soak_s=1800)
+    benchmarks = hosts.read_benchmarks(*folders)
+    row = benchmarks.table().splitlines()[2].split()
+    assert row[:3] == ["rover1", "static", "90.0"] and row[-3:] == ["87.9", "1500", "0x80008"]
+    assert hosts.NO_SOAK not in benchmarks.table() and hosts.NO_ROVER not in benchmarks.table()
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (lambda c: "{", "not readable as JSON"),
+        (lambda c: b"\xff\xfe".decode("latin-1"), "not readable as JSON"),
+        (lambda c: json.dumps({"schema": 1, "stage": "compare"}), "expected schema 1 of stage 'benchmark'"),
+        (lambda c: json.dumps({**c, "schema": 9}), "expected schema 1"),
+        (lambda c: json.dumps({**c, "metrics": {}}), "no figures of a benchmark"),
+        (lambda c: json.dumps({**c, "metrics": {**c["metrics"], "artifacts": {}}}), "no figures of a benchmark"),
+        (lambda c: json.dumps({**c, "metrics": {**c["metrics"], "throttled": "hot"}}), "no figures of a benchmark"),
+        (lambda c: json.dumps({**c, "metrics": {**c["metrics"], "series": [{"t_s": 1}]}}), "no figures of a benchmark"),
+        (lambda c: json.dumps({**c, "env": None}), "no figures of a benchmark"),
+        (lambda c: json.dumps({**c, "inputs": [1]}), "no figures of a benchmark"),
+    ],
+)
+def test_a_damaged_or_foreign_file_is_counted_and_named(folders, spoil, words):
+    written(folders[1], "rover1", 60.0)
+    bad = written(folders[1], "rover2", 60.0)
+    bad.write_bytes(spoil(json.loads(bad.read_text())).encode("latin-1"))
+    benchmarks = hosts.read_benchmarks(*folders)
+    assert list(benchmarks.found) == [hosts.THIS, "rover1"]
+    *_, count, sentence = benchmarks.table().splitlines()
+    assert count == "1 file is left out:" and sentence.startswith("benchmark-rover2.json: ") and words in sentence
+    assert str(folders[1]) not in benchmarks.table()  # a published notebook holds no path
+
+
+def test_a_folder_that_is_not_there_is_nothing(folders, tmp_path):
+    (folders[1] / "benchmark-rover1.json").mkdir()
+    assert hosts.read_benchmarks(folders[0], tmp_path / "nowhere").table().endswith(hosts.NO_ROVER)
+    assert "1 file is left out" in hosts.read_benchmarks(*folders).table()
+
+
+def drawn(figure):
+    figure.canvas.draw()
+    return [ax.get_ylabel().replace("\n", " ") or ax.get_title() for ax in figure.axes]
+
+
+def test_every_host_has_a_panel(folders):
+    written(folders[1], "rover1", 60.0)
+    figure = plots.latency(hosts.read_benchmarks(*folders).found)
+    assert [ax.get_title().partition(" (")[0] for ax in figure.axes] == [hosts.THIS, "rover1"]
+    assert [label.get_text() for label in figure.axes[1].get_yticklabels()] == ["static"]
+
+
+def test_a_soak_over_time(folders):
+    written(folders[1], "rover1", 60.0, hottest_c=88, soak_s=1800)
+    written(folders[1], "rover2", 55.0, hottest_c=70, soak_s=900)
+    soaks = hosts.read_benchmarks(*folders).soaks()
+    assert list(soaks) == ["rover1", "rover2"]
+    figure = plots.soak(soaks)
+    latency, temperature, clock, held = drawn(figure)
+    assert latency == "latency of one inference (ms)" and temperature == "temperature (°C)" and "MHz" in clock
+    assert held.startswith("held back by the firmware")
+    hot, cool = (collection.get_paths() for collection in figure.axes[3].collections)
+    assert hot and not cool
+    first_hot_min = min(path.vertices[:, 0].min() for path in hot)
+    assert 7 < first_hot_min < 10  # 80 degrees after 300 s * ln(43 / 8) = 8.4 min
+    times_ms = figure.axes[0].lines[0].get_ydata()
+    assert times_ms[0] == pytest.approx(60) and times_ms[-1] == pytest.approx(90)
+
+
+def test_a_host_without_sensors_has_no_empty_panels(folders):
+    written(folders[1], "rover1", 60.0, soak_s=60)
+    figure = plots.soak(hosts.read_benchmarks(*folders).soaks())
+    assert drawn(figure) == ["latency of one inference (ms)"]
