@@ -113,7 +113,7 @@ def emulation() -> Iterator[None]:
 
 
 def run(command: list[Any], what: str, **options: Any) -> str:
-    """Run a command, return its stdout. Raises EmulationError that begins with `what`, with the end of its complaint."""
+    """Run a command, return its stdout. Raises EmulationError: `what`, and the end of its complaint."""
     try:
         done = subprocess.run([str(c) for c in command], capture_output=True, text=True, **options)
     except (OSError, subprocess.TimeoutExpired) as error:
