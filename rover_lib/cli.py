@@ -416,7 +416,7 @@ def _drive(
     from rover_lib.onboard.pilot import ReplayPilot
     from rover_lib.onboard.plan import Settings
     from rover_lib.onboard.recording import read_controls
-    from rover_lib.onboard.service import GatedLink, Service
+    from rover_lib.onboard.service import Service
     from rover_lib.onboard.servo_link import ServoLink
     from rover_lib.onboard.telemetry import FlightLog, StatusLine
 
@@ -442,22 +442,17 @@ def _drive(
             car = stack.enter_context(VirtualCar(seed=seed, firmware=firmware))
             camera, port = car.camera, car.port
             stack.callback(lambda: more.update(hits=(r := car.report()).hits, trials=r.trials, camera_late=r.late))
-        if service:
-            frames = stack.enter_context(Camera(camera))
-            human = stack.enter_context(Service(report, stop, log.event))
-            link = stack.enter_context(GatedLink(port, human, [frames.latest]))
-        else:
-            link = None if dry_run else stack.enter_context(ServoLink(port))
+        wait = stack.enter_context(Service(report, stop, log.event)).wait if service else d.at_once
+        link = None if dry_run else stack.enter_context(ServoLink(port))
         common = {"rate_hz": hz, "log": log, "stop": stop, "report": report, **ends}
         if controls:
             limit = 1.0 if throttle_limit is None else throttle_limit
             with w.going_first(log):
                 d.drive(ReplayPilot(controls, throttle_limit=limit), link, watch=w.Troubles(report, link), **common)
             return
-        if not service:
-            frames = stack.enter_context(Camera(camera))
+        frames = stack.enter_context(Camera(camera))
         how = {"threads": threads, "in_thread": in_thread, "latency_s": latency_ms / 1e3, "record": record}
-        d.drive_artifact(artifact, frames, link, settings=settings, **how, **common)
+        d.drive_artifact(artifact, frames, link, settings=settings, wait=wait, **how, **common)
 
 
 @main.command("record")

@@ -39,6 +39,8 @@ RESEND_S = 0.018  # a command takes 3 ms on the wire, a status that is under way
 SPARE_S = 0.004  # before a deadline nothing is sent again
 SETTLED_S = 60.0  # memory is watched from here on
 
+Arm = Callable[[], Telemetry | None]  # arms the car; None: there is none
+
 
 @dataclass
 class Report:
@@ -79,6 +81,11 @@ class Report:
         }
 
 
+def at_once(arm: Arm, looks: Iterable[Callable[[], object]] = ()) -> Telemetry | None:
+    """Arms the car without waiting for anybody."""
+    return arm()
+
+
 def drive(
     pilot: Pilot,
     link: ServoLink | None,
@@ -90,6 +97,7 @@ def drive(
     ticks: int | None = None,
     max_seconds: float | None = None,
     stop: threading.Event | None = None,
+    wait: Callable[[Arm], Telemetry | None] = at_once,
     watch: Callable[[], Iterable[str]] = lambda: (),
     children: Iterable[int] = (),
     report: Report | None = None,
@@ -99,7 +107,8 @@ def drive(
     """Arms the car, then sends the pilot's order at each deadline until one of the ends is reached.
 
     link: None drives no motor. recorder: takes each command too. mode: who drives, for it. stop: ends it, as ticks and
-    max_seconds do. watch: called once a second; what it says goes to the log. children: processes whose memory counts.
+    max_seconds do. wait: called once all is ready, with what arms the car, and returns what that does; a human may say
+    when. watch: called once a second; what it says goes to the log. children: processes whose memory counts.
     report: is filled as it goes, so that it is there after a fault too.
     Raises RoverError if it cannot be begun, DriveFault with what stopped the car, TakenOver when the human did;
     whatever it is, the car was told neutral before.
@@ -114,7 +123,7 @@ def drive(
         report.ended = "stopped before it began"
         return report
     try:
-        loop.arm()
+        loop.arm(wait)
         report.ended = loop.run(stop, ticks, max_seconds, watch)
     except BaseException as error:
         said = loop.neutral()  # first of all, and before anything that may take long
@@ -152,9 +161,9 @@ class _Loop:
     last: Order | None = None
     troubled: bool = False  # the port did not take the last command
 
-    def arm(self) -> None:
-        if self.link:
-            self.boot = self.link.arm().boot
+    def arm(self, wait: Callable[[Arm], Telemetry | None]) -> None:
+        telemetry = wait(self.link.arm if self.link else lambda: None)
+        self.boot = telemetry.boot if telemetry else 0
         self.armed = True
         self.log.event("armed" if self.link else "dry run: no motor is driven")
 
@@ -318,13 +327,15 @@ def drive_artifact(
     in_thread: bool = False,
     latency_s: float = 0.0,
     stop: threading.Event | None = None,
+    wait: Callable[[Arm, Iterable[Callable[[], object]]], Telemetry | None] = at_once,
     **ends: Any,
 ) -> Report:
     """Drives an artifact by an open camera, in this process's main thread; everything else as `drive`.
 
     record: folder in which an episode is written. in_thread: the policy runs in a thread of this process, for
     comparison; not for driving, since one that hangs cannot be ended. latency_s: a plan takes at least so long, for
-    comparison. ends: ticks, max_seconds, report.
+    comparison. wait: as drive's, and gets what must go on working meanwhile too: each raises if it does not.
+    ends: ticks, max_seconds, report.
     """
     stop = stop or threading.Event()
     commanded = Commanded()
@@ -343,7 +354,8 @@ def drive_artifact(
             stack.enter_context(recorder)  # notes in the episode what ended the drive
         report = ends.setdefault("report", Report())
         pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz)
-        looks = (artifact_watch(artifact), pilot.troubles, Troubles(report, link))
+        sayings = (artifact_watch(artifact), pilot.troubles, Troubles(report, link))
+        looks = (camera.latest, planner.newest, *((link.latest,) if link else ()))
         stack.enter_context(going_first(log))
         return drive(
             pilot,
@@ -353,7 +365,8 @@ def drive_artifact(
             recorder=recorder,
             mode=mode,
             stop=stop,
-            watch=lambda: (said for look in looks for said in look()),
+            wait=lambda arm: wait(arm, looks),
+            watch=lambda: (said for say in sayings for said in say()),
             children=policy.pids,
             **ends,
         )

@@ -25,9 +25,9 @@ from typing import Any
 
 from systemd_watchdog import WatchDog
 
-from rover_lib.onboard.drive import Report
+from rover_lib.onboard.drive import Arm, Report
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.servo_link import LinkError, ServoLink, Telemetry
+from rover_lib.onboard.servo_link import LinkError, Telemetry
 
 UNIT = "rover-drive.service"
 ARM = signal.SIGUSR1
@@ -72,17 +72,16 @@ class Service:
     def __exit__(self, *exc: object) -> None:
         self._done.set()
         self._thread.join()
-        # A notification is lines, and the library has no word for this one. It ends the watchdog's time: files may
-        # still have to be written.
-        self._tell(f"{STOPPING}: {self._report.ended or exc[1] or 'ended'}", "STOPPING=1")
+        if self._state != STOPPING:
+            self._stopping(self._report.ended or str(exc[1] or "ended"))
         signal.signal(ARM, self._before)
         self._socket.close()
 
-    def wait(self, arm: Callable[[], Telemetry], looks: Iterable[Callable[[], object]] = ()) -> Telemetry:
+    def wait(self, arm: Arm, looks: Iterable[Callable[[], object]] = ()) -> Telemetry | None:
         """Ready: waits until a human arms the car and the Arduino agrees; what arm() returned.
 
-        looks: what must go on working meanwhile; each raises if it does not. Raises NotArmed when told to stop, and
-        what a look raises.
+        What drive_artifact() takes as `wait`. looks: what must go on working meanwhile; each raises if it does not.
+        Raises NotArmed when told to stop, and what a look raises.
         """
         looks = tuple(looks)
         self._asked.clear()  # whoever asked before could not know what the car would do
@@ -110,6 +109,8 @@ class Service:
     def _feed(self) -> None:
         seen, told_s = -1, 0.0
         while not self._done.wait(FEED_S):
+            if self._report.ended:
+                return self._stopping(self._report.ended)
             happened = self._looks + self._report.ticks
             if happened == seen or not self._looks:
                 continue
@@ -120,24 +121,15 @@ class Service:
                 told_s = time.monotonic()
                 self._tell(f"{DRIVING}: {self._report.status}")
 
+    def _stopping(self, why: str) -> None:
+        """Ends the watchdog's time: a policy has to be ended, and files to be written."""
+        self._state = STOPPING
+        # A notification is lines, and the library has no word for this one.
+        self._tell(f"{STOPPING}: {why}", "STOPPING=1")
+
     def _tell(self, text: str, *more: str) -> None:
         with contextlib.suppress(OSError):
             self._systemd.status("\n".join([" ".join(text.split()), *more]))
-
-
-class GatedLink(ServoLink):
-    """A link whose arm() waits for a human: what drives through it need not know.
-
-    service: asked before the Arduino is. looks: as Service.wait() takes them, beside the link itself.
-    """
-
-    def __init__(self, port: str, service: Service, looks: Iterable[Callable[[], object]] = (), **options: Any):
-        super().__init__(port, **options)
-        self._service, self._more_looks = service, tuple(looks)
-
-    def arm(self) -> Telemetry:
-        """Hands the car to the host once a human has said so. Raises as Service.wait()."""
-        return self._service.wait(super().arm, (self.latest, *self._more_looks))
 
 
 def state_of(unit: str = UNIT) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from rover_lib.onboard.pilot import Order, PolicyPilot, ReplayPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import Controls
+from rover_lib.onboard.service import NotArmed
 from rover_lib.onboard.servo_link import Hello, LinkError, State, Telemetry
 from rover_lib.onboard.telemetry import FlightLog
 from rover_lib.onboard.watch import OFTEN, Troubles, _processors, artifact_watch, ended_by_signals, memory_mb, unended
@@ -212,6 +213,32 @@ def test_whatever_ends_it_neutral_is_the_first_that_follows(link, clock, what, r
     assert report.ticks == 3
     assert report.ended in log.events  # no fault without its line
     assert report.ended.startswith(str(what) if raised is DriveFault else type(what).__name__)
+
+
+def test_a_human_says_when(link, clock):
+    """All is ready by then; nothing was sent before."""
+
+    def wait(arm):
+        said = list(pilot.was_ready), list(link.said)
+        assert said == ([True], [])
+        clock.sleep(5)
+        return arm()
+
+    pilot = Always()
+    pilot.was_ready = []
+    pilot.ready = lambda stop: pilot.was_ready.append(True)
+    report = go(pilot, link, clock, ticks=3, wait=wait)
+    assert link.said == ["arm", *[(1456, 150)] * 3, "neutral"]
+    assert report.missed == 0 and link.sent_at[0] == 1005.0  # the deadlines begin when it is armed
+
+
+def test_a_human_who_never_says_so(link, clock):
+    def wait(arm):
+        raise NotArmed("told to stop")
+
+    with pytest.raises(NotArmed):
+        go(Always(), link, clock, wait=wait)
+    assert link.said == ["neutral"]
 
 
 def test_what_happens_before_it_is_armed_is_no_fault_of_a_drive(link, clock):

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
@@ -158,6 +157,16 @@ def test_the_watchdog_hears_of_ticks_that_happened_only(systemd):
     assert "STATUS=driving: steering +0.10 READY=0" in systemd.lines and "READY=0" not in systemd.lines
 
 
+def test_the_watchdog_has_no_say_once_the_drive_has_ended(systemd):
+    """An episode is finished, say, which takes what it takes; said once."""
+    report = Report()
+    with s.Service(report, threading.Event()):
+        report.ended = "told to stop"
+        systemd.hear_until("STOPPING=1")
+    systemd.hear(0.1)
+    assert systemd.lines == ["STATUS=stopping: told to stop", "STOPPING=1"]
+
+
 def test_without_systemd_it_works_the_same(monkeypatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     threading.Timer(0.3, human).start()
@@ -177,14 +186,6 @@ def test_the_signal_means_what_it_meant_before(systemd):
     with s.Service(Report(), threading.Event()):
         assert signal.getsignal(s.ARM) != before
     assert signal.getsignal(s.ARM) == before
-
-
-def test_a_gated_link_asks_the_human_first(monkeypatch):
-    order = []
-    service = SimpleNamespace(wait=lambda arm, looks: (order.append(len(looks)), arm())[1])
-    monkeypatch.setattr(s.ServoLink, "arm", lambda self: order.append("arduino") or "telemetry")
-    link = s.GatedLink("/dev/none", service, [lambda: None])
-    assert link.arm() == "telemetry" and order == [2, "arduino"]
 
 
 # rover arm-car
