@@ -567,6 +567,34 @@ def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...]) -> No
     ctx.exit(1 if outcome.wrong else 0)
 
 
+@main.group()
+def pi() -> None:
+    """Emulated Pis: the playbooks, the service and its faults on real Debian arm64 systems. Needs root, and Debian."""
+
+
+@pi.command("whole")
+@click.argument("output", type=FILE, default="runs/pi.json")
+@click.option("--artifact", type=FILE, default="runs/demo/policy_static.pt", show_default=True, help="To deploy.")
+@click.option(
+    "--recordings", type=FILE, default="runs/demo/episodes", show_default=True, help="What the camera shows."
+)
+@click.option("--fresh", is_flag=True, help="Provision anew, even if the cache has a card that was provisioned so.")
+@click.pass_context
+def pi_whole(ctx: click.Context, output: Path, **options: Any) -> None:
+    """Provision, deploy and drive a whole emulated Pi, and hold each servo pulse against its command.
+
+    QEMU's Cortex-A76 with kernel, camera and USB; the real firmware on an emulated Arduino. Then cables are pulled while
+    it drives. OUTPUT is JSON; exit code 1 if anything is not as expected, the machine's console is beside it then.
+    """
+    from rover_lib.emulated.whole import run_whole
+
+    outcome = run_whole(output, **options, say=click.echo)
+    for sentence in outcome.wrong:
+        click.echo(f"rover: {sentence}", err=True)
+    click.echo(f"{'not as expected' if outcome.wrong else 'as expected'}: {output}")
+    ctx.exit(1 if outcome.wrong else 0)
+
+
 @main.command("arm-car")
 @click.option("--yes", is_flag=True, help="Do not ask.")
 def arm_car(yes: bool) -> None:

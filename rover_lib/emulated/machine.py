@@ -75,6 +75,7 @@ MASKED = (
     *("apt-daily.timer", "apt-daily-upgrade.timer", "man-db.timer", "e2scrub_all.timer", "e2scrub_reap.service"),
     *("fstrim.timer", "dpkg-db-backup.timer", "systemd-networkd-wait-online.service", "systemd-timesyncd.service"),
 )
+ADAPTER, CAMERA = "adapter", "camera"  # what can be plugged in
 KERNEL_LINE = "console=ttyAMA0 root=/dev/vda rw quiet mitigations=off systemd.show_status=0 audit=0"
 BOOT_S = 600.0
 OFF_S = 120.0
@@ -296,7 +297,7 @@ class Qmp:
 
 
 class Machine:
-    """An emulated Pi that runs; a context manager. port: of its ssh, on the loopback.
+    """An emulated Pi that runs; a context manager. name, port, key: for plays.run(), and whoever logs in.
 
     card: what it boots from. folder: for its console, its own disk and sockets; emptied of the last two at the end.
     layer: a disk to build on, of an earlier machine on the same card, instead of the card itself. slow: so many times
@@ -316,7 +317,8 @@ class Machine:
     ):
         if not 1 <= slow <= SLOWEST:
             raise MachineError(f"the machine's clock can run 1 to {SLOWEST} times slower, found {slow:g}")
-        self.card, self.slow, self.port = card, slow, _free_port()
+        self.card, self.slow = card, slow
+        self.name, self.port, self.key = "rover-pi", _free_port(), card.key
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         self.console = self.folder / "console.log"
@@ -434,15 +436,24 @@ class Machine:
 
     def plug(self, port: Path | str) -> None:
         """Plugs in a USB serial adapter (an FTDI's ids) with what is at a serial port of the host behind it."""
-        device = str(Path(port).resolve())
-        self._qmp.command("chardev-add", id="serial", backend={"type": "serial", "data": {"device": device}})
-        self._qmp.command("device_add", driver="usb-serial", id="adapter", chardev="serial", bus="xhci.0")
+        device = {"device": str(Path(port).resolve())}
+        self._plug(ADAPTER, "usb-serial", {"type": "serial", "data": device})
 
-    def unplug(self) -> None:
-        """Pulls the adapter out."""
-        self._qmp.command("device_del", id="adapter")
-        self._qmp.wait_for("DEVICE_DELETED", device="adapter")
-        self._qmp.command("chardev-remove", id="serial")
+    def plug_camera(self, socket: Path | str) -> None:
+        """Plugs in the USB device that speaks the usbredir protocol on a Unix socket."""
+        address = {"type": "unix", "data": {"path": str(socket)}}
+        self._plug(CAMERA, "usb-redir", {"type": "socket", "data": {"addr": address, "server": False}})
+
+    def unplug(self, what: str = ADAPTER) -> None:
+        """Pulls it out: ADAPTER or CAMERA."""
+        self._qmp.command("device_del", id=what)
+        self._qmp.wait_for("DEVICE_DELETED", device=what)
+        if what == ADAPTER:  # usb-redir takes its wire along
+            self._qmp.command("chardev-remove", id=f"{what}-wire")
+
+    def _plug(self, what: str, driver: str, backend: dict[str, Any]) -> None:
+        self._qmp.command("chardev-add", id=f"{what}-wire", backend=backend)
+        self._qmp.command("device_add", driver=driver, id=what, chardev=f"{what}-wire", bus="xhci.0")
 
     # -- the end
 

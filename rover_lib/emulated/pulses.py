@@ -1,0 +1,72 @@
+"""What was commanded on one machine, against what the servo pins did on another's clock."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from rover_lib.onboard.telemetry import Flight
+from rover_lib.playground.arduino import PinEvent
+from rover_lib.playground.pins import NEUTRAL_US, PERIOD_US, STEP_US
+
+# A command counts from the next pulse that begins after it has come, sent anew if need be (drive.RESEND_S), until that
+# of the next command. So a pulse is one of the commands of the last 33 + 18 + 21 ms and some for the serial line.
+HELD_S = 0.1
+
+
+def compare(
+    flight: Flight, events: Sequence[PinEvent], host_s: Callable[[np.ndarray], np.ndarray], slow: float
+) -> dict[str, Any]:
+    """Each pulse of a drive against the commands that it may be, and each command against the pulses that it caused.
+
+    host_s: the rover's monotonic seconds as the host's, by which the events are. slow: seconds of the host in one of
+    the rover's and the Arduino's. worst_us: the largest difference of any pulse from the nearest of its commands, and
+    of any command from the nearest of its pulses; None where there is nothing to compare. unseen: commands without any
+    pulse in their time. distinct: values among the commands: a servo that stands still proves little.
+    """
+    sent_s = host_s(flight.ticks["t_s"] + float(flight.header["start_monotonic_s"]))
+    held_s = HELD_S * slow
+    result: dict[str, Any] = {"commands": len(sent_s), "pulses": 0, "worst_us": None, "unseen": 0, "distinct": {}}
+    worst: list[float] = []
+    for pin in PERIOD_US:
+        commanded = flight.ticks[f"{pin}_us"]
+        pulses = [e for e in events if e.pin == pin and e.kind == "pulse"]
+        rose_s, us = np.array([e.monotonic_s for e in pulses]), np.array([e.pulse_us for e in pulses])
+        result["distinct"][pin] = len(np.unique(commanded))
+        if not len(sent_s) or not len(pulses):
+            return result
+        # From the first command until the last; before and after, the pins are in neutral.
+        driven = np.flatnonzero((rose_s > sent_s[0] + held_s) & (rose_s < sent_s[-1]))
+        for i in driven:
+            choice = commanded[(sent_s > rose_s[i] - held_s) & (sent_s <= rose_s[i])]
+            worst.append(float(np.abs(choice - us[i]).min()) if len(choice) else np.inf)
+        result["pulses"] += len(driven)
+        for at_s, wanted in zip(sent_s[:-3], commanded[:-3], strict=True):
+            caused = us[(rose_s > at_s) & (rose_s <= at_s + held_s)]
+            result["unseen"] += not len(caused)
+            worst.append(float(np.abs(caused - wanted).min()) if len(caused) else np.inf)
+    result["worst_us"] = round(max(worst), 2) if worst and np.isfinite(max(worst)) else None
+    return result
+
+
+def stopped(events: Sequence[PinEvent], at_s: float, slow: float, throttle_max_us: float) -> dict[str, Any]:
+    """How the pins went to neutral after `at_s` (by the host's clock), in the Arduino's milliseconds.
+
+    after_line_ms: from the last whole line of the rover until the throttle was off, which the firmware promises after
+    150. after_ms: the same since it happened. steering_us: at the end. Each None if it did not happen.
+    """
+    lines = [e.monotonic_s for e in events if e.kind == "line"]
+    throttle = [e for e in events if e.pin == "throttle" and e.kind == "pulse"]
+    steering = [e for e in events if e.pin == "steering" and e.kind == "pulse"]
+    moving = [i for i, e in enumerate(throttle) if e.pulse_us > throttle_max_us]
+    drove = any(at_s - slow < throttle[i].monotonic_s <= at_s for i in moving)
+    off = throttle[moving[-1] + 1].monotonic_s if moving and moving[-1] + 1 < len(throttle) else None
+    last_line = max((s for s in lines if off is None or s < off), default=None)
+    centred = bool(steering) and abs(steering[-1].pulse_us - NEUTRAL_US["steering"]) <= STEP_US
+    return {
+        "drove": drove,
+        "after_ms": None if off is None else round((off - at_s) / slow * 1e3, 1),
+        "after_line_ms": None if off is None or last_line is None else round((off - last_line) / slow * 1e3, 1),
+        "steering_us": round(steering[-1].pulse_us, 1) if steering else None,
+        "neutral": off is not None and centred,
+    }

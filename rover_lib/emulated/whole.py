@@ -1,0 +1,447 @@
+"""`make pi`: from a flashed card to servo pulses, on a whole emulated Pi.
+
+A camera frame goes in at the kernel's /dev/video0, the INT8 policy runs on four emulated Cortex-A76, commands leave by
+a USB serial adapter, and the project's firmware on an emulated Arduino makes servo pulses of them, each of which is
+held against what the rover says that it commanded. Then cables are pulled while it drives.
+
+What it says about time: nothing about a Pi. The machine's clock and the Arduino's run SLOW times slower than the host's
+(machine.py), which makes the machine about as fast as a Pi by its own clock.
+"""
+
+import contextlib
+import json
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rover_lib.emulated import machine, plays
+from rover_lib.emulated.camera import UsbCamera
+from rover_lib.emulated.machine import DEBS, Card, Machine, card
+from rover_lib.emulated.pulses import compare, stopped
+from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.stage import write_stage
+from rover_lib.onboard.telemetry import Flight, read_log
+from rover_lib.onboard.watch import signals
+from rover_lib.playground import arduino
+from rover_lib.playground.arduino import REST_US, Arduino, PinEvent
+from rover_lib.workshop.arm import install
+from rover_lib.workshop.cache import cache_root, cached_folder, key_of
+from rover_lib.workshop.wheelhouse import own_version
+
+REPOSITORY = Path(__file__).parents[2]
+ANSIBLE = REPOSITORY / "ansible"
+PORT, CAMERA, MODEL = "/dev/rover-arduino", "/dev/video0", "/var/lib/rover/models/current/policy.pt"
+UNIT = "rover-drive.service"
+SIZE = (640, 360)
+FRAMES = 150  # of the recordings, 5 s
+TWICE = 2  # each: vivid's HDMI has no 30 Hz at this size, only 60
+# The camera: frames that are written to vivid's output come out of its input, as through an HDMI cable.
+SCREEN = "rover-screen"
+SHOW = f"""set -e
+modprobe vivid n_devs=1 node_types=0x101 num_inputs=1 input_types=0x3 num_outputs=1 output_types=0x1
+udevadm settle
+test -e {CAMERA} -a -e /dev/video1
+for d in {CAMERA} /dev/video1; do v4l2-ctl -d $d --set-dv-bt-timings cvt,width={SIZE[0]},height={SIZE[1]},fps=60; done
+v4l2-ctl -d {CAMERA} --set-fmt-video=width={SIZE[0]},height={SIZE[1]},pixelformat=YUYV
+v4l2-ctl -d /dev/video1 --set-fmt-video-out=width={SIZE[0]},height={SIZE[1]},pixelformat=YUYV
+v4l2-ctl -d {CAMERA} -c loop_video=1
+systemctl reset-failed {SCREEN} 2> /dev/null || true
+systemd-run --quiet --unit={SCREEN} v4l2-ctl -d /dev/video1 --stream-out-mmap --stream-from=/dev/vdb --stream-loop
+"""
+HIDE = f"systemctl stop {SCREEN}; modprobe -r vivid"
+WATCH_S = 3.0  # of the rover's time, after a fault
+READ_S = 0.2  # between readings of the pins
+
+
+class WholeError(RoverError):
+    """A step of the whole machine that did not do what it should."""
+
+
+@dataclass
+class Outcome:
+    """metrics: as written. wrong: a sentence for each thing that is not as it should be."""
+
+    metrics: dict[str, Any] = field(default_factory=dict)
+    inputs: dict[str, str] = field(default_factory=dict)
+    wrong: list[str] = field(default_factory=list)
+
+    def write(self, path: Path | str) -> dict[str, Any]:
+        """To a file, for people and programs."""
+        return write_stage(path, "pi", params=params()["pi"], metrics=self.metrics, inputs=self.inputs)
+
+
+class Pins:
+    """Everything that an Arduino's pins do, from now on; a context manager."""
+
+    def __init__(self, board: Arduino):
+        self._board = board
+        self._events: list[PinEvent] = []
+        self._done = threading.Event()
+        self._failure: RoverError | None = None
+        self._thread = threading.Thread(target=self._run, name="pins", daemon=True)
+
+    def __enter__(self) -> "Pins":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def since(self, at_s: float) -> list[PinEvent]:
+        """What happened since then. Raises ArduinoError if it has ended."""
+        if self._failure:
+            raise self._failure
+        return [e for e in self._events[:] if e.monotonic_s >= at_s]
+
+    def _run(self) -> None:
+        while not self._done.wait(READ_S):
+            try:
+                self._events += self._board.pulses()
+            except RoverError as error:
+                self._failure = error
+                return
+
+
+def run_whole(
+    output: Path | str,
+    artifact: Path | str,
+    recordings: Path | str,
+    *,
+    fresh: bool = False,
+    say: Callable[[str], None] = print,
+) -> Outcome:
+    """All of it; what was found, which is written to `output` even where a step fails.
+
+    artifact: to deploy. recordings: episodes, whose frames the camera shows. fresh: provision anew, even if a card that
+    was provisioned with just this role and these wheels is in the cache. say: told each step. Raises RoverError where
+    it cannot be begun. The machine's console and Ansible's words are beside `output` afterwards if anything failed.
+    """
+    output, artifact, recordings = Path(output), Path(artifact), Path(recordings)
+    if missing := arduino.missing_packages():
+        install(missing, f"the emulated Arduino needs the Debian packages {' '.join(missing)}, which are not here")
+    if not artifact.is_file():
+        raise WholeError(f"{artifact}: no artifact to deploy; make demo leaves one")
+    outcome = Outcome(inputs={artifact.name: content_hash(artifact)})
+    kept = output.with_suffix("")
+    shutil.rmtree(kept, ignore_errors=True)
+    with (
+        _interruptible(),
+        tempfile.TemporaryDirectory(prefix=".pi-whole.", dir=_cache()) as scratch,  # large, so not in /tmp
+        tempfile.TemporaryDirectory(prefix="rover-plays-") as ansible,  # ssh's sockets want a short path
+    ):
+        run = _Run(outcome, Path(scratch), Path(ansible), say)
+        try:
+            run.all(artifact, recordings, fresh)
+        except RoverError as error:
+            outcome.wrong.append(str(error))
+        if outcome.wrong:
+            kept.mkdir(parents=True)
+            for file in Path(scratch).glob("*.log"):
+                shutil.copy(file, kept)
+            outcome.metrics["kept"] = str(kept)
+    outcome.metrics["wrong"] = outcome.wrong
+    outcome.write(output)
+    return outcome
+
+
+def _cache() -> Path:
+    cache_root().mkdir(parents=True, exist_ok=True)
+    return cache_root()
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM and SIGHUP end what is inside as Ctrl-C does: machine, Arduino and files are left by their own doors."""
+
+    def on_signal(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt(signal.Signals(number).name)
+
+    with signals(on_signal):
+        yield
+
+
+class _Run:
+    def __init__(self, outcome: Outcome, folder: Path, ansible: Path, say: Callable[[str], None]):
+        self.outcome, self.folder, self.ansible, self.say = outcome, folder, ansible, say
+        self.gates = params()["pi"]
+        self.slow = float(self.gates["slow"])
+        self.steps: list[dict[str, Any]] = []
+        self.zero_s = 0.0
+        outcome.metrics |= {"slow": self.slow, "steps": self.steps, "faults": []}
+        self.pi: Machine
+        self.pins: Pins
+
+    def all(self, artifact: Path, recordings: Path, fresh: bool) -> None:
+        start = time.monotonic()
+        metrics = self.outcome.metrics
+        with self.step("the card, as flashed"):
+            flashed = card()
+        layer = self.provisioned(flashed, fresh)
+        with self.step("the frames that the camera will show"):
+            frames = _frames(recordings, self.folder / "frames.yuyv")
+        with contextlib.ExitStack() as on:
+            self.pi = on.enter_context(Machine(flashed, self.folder, layer=layer, slow=self.slow, drives=[frames]))
+            board = on.enter_context(Arduino(transmitter=REST_US, slow=self.slow, nice=-5))
+            self.pins = on.enter_context(Pins(board))
+            self.pi.plug(board.port)
+            with self.step("boot, until ssh answers"):
+                self.pi.wait_for_ssh()
+            self.zero_s = self.clock()
+            metrics["machine"] = self.machine()
+            with self.step("camera and Arduino"):
+                self.sudo(SHOW)
+                self.until(f"test -e {PORT}", f"no {PORT} although the adapter is plugged in")
+            with self.step("deploy.yml"):
+                self.play("deploy", rover_artifact=artifact.resolve(), rover_packed=self.folder / "packed")
+            with self.step("rover doctor"):
+                metrics["doctor"] = self.doctor()
+            with self.step("drive.yml: doctor, start, arm, drive, stop, fetch"):
+                self.drive(metrics)
+            self.fault("USB serial unplugged while driving, by QMP", self.pi.unplug, lambda: self.pi.plug(board.port))
+            with self.step("another camera, on USB"):
+                self.sudo(HIDE)
+                usb = on.enter_context(UsbCamera([p.read_bytes() for p in _pictures(recordings)], slow=self.slow))
+                self.pi.plug_camera(usb.path)
+                self.until(f"test -e {CAMERA}", f"no {CAMERA} although the USB camera is plugged in")
+            self.fault(
+                "USB camera unplugged while driving, by QMP",
+                lambda: self.pi.unplug(machine.CAMERA),
+                lambda: self.pi.plug_camera(usb.path),
+            )
+        metrics["seconds"] = round(time.monotonic() - start, 1)
+        if metrics["provisioned"] == "from the cache" and metrics["seconds"] > self.gates["minutes"] * 60:
+            self.wrong(f"it took {metrics['seconds'] / 60:.0f} minutes, {self.gates['minutes']} are allowed")
+
+    # -- provisioning
+
+    def provisioned(self, flashed: Card, fresh: bool) -> Path:
+        """The card as provision.yml leaves it: a layer over the flashed one, from the cache or made now."""
+        sources = sorted(p for p in (ANSIBLE / "roles").rglob("*") if p.is_file())
+        sources += [ANSIBLE / "provision.yml", REPOSITORY / "requirements_pi.txt", REPOSITORY / "params.yml"]
+        recipe = {"card": str(flashed.folder), "rover": own_version()}
+        key = key_of({**recipe, "files": [str(p.relative_to(REPOSITORY)) for p in sources]}, *sources)
+        if fresh:
+            shutil.rmtree(cache_root() / f"pi-provisioned-{key}", ignore_errors=True)
+        made: list[bool] = []
+
+        def make(folder: Path) -> None:
+            made.append(True)
+            with Machine(flashed, self.folder / "first", slow=self.slow) as self.pi:
+                with self.step("first boot, until ssh answers"):
+                    self.pi.wait_for_ssh()
+                with self.step("Debian packages for a rover without internet"):
+                    self.sudo(f"DEBIAN_FRONTEND=noninteractive dpkg --install {DEBS}/*.deb")
+                with self.step("provision.yml"):
+                    self.outcome.metrics["provision"] = self.provision()
+                with self.step("shut down"):
+                    self.pi.power_off()
+                shutil.move(self.pi.disk, folder / "disk.qcow2")
+            (folder / "provision.json").write_text(json.dumps(self.outcome.metrics["provision"]))
+
+        folder = cached_folder("pi-provisioned", key, make)
+        self.outcome.metrics["provisioned"] = "now" if made else "from the cache"
+        self.outcome.metrics.setdefault("provision", json.loads((folder / "provision.json").read_text()))
+        return folder / "disk.qcow2"
+
+    def provision(self) -> dict[str, int]:
+        # Offline: the machine reaches nothing, as at a track, and wheels come from a folder that is fetched once.
+        return self.play("provision", rover_offline=True, rover_wheels=cache_root() / "wheels")
+
+    # -- driving
+
+    def drive(self, metrics: dict[str, Any]) -> None:
+        began = time.monotonic()
+        seconds = float(self.gates["drive_s"]) * self.slow
+        self.play("drive", rover_arm=True, rover_seconds=round(seconds), rover_fetched=self.folder / "fetched")
+        time.sleep(2 * READ_S)
+        flight = self.fetched()
+        events = self.pins.since(began)
+        summary = flight.summary()
+        pulses = compare(flight, events, lambda s: self.zero_s + self.slow * s, self.slow)
+        frame, plan = flight.ticks["frame"], flight.ticks["plan"]
+        metrics["drive"] = {
+            **{k: v for k, v in summary.items() if k != "events"},
+            "frames": int(frame[-1] - frame[0]) if len(frame) else 0,
+            "inferences": len(np.unique(plan[plan > 0])),
+            "events": [str(e) for e in flight.events],
+            "stalled_ms": round(sum(e.pulse_us for e in events if e.kind == "stall") / 1e3, 1),
+            "lost": sum(e.kind == "lost" for e in events),
+        }
+        metrics["pulses"] = pulses
+        g = self.gates
+        if pulses["worst_us"] is None or pulses["worst_us"] > g["pulse_us"] or pulses["unseen"]:
+            self.wrong(f"pulses are not as commanded within {g['pulse_us']} us: {pulses}")
+        for name, found in (("ticks", summary["ticks"]), *((n, metrics["drive"][n]) for n in ("inferences", "frames"))):
+            if found < g[name]:
+                self.wrong(f"{found} {name} in the drive, at least {g[name]} are wanted")
+        if min(pulses["distinct"].values(), default=0) < g["distinct"]:
+            self.wrong(f"the servos hardly moved: {pulses['distinct']} different pulses were commanded")
+
+    def fetched(self) -> Flight:
+        logs = sorted((self.folder / "fetched").rglob("flight.log"))
+        if not logs:
+            raise WholeError("drive.yml fetched no flight log; its words are in ansible.log")
+        return read_log(logs[-1])
+
+    def fault(self, name: str, pull: Callable[[], object], put_back: Callable[[], object]) -> None:
+        """Pulls something while the car drives: pins, service, and whether all is well once it is back."""
+        with self.step(name) as row:
+            self.sudo(f"systemctl reset-failed {UNIT}; systemctl start {UNIT}", timeout_s=900)
+            self.sudo("rover arm-car --yes")
+            began = time.monotonic()
+            while not (moving := self.moving(began)):
+                if time.monotonic() - began > 5 * self.slow:
+                    raise WholeError(f"{name}: the car did not begin to drive within 5 s of its clock")
+                time.sleep(READ_S)
+            time.sleep(1.0 * self.slow)
+            at_s = time.monotonic()
+            pull()
+            time.sleep(WATCH_S * self.slow)
+            row |= {"fault": name, **stopped(self.pins.since(moving), at_s, self.slow, self.gates["throttle_max_us"])}
+            row |= {"service": self.service(), "says": self.journal()}
+            again = [
+                e for e in self.pins.since(at_s) if e.pin == "throttle" and e.pulse_us > self.gates["throttle_max_us"]
+            ]
+            put_back()
+            self.sudo(f"systemctl stop {UNIT}")
+            self.until(f"test -e {PORT} -a -e {CAMERA}", f"{PORT} or {CAMERA} is not back")
+            row["doctor"] = self.doctor()["drives"]
+            self.outcome.metrics["faults"].append(dict(row))
+            if not row["drove"] or not row["neutral"] or row["after_line_ms"] > self.gates["neutral_ms"]:
+                self.wrong(f"{name}: the pins did not go to neutral as promised: {row}")
+            if row["service"].get("StatusText", "").startswith("driving") or (
+                again and max(e.monotonic_s for e in again) > at_s + WATCH_S * self.slow
+            ):
+                self.wrong(f"{name}: the car drove on: {row['service']}")
+            if not row["says"]:
+                self.wrong(f"{name}: the service said nothing about it")
+            if not row["doctor"]:
+                self.wrong(f"{name}: rover doctor is not content after it was put back")
+
+    def moving(self, since_s: float) -> float | None:
+        """When the throttle rose above neutral."""
+        limit = self.gates["throttle_max_us"]
+        return next(
+            (e.monotonic_s for e in self.pins.since(since_s) if e.pin == "throttle" and e.pulse_us > limit), None
+        )
+
+    def service(self) -> dict[str, str]:
+        """What systemd knows of it."""
+        told = self.pi.ssh(f"systemctl show --property=ActiveState,SubState,Result,NRestarts,StatusText {UNIT}")
+        return dict(line.partition("=")[::2] for line in told.splitlines() if "=" in line)
+
+    def journal(self) -> list[str]:
+        """What the service said last."""
+        told = self.sudo(f"journalctl --unit={UNIT} --output=cat --no-pager --lines=60")
+        return [
+            line
+            for line in told.splitlines()
+            if "unplugged" in line or "plugged in" in line or "no such camera" in line
+        ][-4:]
+
+    def doctor(self) -> dict[str, Any]:
+        """`rover doctor` on the rover: whether the car would drive, and each check."""
+        told = self.pi.ssh(
+            f"sudo rover doctor {MODEL} --camera {CAMERA} --port {PORT} --json", check=False, timeout_s=900
+        )
+        try:
+            found = json.loads(told[told.index("{") : told.rindex("}") + 1])
+        except ValueError:
+            raise WholeError(f"rover doctor gave no JSON: {' '.join(told.split())[-400:]}") from None
+        if not found["drives"]:
+            failed = [f"{c['name']}: {c['found']}" for c in found["checks"] if c["verdict"] == "fail"]
+            self.wrong(f"rover doctor: {'; '.join(failed)}")
+        return found
+
+    # -- the machine
+
+    def machine(self) -> dict[str, Any]:
+        """What it says that it is."""
+        told = self.pi.ssh(
+            "uname -rm; nproc; grep -m1 ^Features /proc/cpuinfo; head -1 /proc/meminfo; cat /etc/debian_version"
+        )
+        kernel, cores, features, memory, debian = told.splitlines()[:5]
+        if "asimddp" not in features:
+            self.wrong(f"the machine has no SDOT, which INT8 policies use: {features}")
+        return {
+            "kernel": kernel,
+            "cores": int(cores),
+            "sdot": "asimddp" in features,
+            "memory": memory.split()[1],
+            "debian": debian,
+        }
+
+    def clock(self) -> float:
+        """The host's monotonic time at which the machine's was 0, within some milliseconds of the machine's."""
+        best = (float("inf"), 0.0)
+        for _ in range(10):
+            before = time.monotonic()
+            uptime = float(self.pi.ssh("cat /proc/uptime").split()[0])
+            after = time.monotonic()
+            best = min(best, (after - before, (before + after) / 2 - self.slow * uptime))
+        return best[1]
+
+    def sudo(self, script: str, timeout_s: float = 600) -> str:
+        return self.pi.ssh("sudo sh -s", text=script, timeout_s=timeout_s)
+
+    def until(self, test: str, otherwise: str, timeout_s: float = 120) -> None:
+        end = time.monotonic() + timeout_s
+        while self.pi.ssh(f"{test} && echo yes", check=False).strip() != "yes":
+            if time.monotonic() > end:
+                raise WholeError(otherwise)
+            time.sleep(1)
+
+    def play(self, name: str, **variables: object) -> dict[str, int]:
+        """Runs one of ansible/'s playbooks on the machine; its recap. Raises WholeError if it fails."""
+        given = {k: str(v) if isinstance(v, Path) else v for k, v in variables.items()}
+        play = plays.run(name, [self.pi], folder=self.ansible, variables=given)
+        (self.folder / f"{name}.log").write_text(play.output)
+        if not play.ok:
+            raise WholeError(f"{name}.yml failed: {' '.join(play.end.split())[-500:]}")
+        return play.recap[self.pi.name]
+
+    def wrong(self, sentence: str) -> None:
+        self.outcome.wrong.append(sentence)
+
+    @contextlib.contextmanager
+    def step(self, name: str) -> Iterator[dict[str, Any]]:
+        self.say(f"{name} ...")
+        row: dict[str, Any] = {}
+        start = time.monotonic()
+        try:
+            yield row
+        finally:
+            self.steps.append({"step": name, "seconds": round(time.monotonic() - start, 1)})
+        self.say(f"{name}: {self.steps[-1]['seconds']:g} s")
+
+
+def _pictures(recordings: Path) -> list[Path]:
+    """The first frames of the recordings."""
+    pictures = sorted(recordings.glob("*/frames/*.jpg"))[:FRAMES]
+    if not pictures:
+        raise WholeError(f"{recordings}: no recorded frames in it; make demo leaves some")
+    return pictures
+
+
+def _frames(recordings: Path, file: Path) -> Path:
+    """The same as vivid takes them: YUYV, one after another."""
+    with file.open("wb") as out:
+        for path in _pictures(recordings):
+            image = cv2.imread(str(path))
+            if image is None or image.shape[1::-1] != SIZE:
+                found = None if image is None else image.shape
+                raise WholeError(f"{path}: a frame must be {SIZE[0]}x{SIZE[1]}, found {found}")
+            out.write(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_YUY2).tobytes() * TWICE)
+    return file
