@@ -4,7 +4,7 @@
         pi.boot()
         pi.ssh("uname -m")                  # aarch64
         with VirtualCar(firmware=True) as car:
-            pi.plug(car)                    # CAMERA and /dev/rover-arduino, as /dev/video0 would be and /dev/ttyUSB0 is
+            pi.plug(camera=car.camera, arduino=car.port)    # CAMERA and PORT in there
             ...
         pi.cut_power()
         pi.boot()
@@ -73,8 +73,9 @@ class Container:
             # Not in /tmp, which may be in memory: torch alone has half a gigabyte.
             disk = Path(tempfile.mkdtemp(prefix=f".pi-{self.name}-", dir=cache_root()))
             stack.callback(shutil.rmtree, disk, ignore_errors=True)
-            self._bench = Path(tempfile.mkdtemp(prefix=f"rover-pi-{self.name}-"))
-            stack.callback(shutil.rmtree, self._bench, ignore_errors=True)
+            self._own = Path(tempfile.mkdtemp(prefix=f"rover-pi-{self.name}-"))
+            stack.callback(shutil.rmtree, self._own, ignore_errors=True)
+            self.bench = self._own / "bench"
             self.machine = f"rover-pi-{secrets.token_hex(4)}"
             for folder in ("upper", "work", "root"):
                 (disk / folder).mkdir(mode=0o755)
@@ -117,11 +118,11 @@ class Container:
         if self.on:
             raise EmulationError(f"{self.name} is on already: cut its power, or power it off")
         started = time.monotonic()
-        console = (self._bench / "console.log").open("wb")
+        console = (self._own / "console.log").open("wb")
         command = ["systemd-nspawn", "--quiet", "--boot", "--register=no", "--keep-unit", "--link-journal=no"]
         command += [f"--machine={self.machine}", f"--hostname={self.name}", f"--directory={self.root}"]
         command += ["--resolv-conf=replace-host", "--timezone=off", "--console=pipe"]
-        command += [f"--bind={self._bench}/bench:{BENCH}", f"--bind=/dev/pts:{PTS}"]
+        command += [f"--bind={self.bench}:{BENCH}", f"--bind=/dev/pts:{PTS}"]
         with console:
             self._process = subprocess.Popen(
                 command,
@@ -207,37 +208,34 @@ class Container:
 
     # Devices
 
-    def plug(self, camera: str | Path | None = None, arduino: str | Path | None = None) -> None:
-        """Plugs in a camera, a FIFO of JPEGs on the disk of /tmp, and an Arduino, a pseudo terminal of this machine.
+    def plug(self, *, camera: str | Path | None = None, arduino: str | Path | None = None) -> None:
+        """Plugs in a camera, a FIFO of JPEGs in /tmp, and an Arduino, a pseudo terminal of this machine; on or off.
 
-        None: as it was. They are CAMERA and PORT in there, PORT as udev would have named it.
+        None: as it was. They are CAMERA and PORT in there; both stay plugged in when it boots again.
         """
         if camera is not None:
-            self.unplug(camera=True)
             Path(camera).chmod(0o666)
-            (self._bench / "bench" / "camera").hardlink_to(camera)
+            self.unplug(camera=True)
+            (self.bench / "camera").hardlink_to(camera)
         if arduino is not None:
-            self.unplug(arduino=True)
             terminal = Path(arduino).resolve()
             os.chown(terminal, 0, DIALOUT)
             terminal.chmod(0o660)
-            self._device(PORT).symlink_to(f"{PTS}/{terminal.name}")
+            self.unplug(arduino=True)
+            (self.bench / "arduino").symlink_to(f"{PTS}/{terminal.name}")
 
     def unplug(self, *, camera: bool = False, arduino: bool = False) -> None:
-        """Their names are gone; who has them open notices nothing, so close the car itself for that."""
+        """Their names are gone; who has them open notices nothing: close camera or Arduino itself for that."""
         if camera:
-            (self._bench / "bench" / "camera").unlink(missing_ok=True)
+            (self.bench / "camera").unlink(missing_ok=True)
         if arduino:
-            self._device(PORT).unlink(missing_ok=True)
-
-    def _device(self, path: str) -> Path:
-        return Path(f"/proc/{self.leader}/root{path}")
+            (self.bench / "arduino").unlink(missing_ok=True)
 
     # What is done to the disk before it boots
 
     def _configure(self) -> None:
-        (self._bench / "bench").mkdir(mode=0o755)
-        self._bench.chmod(0o755)
+        self.bench.mkdir(mode=0o755)
+        self._own.chmod(0o755)
         units = self.root / "etc" / "systemd" / "system"
         for name in MASKED:
             (units / name).unlink(missing_ok=True)
@@ -246,8 +244,11 @@ class Container:
             (units / f"{name}.service.d").mkdir(exist_ok=True)
             (units / f"{name}.service.d" / "emulated.conf").write_text("[Service]\nLoadCredential=\n")
         (self.root / "etc" / "hostname").write_text(f"{self.name}\n")
+        (self.root / "etc" / "hosts").write_text(f"127.0.0.1\tlocalhost\n127.0.1.1\t{self.name}\n")
         settings = f"Port {self.port}\nListenAddress 127.0.0.1\nUseDNS no\nPasswordAuthentication no\n"
         (self.root / "etc" / "ssh" / "sshd_config.d" / "emulated.conf").write_text(settings)
+        # What udev would do, and no udev can do here
+        (self.root / "etc" / "tmpfiles.d" / "emulated.conf").write_text(f"L {PORT} - - - - {BENCH}/arduino\n")
         _lend_registries(self.root)
 
     def _ran(
@@ -263,7 +264,7 @@ class Container:
         return done
 
     def _console(self) -> str:
-        text = (self._bench / "console.log").read_text(errors="replace")
+        text = (self._own / "console.log").read_text(errors="replace")
         return " | ".join(text.strip().splitlines()[-8:]) or "nothing"
 
     def _find_leader(self, nspawn: int | None = None) -> int:
