@@ -583,7 +583,7 @@ def pi() -> None:
 def pi_whole(ctx: click.Context, output: Path, **options: Any) -> None:
     """Provision, deploy and drive a whole emulated Pi, and hold each servo pulse against its command.
 
-    QEMU's Cortex-A76 with kernel, camera and USB; the real firmware on an emulated Arduino. Then cables are pulled while
+    QEMU's Cortex-A76 with kernel, camera and USB; the real firmware on an emulated Arduino. Cables are pulled while
     it drives. OUTPUT is JSON; exit code 1 if anything is not as expected, the machine's console is beside it then.
     """
     from rover_lib.emulated.whole import run_whole
