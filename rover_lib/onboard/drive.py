@@ -38,6 +38,7 @@ RATES_HZ = (10.0, 100.0)
 RESEND_S = 0.018  # a command takes 3 ms on the wire, a status that is under way 7, its own 7
 SPARE_S = 0.004  # before a deadline nothing is sent again
 SETTLED_S = 60.0  # memory is watched from here on
+REST_S = 1.0  # between plans that nobody drives by
 
 Arm = Callable[[], Telemetry | None]  # arms the car; None: there is none
 
@@ -342,7 +343,7 @@ def drive_artifact(
     with contextlib.ExitStack() as stack:
         policy = stack.enter_context((PolicyThread if in_thread else PolicyProcess)(artifact, threads=threads))
         predict = late(policy.predict, latency_s) if latency_s else policy.predict
-        planner = stack.enter_context(Planner(camera, predict, commanded, policy.rate_hz))
+        planner = stack.enter_context(Planner(camera, predict, commanded, policy.rate_hz, rest_s=REST_S))
         mode = policy.manifest["mode"]
         recorder = None
         if record:
@@ -356,7 +357,17 @@ def drive_artifact(
         pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz)
         sayings = (artifact_watch(artifact), pilot.troubles, Troubles(report, link))
         looks = (camera.latest, planner.newest, *((link.latest,) if link else ()))
-        stack.enter_context(going_first(log))
+
+        def prepared(arm: Arm) -> Telemetry | None:
+            """Arms with a fresh plan, at the loop's priority; a car that is refused needs neither any more."""
+            with contextlib.ExitStack() as needed:
+                needed.enter_context(planner.hurrying())
+                needed.enter_context(going_first(log))
+                planner.renew(settings.fade_s)
+                telemetry = arm()
+                stack.push(needed.pop_all())
+            return telemetry
+
         return drive(
             pilot,
             link,
@@ -365,7 +376,7 @@ def drive_artifact(
             recorder=recorder,
             mode=mode,
             stop=stop,
-            wait=lambda arm: wait(arm, looks),
+            wait=lambda arm: wait(lambda: prepared(arm), looks),
             watch=lambda: (said for say in sayings for said in say()),
             children=policy.pids,
             **ends,

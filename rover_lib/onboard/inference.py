@@ -18,7 +18,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -33,6 +33,7 @@ from rover_lib.onboard.plan import Commanded, Plan
 LOAD_S = 120.0  # torch and a full policy from a slow card
 POLL_S = 0.05
 WAIT_S = 0.1
+FRESH_S = 0.8  # WatchdogSec of the service is 2 s, and the Arduino has to answer too
 END_S = 1.0
 NICE = 5  # the control loop goes first
 PR_SET_PDEATHSIG = 1
@@ -44,7 +45,8 @@ Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint
 class Planner:
     """Asks for a plan for the newest frame, again and again, in a thread; a context manager.
 
-    predict: gives (chunk, 2) actions, unclipped, for a frame and a state, or raises. rate_hz: of the actions.
+    predict: gives (chunk, 2) actions, unclipped, for a frame and a state, or raises. rate_hz: of the actions. rest_s:
+    so long it rests after each plan unless somebody is hurrying() it; a car that stands would only get warm.
     """
 
     def __init__(
@@ -54,12 +56,14 @@ class Planner:
         commanded: Commanded,
         rate_hz: float,
         *,
+        rest_s: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
     ):
         self._camera, self._predict, self._commanded, self._rate_hz = camera, predict, commanded, rate_hz
-        self._clock = clock
+        self._rest_s, self._clock = rest_s, clock
         self._closing = threading.Event()
-        self._news = threading.Event()
+        self._hurry = threading.Event()
+        self._news = threading.Condition()
         self._plan: Plan | None = None
         self._failure: RoverError | None = None
         self._asked_s: float | None = None
@@ -71,6 +75,7 @@ class Planner:
 
     def __exit__(self, *exc: object) -> None:
         self._closing.set()
+        self._hurry.set()
         if self._thread.is_alive():
             self._thread.join(END_S)
 
@@ -80,10 +85,33 @@ class Planner:
             raise self._failure
         return self._plan
 
-    def wait(self, timeout_s: float) -> Plan | None:
-        """The newest plan, as soon as there is one. Raises as newest()."""
-        self._news.wait(timeout_s)
+    def wait(self, timeout_s: float, after: int = 0) -> Plan | None:
+        """The newest plan, as soon as its number is above `after`, or the time is over. Raises as newest()."""
+        with self._news:
+            self._news.wait_for(lambda: self._failure or (self._plan and self._plan.number > after), timeout_s)
         return self.newest()
+
+    @contextlib.contextmanager
+    def hurrying(self) -> Iterator[None]:
+        """Inside, plans follow each other without a rest."""
+        self._hurry.set()
+        try:
+            yield
+        finally:
+            self._hurry.clear()
+
+    def renew(self, age_s: float) -> None:
+        """Waits for the next plan if the one that is there looked at a frame older than this; for use in hurrying().
+
+        Raises PolicyError if that does not come within FRESH_S, and as newest().
+        """
+        plan = self.newest()
+        number = plan.number if plan else 0
+        if plan and self._clock() - plan.captured_s <= age_s:
+            return
+        plan = self.wait(FRESH_S, after=number)
+        if not plan or plan.number == number:
+            raise PolicyError(f"no fresh plan within {FRESH_S:g} s; is this machine too busy?")
 
     @property
     def asking_s(self) -> float:
@@ -104,13 +132,17 @@ class Planner:
                 actions = self._predict(frame.image, state)
                 self._asked_s = None
                 number += 1
-                self._plan = Plan(number, frame.captured_s, self._clock(), actions)
-                self._news.set()
+                plan = Plan(number, frame.captured_s, self._clock(), actions)
+                with self._news:
+                    self._plan = plan
+                    self._news.notify_all()
+                self._hurry.wait(self._rest_s)
         except RoverError as error:
             self._failure = error
         except Exception as error:  # whatever it is, the loop must learn of it and stop the car
             self._failure = PolicyError(f"the policy failed ({type(error).__name__}: {error}); the car is stopped")
-        self._news.set()
+        with self._news:
+            self._news.notify_all()
 
 
 class PolicyProcess:

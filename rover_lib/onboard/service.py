@@ -6,12 +6,15 @@ leaves nothing behind that could arm the car later (no file, no port), and one t
 forgotten. The Arduino has the last word, as always: it refuses without the transmitter's signal, and when the throttle
 stick is not at rest. Moving a stick takes the car back; the service then ends, is started again and is disarmed.
 
+Disarmed, it is not in a hurry: no real-time priority, a plan a second. Both come before the Arduino is asked, and the
+car begins by a fresh plan.
+
 What the service says of itself (systemctl show --property=StatusText) begins with one of STATES; deploy.yml restarts it
 only while that is "disarmed".
 
 systemd's watchdog hears of ticks that happened and of nothing else: while the car drives, those of the control loop;
-while it is disarmed, the looks at camera and Arduino. A loop that hangs, or a process that does, is killed after
-WatchdogSec; the Arduino has stopped the car 150 ms after the last command.
+while it is disarmed, the looks at camera, policy and Arduino. A loop that hangs, or a process that does, is killed
+after WatchdogSec; the Arduino has stopped the car 150 ms after the last command.
 """
 
 import contextlib
@@ -27,7 +30,7 @@ from systemd_watchdog import WatchDog
 
 from rover_lib.onboard.drive import Arm, Report
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.servo_link import LinkError, Telemetry
+from rover_lib.onboard.servo_link import Telemetry
 
 UNIT = "rover-drive.service"
 ARM = signal.SIGUSR1
@@ -97,7 +100,7 @@ class Service:
             self._asked.clear()
             try:
                 telemetry = arm()
-            except LinkError as error:
+            except RoverError as error:  # what is broken, and not only in the way, the next look finds
                 self._say(f"not armed: {error}")
                 self._tell(f"{DISARMED}: {error}")
                 continue

@@ -88,6 +88,54 @@ def test_what_the_camera_raises():
         until_raises(planner, CameraError, "unplugged")
 
 
+def counted_plans(planner, seconds):
+    before = planner.newest().number
+    time.sleep(seconds)
+    return planner.newest().number - before
+
+
+def test_it_rests_unless_somebody_is_in_a_hurry():
+    with Planner(Frames(), lambda frame, state: CHUNK, Commanded(), 30.0, rest_s=0.2) as planner:
+        planner.wait(2.0)
+        assert 1 <= counted_plans(planner, 0.7) <= 4
+        with planner.hurrying():
+            assert counted_plans(planner, 0.5) > 20
+        assert counted_plans(planner, 0.7) <= 5
+        start = time.monotonic()
+    assert time.monotonic() - start < 0.15  # closing does not wait for its rest
+
+
+def test_a_plan_to_begin_by_is_fresh():
+    with Planner(Frames(), lambda frame, state: CHUNK, Commanded(), 30.0, rest_s=10.0) as planner:
+        old = planner.wait(2.0)
+        planner.renew(5.0)
+        assert planner.newest() is old
+        time.sleep(0.1)
+        with planner.hurrying():
+            planner.renew(0.05)
+        assert planner.newest().number > old.number
+
+
+def test_a_policy_that_has_no_fresh_plan(monkeypatch):
+    monkeypatch.setattr("rover_lib.onboard.inference.FRESH_S", 0.1)
+    answers = iter([CHUNK])
+
+    def predict(frame, state):
+        if (answer := next(answers, None)) is None:
+            time.sleep(0.4)
+            raise PolicyError("too late")
+        return answer
+
+    with Planner(Frames(), predict, Commanded(), 30.0, rest_s=10.0) as planner:
+        planner.wait(2.0)
+        with planner.hurrying():
+            with pytest.raises(PolicyError, match=r"no fresh plan within 0\.1 s; is this machine too busy"):
+                planner.renew(0.0)
+            time.sleep(0.5)
+            with pytest.raises(PolicyError, match="too late"):
+                planner.renew(0.0)
+
+
 def test_how_long_it_has_been_asked():
     hanging = time.monotonic() + 0.3
     with Planner(

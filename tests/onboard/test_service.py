@@ -16,6 +16,8 @@ from click.testing import CliRunner
 from rover_lib.cli import main
 from rover_lib.onboard import service as s
 from rover_lib.onboard.drive import Report
+from rover_lib.onboard.errors import PolicyError
+from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.servo_link import LinkError
 from rover_lib.onboard.telemetry import read_log
 
@@ -122,6 +124,24 @@ def test_an_arduino_that_refuses_leaves_it_waiting(systemd):
         thread.join()
     assert "STATUS=disarmed: no transmitter; switch it on" in systemd.lines
     assert said == ["not armed: no transmitter; switch it on"]
+
+
+def test_a_plan_that_is_late_is_no_reason_to_give_up(systemd):
+    answers = [PolicyError("no fresh plan within 0.8 s"), "telemetry"]
+
+    def arm():
+        threading.Timer(0.1, human).start()
+        if isinstance(answer := answers.pop(0), PolicyError):
+            raise answer
+        return answer
+
+    with s.Service(Report(), threading.Event()) as service:
+        thread = waiting(systemd, human)
+        assert service.wait(arm) == "telemetry"
+        thread.join()
+        time.sleep(0.2)  # the last signal
+    systemd.hear()
+    assert "STATUS=disarmed: no fresh plan within 0.8 s" in systemd.lines
 
 
 def test_what_breaks_while_it_waits_ends_it(systemd):
@@ -284,8 +304,11 @@ def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(syst
     try:
         assert feeds(systemd.hear(1.5)) >= 3
         assert not any("driving" in line for line in systemd.lines)
+        assert os.sched_getscheduler(process.pid) == os.SCHED_OTHER  # nobody is in a hurry
         process.send_signal(s.ARM)
         systemd.hear_until("STATUS=driving: armed by a human")
+        if os.geteuid() == 0:
+            assert os.sched_getscheduler(process.pid) == os.SCHED_RR | os.SCHED_RESET_ON_FORK
         assert feeds(systemd.hear(2.0)) >= 4
         assert any(line.startswith("STATUS=driving: ") and "steering" in line for line in systemd.lines)
         process.send_signal(signal.SIGSTOP)
@@ -299,7 +322,9 @@ def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(syst
     assert process.returncode == 3 and ("stopped the car" in said or "the Arduino said nothing" in said), said
     systemd.hear()
     assert "STOPPING=1" in systemd.lines
-    assert any(e.text == "armed" for e in read_log(tmp_path / "flight.log").events)
+    flight = read_log(tmp_path / "flight.log")
+    assert any(e.text == "armed" for e in flight.events)
+    assert flight.ticks["plan"][0] < 10 and flight.ticks["plan_age_ms"][0] <= 1e3 * Settings().fade_s
 
 
 def test_a_service_that_nobody_armed_ends_without_having_moved(systemd, tmp_path, demo_run):
