@@ -14,9 +14,10 @@ Its disk is a layer over the folders below it, which stay as they are: what one 
     pi.power_off()
     with Container("rover2", layers=pi.layers) as another: ...
 
-What a container cannot have: a kernel of its own, so no udev, no V4L2 camera (a FIFO of JPEGs stands in for it) and no
-time of its own; with qemu-user no seccomp filter; and what is written is with the host's kernel at once, so that a
-power cut ends all programs at one moment but takes no unsynced write with it. The whole machine has all that.
+Its systemd is this machine's own program, of the same version, and so real with all that a service's sandbox is made
+of; all other programs are aarch64. What a container cannot have: a kernel of its own, so no udev, no V4L2 camera (a
+FIFO of JPEGs stands in for it) and no time of its own; and what is written is with this machine's kernel at once, so
+that a power cut ends all programs at one moment, but takes no unsynced write with it. The whole machine has all that.
 """
 
 import ast
@@ -45,8 +46,9 @@ CAMERA, PORT = f"{BENCH}/camera", "/dev/rover-arduino"
 DIALOUT = 20  # Debian's number for the group
 # The network is the host's, which has its own; and nothing begins to update itself while something is measured.
 MASKED = ("systemd-networkd.service", "systemd-resolved.service", "apt-daily.timer", "apt-daily-upgrade.timer")
-# Credentials need a system call that qemu-user has not, and these have none to be given.
-WITHOUT_CREDENTIALS = ("systemd-sysusers", "systemd-tmpfiles-setup", "systemd-tmpfiles-setup-dev", "systemd-sysctl")
+# Their own programs, which may make no memory executable: an emulator must.
+TRANSLATED = ("systemd-journald", "systemd-logind", "systemd-hostnamed", "systemd-timedated", "systemd-localed")
+SYSTEMD = Path("/usr/lib/systemd/systemd")
 CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 
 
@@ -240,15 +242,16 @@ class Container:
         for name in MASKED:
             (units / name).unlink(missing_ok=True)
             (units / name).symlink_to("/dev/null")
-        for name in WITHOUT_CREDENTIALS:
+        for name in TRANSLATED:
             (units / f"{name}.service.d").mkdir(exist_ok=True)
-            (units / f"{name}.service.d" / "emulated.conf").write_text("[Service]\nLoadCredential=\n")
+            (units / f"{name}.service.d" / "emulated.conf").write_text("[Service]\nMemoryDenyWriteExecute=no\n")
         (self.root / "etc" / "hostname").write_text(f"{self.name}\n")
         (self.root / "etc" / "hosts").write_text(f"127.0.0.1\tlocalhost\n127.0.1.1\t{self.name}\n")
         settings = f"Port {self.port}\nListenAddress 127.0.0.1\nUseDNS no\nPasswordAuthentication no\n"
         (self.root / "etc" / "ssh" / "sshd_config.d" / "emulated.conf").write_text(settings)
         # What udev would do, and no udev can do here
         (self.root / "etc" / "tmpfiles.d" / "emulated.conf").write_text(f"L {PORT} - - - - {BENCH}/arduino\n")
+        _lend_systemd(self.root)
         _lend_registries(self.root)
 
     def _ran(
@@ -301,6 +304,29 @@ def _forget(machine: str) -> None:
     for lock in Path("/run/systemd/nspawn/locks").glob("*"):
         if machine in lock.name:
             lock.unlink(missing_ok=True)
+
+
+def _lend_systemd(root: Path) -> None:
+    """This machine's own systemd as the first process, of the version that the Pi has; everything else stays aarch64.
+
+    What sets up a service's sandbox runs in it, and under qemu-user that fails (PrivateNetwork=, credentials) or does
+    nothing (seccomp). The sandbox holds for the emulator that a service runs in just as well.
+    """
+    told = run(["ldd", SYSTEMD], f"{SYSTEMD} cannot be examined")
+    libraries = {Path(word) for line in told.splitlines() for word in line.split() if word.startswith("/")}
+    ask = ["--show", "--showformat=${Version}"]
+    here = run(["dpkg-query", *ask, "systemd"], "this machine's systemd is no Debian package")
+    theirs = ["dpkg-query", f"--admindir={root}/var/lib/dpkg", *ask, "systemd:arm64"]
+    there = run(theirs, "the emulated Pi has no systemd")
+    if here.partition(".")[0] != there.partition(".")[0]:
+        raise EmulationError(
+            f"systemd is {here} here and {there} on the emulated Pi: remove {cache_root()}/pi-system-*"
+        )
+    for path in (SYSTEMD, *libraries):
+        target = root / path.relative_to("/")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.unlink(missing_ok=True)
+        shutil.copy(path, target)
 
 
 def _lend_registries(root: Path) -> None:
