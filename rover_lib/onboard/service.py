@@ -24,13 +24,15 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from systemd_watchdog import WatchDog
 
-from rover_lib.onboard.drive import Arm, Report
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.servo_link import Telemetry
+
+if TYPE_CHECKING:  # who asks for the service's state, as every playbook does, waits for neither numpy nor OpenCV
+    from rover_lib.onboard.drive import Arm, Report
+    from rover_lib.onboard.servo_link import Telemetry
 
 UNIT = "rover-drive.service"
 ARM = signal.SIGUSR1
@@ -56,7 +58,7 @@ class Service:
     nothing is told to anybody, and all else is the same.
     """
 
-    def __init__(self, report: Report, stop: threading.Event, say: Callable[[str], None] = lambda text: None):
+    def __init__(self, report: "Report", stop: threading.Event, say: Callable[[str], None] = lambda text: None):
         self._report, self._stop, self._say = report, stop, say
         # One that never waits: systemd may be busy, and the loop must not be.
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
@@ -80,7 +82,7 @@ class Service:
         signal.signal(ARM, self._before)
         self._socket.close()
 
-    def wait(self, arm: Arm, looks: Iterable[Callable[[], object]] = ()) -> Telemetry | None:
+    def wait(self, arm: "Arm", looks: Iterable[Callable[[], object]] = ()) -> "Telemetry | None":
         """Ready: waits until a human arms the car and the Arduino agrees; what arm() returned.
 
         What drive_artifact() takes as `wait`. looks: what must go on working meanwhile; each raises if it does not.
