@@ -124,6 +124,22 @@ def test_cameras_are_listed_with_formats_and_sizes(tmp_path):
     assert "video10: does not say what it is" in checks[1].found
 
 
+def test_many_formats_are_cut_and_a_big_endian_one_is_named(tmp_path):
+    names = [b"Y16" + bytes([ord(" ") | 0x80]), *(b"F%03d" % i for i in range(39))]
+
+    def ioctl(file, request, data):
+        if request == doctor.VIDIOC_QUERYCAP:
+            data[:] = struct.pack("<16s32s32sIII12x", b"vivid", b"vivid", b"", 0, 0x1, 0)
+        elif request == doctor.VIDIOC_ENUM_FMT and (index := struct.unpack_from("<I", data)[0]) < len(names):
+            data[44:48] = names[index]
+        else:
+            raise OSError(errno.EINVAL, "")
+        return 0
+
+    found = only(doctor.cameras(make_nodes(tmp_path, "video0"), ioctl)).found
+    assert found.partition("vivid: ")[2].split("; ") == ["Y16-BE", *(f"F{i:03}" for i in range(7)), "32 more"]
+
+
 def test_sizes_in_steps(tmp_path):
     def ioctl(file, request, data):
         if struct.unpack_from("<I", data)[0] and request != doctor.VIDIOC_QUERYCAP:
