@@ -325,6 +325,7 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
 @click.option("--hz", type=click.FloatRange(10, 100), default=30.0, show_default=True, help="Commands a second.")
 @click.option("--dry-run", is_flag=True, help="No Arduino, no motor: logs what would be sent.")
 @click.option("--record", type=FILE, help="Write the drive as an episode into this folder.")
+@click.option("--record-mb", type=click.FloatRange(min=1), help="All in that folder take at most so much.")
 @click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="End after so many.")
 @click.option("--ticks", type=click.IntRange(min=1), help="End after so many commands.")
 @click.option("--throttle-limit", type=click.FloatRange(0, 1), help="[default: params.yml; with --replay: none]")
@@ -357,6 +358,8 @@ def drive(ctx: click.Context, artifact: Path | None, replay: Path | None, json_f
         raise click.UsageError("give an ARTIFACT, or --replay EPISODE")
     if options["service"] and (replay or options["dry_run"]):
         raise click.UsageError("--service drives a car by an artifact: no --replay, no --dry-run")
+    if options["record_mb"] and not options["record"]:
+        raise click.UsageError("--record-mb belongs to --record")
     if not options["in_world"] and (options["firmware"] or options["latency_ms"] or options["in_thread"]):
         raise click.UsageError("--firmware, --latency-ms and --in-thread belong to --world")
     report, more, code = Report(), {}, 0
@@ -391,6 +394,7 @@ def _drive(
     hz: float,
     dry_run: bool,
     record: Path | None,
+    record_mb: float | None,
     throttle_limit: float | None,
     blend_ticks: int | None,
     ensemble: float | None,
@@ -451,8 +455,9 @@ def _drive(
                 d.drive(ReplayPilot(controls, throttle_limit=limit), link, watch=w.Troubles(report, link), **common)
             return
         frames = stack.enter_context(Camera(camera))
-        how = {"threads": threads, "in_thread": in_thread, "latency_s": latency_ms / 1e3, "record": record}
-        d.drive_artifact(artifact, frames, link, settings=settings, wait=wait, **how, **common)
+        recording = {"record": record, "record_mb": record_mb}
+        how = {"threads": threads, "in_thread": in_thread, "latency_s": latency_ms / 1e3}
+        d.drive_artifact(artifact, frames, link, settings=settings, wait=wait, **recording, **how, **common)
 
 
 @main.command("record")

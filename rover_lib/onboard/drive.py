@@ -29,7 +29,7 @@ from rover_lib.onboard.inference import Planner, PolicyProcess, PolicyThread, la
 from rover_lib.onboard.pilot import Order, Pilot, PolicyPilot
 from rover_lib.onboard.plan import Commanded, Settings
 from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.onboard.recorder import Recorder
+from rover_lib.onboard.recorder import Recorder, room_for
 from rover_lib.onboard.servo_link import SEQUENCES, LinkError, ServoLink, State, Telemetry
 from rover_lib.onboard.telemetry import FlightLog, Tick
 from rover_lib.onboard.watch import Troubles, artifact_watch, going_first, memory_mb
@@ -93,7 +93,7 @@ def drive(
     *,
     rate_hz: float,
     log: FlightLog,
-    recorder: Recorder | None = None,
+    record: Callable[..., None] | None = None,
     mode: str = "",
     ticks: int | None = None,
     max_seconds: float | None = None,
@@ -107,10 +107,10 @@ def drive(
 ) -> Report:
     """Arms the car, then sends the pilot's order at each deadline until one of the ends is reached.
 
-    link: None drives no motor. recorder: takes each command too. mode: who drives, for it. stop: ends it, as ticks and
-    max_seconds do. wait: called once all is ready, with what arms the car, and returns what that does; a human may say
-    when. watch: called once a second; what it says goes to the log. children: processes whose memory counts.
-    report: is filled as it goes, so that it is there after a fault too.
+    link: None drives no motor. record: takes each command too, as Recorder.control does. mode: who drives, for it.
+    stop: ends it, as ticks and max_seconds do. wait: called once all is ready, with what arms the car, and returns what
+    that does; a human may say when. watch: called once a second; what it says goes to the log. children: processes
+    whose memory counts. report: is filled as it goes, so that it is there after a fault too.
     Raises RoverError if it cannot be begun, DriveFault with what stopped the car, TakenOver when the human did;
     whatever it is, the car was told neutral before.
     """
@@ -119,7 +119,7 @@ def drive(
     report = report if report is not None else Report()
     stop = stop or threading.Event()
     pilot.ready(stop)
-    loop = _Loop(pilot, link, 1 / rate_hz, log, recorder, mode, report, clock, sleep, (os.getpid(), *children))
+    loop = _Loop(pilot, link, 1 / rate_hz, log, record, mode, report, clock, sleep, (os.getpid(), *children))
     if stop.is_set():
         report.ended = "stopped before it began"
         return report
@@ -148,7 +148,7 @@ class _Loop:
     link: ServoLink | None
     period_s: float
     log: FlightLog
-    recorder: Recorder | None
+    record: Callable[..., None] | None
     mode: str
     report: Report
     clock: Callable[[], float]
@@ -301,9 +301,9 @@ class _Loop:
                 frame=order.frame,
             )
         )
-        if self.recorder:
+        if self.record:
             calibration = self.link.calibration if self.link else PwmCalibration()
-            self.recorder.control(
+            self.record(
                 self.sent_s,
                 telemetry.uptime_ms if telemetry else round((now - self.start_s) * 1e3),
                 order.steering_us,
@@ -324,6 +324,7 @@ def drive_artifact(
     rate_hz: float,
     log: FlightLog,
     record: Path | None = None,
+    record_mb: float | None = None,
     threads: int | None = None,
     in_thread: bool = False,
     latency_s: float = 0.0,
@@ -333,10 +334,10 @@ def drive_artifact(
 ) -> Report:
     """Drives an artifact by an open camera, in this process's main thread; everything else as `drive`.
 
-    record: folder in which an episode is written. in_thread: the policy runs in a thread of this process, for
-    comparison; not for driving, since one that hangs cannot be ended. latency_s: a plan takes at least so long, for
-    comparison. wait: as drive's, and gets what must go on working meanwhile too: each raises if it does not.
-    ends: ticks, max_seconds, report.
+    record: folder in which an episode is written; record_mb: all in it together take at most so much, None: what the
+    disk has. in_thread: the policy runs in a thread of this process, for comparison; not for driving, since one that
+    hangs cannot be ended. latency_s: a plan takes at least so long, for comparison. wait: as drive's, and gets what
+    must go on working meanwhile too: each raises if it does not. ends: ticks, max_seconds, report.
     """
     stop = stop or threading.Event()
     commanded = Commanded()
@@ -345,35 +346,41 @@ def drive_artifact(
         predict = late(policy.predict, latency_s) if latency_s else policy.predict
         planner = stack.enter_context(Planner(camera, predict, commanded, policy.rate_hz, rest_s=REST_S))
         mode = policy.manifest["mode"]
-        recorder = None
-        if record:
-            port = link.port if link else ""
-            recorder = Recorder(
-                record, camera, label=f"driven by {mode}", rate_hz=rate_hz, arduino_port=port, source="rover drive"
-            )
-            stack.callback(lambda: log.event(f"recorded: {recorder.path or recorder.failure}"))
-            stack.enter_context(recorder)  # notes in the episode what ended the drive
+        recorder: Recorder | None = None
+        room = room_for(record, record_mb) if record and record_mb else None  # now: it may take a while
         report = ends.setdefault("report", Report())
         pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz)
         sayings = (artifact_watch(artifact), pilot.troubles, Troubles(report, link))
         looks = (camera.latest, planner.newest, *((link.latest,) if link else ()))
 
         def prepared(arm: Arm) -> Telemetry | None:
-            """Arms with a fresh plan, at the loop's priority; a car that is refused needs neither any more."""
+            """Arms with a fresh plan, at the loop's priority, recorded; where it is refused, all that is undone."""
+            nonlocal recorder
             with contextlib.ExitStack() as needed:
                 needed.enter_context(planner.hurrying())
+                if record:
+                    about = {"label": f"driven by {mode}", "arduino_port": link.port if link else ""}
+                    recorder = needed.enter_context(
+                        Recorder(record, camera, **about, rate_hz=rate_hz, source="rover drive", most_bytes=room)
+                    )  # notes in the episode what ended the drive
                 needed.enter_context(going_first(log))
                 planner.renew(settings.fade_s)
                 telemetry = arm()
                 stack.push(needed.pop_all())
             return telemetry
 
+        def recorded() -> None:
+            if recorder and (what := recorder.path or recorder.failure):
+                log.event(f"recorded: {what}")
+
+        stack.callback(recorded)
+
         return drive(
             pilot,
             link,
             rate_hz=rate_hz,
             log=log,
-            recorder=recorder,
+            record=(lambda *row, **more: recorder.control(*row, **more)) if record else None,
             mode=mode,
             stop=stop,
             wait=lambda arm: wait(lambda: prepared(arm), looks),

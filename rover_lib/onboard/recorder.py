@@ -25,6 +25,7 @@ from rover_lib.onboard.telemetry import StatusLine
 from rover_lib.onboard.watch import signals
 
 SPARE_BYTES = 16_000_000  # of the disk are left alone; finishing an episode needs some, and so does the rest of a Pi
+LEAST_BYTES = 1_000_000  # an episode that may only be smaller is not begun
 ROW_BYTES = 1000  # of a control or frame in both of its files, at the end
 QUEUE_MOST = 20_000  # controls that wait for the disk: minutes, and a few megabytes
 SILENT_S = 2.0  # without a frame, or a status of the Arduino, nothing is recorded any more
@@ -39,7 +40,8 @@ class Recorder:
 
     folder: in which the episode appears on close(), as episode_YYYYMMDD_HHMMSS of the start in local time (a second
     later if that is taken). label: what was done. rate_hz: frames a second at most. source, arduino_port: who drove and
-    through what, for the metadata. Raises EpisodeError if there is no room to record; later faults are in `failure`.
+    through what, for the metadata. most_bytes: the episode may take so many, see room_for(); None: what the disk has.
+    Raises EpisodeError if there is no room to record; later faults are in `failure`.
     """
 
     def __init__(
@@ -51,9 +53,10 @@ class Recorder:
         rate_hz: float = 30.0,
         arduino_port: str = "",
         source: str = "",
+        most_bytes: int | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self._camera, self._clock = camera, clock
+        self._camera, self._clock, self._most_bytes = camera, clock, most_bytes
         self.start_s = clock()
         self._to_system_s = time.time() - self.start_s
         self._frame_s = 0.75 / rate_hz  # a frame sooner after the last one is of a faster camera, and left out
@@ -73,6 +76,7 @@ class Recorder:
         self._queue: deque[tuple] = deque()
         self._lost = 0
         self._closing = threading.Event()
+        self._unwanted = False
         try:
             self._check_room()
             self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -85,6 +89,8 @@ class Recorder:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if error and not self.controls and not self._queue:
+            self.discard()  # it had not begun: a car that was not armed, say
         self.close(sentence_of(error) if error else None)
 
     def control(
@@ -124,6 +130,12 @@ class Recorder:
             self._fail(f"{self.folder}: the disk has not taken the episode for {CLOSE_S:g} s: check it")
         return self.path
 
+    def discard(self) -> None:
+        """Ends the episode and leaves nothing of it."""
+        self._unwanted = True
+        self._closing.set()
+        self._thread.join(CLOSE_S)
+
     @property
     def controls(self) -> int:
         """So many were written."""
@@ -140,7 +152,13 @@ class Recorder:
             _log.error("recording ended: %s", sentence)
 
     def _check_room(self) -> None:
-        needed = SPARE_BYTES + ROW_BYTES * (self._writer.controls + self._writer.frames)
+        rows = ROW_BYTES * (self._writer.controls + self._writer.frames)
+        needed = SPARE_BYTES + rows
+        if self._most_bytes is not None and self._most_bytes - rows - self._writer.picture_bytes < LEAST_BYTES:
+            raise EpisodeError(
+                f"{self.folder.parent}: no room is left of what episodes may take here: fetch them with "
+                "ansible/drive.yml, or delete some"
+            )
         disk = os.statvfs(self.folder.parent)
         if (free := disk.f_bavail * disk.f_frsize) < needed:
             raise EpisodeError(
@@ -153,6 +171,8 @@ class Recorder:
             self._collect()
         except Exception as error:  # whatever it is: the car drives on, and what was recorded is an episode
             self._fail(sentence_of(error))
+        if self._unwanted:
+            return self._writer.discard()
         if self.failure:
             self._writer.metadata["fault"] = self.failure
         if self._lost:
@@ -190,6 +210,19 @@ class Recorder:
         for _ in range(len(self._queue)):
             host_s, *control, extra = self._queue.popleft()
             self._writer.control(host_s + self._to_system_s, *control, **extra)
+
+
+def room_for(folder: Path | str, most_mb: float) -> int:
+    """Bytes that the next episode in a folder may take, if all in it may take most_mb. Looks at every file.
+
+    Never more than half of what the disk has left: an episode is packed beside itself to be fetched, and a rover wants
+    to get another model some day.
+    """
+    folder = Path(folder)
+    taken = sum(path.lstat().st_size for path in folder.rglob("*"))
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    disk = os.statvfs(there)
+    return int(min(most_mb * 1e6 - taken, disk.f_bavail * disk.f_frsize / 2))
 
 
 def _new_episode(folder: Path, start_s: float, **options: Any) -> EpisodeWriter:

@@ -93,7 +93,7 @@ class EpisodeWriter:
         self.pwm = pwm or PwmCalibration()
         self.flags = flags
         self.metadata: dict[str, Any] = {}  # what else is to be noted of this episode
-        self.controls = self.frames = 0
+        self.controls = self.frames = self.picture_bytes = 0
         self._extra: dict[str, None] = {}  # names of further columns, in order
         self._first_s, self._last_s = math.inf, -math.inf
         self._temporary: Path | None = None
@@ -192,7 +192,7 @@ class EpisodeWriter:
                 picture.unlink()
             raise
         self._append("frame", {"frame_id": number, "timestamp": t_s, "image_path": relative}, t_s)
-        self.frames = number
+        self.frames, self.picture_bytes = number, self.picture_bytes + len(jpeg)
 
     def finish(self) -> Path:
         """Makes the folder appear and returns it; leaves nothing where that fails, and says why."""

@@ -93,7 +93,7 @@ def test_each_default_is_said_once_more_and_the_same():
 
 def test_each_task_file_has_its_arguments_and_uses_no_others():
     files = {p.stem: p.read_text() for p in (ROLE / "tasks").glob("*.yml")}
-    parts = {"not_driving", "restart"}  # of others
+    parts = {"bring_home", "episode", "not_driving", "restart"}  # of others
     assert set(files) - parts == set(SPECS)
     known = {name for s in SPECS.values() for name in s["options"]}
     for name in set(files) - parts:
@@ -152,7 +152,41 @@ def test_an_artifact_that_is_not_there_or_not_fit_does_not_travel(tmp_path, arti
     assert (tmp_path / "packed" / "release.json").exists()
 
 
+@pytest.mark.parametrize("name", ["episode_20251007_144013", ".episode_20251007_144013.part"])
+def test_an_episode_comes_home_and_leaves_the_rover(tmp_path, name):
+    picture = tmp_path / "rover" / name / "frames" / "frame_000001.jpg"
+    picture.parent.mkdir(parents=True)
+    picture.write_bytes(b"a picture")
+    before = set(Path("/var/tmp").iterdir())
+    found = play(
+        tmp_path, [entry("episode")], rover_episode=str(tmp_path / "rover" / name), rover_fetched=str(tmp_path / "home")
+    )
+    assert found.returncode == 0, found.stdout
+    home = tmp_path / "home" / "localhost" / "episodes"
+    assert [p.name for p in home.iterdir()] == [name]
+    assert (home / name / "frames" / "frame_000001.jpg").read_bytes() == b"a picture"
+    assert not list((tmp_path / "rover").iterdir()) and set(Path("/var/tmp").iterdir()) <= before
+
+
+def test_an_episode_that_does_not_come_home_stays(tmp_path):
+    episode = tmp_path / "rover" / "episode_20251007_144013"
+    episode.mkdir(parents=True)
+    (tmp_path / "home").write_text("no folder")
+    before = set(Path("/var/tmp").iterdir())
+    found = play(tmp_path, [entry("episode")], rover_episode=str(episode), rover_fetched=str(tmp_path / "home"))
+    assert found.returncode == 2 and episode.is_dir()
+    assert set(Path("/var/tmp").iterdir()) <= before
+
+
 # The units, as they are on a rover
+
+
+def rendered(name: str, **given: object) -> str:
+    """A template as Ansible fills it, with the defaults but for what is given."""
+    loader = jinja2.FileSystemLoader(ROLE / "templates")
+    jinja = jinja2.Environment(loader=loader, trim_blocks=True, autoescape=False)
+    jinja.filters["bool"] = lambda value: str(value).lower() in ("true", "yes", "1")  # Ansible's own
+    return jinja.get_template(f"{name}.j2").render({**DEFAULTS, "ansible_managed": "Ansible", **given})
 
 
 @pytest.fixture
@@ -160,10 +194,8 @@ def units(tmp_path) -> Path:
     """The service's units with the defaults, and a rover_home that has something to execute."""
     (tmp_path / "venv" / "bin").mkdir(parents=True)
     (tmp_path / "venv" / "bin" / "rover").symlink_to("/bin/true")
-    given = {**DEFAULTS, "rover_home": str(tmp_path), "ansible_managed": "Ansible"}
-    jinja = jinja2.Environment(loader=jinja2.FileSystemLoader(ROLE / "templates"), trim_blocks=True, autoescape=False)
     for name in ("rover-drive.service", "rover-check@.service"):
-        (tmp_path / name).write_text(jinja.get_template(f"{name}.j2").render(given))
+        (tmp_path / name).write_text(rendered(name, rover_home=tmp_path))
     return tmp_path
 
 
@@ -214,6 +246,17 @@ def test_both_units_have_the_same_sandbox(units):
         *("RestartSec", "KillMode", "TimeoutStopSec", "OOMPolicy", "WantedBy"),
         *("LimitRTPRIO", "RestrictRealtime", "SupplementaryGroups", "DeviceAllow", "PrivateDevices"),
     }, kinds
+
+
+def test_a_service_that_records_does_so_in_its_own_folder_and_may_finish(units):
+    recording = rendered("rover-drive.service", rover_home=units, rover_record="true", rover_threads=2)
+    (units / "rover-drive.service").write_text(recording)
+    found = analyze("verify", "--man=no", "--recursive-errors=no", units / "rover-drive.service")
+    assert found.returncode == 0 and str(units) not in found.stderr, found.stderr
+    line = next(x for x in recording.splitlines() if x.startswith("ExecStart="))
+    assert line.endswith(" --threads 2 --record /var/lib/rover-drive/episodes --record-mb 2000")
+    assert "StateDirectory=rover-drive\n" in recording and "TimeoutStopSec=90\n" in recording
+    assert "--record" not in rendered("rover-drive.service")
 
 
 def test_the_service_says_what_the_command_line_takes(units):

@@ -303,15 +303,9 @@ def test_each_second_is_watched(link, clock):
 
 
 def test_a_recorder_gets_what_was_commanded(link, clock):
-    class Recorder:
-        def __init__(self):
-            self.rows = []
-
-        def control(self, *row, **extra):
-            self.rows.append((row, extra))
-
-    go(Always(), link, clock, ticks=3, recorder=(recorder := Recorder()), mode="static")
-    (_, arduino_ms, *pulses), extra = recorder.rows[0]
+    rows = []
+    go(Always(), link, clock, ticks=3, record=lambda *row, **extra: rows.append((row, extra)), mode="static")
+    (_, arduino_ms, *pulses), extra = rows[0]
     assert (arduino_ms, pulses) == (0, [1456, 150, 21316, 1016])
     assert extra == {"mode": "static", "plan_age_ms": 100.0}
 

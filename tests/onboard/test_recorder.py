@@ -284,6 +284,43 @@ def test_a_full_disk_is_seen_before_it_is_full(tmp_path, monkeypatch):
     assert len(load_recordings(folder, chunk=2).samples) == 1
 
 
+def test_episodes_take_no_more_than_they_may(tmp_path, monkeypatch):
+    picture = np.random.default_rng(0).integers(0, 256, (360, 640, 3), np.uint8)  # 500 kB as JPEG
+    camera = FakeCamera()
+    (tmp_path / "episode_before" / "frames").mkdir(parents=True)
+    (tmp_path / "episode_before" / "frames" / "frame_000001.jpg").write_bytes(bytes(2_000_000))
+    room = module.room_for(tmp_path, 6.0)
+    assert 3_900_000 < room <= 4_000_000
+    recorder = Recorder(tmp_path, camera, most_bytes=room)
+    recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
+    for _ in range(20):
+        camera.push(picture)
+        time.sleep(0.03)
+    until(lambda: recorder.failure)
+    folder = recorder.close()
+    assert "no room is left of what episodes may take here: fetch them" in recorder.failure
+    taken = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
+    assert 1_500_000 < taken < 4_000_000 and recorder.frames < 20
+    assert content_of(folder)["metadata"]["fault"] == recorder.failure
+    with pytest.raises(EpisodeError, match="or delete some"):
+        Recorder(tmp_path, camera, most_bytes=module.room_for(tmp_path, 6.0))
+    assert left_in(tmp_path) == [folder.name, "episode_before"]
+
+
+def test_an_episode_leaves_room_to_be_packed(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "statvfs", disk_with(30_000_000))
+    assert module.room_for(tmp_path, 2000.0) == 15_000_000
+    assert module.room_for(tmp_path / "not" / "there yet", 10.0) == 10_000_000
+
+
+def test_a_car_that_was_not_armed_leaves_no_episode(tmp_path, caplog):
+    camera = FakeCamera()
+    with camera.filming(), pytest.raises(LinkError), Recorder(tmp_path, camera) as recorder:
+        until(lambda: recorder.frames)
+        raise LinkError("arming was refused")
+    assert left_in(tmp_path) == [] and (recorder.path, recorder.failure) == (None, None) and not caplog.records
+
+
 def test_a_disk_that_takes_nothing_leaves_nothing(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")

@@ -18,6 +18,7 @@ from rover_lib.onboard import service as s
 from rover_lib.onboard.drive import Report
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.plan import Settings
+from rover_lib.onboard.recording import read_controls
 from rover_lib.onboard.servo_link import LinkError
 from rover_lib.onboard.telemetry import read_log
 
@@ -286,8 +287,10 @@ def test_the_services_state(systemctl, monkeypatch):
 
 def started(systemd: Systemd, tmp_path: Path, artifact: Path) -> subprocess.Popen:
     command = [str(Path(sys.executable).with_name("rover")), "drive", str(artifact), "--world", "--service"]
+    for option, name in (("log", "flight.log"), ("json", "drive.json"), ("record", "episodes")):
+        command += [f"--{option}", str(tmp_path / name)]
     process = subprocess.Popen(
-        [*command, "--log", str(tmp_path / "flight.log"), "--json", str(tmp_path / "drive.json")],
+        [*command, "--record-mb", "200"],
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "WATCHDOG_USEC": "2000000"},
@@ -324,6 +327,8 @@ def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(syst
     assert "STOPPING=1" in systemd.lines
     flight = read_log(tmp_path / "flight.log")
     assert any(e.text == "armed" for e in flight.events)
+    (episode,) = (tmp_path / "episodes").iterdir()  # of the drive, not of the time before
+    assert len(read_controls(episode).times_s) == pytest.approx(len(flight.ticks["t_s"]), abs=2)
     assert flight.ticks["plan"][0] < 10 and flight.ticks["plan_age_ms"][0] <= 1e3 * Settings().fade_s
 
 
@@ -340,6 +345,7 @@ def test_a_service_that_nobody_armed_ends_without_having_moved(systemd, tmp_path
     assert "STOPPING=1" in systemd.lines and not any("driving" in line for line in systemd.lines)
     flight = read_log(tmp_path / "flight.log")
     assert len(flight.ticks["t_s"]) == 0 and not any(e.text == "armed" for e in flight.events)
+    assert not (tmp_path / "episodes").exists()
 
 
 @pytest.mark.parametrize("options", [["policy.pt", "--dry-run"], ["--replay", "episode"]])
