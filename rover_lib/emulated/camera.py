@@ -240,7 +240,7 @@ class _Plugged:
                 if now < self._due_s:
                     return
                 # A driver that was late misses frames, as with a real camera.
-                self._due_s = max(self._due_s, now - camera._period_s) + camera._period_s
+                self._due_s = max(self._due_s or now, now - camera._period_s) + camera._period_s
                 jpeg = camera._jpegs[self._number % len(camera._jpegs)]
                 flags = 0x80 | 0x02 | self._number & 1  # end of header, end of frame, which of two frames it is
                 self._payload, self._whole = bytes([2, flags]) + jpeg, False
