@@ -5,7 +5,7 @@ ROVER := $(VENV)/bin/rover
 READY := $(VENV)/.ready
 NAME ?= mine
 
-.PHONY: help demo run test lint lab arm faults pi firmware flash notebooks clean
+.PHONY: help demo run test lint lab arm faults pi-fast pi firmware flash notebooks clean
 
 help:
 	@echo "make demo                                   record, train, quantize, compare, benchmark and drive in the balloon world"
@@ -14,6 +14,8 @@ help:
 	@echo "make arm NAME=demo [PEERS=1]                count a run's instructions on an emulated Cortex-A76;"
 	@echo "                                            NAME=full makes a policy of the real car's size, PEERS=1 adds other runtimes"
 	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino: about 6 minutes"
+	@echo "make pi-fast                                every playbook on an emulated Pi in a container, and what they promise,"
+	@echo "                                            proven from within: a quarter of an hour or two; root, on Debian 12"
 	@echo "make pi                                     a whole emulated Pi: kernel, camera, INT8, USB serial, servo pulses, pulled"
 	@echo "                                            cables: half an hour, the first time an hour; root, on Debian 12"
 	@echo "make firmware; make flash PORT=/dev/ttyUSB0  build the Arduino's firmware, and put it on the board"
@@ -53,6 +55,11 @@ arm: $(READY)
 
 faults: $(READY)
 	$(ROVER) faults runs/faults.json
+
+# The demo's artifacts are deployed.
+pi-fast: $(READY)
+	@test -f runs/demo/policy_mixed.pt || $(MAKE) demo
+	$(ROVER) pi fast runs/pi-fast.json
 
 # The demo's artifact is deployed, and its recordings are what the camera sees.
 pi: $(READY)

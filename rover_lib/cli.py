@@ -577,12 +577,31 @@ def pi() -> None:
     """Emulated Pis: the playbooks, the service and its faults on real Debian arm64 systems. Needs root, and Debian."""
 
 
+@pi.command("fast")
+@click.argument("output", type=FILE, default="runs/pi-fast.json")
+@click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifacts are deployed.")
+@click.pass_context
+def pi_fast(ctx: click.Context, output: Path, demo: Path) -> None:
+    """Run every playbook on an emulated Pi in a container, and prove from within what they promise.
+
+    Real systemd and sshd, aarch64 programs, the real firmware on an emulated Arduino. OUTPUT is JSON, what the
+    playbooks said is beside it; exit code 1 if anything is not as expected.
+    """
+    from rover_lib.emulated.fast import run_fast
+
+    outcome = run_fast(output, demo, say=click.echo)
+    for gate in outcome.metrics.get("gates", []):
+        click.echo(f"{'ok  ' if gate['holds'] else 'FAIL'}  {gate['gate']}: {gate['wanted']}")
+    for sentence in outcome.wrong:
+        click.echo(f"rover: {sentence}", err=True)
+    click.echo(f"{'not as expected' if outcome.wrong else 'as expected'}: {output}")
+    ctx.exit(1 if outcome.wrong else 0)
+
+
 @pi.command("whole")
 @click.argument("output", type=FILE, default="runs/pi.json")
 @click.option("--artifact", type=FILE, default="runs/demo/policy_static.pt", show_default=True, help="To deploy.")
-@click.option(
-    "--recordings", type=FILE, default="runs/demo/episodes", show_default=True, help="What the camera shows."
-)
+@click.option("--recordings", type=FILE, default="runs/demo/episodes", show_default=True, help="What the camera shows.")
 @click.option("--fresh", is_flag=True, help="Provision anew, even if the cache has a card that was provisioned so.")
 @click.pass_context
 def pi_whole(ctx: click.Context, output: Path, **options: Any) -> None:
