@@ -313,7 +313,7 @@ class Machine:
         layer: Path | None = None,
         slow: float = 1.0,
         drives: Sequence[Path] = (),
-        nice: int = 5,
+        nice: int = 0,
     ):
         if not 1 <= slow <= SLOWEST:
             raise MachineError(f"the machine's clock can run 1 to {SLOWEST} times slower, found {slow:g}")

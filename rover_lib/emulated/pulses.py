@@ -1,17 +1,54 @@
-"""What was commanded on one machine, against what the servo pins did on another's clock."""
+"""What an emulated Arduino's servo pins did, against what was commanded on another machine with another clock."""
 
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.telemetry import Flight
-from rover_lib.playground.arduino import PinEvent
+from rover_lib.playground.arduino import Arduino, PinEvent
 from rover_lib.playground.pins import NEUTRAL_US, PERIOD_US, STEP_US
 
 # A command counts from the next pulse that begins after it has come, sent anew if need be (drive.RESEND_S), until that
 # of the next command. So a pulse is one of the commands of the last 33 + 18 + 21 ms and some for the serial line.
 HELD_S = 0.1
+ERROR_S = 0.02  # of one clock seen from the other, over ssh: 5 ms by what is read, and half of how long that takes
+READ_S = 0.2  # between readings of the pins
+
+
+class Pins:
+    """Everything that an Arduino's pins do, from now on; a context manager."""
+
+    def __init__(self, board: Arduino):
+        self._board = board
+        self._events: list[PinEvent] = []
+        self._done = threading.Event()
+        self._failure: RoverError | None = None
+        self._thread = threading.Thread(target=self._run, name="pins", daemon=True)
+
+    def __enter__(self) -> "Pins":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def since(self, at_s: float) -> list[PinEvent]:
+        """What happened since then. Raises ArduinoError if it has ended."""
+        if self._failure:
+            raise self._failure
+        return [e for e in self._events[:] if e.monotonic_s >= at_s]
+
+    def _run(self) -> None:
+        while not self._done.wait(READ_S):
+            try:
+                self._events += self._board.pulses()
+            except RoverError as error:
+                self._failure = error
+                return
 
 
 def compare(
@@ -25,7 +62,7 @@ def compare(
     pulse in their time. distinct: values among the commands: a servo that stands still proves little.
     """
     sent_s = host_s(flight.ticks["t_s"] + float(flight.header["start_monotonic_s"]))
-    held_s = HELD_S * slow
+    held_s, error_s = HELD_S * slow, ERROR_S * slow
     result: dict[str, Any] = {"commands": len(sent_s), "pulses": 0, "worst_us": None, "unseen": 0, "distinct": {}}
     worst: list[float] = []
     for pin in PERIOD_US:
@@ -38,11 +75,11 @@ def compare(
         # From the first command until the last; before and after, the pins are in neutral.
         driven = np.flatnonzero((rose_s > sent_s[0] + held_s) & (rose_s < sent_s[-1]))
         for i in driven:
-            choice = commanded[(sent_s > rose_s[i] - held_s) & (sent_s <= rose_s[i])]
+            choice = commanded[(sent_s > rose_s[i] - held_s) & (sent_s <= rose_s[i] + error_s)]
             worst.append(float(np.abs(choice - us[i]).min()) if len(choice) else np.inf)
         result["pulses"] += len(driven)
         for at_s, wanted in zip(sent_s[:-3], commanded[:-3], strict=True):
-            caused = us[(rose_s > at_s) & (rose_s <= at_s + held_s)]
+            caused = us[(rose_s > at_s - error_s) & (rose_s <= at_s + held_s)]
             result["unseen"] += not len(caused)
             worst.append(float(np.abs(caused - wanted).min()) if len(caused) else np.inf)
     result["worst_us"] = round(max(worst), 2) if worst and np.isfinite(max(worst)) else None

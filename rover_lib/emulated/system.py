@@ -235,20 +235,16 @@ def _personalize(root: Path, public_key: str) -> None:
 
 @contextlib.contextmanager
 def in_cgroup(name: str) -> Iterator[Callable[[], None]]:
-    """A control group of its own, in each hierarchy, for a process to enter before it becomes something else.
+    """A control group of its own, for a process to enter before it becomes something else.
 
     Without one, the systemds of two containers would take each other's processes for theirs. It is removed afterwards,
-    with what is left in it killed.
+    with what is left in it killed. Of cgroup v1's controllers none: its cpu lets nobody in who is real-time.
     """
     mounts = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
-    tops = [Path(m[1]) for m in mounts if m[2] in ("cgroup", "cgroup2")]
-    folders = [top / name for top in tops]
+    folders = [Path(m[1], name) for m in mounts if m[2] == "cgroup2" or (m[2] == "cgroup" and "name=" in m[3])]
     try:
         for folder in folders:
             folder.mkdir(exist_ok=True)
-            for setting in ("cpuset.cpus", "cpuset.mems"):  # a cpuset of cgroup v1 takes nobody until it has both
-                if (folder / setting).exists() and not (folder / setting).read_text().strip():
-                    (folder / setting).write_text((folder.parent / setting).read_text())
     except OSError as error:
         remove_cgroups(folders)
         raise EmulationError(f"no control group can be made ({error}); is this a container without rights?") from None
