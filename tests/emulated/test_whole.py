@@ -1,6 +1,7 @@
 """The whole emulated Pi, without booting it: QEMU's protocol, the USB camera's, and pulses against commands."""
 
 import json
+import signal
 import socket
 import struct
 import threading
@@ -16,6 +17,7 @@ from rover_lib.emulated.camera import UsbCamera
 from rover_lib.emulated.machine import MachineError, Qmp
 from rover_lib.emulated.pulses import compare, stopped
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.stage import read_stage
 from rover_lib.onboard.telemetry import Flight
 from rover_lib.playground.arduino import PinEvent
 
@@ -103,6 +105,31 @@ def test_what_is_missing_is_said_in_a_sentence(monkeypatch, tmp_path):
         machine.Machine(machine.Card(tmp_path), tmp_path, slow=0)
     with pytest.raises(RoverError, match="no recorded frames"):
         whole._pictures(tmp_path)
+
+
+def test_a_report_is_left_where_a_step_fails_too(monkeypatch, tmp_path):
+    def fails():
+        raise MachineError("no card for a test")
+
+    monkeypatch.setattr(whole, "card", fails)
+    monkeypatch.setattr(whole.arduino, "missing_packages", list)
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
+    with pytest.raises(RoverError, match="no artifact to deploy"):
+        whole.run_whole(tmp_path / "pi.json", tmp_path / "none.pt", tmp_path)
+    (tmp_path / "policy.pt").write_bytes(b"x")
+    monkeypatch.setattr(whole, "content_hash", lambda path: "abc")
+    said = []
+    outcome = whole.run_whole(tmp_path / "pi.json", tmp_path / "policy.pt", tmp_path, say=said.append)
+    assert outcome.wrong == ["no card for a test"]
+    written = read_stage(tmp_path / "pi.json", "pi")
+    assert written["metrics"]["wrong"] == outcome.wrong
+    assert [s["step"] for s in written["metrics"]["steps"]] == ["the card, as flashed"]
+    assert not list((tmp_path / "cache").iterdir())
+
+
+def test_sigterm_ends_a_run_as_ctrl_c_does():
+    with pytest.raises(KeyboardInterrupt, match="SIGTERM"), whole._interruptible():
+        signal.raise_signal(signal.SIGTERM)
 
 
 def test_frames_for_vivid_are_the_recorded_ones(tmp_path):

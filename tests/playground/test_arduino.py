@@ -294,3 +294,15 @@ def gone(pid):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:
         return True
+
+
+@pytest.mark.emulated
+@needs.simavr
+def test_a_slow_arduino_is_the_same_by_its_own_clock():
+    with Arduino(transmitter=REST_US, slow=4) as board:
+        time.sleep(1.2)
+        pulses = [e for e in board.pulses() if e.pin == "steering" and e.kind == "pulse"][2:]
+    assert len(pulses) >= 6
+    assert all(abs(e.period_us - 21316) < 2 for e in pulses)
+    apart_s = [b.monotonic_s - a.monotonic_s for a, b in pairwise(pulses)]
+    assert sorted(apart_s)[len(apart_s) // 2] == pytest.approx(4 * 0.021316, rel=0.01)
