@@ -112,8 +112,8 @@ def run_whole(
             outcome.wrong.append(str(error))
         if outcome.wrong:
             kept.mkdir(parents=True)
-            for file in Path(scratch).glob("*.log"):
-                shutil.copy(file, kept)
+            for file in Path(scratch).rglob("*.log"):
+                shutil.copy(file, kept / "-".join(file.relative_to(scratch).parts))
             outcome.metrics["kept"] = str(kept)
     outcome.metrics["wrong"] = outcome.wrong
     outcome.write(output)
