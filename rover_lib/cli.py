@@ -416,6 +416,7 @@ def _drive(
     from rover_lib.onboard import drive as d
     from rover_lib.onboard import watch as w
     from rover_lib.onboard.camera import Camera
+    from rover_lib.onboard.host import default_log
     from rover_lib.onboard.params import params
     from rover_lib.onboard.pilot import ReplayPilot
     from rover_lib.onboard.plan import Settings
@@ -433,7 +434,7 @@ def _drive(
         status = stack.enter_context(StatusLine(lambda: report.status, sys.stderr))
         logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status.handler], force=True)
         limits = {"max_bytes": int(p["flight_log"]["max_mb"] * 1e6), "keep": p["flight_log"]["keep"]}
-        path = log_file or d.default_log()
+        path = log_file or default_log()
         unended = w.unended(path)
         log = stack.enter_context(FlightLog(path, header=header, **limits))
         if unended:
@@ -536,7 +537,7 @@ def doctor(ctx: click.Context, artifact: Path | None, camera: str, port: str, hz
     driving cannot do without; warnings do not count.
     """
     from rover_lib.onboard.doctor import examine
-    from rover_lib.onboard.drive import default_log
+    from rover_lib.onboard.host import default_log
 
     checks = []
     for check in examine(artifact, camera=camera, port=port, rate_hz=hz, log_folder=default_log().parent):
@@ -721,8 +722,7 @@ def status(releases: Any, as_json: bool) -> None:
     if as_json:
         import socket
 
-        from rover_lib.onboard.drive import default_log
-        from rover_lib.onboard.host import Host
+        from rover_lib.onboard.host import Host, default_log
         from rover_lib.onboard.service import ServiceError, state_of
 
         try:

@@ -388,9 +388,3 @@ def drive_artifact(
             children=policy.pids,
             **ends,
         )
-
-
-def default_log() -> Path:
-    """Where a drive's flight log goes: systemd's state folder of the service, or the user's."""
-    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(os.environ.get("STATE_DIRECTORY") or Path(home) / "rover") / "flight.log"

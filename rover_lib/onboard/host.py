@@ -1,5 +1,6 @@
 """What the machine says about itself: temperature, clock, throttling, memory. What it cannot tell is None, not 0."""
 
+import os
 import resource
 import subprocess
 import sys
@@ -88,3 +89,9 @@ def _number_in(path: Path) -> float | None:
         return float(_text_in(path) or "")
     except ValueError:
         return None
+
+
+def default_log() -> Path:
+    """Where a drive's flight log goes: systemd's state folder of the service, or the user's."""
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(os.environ.get("STATE_DIRECTORY") or Path(home) / "rover") / "flight.log"
