@@ -13,6 +13,8 @@ import jinja2
 import pytest
 import yaml
 
+from rover_lib.onboard.watch import PRIORITY
+
 ROOT = Path(__file__).parents[2]
 ANSIBLE = ROOT / "ansible"
 ROLE = ANSIBLE / "roles" / "rover"
@@ -257,6 +259,11 @@ def test_a_service_that_records_does_so_in_its_own_folder_and_may_finish(units):
     assert line.endswith(" --threads 2 --record /var/lib/rover-drive/episodes --record-mb 2000")
     assert "StateDirectory=rover-drive\n" in recording and "TimeoutStopSec=90\n" in recording
     assert "--record" not in rendered("rover-drive.service")
+
+
+def test_the_service_may_have_the_priority_that_it_asks_for():
+    """The kernel refuses one above the limit, and the loop would run at ordinary priority without a sound."""
+    assert f"LimitRTPRIO={PRIORITY}\n" in rendered("rover-drive.service")
 
 
 def test_the_service_says_what_the_command_line_takes(units):
