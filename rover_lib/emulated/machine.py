@@ -301,8 +301,7 @@ class Machine:
 
     card: what it boots from. folder: for its console, its own disk and sockets; emptied of the last two at the end.
     layer: a disk to build on, of an earlier machine on the same card, instead of the card itself. slow: so many times
-    slower than this host's its clock runs, 1 to 60. drives: more disks, read only: /dev/vdb, /dev/vdc, ... nice: of its
-    process.
+    slower than this host's its clock runs, 1 to 60. drives: more disks, read only: /dev/vdb, /dev/vdc, ...
     """
 
     def __init__(
@@ -313,7 +312,6 @@ class Machine:
         layer: Path | None = None,
         slow: float = 1.0,
         drives: Sequence[Path] = (),
-        nice: int = 0,
     ):
         if not 1 <= slow <= SLOWEST:
             raise MachineError(f"the machine's clock can run 1 to {SLOWEST} times slower, found {slow:g}")
@@ -330,7 +328,7 @@ class Machine:
         try:
             base, kind = (layer, "qcow2") if layer else (card.disk, "raw")
             _run(["qemu-img", "create", "-q", "-f", "qcow2", "-b", base.resolve(), "-F", kind, self.disk])
-            self._start(drives, nice)
+            self._start(drives)
         except BaseException:
             self.close()
             raise
@@ -346,7 +344,7 @@ class Machine:
         """Of QEMU's process."""
         return self._process.pid if self._process else None
 
-    def _start(self, drives: Sequence[Path], nice: int) -> None:
+    def _start(self, drives: Sequence[Path]) -> None:
         machine = ["-cpu", CPU, "-smp", str(CORES), "-m", str(MEMORY_MB), "-display", "none", "-nodefaults"]
         tree = self._work / "tree.dtb"
         _run(["qemu-system-aarch64", "-machine", f"virt,dumpdtb={tree}", *machine])
@@ -378,8 +376,6 @@ class Machine:
             start_new_session=True,  # a terminal's ^C is not for it
             preexec_fn=_end_with_parent,
         )
-        with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, nice)
         end = time.monotonic() + QMP_S
         while self._qmp is None:
             try:
