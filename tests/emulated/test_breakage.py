@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from rover_lib.emulated import breakage
-from rover_lib.emulated.breakage import FAULTS, Disk, Line, line_of, results_of, wanted_of, wrong_rows
+from rover_lib.emulated.bench import Disk, Line, line_of
+from rover_lib.emulated.breakage import FAULTS, wrong_rows
+from rover_lib.emulated.fleet import results_of, wanted_of
 from rover_lib.emulated.system import EmulationError
 from rover_lib.onboard.params import params
 
