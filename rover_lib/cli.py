@@ -581,8 +581,9 @@ def pi() -> None:
 @pi.command("fast")
 @click.argument("output", type=FILE, default="runs/pi-fast.json")
 @click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifacts are deployed.")
+@click.option("--faults/--no-faults", default=True, help="Leave out a deployment's faults and the fleet.")
 @click.pass_context
-def pi_fast(ctx: click.Context, output: Path, demo: Path) -> None:
+def pi_fast(ctx: click.Context, output: Path, demo: Path, faults: bool) -> None:
     """Run every playbook on an emulated Pi in a container, and prove from within what they promise.
 
     Real systemd and sshd, aarch64 programs, the real firmware on an emulated Arduino. OUTPUT is JSON, what the
@@ -590,7 +591,7 @@ def pi_fast(ctx: click.Context, output: Path, demo: Path) -> None:
     """
     from rover_lib.emulated.fast import run_fast
 
-    outcome = run_fast(output, demo, say=click.echo)
+    outcome = run_fast(output, demo, faults=faults, say=click.echo)
     for gate in outcome.metrics.get("gates", []):
         click.echo(f"{'ok  ' if gate['holds'] else 'FAIL'}  {gate['gate']}: {gate['wanted']}")
     for sentence in outcome.wrong:

@@ -58,8 +58,13 @@ class FaultError(RoverError):
 # ---- the policy, and what tells it what to do
 
 
-def make_artifact(path: Path) -> None:
-    """An artifact with constant plans that obeys the corner of the picture, see PLAIN to OTHER."""
+def make_artifact(
+    path: Path, *, camera: str = "front", size: tuple[int, int] = (48, 96), engine: str | None = None
+) -> None:
+    """An artifact with constant plans that obeys the corner of the picture, see PLAIN to OTHER.
+
+    camera, size: its name, and height and width of what the policy looks at. engine: in the manifest; this machine's.
+    """
     import torch
 
     class Obedient(torch.nn.Module):
@@ -88,15 +93,15 @@ def make_artifact(path: Path) -> None:
                 plan = self.other.clone()
             return plan
 
-    height, width = 48, 96
+    height, width = size
     module = torch.jit.script(Obedient().eval())
     names = ["steering", "throttle"]
     manifest = {
         "schema": SCHEMA,
         "mode": "fp32",
         "scheme": "float",
-        "engine": torch.backends.quantized.engine,
-        "cameras": [{"name": "front", "height": height, "width": width}],
+        "engine": engine or torch.backends.quantized.engine,
+        "cameras": [{"name": camera, "height": height, "width": width}],
         "state_names": names,
         "action_names": names,
         "chunk": CHUNK,
@@ -112,7 +117,7 @@ def make_artifact(path: Path) -> None:
     frames = np.zeros((1, height, width, 3), np.uint8)
     parity = {
         "state": np.zeros((1, 2), np.float32),
-        "frame_front": frames,
+        f"frame_{camera}": frames,
         "chunk": np.full((1, CHUNK, 2), PLAN, np.float32),
     }
     save_artifact(path, module, manifest, parity)
