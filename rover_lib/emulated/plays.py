@@ -132,6 +132,7 @@ def environment(folder: Path) -> dict[str, str]:
     """Of Ansible: nothing of the user's own settings, and its files in a folder."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("ANSIBLE")}
     own = {"ANSIBLE_HOME": str(folder), "ANSIBLE_NOCOLOR": "1", "ANSIBLE_LOCAL_TEMP": str(folder / "local")}
+    own["ANSIBLE_TIMEOUT"] = "120"  # sudo, emulated on a busy machine, took more than the usual 10 s
     return {**kept, **own, "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}"}
 
 
