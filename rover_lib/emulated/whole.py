@@ -175,8 +175,6 @@ class _Run:
                 )
             with self.step("drive.yml: doctor, start, arm, drive, stop, fetch") as row:
                 row["recap"] = self.drive(metrics)
-            with self.step("rover doctor"):
-                metrics["doctor"] = self.doctor()
             self.fault("USB serial unplugged while driving, by QMP", self.pi.unplug, lambda: self.pi.plug(board.port))
             with self.step("another camera, on USB"):
                 self.sudo(HIDE)
@@ -253,7 +251,7 @@ class _Run:
         for name, found in (("ticks", summary["ticks"]), *((n, metrics["drive"][n]) for n in ("inferences", "frames"))):
             if found < g[name]:
                 self.wrong(f"{found} {name} in the drive, at least {g[name]} are wanted")
-        if min(pulses["distinct"].values(), default=0) < g["distinct"]:
+        if any(pulses["distinct"].get(pin, 0) < wanted for pin, wanted in g["distinct"].items()):
             self.wrong(f"the servos hardly moved: {pulses['distinct']} different pulses were commanded")
         return recap
 
@@ -282,7 +280,8 @@ class _Run:
             put_back()
             self.sudo(f"systemctl stop {UNIT}")
             self.until(f"test -e {PORT} -a -e {CAMERA}", f"{PORT} or {CAMERA} is not back")
-            row["doctor"] = self.doctor()["drives"]
+            self.outcome.metrics["doctor"] = self.doctor()
+            row["doctor"] = self.outcome.metrics["doctor"]["drives"]
             self.outcome.metrics["faults"].append(dict(row))
             if not row["drove"] or not row["neutral"] or row["after_line_ms"] > self.gates["neutral_ms"]:
                 self.wrong(f"{name}: the pins did not go to neutral as promised: {row}")
