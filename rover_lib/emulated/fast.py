@@ -96,8 +96,8 @@ def run_fast(
 ) -> Outcome:
     """All of it; the report is written to `output` whatever fails.
 
-    demo: a run's folder with ARTIFACTS. faults: of deployments, and the fleet, too. say: told a line for each step. Raises RoverError where it cannot begin: no
-    root, packages that cannot be installed, no artifacts.
+    demo: a run's folder with ARTIFACTS. faults: of deployments, and the fleet, too. say: told a line for each step.
+    Raises RoverError where it cannot begin: no root, packages that cannot be installed, no artifacts.
     """
     output, demo = Path(output), Path(demo)
     artifacts = [demo / name for name in ARTIFACTS]
@@ -457,7 +457,8 @@ def sandbox(pi: Container) -> dict[str, Any]:
     try:
         for home in homes:
             (pi.root / home.lstrip("/")).chmod(0o755)
-        inside = _probe(pi, "rover-probe.service", unit_for(pi, argv))
+        installed = (pi.root / "etc/systemd/system" / UNIT).read_text()
+        inside = _probe(pi, "rover-probe.service", unit_for(installed, argv))
         plain = ["[Service]", "Type=oneshot", "User=rover", "StateDirectory=rover-drive", f"ExecStart={escaped(argv)}"]
         outside = _probe(pi, "rover-probe-outside.service", "\n".join(plain) + "\n")
     finally:
@@ -487,9 +488,8 @@ def sandbox(pi: Container) -> dict[str, Any]:
     }
 
 
-def unit_for(pi: Container, argv: str) -> str:
-    """The drive service as it is installed, with another program, that starts once and has nobody to tell."""
-    text = (pi.root / "etc/systemd/system" / UNIT).read_text()
+def unit_for(text: str, argv: str) -> str:
+    """The drive service's unit with another program, that is started once and has nobody to tell."""
     drop = ("ExecStart", "ExecStartPre", "NotifyAccess", "WatchdogSec", "WatchdogSignal", "Restart", "RestartSec",
             "ConditionPathExists", "StartLimitIntervalSec", "StartLimitBurst", "Type", "WantedBy")  # fmt: skip
     lines = [line for line in text.splitlines() if line.partition("=")[0] not in drop]

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jinja2
@@ -178,6 +179,60 @@ def test_an_episode_that_does_not_come_home_stays(tmp_path):
     found = play(tmp_path, [entry("episode")], rover_episode=str(episode), rover_fetched=str(tmp_path / "home"))
     assert found.returncode == 2 and episode.is_dir()
     assert set(Path("/var/tmp").iterdir()) <= before
+
+
+# Preflight: what a machine says of itself, and what is said of it then
+
+
+PI = {
+    "architecture": "aarch64",
+    "os_family": "Debian",
+    "distribution": "Debian",
+    "distribution_version": "12.9",
+    "distribution_major_version": "12",
+    "python_version": "3.11.2",
+    "memtotal_mb": 7900,
+    "mounts": [{"mount": "/", "size_available": 20_000_000_000}],
+}
+
+
+def preflight(tmp_path: Path, **facts: object) -> subprocess.CompletedProcess:
+    clock = {"epoch": str(int(time.time())), "iso8601": "now"}
+    nowhere = str(tmp_path / "nothing installed")
+    return play(tmp_path, [entry("main")], ansible_facts={**PI, "date_time": clock, **facts}, rover_home=nowhere)
+
+
+def test_a_pi_can_be_a_rover(tmp_path):
+    assert preflight(tmp_path).returncode == 0
+    trixie = {"distribution_version": "13.1", "distribution_major_version": "13", "python_version": "3.13.5"}
+    assert preflight(tmp_path, **trixie).returncode == 0
+
+
+@pytest.mark.parametrize(
+    "facts, sentence",
+    [
+        ({"architecture": "armv7l"}, "localhost is armv7l, a rover is aarch64: flash the 64-bit Raspberry Pi OS"),
+        ({"distribution_version": "11.8", "distribution_major_version": "11"}, "localhost runs Debian 11.8: flash"),
+        ({"os_family": "RedHat", "distribution": "Fedora"}, "localhost runs Fedora 12.9: flash Raspberry Pi OS"),
+        ({"python_version": "3.9.2"}, "localhost has Python 3.9.2, torch 2.8 is wanted for 3.11 to 3.13"),
+        ({"python_version": "3.14.0"}, "localhost has Python 3.14.0, torch 2.8 is wanted for 3.11 to 3.13"),
+        (
+            {"mounts": [{"mount": "/", "size_available": 900_000_000}]},
+            "localhost has 900 MB free on /, 2500 are needed",
+        ),
+        ({"memtotal_mb": 430}, "localhost has 430 MB of memory, the policy needs 436"),
+        ({"date_time": {"epoch": "1483228800", "iso8601": "2017-01-01T00:00:00Z"}}, "thinks that it is 2017-01-01"),
+    ],
+)
+def test_a_machine_that_cannot_is_told_why(tmp_path, facts, sentence):
+    found = preflight(tmp_path, **facts)
+    assert found.returncode == 2 and sentence in " ".join(found.stdout.split()), found.stdout
+    assert "changed=0" in found.stdout
+
+
+def test_a_card_that_is_full_because_of_us_is_not_refused(tmp_path):
+    (tmp_path / "nothing installed" / "venv").mkdir(parents=True)
+    assert preflight(tmp_path, mounts=[{"mount": "/", "size_available": 900_000_000}]).returncode == 0
 
 
 # The units, as they are on a rover
