@@ -11,6 +11,7 @@ MAY = {
     "onboard": {"onboard"},
     "workshop": {"onboard", "workshop"},
     "playground": {"onboard", "workshop", "playground"},
+    "emulated": {"onboard", "workshop", "playground", "emulated"},
 }
 ONBOARD_NEEDS = {"torch", "numpy", "cv2", "serial", "yaml", "systemd_watchdog", "rover_lib"}
 
