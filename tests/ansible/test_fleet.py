@@ -24,6 +24,14 @@ case $1 in
   start) [ ! -e {folder}/parity-fails ] ;;
 esac
 """
+LOSING = """#!/bin/sh
+{rover} "$@"
+code=$?
+case "$*" in
+  *{name}/models*{at}*) touch {mark} ;;
+esac
+exit $code
+"""
 
 pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="the playbooks give files to root"),
@@ -44,6 +52,7 @@ class Fleet:
             (folder / "bin" / name).write_text(text)
             (folder / "bin" / name).chmod(0o755)
         self.service("inactive")
+        self.environment = {"ANSIBLE_CONNECTION_PLUGINS": str(Path(__file__).parent / "connections")}
         self.lines = {name: f"{name} rover_models={folder}/{name}/models" for name in NAMES}
 
     def service(self, active: str, text: str = "") -> None:
@@ -51,6 +60,16 @@ class Fleet:
 
     def unreachable(self, name: str) -> None:
         self.lines[name] = f"{name} ansible_connection=ssh ansible_host=127.0.0.1 ansible_port=9"
+
+    def lost(self, name: str, at: str) -> None:
+        """It is out of reach for good, once a file of that name is to travel, or after the rover command of that name."""
+        mark, rover = self.folder / "out-of-reach", self.folder / "home" / "venv" / "bin" / "rover"
+        mark.unlink(missing_ok=True)
+        self.environment |= {"LOST_AT": at, "LOST": str(mark)}
+        rover.unlink()
+        rover.write_text(LOSING.format(name=name, at=at, mark=mark, rover=BINARY / "rover"))
+        rover.chmod(0o755)
+        self.lines[name] = f"{name} rover_models={self.folder}/{name}/models ansible_connection=lost"
 
     def releases(self, name: str) -> Releases:
         return Releases(self.folder / name / "models", check=lambda name: None)
@@ -78,6 +97,7 @@ class Fleet:
             "PATH": f"{self.folder}/bin:{BINARY}:{os.environ['PATH']}",
             "ANSIBLE_HOME": str(self.folder / "ansible"),
             "ANSIBLE_NOCOLOR": "1",
+            **self.environment,
         }
         command += [*options, "-e", json.dumps(given)]
         return subprocess.run(list(map(str, command)), capture_output=True, text=True, env=env)
@@ -159,6 +179,21 @@ def test_one_that_does_not_answer_is_reported_and_holds_up_no_other(fleet, artif
     assert "does not answer" in rows["second"]
     for name in ("canary", "third"):
         assert "yes" in rows[name] and content_hash(artifacts["static"])[:12] in rows[name] and "static" in rows[name]
+
+
+@pytest.mark.parametrize("at", ["part-0000", "stage", "prune"])
+def test_one_that_is_lost_while_it_is_deployed_to_is_reported_and_stops_the_rest(fleet, artifacts, at):
+    fleet.lost("second", at)
+    done = fleet.deploy(artifacts["static"], rover_batches=[1, 1, 1])
+    assert done.returncode != 0
+    assert (fleet.folder / "out-of-reach").exists(), done.stdout
+    assert "canary: deployed" in done.stdout and "third: untouched: second failed before" in done.stdout, done.stdout
+    assert "second: failed: it does not answer any more" in done.stdout, done.stdout
+    assert not (fleet.folder / "third").exists()
+    (fleet.folder / "out-of-reach").unlink()
+    fleet.lost("second", "never")
+    assert fleet.deploy(artifacts["static"], rover_batches=[1, 1, 1]).returncode == 0
+    assert all(fleet.releases(n).status()["healthy"] for n in NAMES)
 
 
 def test_status_says_what_is_wrong(fleet, artifacts):
