@@ -99,7 +99,7 @@ def _power_cut(
 
 
 def _arriving(bench: Bench, disk: Disk) -> bool:
-    return bool(disk.arrived) and not disk.complete(bench.about)
+    return any(name.startswith("part-") for name in disk.arrived) and not disk.complete(bench.about)
 
 
 def _written_in_part(bench: Bench, disk: Disk) -> bool:
@@ -117,11 +117,11 @@ _power_cut(
 )
 _power_cut("before fsync", _written_in_part, "while the new release's policy.pt is written")
 _power_cut(
-    "after fsync",
-    lambda b, d: bool(d.staging.get("policy.pt.sha256")) and not d.released,
-    "once its bytes are on the disk, and its folder has no name yet",
+    "before the release has its name",
+    lambda b, d: d.staging.get(POLICY) == b.about["bytes"] and not d.released,
+    "once all its bytes are written, while they are looked at",
 )
-_power_cut("after the release has its name", lambda b, d: d.released and not d.switched, "once its folder has its name")
+_power_cut("after fsync and rename", lambda b, d: d.released and not d.switched, "once its folder has its name")
 _power_cut(
     "in the health check before the switch",
     lambda b, d: d.released and not d.switched,
