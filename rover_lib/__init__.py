@@ -1,6 +1,6 @@
 """Put a learned driving policy (LeRobot ACT) on a small computer.
 
-Imports go one way: onboard <- workshop <- playground <- cli.
+Imports go one way: onboard <- workshop <- playground <- emulated <- cli.
 """
 
 import os
