@@ -186,10 +186,15 @@ def _fill_while_staging(bench: Bench) -> None:
             while True:
                 f.write(bytes(1 << 20))
 
-    bench.deploy_until(lambda disk: bool(disk.staging), fill)
+    bench.deploy_until(lambda disk: disk.complete(bench.about) and bool(disk.staging), fill)
 
 
-@_fault("a byte flipped on the way", LOST, "in the network, once a part has come through: ssh notices", fresh=True)
+@_fault(
+    "a byte flipped on the way",
+    f"transfer mechanism failed|{LOST}",
+    "in the network, once a part has come through: ssh notices and ends, and Ansible may send it again",
+    fresh=True,
+)
 def _flip_on_the_wire(bench: Bench) -> None:
     bench.deploy_until(lambda disk: _arriving(bench, disk), lambda: bench.wire.flip(after=1 << 20))
 
