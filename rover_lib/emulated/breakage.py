@@ -45,6 +45,7 @@ from rover_lib.onboard.release import ORIGIN, POLICY, SPARE_BYTES
 ROOM = 4 << 20  # bytes free on a full disk
 TRIES = 2  # of a row whose moment was missed
 WORKERS = 2  # rovers that are broken at the same time; each keeps a core busy
+RETRY_S = 30
 NOBODY = 9  # a port on which no sshd listens
 
 Say = Callable[[str], None]
@@ -254,7 +255,8 @@ def _lose_ssh_in_check(bench: Bench) -> None:
     "network silent in the transfer", LOST, "out of reach: no packet comes through, and no connection ends", fresh=True
 )
 def _go_silent(bench: Bench) -> None:
-    bench.deploy_until(lambda disk: _arriving(bench, disk), bench.wire.silence)
+    # Of each try to reach it again; ssh's own limit is that of inventory.ini.
+    bench.deploy_until(lambda disk: _arriving(bench, disk), bench.wire.silence, ansible_ssh_timeout=RETRY_S)
 
 
 @_fault(
