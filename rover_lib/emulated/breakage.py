@@ -143,7 +143,7 @@ _power_cut(
 _power_cut(
     "between switch and restart",
     lambda b, d: d.remembered,
-    "once it was proven again, before anything restarts",
+    "once it was proven again; a power cut ends a service too, which then loads what current points to",
     fresh=False,
 )
 
