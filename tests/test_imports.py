@@ -1,4 +1,4 @@
-"""One direction of imports: onboard <- workshop <- playground <- emulated <- cli; the Pi's part needs nothing of a workstation."""
+"""Imports go one way, onboard <- workshop <- playground <- emulated; the Pi's part needs nothing of a workstation."""
 
 import ast
 import sys

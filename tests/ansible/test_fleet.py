@@ -62,7 +62,7 @@ class Fleet:
         self.lines[name] = f"{name} ansible_connection=ssh ansible_host=127.0.0.1 ansible_port=9"
 
     def lost(self, name: str, at: str) -> None:
-        """It is out of reach for good, once a file of that name is to travel, or after the rover command of that name."""
+        """It is out of reach for good, once a file of that name is to travel, or after that rover command."""
         mark, rover = self.folder / "out-of-reach", self.folder / "home" / "venv" / "bin" / "rover"
         mark.unlink(missing_ok=True)
         self.environment |= {"LOST_AT": at, "LOST": str(mark)}

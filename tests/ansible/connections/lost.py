@@ -1,4 +1,4 @@
-"""A connection to this machine that is lost for good, once a command or a file with LOST_AT in its name is to go over it."""
+"""A connection to this machine that is lost for good, once something with LOST_AT in its name is to go over it."""
 
 import os
 from pathlib import Path
