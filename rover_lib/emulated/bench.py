@@ -136,8 +136,12 @@ def changed_artifact(artifact: Path, target: Path, **changes: Any) -> Path:
 class Bench:
     """A rover that is deployed to, and the network to it. before, target: the mode in use, and the one to be deployed.
 
-    artifacts: two that are fit to be deployed, by their mode.
+    artifacts: two that are fit to be deployed, by their mode. packed: what pack() says of them. found: the disk when
+    its power was cut.
     """
+
+    before = target = ""
+    found = Disk()
 
     def __init__(self, pi: Container, artifacts: Mapping[str, Path], folder: Path, stop: threading.Event):
         self.pi, self.artifacts, self.stop = pi, dict(artifacts), stop
@@ -147,7 +151,7 @@ class Bench:
         self.undo = contextlib.ExitStack()
         self.seconds: dict[str, float] = {}
         self.said: list[str] = []
-        self._about = {mode: pack(path, self.folder / "packed") for mode, path in self.artifacts.items()}
+        self.packed = {mode: pack(path, self.folder / "packed") for mode, path in self.artifacts.items()}
 
     def __enter__(self) -> "Bench":
         self.wire.__enter__()
@@ -172,7 +176,7 @@ class Bench:
     @property
     def about(self) -> dict[str, Any]:
         """What pack() says of the model to be deployed."""
-        return self._about[self.target]
+        return self.packed[self.target]
 
     @property
     def disk(self) -> Disk:
@@ -190,7 +194,7 @@ class Bench:
     def begin(self, fresh: bool = False) -> None:
         """Of a row: what is not in use is to be deployed. fresh: it was never on the rover."""
         current = self.releases.current or ""
-        self.before = next((mode for mode, about in self._about.items() if current.startswith(about["name"])), "")
+        self.before = next((mode for mode, about in self.packed.items() if current.startswith(about["name"])), "")
         self.target = next(mode for mode in self.artifacts if mode != self.before)
         self.seconds, self.said = {}, []
         if fresh:
@@ -323,7 +327,7 @@ class Bench:
         current = self.releases.current
         if current is None:
             return "none", False
-        mode = next((mode for mode, about in self._about.items() if current.startswith(about["name"])), "another")
+        mode = next((mode for mode, about in self.packed.items() if current.startswith(about["name"])), "another")
         return mode, not self.releases.wrong_with(current)
 
     def healthy(self) -> bool:
@@ -335,7 +339,7 @@ class Bench:
         """What status.yml shows, and what of it is not so: an empty string if all is."""
         line = line_of(self.play("status").output, self.pi.name)
         current = self.releases.current
-        mode = next((m for m, about in self._about.items() if (current or "").startswith(about["name"])), line.mode)
+        mode = next((m for m, about in self.packed.items() if (current or "").startswith(about["name"])), line.mode)
         wrong = [r.name[:12] for r in self.releases.all() if r.wrong and not r.current]
         is_so = {
             f"healthy is {healthy}": line.healthy == healthy,

@@ -45,7 +45,7 @@ from rover_lib.onboard.release import ORIGIN, POLICY, SPARE_BYTES
 ROOM = 4 << 20  # bytes free on a full disk
 TRIES = 2  # of a row whose moment was missed
 WORKERS = 2  # rovers that are broken at the same time; each keeps a core busy
-RETRY_S = 30
+RETRY_S = 30  # of trying to reach a rover that does not answer
 NOBODY = 9  # a port on which no sshd listens
 
 Say = Callable[[str], None]
@@ -59,7 +59,7 @@ class Fault:
     """A row. inject: makes a deployment meet it. says: what must be said of it, a regular expression. how: it is made.
 
     heal: what a human does about the cause before deploying again. fresh: the model to be deployed is not on the rover
-    yet, so that it travels; otherwise it is there, of which the deployment takes the other half.
+    yet, so that it travels; otherwise it is there from before, which is quicker.
     """
 
     name: str
@@ -248,7 +248,7 @@ def _lose_ssh_in_transfer(bench: Bench) -> dict[str, Any]:
 
 @_fault("ssh lost in the health check", LOST, "the network is cut while the rover proves the new model; it goes on")
 def _lose_ssh_in_check(bench: Bench) -> None:
-    bench.deploy_until(lambda disk: disk.released, lambda: (bench.wait_for_check(), bench.wire.cut()))
+    bench.deploy_until(lambda disk: bench.proves(), lambda: (bench.wait_for_check(), bench.wire.cut()))
 
 
 @_fault(
@@ -268,7 +268,7 @@ def _go_silent(bench: Bench) -> None:
 def _wrong_hash(bench: Bench) -> None:
     def strike() -> None:
         path = bench.incoming / ORIGIN
-        other = bench._about[bench.before]["name"]
+        other = bench.packed[bench.before]["name"]
         path.write_text(json.dumps({**json.loads(path.read_text()), "name": other[::-1]}))
 
     bench.deploy_until(lambda disk: disk.complete(bench.about), strike)
