@@ -86,7 +86,8 @@ class Container:
                 (disk / folder).mkdir(mode=0o755)
             self.root, self._upper = disk / "root", disk / "upper"
             below = ":".join(str(p) for p in (*reversed(self._below), made.root))
-            how = f"lowerdir={below},upperdir={self._upper},workdir={disk / 'work'}"
+            # redirect_dir: a folder of a layer below can be renamed, as on any disk.
+            how = f"lowerdir={below},upperdir={self._upper},workdir={disk / 'work'},redirect_dir=on"
             run(
                 ["mount", "-t", "overlay", self.machine, "-o", how, self.root],
                 f"{cache_root()} cannot hold a layered file system; put ROVER_CACHE on a plain disk",
