@@ -578,6 +578,13 @@ def pi() -> None:
     """Emulated Pis: the playbooks, the service and its faults on real Debian arm64 systems. Needs root, and Debian."""
 
 
+def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
+    for sentence in wrong:
+        click.echo(f"rover: {sentence}", err=True)
+    click.echo(f"{'not as expected' if wrong else 'as expected'}: {output}")
+    ctx.exit(1 if wrong else 0)
+
+
 @pi.command("fast")
 @click.argument("output", type=FILE, default="runs/pi-fast.json")
 @click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifacts are deployed.")
@@ -594,10 +601,7 @@ def pi_fast(ctx: click.Context, output: Path, demo: Path, faults: bool) -> None:
     outcome = run_fast(output, demo, faults=faults, say=click.echo)
     for gate in outcome.metrics.get("gates", []):
         click.echo(f"{'ok  ' if gate['holds'] else 'FAIL'}  {gate['gate']}: {gate['wanted']}")
-    for sentence in outcome.wrong:
-        click.echo(f"rover: {sentence}", err=True)
-    click.echo(f"{'not as expected' if outcome.wrong else 'as expected'}: {output}")
-    ctx.exit(1 if outcome.wrong else 0)
+    _end_pi(ctx, outcome.wrong, output)
 
 
 @pi.command("whole")
@@ -615,10 +619,7 @@ def pi_whole(ctx: click.Context, output: Path, **options: Any) -> None:
     from rover_lib.emulated.whole import run_whole
 
     outcome = run_whole(output, **options, say=click.echo)
-    for sentence in outcome.wrong:
-        click.echo(f"rover: {sentence}", err=True)
-    click.echo(f"{'not as expected' if outcome.wrong else 'as expected'}: {output}")
-    ctx.exit(1 if outcome.wrong else 0)
+    _end_pi(ctx, outcome.wrong, output)
 
 
 @main.command("arm-car")

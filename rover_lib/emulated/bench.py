@@ -193,8 +193,7 @@ class Bench:
 
     def begin(self, fresh: bool = False) -> None:
         """Of a row: what is not in use is to be deployed. fresh: it was never on the rover."""
-        current = self.releases.current or ""
-        self.before = next((mode for mode, about in self.packed.items() if current.startswith(about["name"])), "")
+        self.before = self._mode_of(self.releases.current or "", "")
         self.target = next(mode for mode in self.artifacts if mode != self.before)
         self.seconds, self.said = {}, []
         if fresh:
@@ -327,8 +326,10 @@ class Bench:
         current = self.releases.current
         if current is None:
             return "none", False
-        mode = next((mode for mode, about in self.packed.items() if current.startswith(about["name"])), "another")
-        return mode, not self.releases.wrong_with(current)
+        return self._mode_of(current, "another"), not self.releases.wrong_with(current)
+
+    def _mode_of(self, release: str, otherwise: str) -> str:
+        return next((mode for mode, about in self.packed.items() if release.startswith(about["name"])), otherwise)
 
     def healthy(self) -> bool:
         """Whether what is in use passes its parity vectors, in the service's sandbox."""
@@ -339,7 +340,7 @@ class Bench:
         """What status.yml shows, and what of it is not so: an empty string if all is."""
         line = line_of(self.play("status").output, self.pi.name)
         current = self.releases.current
-        mode = next((m for m, about in self.packed.items() if (current or "").startswith(about["name"])), line.mode)
+        mode = self._mode_of(current or "", line.mode)
         wrong = [r.name[:12] for r in self.releases.all() if r.wrong and not r.current]
         is_so = {
             f"healthy is {healthy}": line.healthy == healthy,

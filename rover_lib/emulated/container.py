@@ -34,7 +34,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rover_lib.emulated.system import USER, EmulationError, emulation, in_cgroup, run, system
+from rover_lib.emulated.system import USER, EmulationError, emulation, free_port, in_cgroup, run, system
 from rover_lib.workshop.cache import cache_root
 
 BOOT_S = 180.0  # until sshd answers; 10 on two quiet cores
@@ -65,7 +65,7 @@ class Container:
         """
         self.name = name
         self._nice = nice
-        self.port = _free_port()
+        self.port = free_port()
         self._below = tuple(layers)
         self._process: subprocess.Popen | None = None
         self._leader = 0
@@ -297,12 +297,6 @@ SSH = [
     *("-o", "UserKnownHostsFile=/dev/null", "-o", "StrictHostKeyChecking=no", "-o", "IdentitiesOnly=yes"),
     *("-o", "BatchMode=yes", "-o", f"ConnectTimeout={SSH_S:g}"),
 ]
-
-
-def _free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
 
 
 def _forget(machine: str) -> None:

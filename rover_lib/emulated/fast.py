@@ -47,12 +47,12 @@ from rover_lib.emulated import plays
 from rover_lib.emulated.breakage import break_deployments, wrong_rows
 from rover_lib.emulated.container import CAMERA, PORT, Container
 from rover_lib.emulated.fleet import fleet
-from rover_lib.emulated.system import EmulationError, emulation, require, system
-from rover_lib.emulated.whole import Pins
+from rover_lib.emulated.pulses import Pins
+from rover_lib.emulated.system import EmulationError, emulation, interruptible, require, system
 from rover_lib.onboard.params import params
+from rover_lib.onboard.service import UNIT
 from rover_lib.onboard.stage import sha256_of, write_stage
 from rover_lib.onboard.telemetry import read_log
-from rover_lib.onboard.watch import signals
 from rover_lib.playground import arduino
 from rover_lib.playground.arduino import REST_US, Arduino
 from rover_lib.playground.bench import PLAIN, make_artifact, pictures
@@ -61,7 +61,6 @@ from rover_lib.workshop.arm import install
 
 STAGE = "pi-fast"
 ROVER = "rover1"
-UNIT = "rover-drive.service"
 VENV, STATE = "/opt/rover/venv", "/var/lib/rover-drive"
 ARTIFACTS = ("policy_static.pt", "policy_mixed.pt")
 HZ = 10  # of the service: what the emulator manages on a busy machine; a Pi has 30
@@ -122,17 +121,6 @@ def run_fast(
         finally:
             outcome.write(output)
     return outcome
-
-
-@contextlib.contextmanager
-def interruptible() -> Iterator[None]:
-    """SIGTERM, SIGHUP and ^C end what is inside as ^C does, with everything put away."""
-
-    def on_signal(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    with signals(on_signal):
-        yield
 
 
 class _Run:

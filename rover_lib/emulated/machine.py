@@ -18,7 +18,6 @@ import contextlib
 import ctypes
 import gzip
 import json
-import os
 import shutil
 import signal
 import socket
@@ -31,9 +30,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rover_lib.emulated.system import USER, System, emulation, system
+from rover_lib.emulated.system import USER, System, emulation, free_port, make_sure, system
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.arm import fetch_packages, install
+from rover_lib.workshop.arm import fetch_packages
 from rover_lib.workshop.cache import cached_folder, key_of
 
 PACKAGES = {  # commands, and the Debian packages that have them
@@ -116,14 +115,8 @@ def card() -> Card:
 
     Debian packages that are missing are installed when this runs as root. Raises RoverError where no card can be made.
     """
-    missing = missing_packages()
-    if os.geteuid() != 0:
-        packages = f" (and of the Debian packages {' '.join(missing)})" if missing else ""
-        raise MachineError(
-            f"an emulated Pi's card is written with its owner's rights, which needs root{packages}: use sudo"
-        )
-    if missing:
-        install(missing, f"the emulated machine needs the Debian packages {' '.join(missing)}, which are not here")
+    why = "an emulated Pi's card is written with its owner's rights"
+    make_sure(missing_packages(), "the emulated machine", why, MachineError)
     with emulation():
         flashed = system()
     made = [RECIPE, CARD_GB, MODULES, FIRST_MODULES, INIT, NETWORK, MASKED, ROVER_PACKAGES, KERNEL_PACKAGES]
@@ -316,7 +309,7 @@ class Machine:
         if not 1 <= slow <= SLOWEST:
             raise MachineError(f"the machine's clock can run 1 to {SLOWEST} times slower, found {slow:g}")
         self.card, self.slow = card, slow
-        self.name, self.port, self.key = "rover-pi", _free_port(), card.key
+        self.name, self.port, self.key = "rover-pi", free_port(), card.key
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         self.console = self.folder / "console.log"
@@ -486,12 +479,6 @@ class Machine:
 def _comma(path: Path) -> str:
     """A path in one of QEMU's options."""
     return str(path.resolve()).replace(",", ",,")
-
-
-def _free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
 
 
 def _end_with_parent() -> None:

@@ -13,6 +13,7 @@ import fcntl
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import tempfile
 import time
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.watch import signals
 from rover_lib.workshop.arm import fetch_packages, install
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
 
@@ -72,14 +74,37 @@ def missing_packages() -> list[str]:
 
 def require() -> None:
     """Makes sure of root and of NEEDS, which are installed. Raises EmulationError."""
-    missing = missing_packages()
+    make_sure(missing_packages(), "an emulated Pi", "an emulated Pi mounts file systems and starts a container")
+
+
+def make_sure(missing: list[str], what: str, why: str, error: type[RoverError] = EmulationError) -> None:
+    """Of root, and of Debian packages that `what` lacks here, which are installed. why: what root is for.
+
+    Raises `error` without root, ArmError for packages that cannot be installed.
+    """
     if os.geteuid() != 0:
         packages = f" (and of the Debian packages {' '.join(missing)})" if missing else ""
-        raise EmulationError(
-            f"an emulated Pi mounts file systems and starts a container, which needs root{packages}: use sudo"
-        )
+        raise error(f"{why}, which needs root{packages}: use sudo")
     if missing:
-        install(missing, f"an emulated Pi needs the Debian packages {' '.join(missing)}, which are not here")
+        install(missing, f"{what} needs the Debian packages {' '.join(missing)}, which are not here")
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """SIGTERM and SIGHUP end what is inside as ^C does: everything is put away by its own doors."""
+
+    def on_signal(number: int, frame: object) -> None:
+        raise KeyboardInterrupt(signal.Signals(number).name)
+
+    with signals(on_signal):
+        yield
+
+
+def free_port() -> int:
+    """Of the loopback."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
 
 
 def system() -> System:

@@ -11,7 +11,6 @@ What it says about time: nothing about a Pi. The machine's clock and the Arduino
 import contextlib
 import json
 import shutil
-import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -26,12 +25,13 @@ from rover_lib.emulated import machine, plays
 from rover_lib.emulated.camera import UsbCamera
 from rover_lib.emulated.machine import DEBS, Card, Machine, card
 from rover_lib.emulated.pulses import READ_S, Pins, compare, stopped
+from rover_lib.emulated.system import interruptible
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.service import UNIT
 from rover_lib.onboard.stage import write_stage
 from rover_lib.onboard.telemetry import Flight, read_log
-from rover_lib.onboard.watch import signals
 from rover_lib.playground import arduino
 from rover_lib.playground.arduino import REST_US, Arduino
 from rover_lib.workshop.arm import install
@@ -40,7 +40,6 @@ from rover_lib.workshop.cache import cache_root, cached_folder, key_of
 REPOSITORY = Path(__file__).parents[2]
 ANSIBLE = REPOSITORY / "ansible"
 PORT, CAMERA, MODEL = "/dev/rover-arduino", "/dev/video0", "/var/lib/rover/models/current/policy.pt"
-UNIT = "rover-drive.service"
 SIZE = (640, 360)
 FRAMES = 150  # of the recordings, 5 s
 TWICE = 2  # each: vivid's HDMI has no 30 Hz at this size, only 60
@@ -101,7 +100,7 @@ def run_whole(
     kept = output.with_suffix("")
     shutil.rmtree(kept, ignore_errors=True)
     with (
-        _interruptible(),
+        interruptible(),
         tempfile.TemporaryDirectory(prefix=".pi-whole.", dir=_cache()) as scratch,  # large, so not in /tmp
         tempfile.TemporaryDirectory(prefix="rover-plays-") as ansible,  # ssh's sockets want a short path
     ):
@@ -123,17 +122,6 @@ def run_whole(
 def _cache() -> Path:
     cache_root().mkdir(parents=True, exist_ok=True)
     return cache_root()
-
-
-@contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """SIGTERM and SIGHUP end what is inside as Ctrl-C does: machine, Arduino and files are left by their own doors."""
-
-    def on_signal(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt(signal.Signals(number).name)
-
-    with signals(on_signal):
-        yield
 
 
 class _Run:

@@ -59,16 +59,16 @@ def test_the_inventory_is_the_users_with_other_rovers(tmp_path):
 
 
 def test_pip_finds_packages_elsewhere_as_it_does_here():
-    told = "global.index-url='https://example.org/simple'\n:env:.find-links='/here'\nglobal.extra-index-url="
-    told += "'file:///here https://example.net/simple'\n:env:.default-timeout='180'\ninstall.user='yes'\n"
+    told = "global.index-url='index:here/simple'\n:env:.find-links='/here'\nglobal.extra-index-url="
+    told += "'file:///here index:there/simple'\n:env:.default-timeout='180'\ninstall.user='yes'\n"
     assert container.pip_settings(told).splitlines() == [
         "[global]",
         "cert = /etc/ssl/certs/ca-certificates.crt",
-        "index-url = https://example.org/simple",
-        "extra-index-url = https://example.net/simple",
+        "index-url = index:here/simple",
+        "extra-index-url = index:there/simple",
         "default-timeout = 180",
     ]
-    assert "proxy = http://example.org:3128" in container.pip_settings("", "http://example.org:3128")
+    assert "proxy = proxy:3128" in container.pip_settings("", "proxy:3128")
 
 
 # Beginning

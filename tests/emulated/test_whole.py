@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rover_lib.emulated import camera, machine, whole
+from rover_lib.emulated import camera, machine, system, whole
 from rover_lib.emulated.camera import UsbCamera
 from rover_lib.emulated.machine import MachineError, Qmp
 from rover_lib.emulated.pulses import compare, stopped
@@ -128,7 +128,7 @@ def test_a_report_is_left_where_a_step_fails_too(monkeypatch, tmp_path):
 
 
 def test_sigterm_ends_a_run_as_ctrl_c_does():
-    with pytest.raises(KeyboardInterrupt, match="SIGTERM"), whole._interruptible():
+    with pytest.raises(KeyboardInterrupt, match="SIGTERM"), system.interruptible():
         signal.raise_signal(signal.SIGTERM)
 
 

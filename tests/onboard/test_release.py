@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,22 +17,12 @@ import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
+from rover_lib.emulated.bench import changed_artifact
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.release import Expected, ReleaseError, Releases, inspect_artifact, pack
 from rover_lib.onboard.stage import sha256_of
-
-
-def changed_manifest(artifact: Path, target: Path, **changes) -> Path:
-    """The artifact with another manifest, and all checksums right."""
-    with zipfile.ZipFile(artifact) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as new:
-        for item in old.infolist():
-            content = old.read(item)
-            if item.filename.endswith("/extra/manifest.json"):
-                content = json.dumps({**json.loads(content), **changes}).encode()
-            new.writestr(item.filename, content)
-    return target
 
 
 @pytest.fixture(scope="session")
@@ -348,7 +337,7 @@ def test_a_wrong_hash(releases, two):
     ],
 )
 def test_refused_by_its_manifest_before_it_travels_and_on_arrival(releases, two, tmp_path, changes, sentence):
-    old, bad = releases.current, changed_manifest(two[1], tmp_path / "bad.pt", **changes)
+    old, bad = releases.current, changed_artifact(two[1], tmp_path / "bad.pt", **changes)
     with pytest.raises(RoverError, match=sentence):
         pack(bad, tmp_path / "packed")
     assert not (tmp_path / "packed").exists()
@@ -381,14 +370,14 @@ def test_a_rover_with_another_chunk_or_camera(two, tmp_path):
 
 
 def test_fp32_that_says_it_is_static(releases, artifacts, tmp_path):
-    lie = changed_manifest(artifacts["fp32"], tmp_path / "lie.pt", mode="static")
+    lie = changed_artifact(artifacts["fp32"], tmp_path / "lie.pt", mode="static")
     with pytest.raises(ArtifactError, match="its manifest says static, its code is not"):
         releases.stage(lie)
 
 
 def test_parity_vectors_that_fail_keep_it_from_being_used(releases, two, tmp_path):
     tolerance = {"steering": 0.0, "throttle": -1.0}
-    bad = changed_manifest(two[1], tmp_path / "bad.pt", parity={"tolerance": tolerance, "reason": "test"})
+    bad = changed_artifact(two[1], tmp_path / "bad.pt", parity={"tolerance": tolerance, "reason": "test"})
     proving = Releases(releases.models)
     old, name = releases.current, proving.stage(bad).name
     with pytest.raises(ArtifactError, match="computes something else here"):
