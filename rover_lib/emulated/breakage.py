@@ -19,6 +19,7 @@ import contextlib
 import json
 import re
 import shutil
+import threading
 import time
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
@@ -417,25 +418,31 @@ def break_deployments(
     *,
     only: str = "",
     workers: int = WORKERS,
+    done: Callable[[dict[str, Any]], object] = lambda row: None,
     say: Say = lambda text: None,
 ) -> list[dict[str, Any]]:
     """Every fault whose name contains `only`, each on one of so many rovers; their rows, in the order of FAULTS.
 
     layers: of a Container that was provisioned, and is off. A rover with another model gets the first of the artifacts.
+    done: gets each row once it is there, one at a time.
     Raises EmulationError if no row can be made at all.
     """
     waiting = [fault for fault in FAULTS if only in fault.name]
     if not waiting:
         raise EmulationError(f"no fault has '{only}' in its name; there are: {', '.join(f.name for f in FAULTS)}")
     rows: dict[str, dict[str, Any]] = {}
+    telling = threading.Lock()
     with rovers([f"breaks{i + 1}" for i in range(min(workers, len(waiting)))], layers, artifacts) as benches:
 
         def work(bench: Bench) -> None:
             give_first_model([bench])
             while waiting and not bench.stop.is_set():
                 fault = waiting.pop(0)
-                rows[fault.name] = _row(fault, bench)
-                say(_told(rows[fault.name]))
+                row = _row(fault, bench)
+                with telling:
+                    rows[fault.name] = row
+                    done(row)
+                    say(_told(row))
 
         in_parallel(work, benches)
     return [rows[fault.name] for fault in FAULTS if fault.name in rows]

@@ -38,7 +38,6 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
@@ -47,11 +46,11 @@ from rover_lib.emulated import plays
 from rover_lib.emulated.breakage import break_deployments, wrong_rows
 from rover_lib.emulated.container import CAMERA, PORT, Container
 from rover_lib.emulated.fleet import fleet
+from rover_lib.emulated.outcome import Outcome
 from rover_lib.emulated.pulses import Pins
 from rover_lib.emulated.system import EmulationError, emulation, interruptible, require, system
-from rover_lib.onboard.params import params
 from rover_lib.onboard.service import UNIT
-from rover_lib.onboard.stage import sha256_of, write_stage
+from rover_lib.onboard.stage import sha256_of
 from rover_lib.onboard.telemetry import read_log
 from rover_lib.playground import arduino
 from rover_lib.playground.arduino import REST_US, Arduino
@@ -69,27 +68,6 @@ READY_S = 600  # torch under emulation on a busy machine
 MOVING_US = 124  # throttle pulses above it move the car; neutral is 120, a step 4
 
 
-@dataclass
-class Outcome:
-    """What a run found: metrics as the module says, and a sentence for all that is not as it should be."""
-
-    metrics: dict[str, Any] = field(default_factory=dict)
-    inputs: dict[str, str] = field(default_factory=dict)
-    wrong: list[str] = field(default_factory=list)
-
-    def write(self, path: Path | str) -> dict[str, Any]:
-        """Writes the stage, and returns it."""
-        return write_stage(
-            path, STAGE, params=params()["pi_fast"], metrics={**self.metrics, "wrong": self.wrong}, inputs=self.inputs
-        )
-
-    def gate(self, name: str, wanted: str, found: Any, holds: bool) -> None:
-        """One of the report's promises; a broken one is wrong."""
-        self.metrics.setdefault("gates", []).append({"gate": name, "wanted": wanted, "found": found, "holds": holds})
-        if not holds:
-            self.wrong.append(f"{name}: wanted {wanted}, found {found}")
-
-
 def run_fast(
     output: Path | str, demo: Path | str, *, faults: bool = True, say: Callable[[str], None] = lambda text: None
 ) -> Outcome:
@@ -105,7 +83,7 @@ def run_fast(
     require()
     if missing := arduino.missing_packages():
         install(missing, f"the emulated Arduino needs the Debian packages {' '.join(missing)}, which are not here")
-    outcome = Outcome(inputs={a.name: sha256_of(a) for a in artifacts})
+    outcome = Outcome(STAGE, output, say, {a.name: sha256_of(a) for a in artifacts})
     output.parent.mkdir(parents=True, exist_ok=True)
     with (
         interruptible(),
@@ -113,22 +91,20 @@ def run_fast(
         tempfile.TemporaryDirectory(prefix="rover-plays-") as folder,  # ssh's sockets want a short path
         output.with_suffix(".log").open("w") as log,
     ):
-        run = _Run(outcome, Path(folder), log, say)
+        run = _Run(outcome, Path(folder), log)
         try:
             run.all(*artifacts, faults)
         except EmulationError as error:
             outcome.wrong.append(str(error))
         finally:
-            outcome.write(output)
+            outcome.write()
     return outcome
 
 
 class _Run:
-    def __init__(self, outcome: Outcome, folder: Path, log: Any, say: Callable[[str], None]):
-        self.outcome, self.folder, self.log, self.say = outcome, folder, log, say
+    def __init__(self, outcome: Outcome, folder: Path, log: Any):
+        self.outcome, self.folder, self.log = outcome, folder, log
         self.metrics = outcome.metrics
-        self.steps: list[dict[str, Any]] = []
-        self.metrics["steps"] = self.steps
         self.variables: dict[str, Any] = {
             "rover_wheels": str(folder / "wheels"),
             "rover_packed": str(folder / "packed"),
@@ -140,14 +116,14 @@ class _Run:
         }
 
     def all(self, static: Path, mixed: Path, faults: bool) -> None:
-        gates = params()["pi_fast"]
-        with self.step("system") as row:
+        gates = self.outcome.gates
+        with self.outcome.step("system") as row:
             before = time.monotonic()
             system()
             row["cached"] = self.metrics["system_cached"] = time.monotonic() - before < 5
-        begun = time.monotonic() - self.steps[0]["seconds"]
+        begun = time.monotonic() - self.outcome.steps[0]["seconds"]
         with Container(ROVER, nice=NICE) as pi:
-            with self.step("boot"):
+            with self.outcome.step("boot"):
                 pi.boot()
             with _car(pi) as pins:
                 driving_s = self.playbooks(pi, static, mixed)
@@ -159,7 +135,7 @@ class _Run:
                     f"all plays green, from nothing to a driving service, image {'' if cached else 'not '}cached",
                     f"at most {minutes} min",
                     round(self.metrics["driving_after_s"] / 60, 1),
-                    self.metrics["driving_after_s"] <= 60 * minutes and all(s["ok"] for s in self.steps),
+                    self.metrics["driving_after_s"] <= 60 * minutes and all(s["ok"] for s in self.outcome.steps),
                 )
                 self.proofs(pi, pins)
             if faults:
@@ -178,7 +154,7 @@ class _Run:
         self.outcome.gate("the service could drive", "active, disarmed", said, could)
         again = self.play("provision", pi, "provision again")
         self.metrics["second_run"] = again.recap_lines
-        self.say("\n".join(again.recap_lines))
+        self.outcome.say("\n".join(again.recap_lines))
         self.outcome.gate("provision a second time", "changed=0", again.changed, again.changed == 0)
         checked = self.play("provision", pi, "provision --check", check=True)
         self.outcome.gate("provision in check mode", "changed=0", checked.changed, checked.changed == 0)
@@ -202,7 +178,7 @@ class _Run:
 
     def play(self, book: str, pi: Container, name: str = "", *, check: bool = False, **variables: Any) -> plays.Play:
         """Runs one, which has to work. Raises EmulationError with the end of what it said if not."""
-        with self.step(name or book) as row:
+        with self.outcome.step(name or book) as row:
             done = plays.run(book, [pi], folder=self.folder, check=check, variables={**self.variables, **variables})
             self.log.write(f"===== {name or book}\n{done.output}\n")
             self.log.flush()
@@ -231,30 +207,17 @@ class _Run:
         driven = self.metrics["drive"]["driven"]
         self.outcome.gate("ticks driven", "at least 10", driven, driven >= 10)
 
-    @contextlib.contextmanager
-    def step(self, name: str) -> Iterator[dict[str, Any]]:
-        """Times one; it is in the report whether it works or not."""
-        row: dict[str, Any] = {"step": name, "ok": False}
-        self.steps.append(row)
-        begun = time.monotonic()
-        try:
-            yield row
-            row["ok"] = True
-        finally:
-            row["seconds"] = round(time.monotonic() - begun, 1)
-            self.say(f"{row['seconds']:7.1f} s  {name}{'' if row['ok'] else ': failed'}")
-
     # The proofs
 
     def proofs(self, pi: Container, pins: Pins) -> None:
-        with self.step("environment"):
+        with self.outcome.step("environment"):
             self.metrics["environment"] = found = environment(pi.root)
-        limit = params()["pi_fast"]["environment_mb"]
+        limit = self.outcome.gates["environment_mb"]
         self.outcome.gate("the Pi's environment", f"under {limit} MB", found["size_mb"], found["size_mb"] < limit)
         self.outcome.gate("all of it hashed, no lerobot", "none else", found["unhashed"], not found["unhashed"])
-        with self.step("sandbox"):
+        with self.outcome.step("sandbox"):
             self.metrics["sandbox"] = found = sandbox(pi)
-        most = params()["pi_fast"]["exposure"]
+        most = self.outcome.gates["exposure"]
         self.outcome.gate("systemd-analyze security", f"at most {most}", found["exposure"], found["exposure"] <= most)
         leaks = [p["probe"] for p in found["probes"] if p["refused"] and not p["inside"]]
         blunt = [p["probe"] for p in found["probes"] if p["outside"]]
@@ -262,9 +225,9 @@ class _Run:
         self.outcome.gate("the same, outside of it", "all work", blunt or "all work", not blunt)
         service = self.metrics["service"] = {}
         for name, proof in (("hang", hang), ("start_limit", start_limit)):
-            with self.step(name):
+            with self.outcome.step(name):
                 service[name] = proof(pi, pins)
-        gates, hung, limited = params()["pi_fast"], service["hang"], service["start_limit"]
+        gates, hung, limited = self.outcome.gates, service["hang"], service["start_limit"]
         in_time = hung["restarted_s"] <= gates["restart_s"]
         self.outcome.gate("hung loop restarted", f"within {gates['restart_s']} s", hung["restarted_s"], in_time)
         stopped = hung["stopped_s"] <= gates["stopped_s"] and hung["disarmed"]
@@ -275,10 +238,10 @@ class _Run:
 
     def boot(self, pi: Container, pins: Pins) -> None:
         """Disabled at boot by default; with rover_start_at_boot it is up, and disarmed, and the car stands."""
-        with self.step("boot without the service"):
+        with self.outcome.step("boot without the service"):
             default = show(pi, "UnitFileState", "ActiveState")
         enabled = self.play("provision", pi, "provision, to start at boot", rover_start_at_boot=True)
-        with self.step("power cut and boot"):
+        with self.outcome.step("power cut and boot"):
             pi.cut_power()
             at_s = time.monotonic()
             pi.boot()
@@ -295,13 +258,19 @@ class _Run:
         """What can go wrong with a deployment, and a fleet, on rovers that start from what this one has become."""
         pi.inside("systemctl", "disable", UNIT)  # their own service would only look for a camera
         pi.power_off()
-        artifacts, wanted = {"static": static, "mixed": mixed}, params()["pi_fast"]["rows"]
-        with self.step("faults of a deployment"):
-            rows = self.metrics["faults"] = break_deployments(pi.layers, artifacts, say=self.say)
+        artifacts, wanted = {"static": static, "mixed": mixed}, self.outcome.gates["rows"]
+        with self.outcome.step("faults of a deployment"):
+            rows = self.metrics["faults"] = []
+
+            def done(row: dict[str, Any]) -> None:
+                rows.append(row)
+                self.outcome.write()
+
+            rows[:] = break_deployments(pi.layers, artifacts, done=done, say=self.outcome.say)
         wrong = wrong_rows(rows, wanted)
         self.outcome.gate("faults of a deployment", f"{wanted} rows, healthy and healed", wrong or len(rows), not wrong)
-        with self.step("fleet"):
-            found = self.metrics["fleet"] = fleet(pi.layers, artifacts, say=self.say)
+        with self.outcome.step("fleet"):
+            found = self.metrics["fleet"] = fleet(pi.layers, artifacts, say=self.outcome.say)
         cases = [case["results"] for case in found["cases"]]
         self.outcome.gate("fleet of three, one broken", "the rest untouched, all reported", cases, found["good"])
 

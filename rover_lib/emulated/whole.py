@@ -13,8 +13,7 @@ import json
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +23,19 @@ import numpy as np
 from rover_lib.emulated import machine, plays
 from rover_lib.emulated.camera import UsbCamera
 from rover_lib.emulated.machine import DEBS, Card, Machine, card
+from rover_lib.emulated.outcome import Outcome
 from rover_lib.emulated.pulses import READ_S, Pins, compare, stopped
 from rover_lib.emulated.system import interruptible
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.params import params
 from rover_lib.onboard.service import UNIT
-from rover_lib.onboard.stage import write_stage
 from rover_lib.onboard.telemetry import Flight, read_log
 from rover_lib.playground import arduino
 from rover_lib.playground.arduino import REST_US, Arduino
 from rover_lib.workshop.arm import install
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
 
+STAGE = "pi"
 REPOSITORY = Path(__file__).parents[2]
 ANSIBLE = REPOSITORY / "ansible"
 PORT, CAMERA, MODEL = "/dev/rover-arduino", "/dev/video0", "/var/lib/rover/models/current/policy.pt"
@@ -64,19 +63,6 @@ class WholeError(RoverError):
     """A step of the whole machine that did not do what it should."""
 
 
-@dataclass
-class Outcome:
-    """metrics: as written. wrong: a sentence for each thing that is not as it should be."""
-
-    metrics: dict[str, Any] = field(default_factory=dict)
-    inputs: dict[str, str] = field(default_factory=dict)
-    wrong: list[str] = field(default_factory=list)
-
-    def write(self, path: Path | str) -> dict[str, Any]:
-        """To a file, for people and programs."""
-        return write_stage(path, "pi", params=params()["pi"], metrics=self.metrics, inputs=self.inputs)
-
-
 def run_whole(
     output: Path | str,
     artifact: Path | str,
@@ -96,7 +82,7 @@ def run_whole(
         install(missing, f"the emulated Arduino needs the Debian packages {' '.join(missing)}, which are not here")
     if not artifact.is_file():
         raise WholeError(f"{artifact}: no artifact to deploy; make demo leaves one")
-    outcome = Outcome(inputs={artifact.name: content_hash(artifact)})
+    outcome = Outcome(STAGE, output, say, {artifact.name: content_hash(artifact)})
     kept = output.with_suffix("")
     shutil.rmtree(kept, ignore_errors=True)
     with (
@@ -104,7 +90,7 @@ def run_whole(
         tempfile.TemporaryDirectory(prefix=".pi-whole.", dir=_cache()) as scratch,  # large, so not in /tmp
         tempfile.TemporaryDirectory(prefix="rover-plays-") as ansible,  # ssh's sockets want a short path
     ):
-        run = _Run(outcome, Path(scratch), Path(ansible), say)
+        run = _Run(outcome, Path(scratch), Path(ansible))
         try:
             run.all(artifact, recordings, fresh)
         except RoverError as error:
@@ -114,8 +100,7 @@ def run_whole(
             for file in Path(scratch).rglob("*.log"):
                 shutil.copy(file, kept / "-".join(file.relative_to(scratch).parts))
             outcome.metrics["kept"] = str(kept)
-    outcome.metrics["wrong"] = outcome.wrong
-    outcome.write(output)
+    outcome.write()
     return outcome
 
 
@@ -125,46 +110,45 @@ def _cache() -> Path:
 
 
 class _Run:
-    def __init__(self, outcome: Outcome, folder: Path, ansible: Path, say: Callable[[str], None]):
-        self.outcome, self.folder, self.ansible, self.say = outcome, folder, ansible, say
-        self.gates = params()["pi"]
+    def __init__(self, outcome: Outcome, folder: Path, ansible: Path):
+        self.outcome, self.folder, self.ansible = outcome, folder, ansible
+        self.gates = outcome.gates
         self.slow = float(self.gates["slow"])
-        self.steps: list[dict[str, Any]] = []
         self.zero_s = 0.0
-        outcome.metrics |= {"slow": self.slow, "steps": self.steps, "faults": []}
+        outcome.metrics |= {"slow": self.slow, "faults": []}
         self.pi: Machine
         self.pins: Pins
 
     def all(self, artifact: Path, recordings: Path, fresh: bool) -> None:
         start = time.monotonic()
         metrics = self.outcome.metrics
-        with self.step("the card, as flashed"):
+        with self.outcome.step("the card, as flashed"):
             flashed = card()
         layer = self.provisioned(flashed, fresh)
-        with self.step("the frames that the camera will show"):
+        with self.outcome.step("the frames that the camera will show"):
             frames = _frames(recordings, self.folder / "frames.yuyv")
         with contextlib.ExitStack() as on:
             self.pi = on.enter_context(Machine(flashed, self.folder, layer=layer, slow=self.slow, drives=[frames]))
             board = on.enter_context(Arduino(transmitter=REST_US, slow=self.slow, nice=-5))
             self.pins = on.enter_context(Pins(board))
             self.pi.plug(board.port)
-            with self.step("boot, until ssh answers"):
+            with self.outcome.step("boot, until ssh answers"):
                 self.pi.wait_for_ssh()
             self.zero_s = self.clock()
             metrics["machine"] = self.machine()
-            with self.step("camera and Arduino"):
+            with self.outcome.step("camera and Arduino"):
                 self.sudo(SHOW)
                 self.until(f"test -e {PORT}", f"no {PORT} although the adapter is plugged in")
-            with self.step("provision.yml again") as row:
+            with self.outcome.step("provision.yml again") as row:
                 row["recap"] = self.provision()
-            with self.step("deploy.yml") as row:
+            with self.outcome.step("deploy.yml") as row:
                 row["recap"] = self.play(
                     "deploy", rover_artifact=artifact.resolve(), rover_packed=self.folder / "packed"
                 )
-            with self.step("drive.yml: doctor, start, arm, drive, stop, fetch") as row:
+            with self.outcome.step("drive.yml: doctor, start, arm, drive, stop, fetch") as row:
                 row["recap"] = self.drive(metrics)
             self.fault("USB serial unplugged while driving, by QMP", self.pi.unplug, lambda: self.pi.plug(board.port))
-            with self.step("another camera, on USB"):
+            with self.outcome.step("another camera, on USB"):
                 self.sudo(HIDE)
                 usb = on.enter_context(UsbCamera([p.read_bytes() for p in _pictures(recordings)], slow=self.slow))
                 self.pi.plug_camera(usb.path)
@@ -194,13 +178,13 @@ class _Run:
         def make(folder: Path) -> None:
             made.append(True)
             with Machine(flashed, self.folder / "first", slow=self.slow) as self.pi:
-                with self.step("first boot, until ssh answers"):
+                with self.outcome.step("first boot, until ssh answers"):
                     self.pi.wait_for_ssh()
-                with self.step("Debian packages for a rover without internet"):
+                with self.outcome.step("Debian packages for a rover without internet"):
                     self.sudo(f"DEBIAN_FRONTEND=noninteractive dpkg --install {DEBS}/*.deb")
-                with self.step("provision.yml, from a flashed card") as row:
+                with self.outcome.step("provision.yml, from a flashed card") as row:
                     row["recap"] = self.provision()
-                with self.step("shut down"):
+                with self.outcome.step("shut down"):
                     self.pi.power_off()
                 shutil.move(self.pi.disk, folder / "disk.qcow2")
 
@@ -251,7 +235,7 @@ class _Run:
 
     def fault(self, name: str, pull: Callable[[], object], put_back: Callable[[], object]) -> None:
         """Pulls something while the car drives: pins, service, and whether all is well once it is back."""
-        with self.step(name) as row:
+        with self.outcome.step(name):
             self.sudo(f"systemctl reset-failed {UNIT}; systemctl start {UNIT}", timeout_s=900)
             self.sudo("rover arm-car --yes")
             began = time.monotonic()
@@ -263,14 +247,14 @@ class _Run:
             at_s = time.monotonic()
             pull()
             time.sleep(WATCH_S * self.slow)
-            row |= {"fault": name, **stopped(self.pins.since(moving), at_s, self.slow, self.gates["throttle_max_us"])}
+            row = {"fault": name, **stopped(self.pins.since(moving), at_s, self.slow, self.gates["throttle_max_us"])}
             row |= {"service": self.service(), "says": self.journal()}
             put_back()
             self.sudo(f"systemctl stop {UNIT}")
             self.until(f"test -e {PORT} -a -e {CAMERA}", f"{PORT} or {CAMERA} is not back")
             self.outcome.metrics["doctor"] = self.doctor()
             row["doctor"] = self.outcome.metrics["doctor"]["drives"]
-            self.outcome.metrics["faults"].append(dict(row))
+            self.outcome.metrics["faults"].append(row)
             if not row["drove"] or not row["neutral"] or row["after_line_ms"] > self.gates["neutral_ms"]:
                 self.wrong(f"{name}: the pins did not go to neutral as promised: {row}")
             if row["service"].get("StatusText", "").startswith("driving"):
@@ -364,17 +348,6 @@ class _Run:
 
     def wrong(self, sentence: str) -> None:
         self.outcome.wrong.append(sentence)
-
-    @contextlib.contextmanager
-    def step(self, name: str) -> Iterator[dict[str, Any]]:
-        self.say(f"{name} ...")
-        row: dict[str, Any] = {}
-        start = time.monotonic()
-        try:
-            yield row
-        finally:
-            self.steps.append({"step": name, "seconds": round(time.monotonic() - start, 1), **row})
-        self.say(f"{name}: {self.steps[-1]['seconds']:g} s")
 
 
 def _pictures(recordings: Path) -> list[Path]:

@@ -1,13 +1,13 @@
 """What `make pi-fast` makes of what it sees, without a Pi."""
 
-import json
 import os
 from types import SimpleNamespace
 
 import pytest
 
 from rover_lib.emulated import container, fast, plays, system
-from rover_lib.emulated.fast import Outcome, environment, hashed, moving, run_fast, stopped_s, unit_for
+from rover_lib.emulated.fast import environment, hashed, moving, run_fast, stopped_s, unit_for
+from rover_lib.emulated.outcome import Outcome
 from rover_lib.emulated.system import EmulationError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
@@ -168,23 +168,23 @@ def test_when_the_car_stopped():
 
 
 def test_a_promise_that_is_broken_is_said_and_written(tmp_path):
-    outcome = Outcome(metrics={"steps": [{"step": "boot", "ok": True, "seconds": 1.0}]}, inputs={"a.pt": "00"})
+    outcome = Outcome(fast.STAGE, tmp_path / "pi-fast.json", inputs={"a.pt": "00"})
     outcome.gate("provision a second time", "changed=0", 0, True)
     outcome.gate("start limit", "5 tries", {"tries": 7}, False)
-    outcome.write(tmp_path / "pi-fast.json")
+    outcome.write()
     content = read_stage(tmp_path / "pi-fast.json", "pi-fast")
     assert content["metrics"]["wrong"] == ["start limit: wanted 5 tries, found {'tries': 7}"]
     assert [g["holds"] for g in content["metrics"]["gates"]] == [True, False]
     assert content["params"] == params()["pi_fast"] and content["inputs"] == {"a.pt": "00"}
 
 
-def test_a_step_that_fails_is_in_the_report(tmp_path):
+def test_a_step_that_fails_is_in_the_report_at_once(tmp_path):
     said = []
-    run = fast._Run(Outcome(), tmp_path, None, said.append)
-    with pytest.raises(EmulationError), run.step("boot"):
-        raise EmulationError("no")
-    with run.step("deploy"):
+    outcome = Outcome(fast.STAGE, tmp_path / "pi-fast.json", said.append)
+    with outcome.step("boot"):
         pass
-    assert [(s["step"], s["ok"]) for s in run.metrics["steps"]] == [("boot", False), ("deploy", True)]
-    assert said[0].endswith("boot: failed")
-    json.dumps(run.metrics)
+    with pytest.raises(EmulationError), outcome.step("deploy"):
+        raise EmulationError("no")
+    steps = read_stage(tmp_path / "pi-fast.json", "pi-fast")["metrics"]["steps"]
+    assert [(s["step"], s["ok"]) for s in steps] == [("boot", True), ("deploy", False)]
+    assert said[0] == "boot ..." and said[-1].endswith("deploy: failed")

@@ -98,7 +98,7 @@ def test_a_qemu_that_ends_or_is_not_there(qemu, tmp_path):
 def test_what_is_missing_is_said_in_a_sentence(monkeypatch, tmp_path):
     monkeypatch.setattr(machine, "_which", lambda command: None if command == "qemu-img" else command)
     assert machine.missing_packages() == ["qemu-utils"]
-    monkeypatch.setattr(machine.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(system.os, "geteuid", lambda: 1000)
     with pytest.raises(MachineError, match=r"needs root \(and of the Debian packages qemu-utils\)"):
         machine.card()
     with pytest.raises(MachineError, match="1 to 60 times slower, found 0"):
