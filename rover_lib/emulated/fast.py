@@ -22,7 +22,7 @@ runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
     environment    {packages: [{name, version, from}], unhashed, lerobot, size_mb}
     sandbox        {exposure, writable, probes: [{probe, inside, outside}]}; inside: "" is "it worked"
     service        {hang: {...}, start_limit: {...}, boot: {...}}, in seconds, see the functions of those names
-    drive          {ticks, driven, ended} of the fetched flight log
+    drive          {ticks, driven, ended} of the fetched flight log; recorded: {episodes, left, frames, commands}
     faults         [{fault, model_after, healthy, healed_by_rerun, ...}], see breakage.py
     fleet          {cases: [{broken, results, models, healthy, ...}], good}, see fleet.py
     gates          [{gate, wanted, found, holds}], the limits from params.yml
@@ -49,6 +49,8 @@ from rover_lib.emulated.fleet import fleet
 from rover_lib.emulated.outcome import Outcome
 from rover_lib.emulated.pulses import Pins
 from rover_lib.emulated.system import EmulationError, emulation, interruptible, require, system
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.recording import read_controls
 from rover_lib.onboard.service import UNIT
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.onboard.telemetry import read_log
@@ -94,7 +96,7 @@ def run_fast(
         run = _Run(outcome, Path(folder), log)
         try:
             run.all(*artifacts, faults)
-        except EmulationError as error:
+        except RoverError as error:
             outcome.wrong.append(str(error))
         finally:
             outcome.write()
@@ -113,6 +115,7 @@ class _Run:
             "rover_port": PORT,
             "rover_hz": HZ,
             "rover_ready_s": READY_S,
+            "rover_record": True,
         }
 
     def all(self, static: Path, mixed: Path, faults: bool) -> None:
@@ -192,7 +195,7 @@ class _Run:
         return (pi.root / "var/lib/rover/models/current").readlink().name
 
     def flight(self, pi: Container) -> None:
-        """What the flight log says that drive.yml brought home."""
+        """What the flight log and the episode say that drive.yml brought home."""
         found = next(iter((self.folder / "fetched" / ROVER).rglob("flight.log")), None)
         if found is None:
             self.outcome.wrong.append("drive.yml fetched no flight log")
@@ -206,6 +209,14 @@ class _Run:
         }
         driven = self.metrics["drive"]["driven"]
         self.outcome.gate("ticks driven", "at least 10", driven, driven >= 10)
+        home = self.folder / "fetched" / ROVER / "episodes"
+        left = [p.name for p in (pi.root / STATE.lstrip("/") / "episodes").glob("*")]
+        episodes = [p.name for p in home.glob("*")]
+        found = {"episodes": episodes, "left": left, "frames": len(list(home.glob("*/frames/*.jpg")))}
+        found["commands"] = sum(len(read_controls(home / name).times_s) for name in episodes)
+        self.metrics["drive"]["recorded"] = found
+        whole = len(episodes) == 1 and not left and min(found["frames"], found["commands"]) >= 10
+        self.outcome.gate("the drive, recorded and brought home", "an episode, none left on the rover", found, whole)
 
     # The proofs
 
