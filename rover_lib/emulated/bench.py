@@ -200,6 +200,12 @@ class Bench:
             for release in (self.state / "models" / "releases").glob(f"{self.about['name']}*"):
                 shutil.rmtree(release)
 
+    def forget_others(self) -> None:
+        """Leaves the rover with the release in use and no other."""
+        for release in (self.state / "models" / "releases").iterdir():
+            if release.name != self.releases.current:
+                shutil.rmtree(release)
+
     def play(self, book: str, *, others: Sequence[plays.Host] = (), name: str = "", **variables: Any) -> Play:
         """Runs a playbook on this rover, and on others after it. name: of a laptop of its own."""
         if self.stop.is_set():

@@ -375,10 +375,10 @@ def _tamper_in_use(bench: Bench) -> dict[str, Any]:
 @_fault(
     "rollback with nothing to roll back to",
     "there is no release to roll back to",
-    "rollback.yml, then deploy.yml",
-    fresh=True,
+    "rollback.yml on a rover with one release, then deploy.yml",
 )
 def _roll_back(bench: Bench) -> None:
+    bench.forget_others()
     play = bench.play("rollback")
     bench.said.append(play.output)
     if play.ok:
