@@ -280,7 +280,7 @@ class Releases:
         that is not whole is replaced, the one in use by a second copy beside it. Raises ReleaseError, ArtifactError.
         """
         source = Path(source)
-        with _disk_full_in_a_sentence(), self._at_work():
+        with _disk_trouble_in_a_sentence(), self._at_work():
             if not source.exists():
                 raise ReleaseError(f"{source}: not found; stage takes an artifact, or the folder that pack wrote")
             about = self._packed(source) if source.is_dir() else None
@@ -316,7 +316,7 @@ class Releases:
 
         Returns whether anything changed. Raises ReleaseError, with what is in use now.
         """
-        with _disk_full_in_a_sentence(), self._at_work():
+        with _disk_trouble_in_a_sentence(), self._at_work():
             before = self.current
             if name == "current":
                 raise ReleaseError("'current' is in use already; name the release to switch to")
@@ -338,7 +338,7 @@ class Releases:
 
     def rollback(self) -> str:
         """Use the release before the one in use, the newest that can be proven. Returns its name."""
-        with _disk_full_in_a_sentence(), self._at_work():
+        with _disk_trouble_in_a_sentence(), self._at_work():
             refused = []
             for name in self._before():
                 try:
@@ -361,7 +361,7 @@ class Releases:
         """
         if keep < 1:
             raise ReleaseError(f"at least 1 release is kept, found {keep}")
-        with _disk_full_in_a_sentence(), self._at_work():
+        with _disk_trouble_in_a_sentence(), self._at_work():
             whole = [name for name in self._by_use() if not self.wrong_with(name)]
             gone = [name for name in self._by_use() if name not in whole[:keep] and name != self.current]
             for name in gone:
@@ -528,12 +528,16 @@ def sandboxed(name: str) -> None:
 
 
 @contextlib.contextmanager
-def _disk_full_in_a_sentence() -> Iterator[None]:
+def _disk_trouble_in_a_sentence() -> Iterator[None]:
     try:
         yield
     except OSError as e:
         if e.errno in (errno.ENOSPC, errno.EDQUOT):
             raise ReleaseError("the disk is full; what was in use still is; prune releases or old recordings") from e
+        if e.errno in (errno.EROFS, errno.EIO):  # so a card ends
+            raise ReleaseError(
+                f"the disk cannot be written ({e.strerror}); what was in use still is; look at dmesg, use another card"
+            ) from e
         raise
 
 

@@ -1,5 +1,6 @@
 """Deployments on the rover: every power cut, every broken artifact; after each there is a model that computes."""
 
+import errno
 import fcntl
 import json
 import os
@@ -535,22 +536,29 @@ def test_a_history_that_is_no_history(releases, two):
         assert_drives(releases, {deploy(releases, two[1]), deploy(releases, two[0])})
 
 
+@pytest.mark.parametrize(
+    "number, says",
+    [
+        (errno.ENOSPC, "the disk is full; what was in use still is"),
+        (errno.EROFS, "the disk cannot be written (Read-only"),
+    ],
+)
 @pytest.mark.parametrize("n", range(1, 7))
-def test_a_disk_that_is_full_at_some_step(releases, two, n):
+def test_a_disk_that_is_full_or_dying_at_some_step(releases, two, n, number, says):
     old, count = releases.current, 0
 
     def hook(name, call, args):
         nonlocal count
         count += name in ("write", "mkdir", "symlink")
         if count >= n and name in ("write", "mkdir", "symlink"):
-            raise OSError(28, "No space left on device")
+            raise OSError(number, os.strerror(number))
         return call()
 
     def task():
         try:
             deploy(releases, two[1])
         except ReleaseError as error:
-            os._exit(7 if "the disk is full; what was in use still is" in str(error) else 8)
+            os._exit(7 if says in str(error) else 8)
 
     status = in_child(task, hook)
     assert os.waitstatus_to_exitcode(status) == 7
@@ -564,7 +572,7 @@ def test_on_a_full_disk_a_rover_can_go_back_and_prune(releases, two):
 
     def hook(name, call, args):
         if name == "write":
-            raise OSError(28, "No space left on device")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return call()
 
     assert in_child(lambda: releases.switch(new), hook) == 0
