@@ -15,7 +15,7 @@ help:
 	@echo "                                            NAME=full makes a policy of the real car's size, PEERS=1 adds other runtimes"
 	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino: about 6 minutes"
 	@echo "make pi-fast                                every playbook on an emulated Pi in a container, and what they promise,"
-	@echo "                                            proven from within: a quarter of an hour or two; root, on Debian 12"
+	@echo "                                            proven from within: an hour; root, on Debian 12"
 	@echo "make pi                                     a whole emulated Pi: kernel, camera, INT8, USB serial, servo pulses, pulled"
 	@echo "                                            cables: half an hour, the first time an hour; root, on Debian 12"
 	@echo "make firmware; make flash PORT=/dev/ttyUSB0  build the Arduino's firmware, and put it on the board"
