@@ -17,7 +17,7 @@ help:
 	@echo "make pi-fast                                every playbook on an emulated Pi in a container, and what they promise,"
 	@echo "                                            proven from within: an hour; root, on Debian 12"
 	@echo "make pi                                     a whole emulated Pi: kernel, camera, INT8, USB serial, servo pulses, pulled"
-	@echo "                                            cables: half an hour, the first time an hour; root, on Debian 12"
+	@echo "                                            cables: half an hour, the first time three quarters; root, on Debian 12"
 	@echo "make firmware; make flash PORT=/dev/ttyUSB0  build the Arduino's firmware, and put it on the board"
 	@echo "make lab                                    JupyterLab on the notebooks"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count, into the committed notebooks"
