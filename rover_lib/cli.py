@@ -370,7 +370,7 @@ def drive(ctx: click.Context, artifact: Path | None, replay: Path | None, json_f
     except (DriveFault, TakenOver) as e:
         click.echo(f"rover: {e}", err=True)
         code = 4 if isinstance(e, TakenOver) else 3
-    except Exception:
+    except Exception:  # whatever ended a drive, the summary of what was driven is still written
         if not report.ticks:
             raise
         traceback.print_exc()  # a defect of this program, which has stopped the car too

@@ -66,7 +66,10 @@ def artifacts(tiny, calibration, tmp_path_factory) -> dict[str, Path]:
 
 @pytest.fixture(scope="session")
 def demo_run() -> Path:
-    """The folder of the demo's run, which `make test` makes before it calls pytest."""
+    """The folder of the demo's run, which `make test` makes before it calls pytest.
+
+    Without it tests skip, so that pytest by hand does not begin with minutes of training.
+    """
     folder = Path(__file__).parents[1] / "runs" / "demo"
     if not (folder / "compare.json").exists():
         pytest.skip("runs/demo is not there: run make demo, or make test, which does")

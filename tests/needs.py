@@ -1,4 +1,7 @@
-"""What a test needs of the machine: it is skipped, with the reason, where that is not there."""
+"""What a test needs of the machine: it is skipped, with the reason, where that is not there.
+
+Debian packages cannot come with pip; .ci/run installs them, so that none of these tests skips there.
+"""
 
 import time
 from collections.abc import Callable
@@ -23,13 +26,22 @@ def until(condition: Callable[[], object], seconds: float = 5.0) -> None:
         time.sleep(0.002)
 
 
-def keep_sending(send: Callable[[], object], seconds: float) -> None:
-    """Sends every 20 ms; the test is skipped where the machine was too busy for that, since the Arduino stops then."""
+def keep_sending(
+    send: Callable[[], object], seconds: float = 10.0, condition: Callable[[], object] | None = None
+) -> None:
+    """Sends every 20 ms for so long, or until something holds, which has to come.
+
+    The test is skipped where the machine was too busy for that: 150 ms after the last command the Arduino stops, as it
+    must, and what the test would judge is no longer what it has sent.
+    """
     last = time.monotonic()
     end = last + seconds
-    while last < end:
+    while not (condition and condition()):
+        if last >= end:
+            assert not condition, "it did not happen"
+            return
         send()
         time.sleep(0.02)
-        if (now := time.monotonic()) - last > 0.1:
+        if (now := time.monotonic()) - last > 0.12:
             pytest.skip(f"this machine was too busy to send in time: {now - last:.2f} s between two commands")
         last = now

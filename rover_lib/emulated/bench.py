@@ -192,19 +192,14 @@ class Bench:
         return next((self.state / "models" / "releases").glob(f"{self.about['name']}*/{POLICY}"))
 
     def begin(self, fresh: bool = False) -> None:
-        """Of a row: what is not in use is to be deployed. fresh: it was never on the rover."""
+        """Of a row: a model that is not in use is to be deployed. fresh: only the one in use is on the rover."""
         self.before = self._mode_of(self.releases.current or "", "")
         self.target = next(mode for mode in self.artifacts if mode != self.before)
         self.seconds, self.said = {}, []
         if fresh:
-            for release in (self.state / "models" / "releases").glob(f"{self.about['name']}*"):
-                shutil.rmtree(release)
-
-    def forget_others(self) -> None:
-        """Leaves the rover with the release in use and no other."""
-        for release in (self.state / "models" / "releases").iterdir():
-            if release.name != self.releases.current:
-                shutil.rmtree(release)
+            for release in (self.state / "models" / "releases").iterdir():
+                if release.name != self.releases.current:
+                    shutil.rmtree(release)
 
     def play(self, book: str, *, others: Sequence[plays.Host] = (), name: str = "", **variables: Any) -> Play:
         """Runs a playbook on this rover, and on others after it. name: of a laptop of its own."""

@@ -376,9 +376,9 @@ def _tamper_in_use(bench: Bench) -> dict[str, Any]:
     "rollback with nothing to roll back to",
     "there is no release to roll back to",
     "rollback.yml on a rover with one release, then deploy.yml",
+    fresh=True,
 )
 def _roll_back(bench: Bench) -> None:
-    bench.forget_others()
     play = bench.play("rollback")
     bench.said.append(play.output)
     if play.ok:

@@ -48,17 +48,15 @@ from rover_lib.emulated.container import CAMERA, PORT, Container
 from rover_lib.emulated.fleet import fleet
 from rover_lib.emulated.outcome import Outcome
 from rover_lib.emulated.pulses import Pins
-from rover_lib.emulated.system import EmulationError, emulation, interruptible, require, system
+from rover_lib.emulated.system import EmulationError, emulation, interruptible, require, require_arduino, system
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.recording import read_controls
 from rover_lib.onboard.service import UNIT
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.onboard.telemetry import read_log
-from rover_lib.playground import arduino
 from rover_lib.playground.arduino import REST_US, Arduino
 from rover_lib.playground.bench import PLAIN, make_artifact, pictures
 from rover_lib.playground.car import EMULATOR_NICE, CameraFeed
-from rover_lib.workshop.arm import install
 
 STAGE = "pi-fast"
 ROVER = "rover1"
@@ -83,8 +81,7 @@ def run_fast(
     if gone := [a.name for a in artifacts if not a.is_file()]:
         raise EmulationError(f"{demo}: no {' and no '.join(gone)} to deploy; make demo leaves them")
     require()
-    if missing := arduino.missing_packages():
-        install(missing, f"the emulated Arduino needs the Debian packages {' '.join(missing)}, which are not here")
+    require_arduino()
     outcome = Outcome(STAGE, output, say, {a.name: sha256_of(a) for a in artifacts})
     output.parent.mkdir(parents=True, exist_ok=True)
     with (

@@ -25,11 +25,10 @@ class Outcome:
     inputs: dict[str, str] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)
     wrong: list[str] = field(default_factory=list)
+    gates: dict[str, Any] = field(init=False)  # of params.yml as it was at the beginning
 
-    @property
-    def gates(self) -> dict[str, Any]:
-        """Of params.yml."""
-        return params()[self.stage.replace("-", "_")]
+    def __post_init__(self) -> None:
+        self.gates = params()[self.stage.replace("-", "_")]
 
     @property
     def steps(self) -> list[dict[str, Any]]:

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.watch import signals
+from rover_lib.playground import arduino
 from rover_lib.workshop.arm import fetch_packages, install
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
 
@@ -75,6 +76,12 @@ def missing_packages() -> list[str]:
 def require() -> None:
     """Makes sure of root and of NEEDS, which are installed. Raises EmulationError."""
     make_sure(missing_packages(), "an emulated Pi", "an emulated Pi mounts file systems and starts a container")
+
+
+def require_arduino() -> None:
+    """Installs what the emulated Arduino lacks here. Raises ArmError where that cannot be."""
+    if missing := arduino.missing_packages():
+        install(missing, f"the emulated Arduino needs the Debian packages {' '.join(missing)}, which are not here")
 
 
 def make_sure(missing: list[str], what: str, why: str, error: type[RoverError] = EmulationError) -> None:

@@ -25,14 +25,12 @@ from rover_lib.emulated.camera import UsbCamera
 from rover_lib.emulated.machine import DEBS, Card, Machine, card
 from rover_lib.emulated.outcome import Outcome
 from rover_lib.emulated.pulses import READ_S, Pins, compare, stopped
-from rover_lib.emulated.system import interruptible
+from rover_lib.emulated.system import interruptible, require_arduino
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.service import UNIT
 from rover_lib.onboard.telemetry import Flight, read_log
-from rover_lib.playground import arduino
 from rover_lib.playground.arduino import REST_US, Arduino
-from rover_lib.workshop.arm import install
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
 
 STAGE = "pi"
@@ -78,8 +76,7 @@ def run_whole(
     it cannot be begun. The machine's console and Ansible's words are beside `output` afterwards if anything failed.
     """
     output, artifact, recordings = Path(output), Path(artifact), Path(recordings)
-    if missing := arduino.missing_packages():
-        install(missing, f"the emulated Arduino needs the Debian packages {' '.join(missing)}, which are not here")
+    require_arduino()
     if not artifact.is_file():
         raise WholeError(f"{artifact}: no artifact to deploy; make demo leaves one")
     outcome = Outcome(STAGE, output, say, {artifact.name: content_hash(artifact)})

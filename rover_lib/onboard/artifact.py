@@ -112,7 +112,7 @@ def check_integrity(path: Path | str) -> None:
     with _open(path) as z:
         try:
             damaged = z.testzip()
-        # RuntimeError and its NotImplementedError: a damaged header may ask for a password, or an unknown compression
+        # RuntimeError, its subclasses too: a damaged header may ask for a password, or for an unknown compression
         except (zipfile.BadZipFile, OSError, RuntimeError) as e:
             raise ArtifactError(f"{path}: damaged ({e}); copy the file again") from None
     if damaged:

@@ -25,10 +25,9 @@ DEFAULTS = yaml.safe_load((ROLE / "defaults" / "main.yml").read_text())
 
 
 def program(name: str) -> str:
-    """Beside this Python, or skip."""
+    """Beside this Python, as pip puts it."""
     path = Path(sys.executable).with_name(name)
-    if not path.exists():
-        pytest.skip(f"no {name}: pip install -e '.[dev]'")
+    assert path.exists(), f"no {name}: pip install -e '.[dev]'"
     return str(path)
 
 
@@ -137,7 +136,7 @@ def test_a_laptop_is_no_rover(tmp_path):
 
 def test_the_other_checks_of_a_machine_pass_here(tmp_path):
     if not re.search(r'VERSION_ID="1[23]"', Path("/etc/os-release").read_text()):
-        pytest.skip("this is no Debian 12 or 13")
+        pytest.skip("this machine is no Debian 12 or 13, and the checks rightly refuse it")
     here = {"rover_architecture": platform.machine(), "rover_home": str(tmp_path)}
     found = play(tmp_path, [{"name": "Look", "ansible.builtin.include_role": {"name": "rover"}}], **here)
     assert found.returncode == 0 and "changed=0" in found.stdout, found.stdout
@@ -257,6 +256,7 @@ def units(tmp_path) -> Path:
 
 
 def analyze(*arguments: object) -> subprocess.CompletedProcess:
+    """systemd's own judgement; a workstation may run without systemd, .ci/run installs it."""
     if not shutil.which("systemd-analyze"):
         pytest.skip("no systemd-analyze: apt install systemd")
     return run("systemd-analyze", *arguments)

@@ -2,11 +2,12 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from rover_lib.emulated import breakage
-from rover_lib.emulated.bench import Disk, Line, line_of
+from rover_lib.emulated.bench import Bench, Disk, Line, line_of
 from rover_lib.emulated.breakage import FAULTS, wrong_rows
 from rover_lib.emulated.fleet import results_of, wanted_of
 from rover_lib.emulated.system import EmulationError
@@ -117,6 +118,23 @@ def test_what_is_not_well_is_said():
         "b: the rover has no model that passes its parity vectors",
         "3 faults of a deployment were made, at least 4 are wanted",
     ]
+
+
+def test_a_row_may_begin_with_no_release_but_the_one_in_use(tmp_path):
+    bench = object.__new__(Bench)  # its making packs real artifacts
+    bench.pi = SimpleNamespace(on=False, root=tmp_path)
+    bench.artifacts = {"static": Path("a"), "mixed": Path("b")}
+    bench.packed = {"static": {"name": "a" * 64}, "mixed": {"name": "b" * 64}}
+    models = bench.state / "models"
+    names = [letter * 64 for letter in "abc"]
+    for name in names:
+        (models / "releases" / name).mkdir(parents=True)
+    (models / "current").symlink_to(f"releases/{names[0]}")
+    bench.begin()
+    assert sorted(p.name for p in (models / "releases").iterdir()) == names
+    bench.begin(fresh=True)
+    assert [p.name for p in (models / "releases").iterdir()] == names[:1]
+    assert (bench.before, bench.target) == ("static", "mixed")
 
 
 def test_a_fault_that_is_not_there_is_told():

@@ -112,7 +112,7 @@ def test_a_report_is_left_where_a_step_fails_too(monkeypatch, tmp_path):
         raise MachineError("no card for a test")
 
     monkeypatch.setattr(whole, "card", fails)
-    monkeypatch.setattr(whole.arduino, "missing_packages", list)
+    monkeypatch.setattr(system.arduino, "missing_packages", list)
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
     with pytest.raises(RoverError, match="no artifact to deploy"):
         whole.run_whole(tmp_path / "pi.json", tmp_path / "none.pt", tmp_path)

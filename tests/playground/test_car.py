@@ -68,17 +68,8 @@ def arm(link):
     link.arm()
 
 
-def drive(link, action, condition, seconds=10.0):
-    last = time.monotonic()
-    end = last + seconds
-    while not condition():
-        now = time.monotonic()
-        assert now < end, "it did not happen"
-        if now - last > 0.12:
-            pytest.skip(f"this machine was too busy to send in time: {now - last:.2f} s between two commands")
-        last = now
-        link.send_action(*action)
-        time.sleep(0.02)
+def drive(link, action, condition):
+    needs.keep_sending(lambda: link.send_action(*action), condition=condition)
 
 
 def test_straight_ahead():
