@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 ROVER := $(VENV)/bin/rover
+LAB := $(VENV)/bin/python -m lab
 READY := $(VENV)/.ready
 NAME ?= mine
 
@@ -50,21 +51,21 @@ test: lint demo
 
 # NAME=full needs no checkpoint: it makes one. quantize.json is the last that a run of it leaves.
 arm: $(READY)
-	@test '$(NAME)' != full -o -f runs/full/quantize.json || { echo $(ROVER) world full runs/full; $(ROVER) world full runs/full; }
-	$(ROVER) arm 'runs/$(NAME)' $(if $(PEERS),--peers) $(if $(filter full,$(NAME)),--details)
+	@test '$(NAME)' != full -o -f runs/full/quantize.json || { echo $(LAB) full runs/full; $(LAB) full runs/full; }
+	$(LAB) arm 'runs/$(NAME)' $(if $(PEERS),--peers) $(if $(filter full,$(NAME)),--details)
 
 faults: $(READY)
-	$(ROVER) faults runs/faults.json
+	$(LAB) faults runs/faults.json
 
 # The demo's artifacts are deployed.
 pi-fast: $(READY)
 	@test -f runs/demo/policy_mixed.pt || $(MAKE) demo
-	$(ROVER) pi fast runs/pi-fast.json
+	$(LAB) pi fast runs/pi-fast.json
 
 # The demo's artifact is deployed, and its recordings are what the camera sees.
 pi: $(READY)
 	@test -f runs/demo/policy_static.pt || $(MAKE) demo
-	$(ROVER) pi whole runs/pi.json
+	$(LAB) pi whole runs/pi.json
 
 firmware:
 	$(MAKE) -C firmware

@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import pytest
 
-from rover_lib.playground import arduino
-from rover_lib.workshop import arm
+from lab.a76 import count as arm
+from lab.arduino import emulator as arduino
 
 QEMU_MISSING = arm.missing_packages()
 qemu = pytest.mark.skipif(bool(QEMU_MISSING), reason=f"needs the Debian packages {' '.join(QEMU_MISSING)}")

@@ -1,45 +1,71 @@
-"""Imports go one way, onboard <- workshop <- playground <- emulated; the Pi's part needs nothing of a workstation."""
+"""Imports go one way: the rover's part needs nothing of a workstation, and nothing needs the laboratory."""
 
 import ast
 import sys
 from pathlib import Path
 
-import rover_lib
+import pytest
 
-ROOT = Path(rover_lib.__file__).parent
-MAY = {
-    "onboard": {"onboard"},
-    "workshop": {"onboard", "workshop"},
-    "playground": {"onboard", "workshop", "playground"},
-    "emulated": {"onboard", "workshop", "playground", "emulated"},
-}
-ONBOARD_NEEDS = {"torch", "numpy", "cv2", "serial", "yaml", "systemd_watchdog", "rover_lib"}
+ROOT = Path(__file__).parents[1]
+FLOORS = ("rover_lib.onboard", "rover_lib.workshop", "rover_lib.world", "rover_lib.cli", "lab")  # the lowest first
+ROOMS = ("lab.arduino", "lab.driving", "lab.a76", "lab.pi", "lab.__main__")  # of the laboratory, the same
+ONBOARD_NEEDS = {"torch", "numpy", "cv2", "serial", "yaml", "systemd_watchdog", "click", "rover_lib"}
+
+
+def modules() -> dict[str, Path]:
+    files = [p for top in ("rover_lib", "lab") for p in (ROOT / top).rglob("*.py") if "guest" not in p.parts]
+    return {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in files}
 
 
 def imported(path: Path) -> set[str]:
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    """Every name that a file imports, those for functions and for type checkers alone too."""
+    names, waiting = set(), [ast.parse(path.read_text())]
+    while waiting:
+        node = waiting.pop()
         if isinstance(node, ast.Import):
-            found |= {a.name for a in node.names}
+            names |= {a.name for a in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            found |= {f"{node.module}.{a.name}" for a in node.names}
-    return found
+            names |= {f"{node.module}.{a.name}" for a in node.names}
+        waiting += ast.iter_child_nodes(node)
+    return names
 
 
-def test_imports_go_one_way():
-    files = [p for part in MAY for p in (ROOT / part).glob("*.py")]
-    assert len(files) > 15
-    for path in files:
-        for name in imported(path):
-            parts = name.split(".")
-            if parts[0] == "rover_lib" and len(parts) > 1 and (ROOT / parts[1]).is_dir():
-                assert parts[1] in MAY[path.parent.name], f"{path}: imports {name}"
-            assert name != "rover_lib.cli" and not name.startswith("rover_lib.cli."), f"{path}: imports the cli"
+def ours(path: Path) -> set[str]:
+    """The modules of this repository that a file imports."""
+    known = modules()
+    names = imported(path)
+    return {n if n in known else n.rpartition(".")[0] for n in names if n.split(".")[0] in ("rover_lib", "lab")}
 
 
-def test_onboard_needs_only_what_a_pi_has():
-    for path in (ROOT / "onboard").glob("*.py"):
+def place(name: str, places: tuple[str, ...]) -> int | None:
+    return next((i for i, p in enumerate(places) if name == p or name.startswith(f"{p}.")), None)
+
+
+@pytest.mark.parametrize("places", [FLOORS, ROOMS], ids=["floors", "rooms of the laboratory"])
+def test_imports_go_one_way(places):
+    checked = 0
+    for name, path in modules().items():
+        if (mine := place(name, places)) is None:
+            continue
+        for other in ours(path):
+            theirs = place(other, places)
+            assert theirs is None or theirs <= mine, f"{name} imports {other}"
+            checked += 1
+    assert checked > 20
+
+
+def test_no_module_imports_itself_in_a_circle():
+    """Not even inside of functions, or for type checkers alone."""
+    arrows = {name: ours(path) for name, path in modules().items()}
+    while leaves := [n for n, targets in arrows.items() if not targets & arrows.keys() - {n}]:
+        for leaf in leaves:
+            del arrows[leaf]
+    assert not arrows, f"these import each other: {sorted(arrows)}"
+
+
+def test_onboard_needs_only_what_a_rover_has():
+    for path in (ROOT / "rover_lib" / "onboard").glob("*.py"):
         for name in imported(path):
             top = name.split(".")[0]
             assert top in ONBOARD_NEEDS or top in sys.stdlib_module_names, f"{path}: imports {name}"

@@ -9,7 +9,7 @@ import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
-from rover_lib.playground import arduino
+from lab.arduino import emulator as arduino
 
 REPOSITORY = arduino.REPOSITORY
 symbol = arduino.symbol

@@ -7,7 +7,11 @@ import yaml
 
 from rover_lib.onboard.errors import ParamsError
 
-PLACES = (Path(__file__).parents[2] / "params.yml", Path("/etc/rover/params.yml"))  # a checkout's; an installed rover's
+PLACES = (
+    Path(__file__).parents[2] / "params.yml",  # a checkout's
+    Path("/etc/rover/params.yml"),  # an installed rover's
+    Path(__file__).parents[1] / "params.yml",  # an installed workstation's
+)
 
 
 def params(path: Path | str | None = None) -> dict[str, Any]:

@@ -10,12 +10,13 @@ import nbformat
 import numpy as np
 import pytest
 
+from lab.a76 import count as arm
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import write_stage
-from rover_lib.playground import latency
-from rover_lib.workshop import arm, session
 from rover_lib.workshop import run as runs
+from rover_lib.workshop import session
 from rover_lib.workshop.run import AFTERWARDS, NAMES, NOTEBOOK_LIMIT, NOTEBOOKS, parameters_of
+from rover_lib.world import latency
 
 PATHS = [NOTEBOOKS / f"{name}.ipynb" for name in NAMES + AFTERWARDS]
 MOST_LINES = 12

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from lab.pi.bench import changed_artifact
 from rover_lib.cli import main
-from rover_lib.emulated.bench import changed_artifact
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.policy import load_policy

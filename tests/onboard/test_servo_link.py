@@ -17,9 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from uno import body_of, line
 
+from lab.arduino.emulator import Arduino
 from rover_lib.onboard.errors import PwmError, RoverError
 from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
-from rover_lib.playground.arduino import Arduino
 
 until = functools.partial(needs.until, seconds=2.0)
 STATUS = "<S 7 1234 5 k M r 1456 120 1460 21316 - - 1 2 3 4"

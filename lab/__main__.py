@@ -1,0 +1,152 @@
+"""The laboratory's commands: python -m lab COMMAND, from a checkout."""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rover_lib.cli.progress import progress
+from rover_lib.onboard.cli import FILE, Rover, drive_options, run_drive, show
+
+
+@click.group("lab", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
+def main(debug: bool) -> None:
+    """What the rover project is proven with: an emulated Arduino, faults, counted instructions, emulated Pis."""
+
+
+@main.command()
+@drive_options
+@click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="A plan takes so long.")
+@click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
+@click.pass_context
+def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> None:
+    """`rover drive --world`, with the real firmware on an emulated Arduino."""
+    from lab.arduino.emulator import BOARD, build
+    from rover_lib.world.car import VirtualCar
+
+    build()  # here, where its errors are seen
+    ctx.exit(run_drive(car=partial(VirtualCar, seed=seed, board=BOARD), latency_ms=latency_ms, **options))
+
+
+@main.command()
+@click.argument("run_dir", type=FILE)
+@click.option(
+    "--frames", type=click.IntRange(min=3), default=50, show_default=True, help="Held-out frames to judge with."
+)
+@click.option("--jobs", type=click.IntRange(min=1), help="Artifacts at a time [default: all cores].")
+@click.option("--peers", is_flag=True, help="Count ONNX Runtime, ExecuTorch and others beside them.")
+@click.option("--details", is_flag=True, help="Count the static policy part by part too, and what else was tried.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, details: bool, as_json: bool) -> None:
+    """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
+
+    A count, never a time. Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of params.yml
+    hold. Needs Debian 12 with qemu-user and gcc, which are installed when you are root.
+    """
+    from lab.a76.count import count_run, table
+    from rover_lib.onboard.stage import read_stage
+    from rover_lib.workshop.run import execute
+
+    count_run(run_dir, frames=frames, jobs=jobs, progress=progress())
+    if peers:
+        from lab.a76.peers import count_peers
+
+        count_peers(run_dir, jobs=jobs, progress=progress())
+    if details:
+        from lab.a76.parts import count_parts
+
+        count_parts(run_dir, progress=progress())
+    execute("06_arm", run_dir)
+    content = read_stage(run_dir / "arm.json", "arm")
+    click.echo(json.dumps(content, indent=2) if as_json else table(content))
+
+
+@main.command()
+@click.argument("run_dir", type=FILE)
+@click.option("--samples", type=click.IntRange(min=1), default=64, show_default=True, help="Calibration samples.")
+@click.option("--steps", type=click.IntRange(min=1), default=24, show_default=True, help="Training steps.")
+def full(run_dir: Path, **options: Any) -> None:
+    """Make a policy of the real car's size in RUN_DIR, and artifacts of it at several image sizes, for `rover arm`.
+
+    Real in format, size and ranges, but trained for a few steps only: it does not drive.
+    """
+    from lab.a76.full import NOTE, full_run
+
+    click.echo(f"made: {full_run(run_dir, progress=progress(), **options)} ({NOTE})")
+
+
+@main.command()
+@click.argument("output", type=FILE, required=False)
+@click.option("--only", metavar="NAME", multiple=True, help="Only this row, 'fuzz' or 'bytes'; several times for more.")
+@click.pass_context
+def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...]) -> None:
+    """Break what can break while the car drives, and see on the pins of an emulated Arduino whether it stops.
+
+    About 6 minutes for all. With OUTPUT, the rows are left there as JSON. Exit code 1 if anything is not as expected.
+    Needs Debian's packages for the Arduino's firmware and simavr, see README.
+    """
+    from lab.driving.faults import run_faults
+
+    outcome = run_faults(only, say=click.echo)
+    if output:
+        outcome.write(output)
+    show(outcome.summary, False)
+    for sentence in outcome.wrong:
+        click.echo(f"rover: {sentence}", err=True)
+    ctx.exit(1 if outcome.wrong else 0)
+
+
+@main.group()
+def pi() -> None:
+    """Emulated Pis: the playbooks, the service and its faults on real Debian arm64 systems. Needs root, and Debian."""
+
+
+def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
+    for sentence in wrong:
+        click.echo(f"rover: {sentence}", err=True)
+    click.echo(f"{'not as expected' if wrong else 'as expected'}: {output}")
+    ctx.exit(1 if wrong else 0)
+
+
+@pi.command("fast")
+@click.argument("output", type=FILE, default="runs/pi-fast.json")
+@click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifacts are deployed.")
+@click.option("--faults/--no-faults", default=True, help="Leave out a deployment's faults and the fleet.")
+@click.pass_context
+def pi_fast(ctx: click.Context, output: Path, demo: Path, faults: bool) -> None:
+    """Run every playbook on an emulated Pi in a container, and prove from within what they promise.
+
+    Real systemd and sshd, aarch64 programs, the real firmware on an emulated Arduino. OUTPUT is JSON, what the
+    playbooks said is beside it; exit code 1 if anything is not as expected.
+    """
+    from lab.pi.fast import run_fast
+
+    outcome = run_fast(output, demo, faults=faults, say=click.echo)
+    for gate in outcome.metrics.get("gates", []):
+        click.echo(f"{'ok  ' if gate['holds'] else 'FAIL'}  {gate['gate']}: {gate['wanted']}")
+    _end_pi(ctx, outcome.wrong, output)
+
+
+@pi.command("whole")
+@click.argument("output", type=FILE, default="runs/pi.json")
+@click.option("--artifact", type=FILE, default="runs/demo/policy_static.pt", show_default=True, help="To deploy.")
+@click.option("--recordings", type=FILE, default="runs/demo/episodes", show_default=True, help="What the camera shows.")
+@click.option("--fresh", is_flag=True, help="Provision anew, even if the cache has a card that was provisioned so.")
+@click.pass_context
+def pi_whole(ctx: click.Context, output: Path, **options: Any) -> None:
+    """Provision, deploy and drive a whole emulated Pi, and hold each servo pulse against its command.
+
+    QEMU's Cortex-A76 with kernel, camera and USB; the real firmware on an emulated Arduino. Cables are pulled while
+    it drives. OUTPUT is JSON; exit code 1 if anything is not as expected, the machine's console is beside it then.
+    """
+    from lab.pi.whole import run_whole
+
+    outcome = run_whole(output, **options, say=click.echo)
+    _end_pi(ctx, outcome.wrong, output)
+
+
+if __name__ == "__main__":
+    main()

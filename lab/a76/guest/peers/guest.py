@@ -1,0 +1,111 @@
+"""Runs inside the emulated Pi: another engine on its own form of the policy, one thread, no torch in the process.
+
+    predict.py ARTIFACT OBSERVATIONS FOLDER COUNTED ENGINE HEIGHT WIDTH
+
+ENGINE is onnxruntime (ARTIFACT an .onnx) or executorch (a .pte); both take `state` (1, S) float32 and `frame`
+(1, 3, HEIGHT, WIDTH) float32 (see planes.py) and give (1, chunk, A) float32. OBSERVATIONS, the marks and what is left
+in FOLDER are those of ../predict.py: a BGR frame of the camera goes in, actions come out, and all between counts.
+"""
+
+import ctypes
+import json
+import platform
+import sys
+import types
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import numpy as np
+from mark import mark
+from planes import planes
+
+import rover_lib
+
+# The package's own __init__ loads torch, whose memory would count as the peer's; prepare_frame does not need it.
+package = types.ModuleType("rover_lib.onboard")
+package.__path__ = [str(Path(rover_lib.__file__).parent / "onboard")]
+sys.modules[package.__name__] = package
+from rover_lib.onboard.preprocess import prepare_frame  # noqa: E402
+
+Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # state (1, S), planes -> (chunk, A), all float32
+
+
+def ticks() -> dict[str, int]:
+    """Processor time that each thread of the process has used, in the kernel's ticks."""
+    found = {}
+    for task in Path("/proc/self/task").iterdir():
+        fields = (task / "stat").read_text().rpartition(")")[2].split()
+        found[task.name] = int(fields[11]) + int(fields[12])
+    return found
+
+
+def worked(before: dict[str, int], after: dict[str, int]) -> int:
+    """How many threads did the work: the emulator's own, and those that only wait, used next to nothing."""
+    used = [count - before.get(thread, 0) for thread, count in after.items()]
+    return sum(u > 0.05 * sum(used) for u in used)
+
+
+def onnxruntime(artifact: str) -> Predict:
+    import onnxruntime as ort
+
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = ort.InferenceSession(artifact, options, providers=["CPUExecutionProvider"])
+    return lambda state, frame: session.run(None, {"state": state, "frame": frame})[0][0]
+
+
+def executorch(artifact: str) -> Predict:
+    import executorch  # for its place only: the runtime is C++ (see executorch.cpp)
+
+    library = ctypes.CDLL(str(Path(next(iter(executorch.__path__))).parent / "policy.so"))
+    library.policy_load.restype = ctypes.c_void_p
+    error = ctypes.c_int()
+    policy = library.policy_load(artifact.encode(), ctypes.byref(error))
+    if error.value:
+        sys.exit(f"error: {artifact}: ExecuTorch does not load it (its error {error.value:#x})")
+    chunk = np.empty([library.policy_output_size(ctypes.c_void_p(policy), i) for i in range(3)], np.float32)
+
+    def pointer(array: np.ndarray) -> ctypes.c_void_p:
+        return ctypes.c_void_p(array.ctypes.data)
+
+    def predict(state: np.ndarray, frame: np.ndarray) -> np.ndarray:
+        _, _, height, width = frame.shape
+        ran = library.policy_run(
+            ctypes.c_void_p(policy), pointer(state), state.shape[1], pointer(frame), height, width, pointer(chunk)
+        )
+        if ran:
+            sys.exit(f"error: ExecuTorch does not run {artifact} (its error {ran:#x})")
+        return chunk[0].copy()
+
+    return predict
+
+
+def main(artifact: str, observations: str, folder: str, counted: str, engine: str, height: str, width: str) -> None:
+    print("load", flush=True)
+    mark(True, 0)
+    predict = {"onnxruntime": onnxruntime, "executorch": executorch}[engine](artifact)
+    mark(False, 0)
+    chunks, before = [], ticks()
+    with np.load(observations) as seen:
+        states = seen["state"]
+        for i in range(max(len(states), int(counted))):
+            state, frame = states[i % len(states)][None], seen[f"frame_{i % len(states):04d}"]
+            print("predict", flush=True)
+            if i < int(counted):
+                mark(True, i + 1)
+            chunks.append(predict(state, planes(prepare_frame(frame, int(height), int(width)))))
+            if i < int(counted):
+                mark(False, i + 1)
+    threads, out = worked(before, ticks()), Path(folder)
+    np.save(out / "chunks.npy", np.stack(chunks[: len(states)]))
+    versions = {"python": platform.python_version(), engine: version(engine), "numpy": np.__version__}
+    versions |= {"cv2": cv2.__version__, "machine": platform.machine(), "libc": " ".join(platform.libc_ver())}
+    (out / "versions.json").write_text(json.dumps(versions | {"threads": threads}))
+    (out / "maps").write_text(Path("/proc/self/maps").read_text())
+    print("done", flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

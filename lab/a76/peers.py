@@ -1,0 +1,307 @@
+"""The ruler's peers: what other engines execute for the same policy on the same emulated Cortex-A76.
+
+    count_peers("runs/full")      # adds metrics.peers to runs/full/arm.json, which arm.count_run has written
+
+Each engine quantizes the float policy with its own tools, on the frames that calibrated ours, and is judged on the same
+held-out frames. It brings packages of its own, pinned here, that are laid before ours on Python's path, on this machine
+and in the emulated Pi, and never installed: nothing of it is in our environment.
+"""
+
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import nn
+
+from lab.a76 import count as arm
+from lab.a76.count import ArmError, Counted, Machine
+from rover_lib.onboard.artifact import read_manifest
+from rover_lib.onboard.params import params
+from rover_lib.onboard.policy import ACTION_LIMITS
+from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+from rover_lib.workshop import act
+from rover_lib.workshop import quantize as q
+from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.compare import thinned
+from rover_lib.workshop.episodes import Sample, choose_calibration
+from rover_lib.workshop.session import opened
+
+FOLDER = Path(__file__).parent / "guest" / "peers"
+GUEST = FOLDER / "guest.py"
+COMMON = (FOLDER / "float_policy.py", FOLDER / "planes.py")
+SHIM = FOLDER / "executorch.cpp"
+COMPILER, COMPILER_PACKAGE = "aarch64-linux-gnu-g++", "g++-aarch64-linux-gnu"
+AFFINE = "policy_static_affine"
+FRAMES = 20  # judge a peer: its error is only to show that it computes the same policy
+
+Progress = Callable[..., Iterable] | None
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Another engine: what it needs before our packages, here and in the emulated Pi, and the file that it makes.
+
+    Without their dependencies: numpy and all else that these use is in ours.
+    """
+
+    name: str
+    suffix: str
+    packages: tuple[str, ...]
+    guest_packages: tuple[str, ...]
+
+    @property
+    def maker(self) -> Path:
+        """The script of ours that runs its tools."""
+        return FOLDER / f"make_{self.name}.py"
+
+
+ENGINES = (
+    Engine(
+        "onnxruntime",
+        ".onnx",
+        ("onnxruntime==1.31.1", "onnx==1.23.2", "ml-dtypes==0.6.0", "protobuf==7.36.2", "flatbuffers==25.12.19"),
+        ("onnxruntime==1.31.1",),
+    ),
+    Engine(
+        "executorch",
+        ".pte",
+        (
+            "executorch==1.5.1",
+            "torchao==0.18.0",
+            # It only exports, and is the newest that runs on the CUDA libraries of our torch 2.8, gigabytes that an
+            # x86-64 wheel insists on; one of them is new since.
+            "torch==2.10.0",
+            "nvidia-nvshmem-cu12==3.4.5; platform_machine == 'x86_64'",
+            "flatbuffers==25.12.19",
+            "ruamel.yaml==0.19.1",
+            "tabulate==0.10.0",
+            "expecttest==0.3.0",
+            "parameterized==0.9.0",
+        ),
+        ("executorch==1.5.1",),  # of it the C++ runtime alone: see executorch.cpp
+    ),
+)
+
+
+# --- their packages ---------------------------------------------------------------------------------------------------
+
+
+def packages_here(engine: Engine) -> Path:
+    """The folder of an engine's packages for this machine, from the cache or fetched now."""
+    made = {"packages": engine.packages, "python": sys.version_info[:2], "machine": os.uname().machine}
+
+    def make(folder: Path) -> None:
+        _fetch(engine.packages, folder, "--python", sys.executable)
+
+    return cached_folder(f"peer-{engine.name}", key_of(made), make)
+
+
+def packages_there(engine: Engine) -> Path:
+    """The same for the emulated Pi; for ExecuTorch with our call of its C++ runtime, compiled."""
+    made = {"packages": engine.guest_packages, "python": arm.PYTHON, "platform": arm.PLATFORM}
+    compiled = engine.name == "executorch"
+
+    def make(folder: Path) -> None:
+        platform = ("--python-platform", arm.PLATFORM, "--python-version", arm.PYTHON)
+        _fetch(engine.guest_packages, folder, *platform)
+        if compiled:
+            _compile(folder)
+
+    return cached_folder(f"arm-peer-{engine.name}", key_of(made, *([SHIM] if compiled else [])), make)
+
+
+def _fetch(packages: Sequence[str], folder: Path, *where: str) -> None:
+    command = [arm._uv(), "pip", "install", "--quiet", "--only-binary", ":all:", "--no-deps", "--target", folder]
+    arm._call([*command, *where, *packages], f"uv cannot fetch {packages[0]} and what it needs")
+
+
+def _compile(folder: Path) -> None:
+    """policy.so from executorch.cpp, as ExecuTorch's own CMake package would compile and link it."""
+    if not shutil.which(COMPILER):
+        arm.install([COMPILER_PACKAGE], f"ExecuTorch needs the Debian package {COMPILER_PACKAGE}")
+    sdk = folder / "executorch"
+    command = [COMPILER, "-std=c++17", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "policy.so", SHIM]
+    command += ["-DC10_USING_CUSTOM_GENERATED_MACROS", "-DET_EVENT_TRACER_ENABLED"]
+    command += ["-isystem", sdk / "include"]
+    command += ["-isystem", sdk / "include" / "executorch" / "runtime" / "core" / "portable_type" / "c10"]
+    command += ["-L", sdk / "lib", "-Wl,-rpath,$ORIGIN/executorch/lib"]
+    # Kernels and backends register themselves when they are loaded; nothing refers to them by name.
+    libraries = ("", "_backend_xnnpack", "_kernels_optimized", "_kernels_quantized", "_threadpool")
+    command += ["-Wl,--no-as-needed", *(f"-lexecutorch{name}" for name in libraries)]
+    arm._call(command, f"{SHIM.name} does not compile")
+
+
+# --- their form of the policy -----------------------------------------------------------------------------------------
+
+
+def made_by(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> tuple[Path, dict]:
+    """The policy as an engine's own tools quantize it, in `folder`, made again only if anything that goes in changed.
+
+    samples: calibrate. Returns the file, and what its maker said: `int8_layers` (how many), `float_layers` (names),
+    `versions`. Raises ArmError if the tools fail, or if they left a layer in float that ours has in INT8.
+    """
+    artifact, said = folder / f"{engine.name}{engine.suffix}", folder / f"{engine.name}.json"
+    frames = [sha256_of(s.frame_path) for s in samples]
+    states = [s.state.tolist() for s in samples]
+    goes_in = {"checkpoint": checkpoint.sha256, "frames": frames, "states": states, "packages": engine.packages}
+    key = key_of(goes_in, engine.maker, *COMMON, act)
+    if artifact.exists() and said.exists():
+        before = read_stage(said, "peer")
+        if before["params"] == {"key": key} and before["inputs"] == {artifact.name: sha256_of(artifact)}:
+            return artifact, before["metrics"]
+    height, width = checkpoint.config.image_sizes[0]
+    with tempfile.TemporaryDirectory(prefix="rover-peer-") as scratch, atomic_path(artifact) as temporary:
+        calibration = Path(scratch) / "calibration.npz"
+        prepared = np.stack([prepare_frame(s.frame_bgr(), height, width) for s in samples])
+        np.savez(calibration, state=np.stack([s.state for s in samples]).astype(np.float32), frames=prepared)
+        environment = {**os.environ, "PYTHONPATH": str(packages_here(engine))}
+        command = [sys.executable, engine.maker, checkpoint.path.resolve(), calibration, temporary]
+        printed = arm._call(command, f"{engine.name} cannot quantize {checkpoint.path}", env=environment)
+        made = json.loads(printed.splitlines()[-1])
+        check_int8(engine.name, made, int8_layers(checkpoint))
+    write_stage(said, "peer", params={"key": key}, metrics=made, inputs={artifact.name: sha256_of(artifact)})
+    return artifact, made
+
+
+def int8_layers(checkpoint: Checkpoint) -> int:
+    """How many convolutions and linears of the policy are INT8 in ours."""
+    modules = act.ACT(checkpoint.config, checkpoint.weights).named_modules()
+    layers = (name for name, m in modules if isinstance(m, (nn.Conv2d, nn.Linear)))
+    return sum(act.block_of(name) not in q.STAYS_FLOAT for name in layers)
+
+
+def check_int8(name: str, made: dict[str, Any], expected: int) -> None:
+    """Raise ArmError unless a peer has as many layers in INT8 as ours: tools have left them in float without a word."""
+    if made["int8_layers"] != expected:
+        raise ArmError(
+            f"{name}: {made['int8_layers']} convolutions and linears became INT8, ours has {expected}; "
+            f"float are {made['float_layers'][:5]}"
+        )
+
+
+def affine(run_dir: Path, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> Path:
+    """Our static artifact by the recipe of the tutorials (quint8 activations), from the run's own calibration."""
+    calibration = q.Calibration.load(run_dir / "calibration.pt")
+    path = folder / f"{AFFINE}.pt"
+    policy = q.quantize(checkpoint, q.Scheme("static", kind="affine", smooth=calibration.smooth), calibration)
+    v = params()["parity"]
+    options = {"tolerance": v["fp32"], "int8_errors": v["int8_errors"], "vectors": v["vectors"]}
+    q.export(policy, checkpoint, path, samples=samples, calibration=calibration, **options)
+    return path
+
+
+# --- counting ---------------------------------------------------------------------------------------------------------
+
+
+def count_peer(
+    machine: Machine,
+    engine: Engine,
+    artifact: Path,
+    samples: Sequence[Any],
+    size: tuple[int, int],
+    **how: Any,
+) -> Counted:
+    """`arm.count_artifact` of an engine's artifact. size: (height, width) of the image that it takes. how: of that."""
+    there = packages_there(engine)
+    return arm.count_guest(machine, GUEST, artifact, samples, engine.name, *size, packages=there, **how)
+
+
+def count_peers(
+    run_dir: Path | str, *, frames: int = FRAMES, jobs: int | None = None, progress: Progress = None
+) -> dict[str, Any]:
+    """Count the peers of a run's static artifact, add them to its arm.json and return what is in it.
+
+    metrics.peers has, keyed as metrics.artifacts: `torch_fp32` and, where the run has that artifact, `torch_affine`
+    (with the `artifact` that they repeat), `onnxruntime` and `executorch` (with `file_mb`, `int8_layers` and
+    `made_with`, the versions of their tools). What the engines make is kept in run_dir/peers. A peer's chunks come from
+    the emulated Pi, the reference from this machine, whose FP32 count_run has held against the Pi's.
+    frames: held-out frames to judge with (`torch_affine`, several times slower, with half of them). jobs: emulated
+    machines at a time. Raises ArmError if arm.json is not there or is of other artifacts, or if a peer cannot be had,
+    made or run.
+    """
+    run_dir = Path(run_dir)
+    content, reference = counted_run(run_dir)
+    artifacts = content["metrics"]["artifacts"]
+    manifest = read_manifest(reference)
+    again = opened(run_dir)
+    checkpoint, ranges = again.checkpoint, again.recordings.action_range()
+    given = read_stage(run_dir / "calibrate.json", "calibrate")["params"]
+    calibrating, _ = choose_calibration(again.parts.calibration, given["samples"], given["seed"])
+    samples = thinned(again.parts.held_out, frames)
+    machine = arm.prepare(progress)
+    folder, size = run_dir / "peers", checkpoint.config.image_sizes[0]
+    # The packages of all of them first: what cannot be had should fail before hours are spent on the others.
+    steps = [lambda e=e, get=get: get(e) for e in ENGINES for get in (packages_here, packages_there)]
+    for step in progress(steps, desc="peers' packages", total=len(steps)) if progress else steps:
+        step()
+    made = {}
+    for engine in progress(ENGINES, desc="peers' quantization", total=len(ENGINES)) if progress else ENGINES:
+        made[engine.name] = made_by(engine, checkpoint, calibrating, folder)
+
+    todo: dict[str, Callable[..., Counted]] = {}
+    for engine in ENGINES:
+        todo[engine.name] = lambda engine=engine, **how: count_peer(
+            machine, engine, made[engine.name][0], samples, size, **how
+        )
+    if AFFINE not in artifacts:
+        path = affine(run_dir, checkpoint, thinned(again.parts.choosing, 8), folder)
+        todo["torch_affine"] = lambda **how: arm.count_artifact(machine, path, samples[::2], **how)
+        made["torch_affine"] = path, {}
+    steps = max(len(samples), arm.COUNTED) * len(todo)
+    counts = arm.side_by_side(todo, steps, "peers, emulated", jobs or os.cpu_count() or 1, progress)
+
+    here = arm._chunks_here(reference, samples, progress)
+    peers = {}
+    for name, stem in (("torch_fp32", arm.REFERENCE), ("torch_affine", AFFINE)):
+        if stem in artifacts:
+            file_mb = (run_dir / f"{stem}.pt").stat().st_size / 1e6
+            peers[name] = {"artifact": stem, "file_mb": file_mb} | artifacts[stem]
+    for name, counted in counts.items():
+        path, said = made[name]
+        judged = here[::2] if name == "torch_affine" else here
+        peers[name] = peer_metrics(counted, manifest, judged, ranges) | {"file_mb": path.stat().st_size / 1e6}
+        if said:
+            peers[name] |= {"int8_layers": said["int8_layers"], "made_with": said["versions"]}
+    return with_peers(run_dir, content, peers, [path for path, _ in made.values()])
+
+
+def counted_run(run_dir: Path) -> tuple[dict[str, Any], Path]:
+    """A run's arm.json, and its FP32 artifact. Raises ArmError unless the one was counted from the other."""
+    path, reference = run_dir / "arm.json", run_dir / f"{arm.REFERENCE}.pt"
+    if not path.exists():
+        raise ArmError(f"{path}: not found; count the run's own artifacts first ('rover arm {run_dir}')")
+    content = read_stage(path, "arm")
+    if not reference.exists() or content["inputs"].get(reference.name) != sha256_of(reference):
+        raise ArmError(f"{path}: counted from another {reference.name}; count the run again ('rover arm {run_dir}')")
+    return content, reference
+
+
+def peer_metrics(
+    counted: Counted, manifest: dict[str, Any], reference: np.ndarray, ranges: dict[str, tuple[float, float]]
+) -> dict[str, Any]:
+    """What arm.json says of one peer. manifest: of our FP32 artifact. reference: its chunks, (n, C, A)."""
+    if counted.chunks.shape != reference.shape or not np.isfinite(counted.chunks).all():
+        raise ArmError(f"a peer gave {counted.chunks.shape} of actions, finite or not, where {reference.shape} belong")
+    names = manifest["action_names"]
+    low, high = np.array([ACTION_LIMITS.get(name, (-np.inf, np.inf)) for name in names], np.float32).T
+    errors = arm.errors_pct(reference, np.clip(counted.chunks, low, high), names, ranges)  # as predict_chunk clips
+    found = arm.artifact_metrics(counted, manifest) | errors
+    return found | {"reference": arm.REFERENCE, "frames": len(reference), "frames_on_the_core": len(counted.chunks)}
+
+
+def with_peers(
+    run_dir: Path, content: dict[str, Any], peers: dict[str, dict[str, Any]], artifacts: Sequence[Path]
+) -> dict[str, Any]:
+    """Write arm.json again, all else as it was."""
+    inputs = content["inputs"] | {f"{p.parent.name}/{p.name}": sha256_of(p) for p in artifacts}
+    metrics = content["metrics"] | {"peers": peers}
+    return write_stage(run_dir / "arm.json", "arm", params=content["params"], metrics=metrics, inputs=inputs)

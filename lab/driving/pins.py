@@ -1,0 +1,177 @@
+"""What the servo pins do after a fault, judged: stopped, the human's, or going on as commanded.
+
+All times are of the monotonic clock that simavr's pins, the cable and the bench share.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from rover_lib.onboard.params import params
+from rover_lib.onboard.pwm import ARDUINO_STEP_US
+from rover_lib.world.standin import REST_US, PinEvent
+
+STOPPED, HUMAN, CONTINUES = "stopped", "human", "continues"
+NEUTRAL_US = {"steering": 1456, "throttle": 120}
+PERIOD_US = {"steering": 21316, "throttle": 1016}
+TICK_US = {"steering": 0.5, "throttle": 4.0}  # of the pin's timer: all that its hardware can do
+EDGE_US = 0.5  # an edge in simavr is known to 0.25 us
+STEP_US = ARDUINO_STEP_US + EDGE_US  # of a pulse that the Arduino measured and made again
+COMMAND_US = {"steering": 1.0, "throttle": 2.5}  # half a step of its timer, and an edge
+STILL_VALID_S = 0.2  # the Arduino holds a command for 150 ms, and a steering pulse begins 21 ms later
+BEFORE_S = 0.2  # so long it must have been driving before a fault
+LAST_S = 0.2  # so much of the end must have pulses
+
+
+@dataclass(frozen=True)
+class Gates:
+    """Of params.yml's section `faults`."""
+
+    stopped_ms: float
+    throttle_max_us: float
+    takeover_ms: float
+    rows: int
+    stopped_rows: int
+    bytes_us: float
+
+    @classmethod
+    def of_params(cls) -> "Gates":
+        """Those of params.yml."""
+        return cls(**params()["faults"])
+
+    @property
+    def stopped_s(self) -> float:
+        return self.stopped_ms / 1e3
+
+
+class Command(NamedTuple):
+    """A drive's line that went into the cable, and when."""
+
+    at_s: float
+    steering_us: int
+    throttle_us: int
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a fault is judged by. events: of the pins, in order; commands: of the drive; from before at_s to end_s."""
+
+    events: Sequence[PinEvent]
+    commands: Sequence[Command]
+    at_s: float
+    end_s: float
+
+    def pulses(self, pin: str, from_s: float | None = None, to_s: float | None = None) -> list[PinEvent]:
+        """Of a pin, those that ended in a span of time [default: from the fault on]."""
+        from_s = self.at_s if from_s is None else from_s
+        to_s = self.end_s if to_s is None else to_s
+        return [e for e in self.events if e.pin == pin and e.kind in ("pulse", "cut") and from_s < e.end_s <= to_s]
+
+    def stalled_ms(self) -> float:
+        """So long this machine had no time for the Arduino, or for who read its pins."""
+        spoilt = [e for e in self.events if e.kind in ("stall", "lost") and self.at_s - BEFORE_S < e.monotonic_s]
+        return sum(e.pulse_us / 1e3 if e.kind == "stall" else 1e9 for e in spoilt)
+
+
+@dataclass
+class Verdict:
+    """figures: for the row. wrong: a sentence for each way in which it is not as expected."""
+
+    figures: dict[str, Any]
+    wrong: list[str]
+
+
+def judge(
+    expected: str, seen: Seen, gates: Gates, *, human_us: tuple[float, float] = REST_US, until_limit: bool = False
+) -> Verdict:
+    """What the pins did from the fault on, against what was expected.
+
+    human_us: the transmitter's pulses. until_limit: of `continues`: a limit stops the car in the end.
+    """
+    throttle, steering = seen.pulses("throttle"), seen.pulses("steering")
+    moving = [e.end_s for e in throttle if e.pulse_us > gates.throttle_max_us]
+    late = [e.pulse_us for e in throttle if e.end_s > seen.at_s + gates.stopped_s]
+    figures: dict[str, Any] = {
+        "stopped_after_ms": round((max(moving) - seen.at_s) * 1e3, 1) if moving else 0.0,
+        "max_throttle_us_after": round(max(late), 1) if late else None,
+        "steering_us_after": round(steering[-1].pulse_us, 1) if steering else None,
+    }
+    wrong = []
+    before = seen.pulses("throttle", seen.at_s - BEFORE_S, seen.at_s)
+    if not before or min(e.pulse_us for e in before) <= gates.throttle_max_us:
+        wrong.append(f"the car was not driving in the {BEFORE_S * 1e3:g} ms before the fault")
+    for pin, period_us in PERIOD_US.items():
+        found, wanted = len(seen.pulses(pin, seen.end_s - LAST_S)), LAST_S * 1e6 / period_us
+        if found < wanted - 2:
+            wrong.append(f"{found} {pin} pulses in the last {LAST_S * 1e3:g} ms, {wanted:.0f} are its rate")
+    if expected == STOPPED:
+        wrong += _not_stopped(seen, gates, figures, human_us)
+    elif expected == HUMAN:
+        wrong += _not_human(seen, gates, figures, human_us)
+    else:
+        wrong += _not_continued(seen, gates, figures, until_limit)
+    return Verdict(figures, wrong)
+
+
+def _not_stopped(seen: Seen, gates: Gates, figures: dict[str, Any], rest_us: tuple[float, float]) -> Iterator[str]:
+    if figures["stopped_after_ms"] > gates.stopped_ms:
+        yield f"throttle off {figures['stopped_after_ms']:g} ms after the fault, {gates.stopped_ms:g} are allowed"
+    if (figures["max_throttle_us_after"] or 0) > gates.throttle_max_us:
+        yield f"throttle at {figures['max_throttle_us_after']:g} us after it had to be off"
+    # A reset leaves the Arduino in manual: then it is the resting stick's, as measured.
+    since_s = seen.at_s + gates.stopped_s + PERIOD_US["steering"] * 1e-6
+    widths = [e.pulse_us for e in seen.pulses("steering", since_s)]
+    if off := [us for us in widths if min(abs(us - NEUTRAL_US["steering"]), abs(us - rest_us[0])) > STEP_US]:
+        yield f"steering at {off[-1]:g} us, neutral is {NEUTRAL_US['steering']}"
+
+
+def _not_human(seen: Seen, gates: Gates, figures: dict[str, Any], human_us: tuple[float, float]) -> Iterator[str]:
+    took_ms = 0.0
+    for pin, wanted_us in zip(PERIOD_US, human_us, strict=True):
+        found = seen.pulses(pin)
+        ours = [i for i, e in enumerate(found) if abs(e.pulse_us - wanted_us) > STEP_US]
+        first = ours[-1] + 1 if ours else 0
+        if first >= len(found):
+            figures["takeover_ms"] = None
+            yield f"{pin} was never the human's"
+            return
+        took_ms = max(took_ms, (found[first].end_s - seen.at_s) * 1e3)
+    figures |= {"stopped_after_ms": None, "takeover_ms": round(took_ms, 1)}
+    if took_ms > gates.takeover_ms:
+        yield f"the human's pulses after {took_ms:.1f} ms, {gates.takeover_ms:g} are allowed"
+
+
+def _not_continued(seen: Seen, gates: Gates, figures: dict[str, Any], until_limit: bool) -> Iterator[str]:
+    if until_limit:
+        yield from _not_limited(seen, gates, figures)
+    stopped_s = seen.at_s + figures["stopped_after_ms"] / 1e3 + 1e-4 if until_limit else seen.end_s
+    if not until_limit:
+        figures["stopped_after_ms"] = None
+    for pin, period_us in PERIOD_US.items():
+        index = 1 if pin == "steering" else 2
+        for e in seen.pulses(pin):
+            recent = [c[index] for c in seen.commands if e.monotonic_s - STILL_VALID_S < c.at_s <= e.monotonic_s]
+            if e.kind == "cut" or abs(e.period_us - period_us) > EDGE_US:
+                yield f"a {pin} pulse out of time: {e.period_us:g} us after the one before, {period_us} is its period"
+                return
+            neutral = until_limit and e.end_s > stopped_s and abs(e.pulse_us - NEUTRAL_US[pin]) <= COMMAND_US[pin]
+            if not neutral and min((abs(e.pulse_us - us) for us in recent), default=1e9) > COMMAND_US[pin]:
+                yield f"{pin} at {e.pulse_us:g} us {(e.monotonic_s - seen.at_s) * 1e3:.0f} ms after the fault, which "\
+                      f"was not commanded ({sorted(set(recent))})"  # fmt: skip
+                return
+    if not until_limit and min((e.pulse_us for e in seen.pulses("throttle")), default=0) <= gates.throttle_max_us:
+        yield "the throttle went off"
+
+
+def _not_limited(seen: Seen, gates: Gates, figures: dict[str, Any]) -> Iterator[str]:
+    """Fading from params' fade_s on, off at its stop_s: ages of a plan, which is younger when the fault comes."""
+    limits, throttle = params()["drive"], seen.pulses("throttle")
+    fading = [e.end_s for e in throttle if e.pulse_us < throttle[0].pulse_us - 2 * ARDUINO_STEP_US]
+    figures["fades_after_ms"] = round((fading[0] - seen.at_s) * 1e3, 1) if fading else None
+    most_ms = limits["stop_s"] * 1e3 + gates.stopped_ms
+    if not fading or abs(fading[0] - seen.at_s - limits["fade_s"]) > 0.15:
+        yield f"the throttle fades after {figures['fades_after_ms']} ms, the limit is {limits['fade_s']:g} s"
+    if not figures["fades_after_ms"] or not figures["fades_after_ms"] < figures["stopped_after_ms"] <= most_ms:
+        yield f"throttle off after {figures['stopped_after_ms']:g} ms, {most_ms:g} are allowed"
+    if throttle and throttle[-1].pulse_us > gates.throttle_max_us:
+        yield "the car was never stopped"

@@ -1,0 +1,419 @@
+"""A rover that is deployed to while something goes wrong, and the network to it: what breakage.py and fleet.py work on.
+
+When a deployment has come to a certain point is seen on the rover's disk, looked at from this machine every millisecond
+or so: no hook in what runs is needed for that.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import tempfile
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lab.a76.count import fetch_packages
+from lab.pi import plays
+from lab.pi.container import Container
+from lab.pi.plays import Play
+from lab.pi.system import EmulationError, run
+from lab.pi.wire import Wire
+from rover_lib.onboard.release import POLICY, Releases, pack
+from rover_lib.workshop.cache import cached_folder, key_of
+
+STATE = "var/lib/rover"  # on the rover; models/ and incoming/ are in it
+ROVER = "/opt/rover/venv/bin/rover"
+CHECK = "rover-check@{}.service"
+LOOK_S = 0.001  # between looks at the disk
+PLAY_S = 1800.0
+CHECK_S = 600.0
+INTO_CHECK_S = 1.0  # of a health check, when the power is cut in it
+LIBRARY = "/usr/lib/aarch64-linux-gnu/faketime/libfaketimeMT.so.1"  # of Debian's libfaketime
+CGROUPS = Path("/sys/fs/cgroup")
+
+
+class Missed(EmulationError):
+    """A moment of a deployment that passed unseen: the row says nothing."""
+
+
+# What is on the disk
+
+
+@dataclass(frozen=True)
+class Disk:
+    """How far a deployment has come, by what is on the rover's disk.
+
+    ready: there is a folder for what arrives. arrived: names of what has. staging: bytes of the files of a release
+    that has no name yet. released: it has. switched: it is in use. remembered: and was proven again since.
+    """
+
+    ready: bool = False
+    arrived: tuple[str, ...] = ()
+    staging: Mapping[str, int] = field(default_factory=dict)
+    released: bool = False
+    switched: bool = False
+    remembered: bool = False
+
+    @classmethod
+    def seen(cls, state: Path, about: Mapping[str, Any]) -> "Disk":
+        """state: the folder of models/ and incoming/. about: what pack() returned."""
+        models, incoming = state / "models", state / "incoming" / about["sha256"]
+        try:
+            arrived = tuple(sorted(p.name for p in incoming.iterdir() if not p.name.startswith(".")))
+            ready = True
+        except OSError:
+            arrived, ready = (), False
+        staging = {}
+        with contextlib.suppress(OSError):
+            staging = {entry.name: entry.stat().st_size for entry in os.scandir(models / "releases" / ".new")}
+        try:
+            current = str((models / "current").readlink()).removeprefix("releases/")
+        except OSError:
+            current = ""
+        try:
+            last = json.loads((models / "history.json").read_text())[-1]
+        except (OSError, ValueError, IndexError):
+            last = ""
+        name = str(about["name"])
+        switched = current.startswith(name)
+        released = any(True for _ in (models / "releases").glob(f"{name}*/{POLICY}"))
+        return cls(ready, arrived, staging, released, switched, switched and last == current)
+
+    def complete(self, about: Mapping[str, Any]) -> bool:
+        """All parts have arrived, and what describes them."""
+        return len(self.arrived) == about["parts"] + 1
+
+    def row(self) -> dict[str, Any]:
+        """For the report."""
+        return {**vars(self), "arrived": list(self.arrived), "staging": dict(self.staging)}
+
+
+class Line(NamedTuple):
+    """A rover in the table of status.yml. model: the beginning of its name. notes: what is said below its line."""
+
+    healthy: bool
+    model: str
+    mode: str
+    notes: str
+
+
+def line_of(output: str, name: str) -> Line:
+    """A rover's line in what status.yml said. Raises EmulationError if it has none."""
+    lines = [line.strip().strip('",') for line in output.splitlines() if line.strip().startswith('"')]
+    for i, line in enumerate(lines):
+        words = line.split()
+        if words[:1] != [name] or len(words) < 4:
+            continue
+        notes = []
+        for note in lines[i + 1 :]:
+            if not note.startswith(" "):
+                break
+            notes.append(note.strip())
+        return Line(words[1] == "yes", words[2], words[3], "; ".join(notes))
+    raise EmulationError(f"status.yml has no line of {name}, it ends: {output[-600:]}")
+
+
+def changed_artifact(artifact: Path, target: Path, **changes: Any) -> Path:
+    """The artifact with another manifest, and every checksum right."""
+    with zipfile.ZipFile(artifact) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as new:
+        for item in old.infolist():
+            content = old.read(item)
+            if item.filename.endswith("/extra/manifest.json"):
+                content = json.dumps({**json.loads(content), **changes}).encode()
+            new.writestr(item.filename, content)
+    return target
+
+
+# One rover, and what is done to it
+
+
+class Bench:
+    """A rover that is deployed to, and the network to it. before, target: the mode in use, and the one to be deployed.
+
+    artifacts: two that are fit to be deployed, by their mode. packed: what pack() says of them. found: the disk when
+    its power was cut.
+    """
+
+    before = target = ""
+    found = Disk()
+
+    def __init__(self, pi: Container, artifacts: Mapping[str, Path], folder: Path, stop: threading.Event):
+        self.pi, self.artifacts, self.stop = pi, dict(artifacts), stop
+        self.folder = folder / pi.name
+        self.folder.mkdir(parents=True)
+        self.wire = Wire(pi)
+        self.undo = contextlib.ExitStack()
+        self.seconds: dict[str, float] = {}
+        self.said: list[str] = []
+        self.packed = {mode: pack(path, self.folder / "packed") for mode, path in self.artifacts.items()}
+
+    def __enter__(self) -> "Bench":
+        self.wire.__enter__()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.undo.close()
+        self.wire.__exit__(*exc)
+
+    @property
+    def state(self) -> Path:
+        """The rover's folder of models/ and incoming/; what is mounted there as long as it is on."""
+        if self.pi.on:
+            return Path(f"/proc/{self.pi.leader}/root/{STATE}")
+        return self.pi.root / STATE
+
+    @property
+    def releases(self) -> Releases:
+        """As this machine reads them; it changes nothing."""
+        return Releases(self.state / "models")
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What pack() says of the model to be deployed."""
+        return self.packed[self.target]
+
+    @property
+    def disk(self) -> Disk:
+        return Disk.seen(self.state, self.about)
+
+    @property
+    def incoming(self) -> Path:
+        return self.state / "incoming" / self.about["sha256"]
+
+    @property
+    def released(self) -> Path:
+        """The policy of the release that is deployed, which is there already."""
+        return next((self.state / "models" / "releases").glob(f"{self.about['name']}*/{POLICY}"))
+
+    def begin(self, fresh: bool = False) -> None:
+        """Of a row: a model that is not in use is to be deployed. fresh: only the one in use is on the rover."""
+        self.before = self._mode_of(self.releases.current or "", "")
+        self.target = next(mode for mode in self.artifacts if mode != self.before)
+        self.seconds, self.said = {}, []
+        if fresh:
+            for release in (self.state / "models" / "releases").iterdir():
+                if release.name != self.releases.current:
+                    shutil.rmtree(release)
+
+    def play(self, book: str, *, others: Sequence[plays.Host] = (), name: str = "", **variables: Any) -> Play:
+        """Runs a playbook on this rover, and on others after it. name: of a laptop of its own."""
+        if self.stop.is_set():
+            raise EmulationError("told to stop")
+        folder = self.folder / (name or "laptop")
+        folder.mkdir(exist_ok=True)
+        given = {"rover_packed": str(folder / "packed"), **variables}
+        return plays.run(book, [self.wire, *others], folder=folder, variables=given, timeout_s=PLAY_S)
+
+    def deploy(self, artifact: Path | None = None, **more: Any) -> Play:
+        """Runs deploy.yml with an artifact, or with the one to be deployed; what it said is noted."""
+        play = self.play("deploy", rover_artifact=str(artifact or self.artifacts[self.target]), **more)
+        self.said.append(play.output)
+        return play
+
+    def deploy_until(self, moment: Callable[[Disk], bool], strike: Callable[[], object], **more: Any) -> Play:
+        """Runs deploy.yml, and strikes once at the moment. Raises Missed if it never came."""
+        struck: list[BaseException | None] = []
+        over = threading.Event()
+
+        def watch() -> None:
+            while not over.is_set():
+                with contextlib.suppress(OSError, EmulationError):
+                    if moment(self.disk):
+                        try:
+                            strike()
+                        except Exception as error:
+                            return struck.append(error)
+                        return struck.append(None)
+                time.sleep(LOOK_S)
+
+        watcher = threading.Thread(target=watch, name=f"watcher of {self.pi.name}")
+        watcher.start()
+        try:
+            play = self.deploy(**more)
+        finally:
+            over.set()
+            watcher.join()
+        if not struck:
+            raise Missed(f"{self.pi.name}: the moment did not come, or passed unseen; deploy.yml: {play.end[-600:]}")
+        if struck[0]:
+            raise struck[0]
+        return play
+
+    def cut_power(self, holds: Callable[[Disk], bool]) -> Callable[[], None]:
+        """To strike with. holds: what the disk is like then; another moment was hit if it is not."""
+
+        def strike() -> None:
+            self.pi.cut_power()
+            self.found = self.disk
+            if not holds(self.found):
+                raise Missed(f"{self.pi.name}: the power was cut a moment too late, there is {self.found.row()}")
+
+        return strike
+
+    def set_clock(self, years: int) -> None:
+        """What starts from now on sees another year, until the row is over: by libfaketime, in every aarch64 program.
+
+        The monotonic clock of what systemd starts stays as it is, as it does when a real clock is set.
+        """
+        copied = self.pi.root / LIBRARY.lstrip("/")
+        preload, settings = self.pi.root / "etc/ld.so.preload", self.pi.root / "etc/faketimerc"
+        copied.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(_faketime() / LIBRARY.lstrip("/"), copied)
+        settings.write_text(f"{years:+d}y\n")
+        preload.write_text(f"{LIBRARY}\n")
+        self.undo.callback(preload.unlink, missing_ok=True)
+        self.undo.callback(settings.unlink, missing_ok=True)
+
+    def proves(self) -> bool:
+        """Whether a health check is at work now, by its control group, which is quicker than to ask systemctl."""
+        tops = [CGROUPS / self.pi.machine, *CGROUPS.glob(f"*/{self.pi.machine}")]  # cgroup v2, and its hierarchies
+        return any(True for top in tops for _ in top.glob(f"**/{CHECK.format('*')}"))
+
+    def wait_for_check(self) -> None:
+        """Until a health check has loaded something of what it needs. Raises Missed if there is none."""
+        until = time.monotonic() + 5
+        while not self.proves():
+            if time.monotonic() > until:
+                raise Missed(f"{self.pi.name}: no health check is at work")
+        self.stop.wait(INTO_CHECK_S)
+
+    def rover(self, *command: object) -> str:
+        """Runs `rover` on the rover, by hand; what it said is noted."""
+        done = self.pi.inside(ROVER, *command, check=False, timeout_s=CHECK_S)
+        said = (done.stdout + done.stderr).decode(errors="replace")
+        self.said.append(said)
+        return said
+
+    def small_disk(self, free: int) -> None:
+        """Models and what arrives are now on a file system with so many bytes free, until the row is over."""
+        used = sum(p.stat().st_size for p in self.state.rglob("*") if p.is_file() and not p.is_symlink())
+        self.pi.inside(
+            "sh",
+            "-ec",
+            f"cd /; mkdir -p /mnt/small; mount -t tmpfs -o mode=755,size={used + free} small /mnt/small;"
+            f" cp -a /{STATE}/. /mnt/small; mount --bind /mnt/small /{STATE}; umount /mnt/small",
+        )
+        self.undo.callback(self.pi.inside, "umount", "--lazy", f"/{STATE}", check=False)
+
+    def make_room(self) -> None:
+        self.pi.inside("mount", "-o", "remount,size=1g", f"/{STATE}")
+        (self.state / "ballast").unlink(missing_ok=True)
+
+    def make_read_only(self) -> None:
+        """As a card does when it comes to its end; until the row is over."""
+        self.pi.inside("mount", "--bind", f"/{STATE}", f"/{STATE}")
+        self.pi.inside("mount", "-o", "remount,bind,ro", f"/{STATE}")
+        self.undo.callback(self.pi.inside, "umount", "--lazy", f"/{STATE}", check=False)
+
+    def clean(self) -> None:
+        """Undoes what the fault has left; what was mounted in a rover that went off is gone."""
+        with contextlib.suppress(EmulationError, OSError):
+            self.undo.close()
+
+    @contextlib.contextmanager
+    def timed(self, what: str) -> Iterator[None]:
+        started = time.monotonic()
+        yield
+        self.seconds[what] = self.seconds.get(what, 0.0) + time.monotonic() - started
+
+    def mode_in_use(self) -> tuple[str, bool]:
+        """The mode of what is in use, "another" or "none" else, and whether its bytes are whole."""
+        current = self.releases.current
+        if current is None:
+            return "none", False
+        return self._mode_of(current, "another"), not self.releases.wrong_with(current)
+
+    def _mode_of(self, release: str, otherwise: str) -> str:
+        return next((mode for mode, about in self.packed.items() if release.startswith(about["name"])), otherwise)
+
+    def healthy(self) -> bool:
+        """Whether what is in use passes its parity vectors, in the service's sandbox."""
+        done = self.pi.inside("systemctl", "start", CHECK.format("current"), check=False, timeout_s=CHECK_S)
+        return done.returncode == 0
+
+    def status(self, healthy: bool) -> tuple[str, str]:
+        """What status.yml shows, and what of it is not so: an empty string if all is."""
+        line = line_of(self.play("status").output, self.pi.name)
+        current = self.releases.current
+        mode = self._mode_of(current or "", line.mode)
+        wrong = [r.name[:12] for r in self.releases.all() if r.wrong and not r.current]
+        is_so = {
+            f"healthy is {healthy}": line.healthy == healthy,
+            f"model is {(current or 'none')[:12]}": line.model == (current or "none")[:12],
+            f"mode is {mode}": line.mode == mode,
+            **{f"release {name} is damaged": name in line.notes for name in wrong},
+        }
+        shown = f"{'healthy' if line.healthy else 'NOT healthy'}, {line.model}, {line.mode}"
+        return shown + (f" ({line.notes})" if line.notes else ""), "; ".join(k for k, v in is_so.items() if not v)
+
+
+def flip(path: Path) -> None:
+    """One bit in the middle of a file, in place."""
+    with path.open("r+b") as f:
+        f.seek(path.stat().st_size // 2)
+        byte = f.read(1)
+        f.seek(-1, os.SEEK_CUR)
+        f.write(bytes([byte[0] ^ 1]))
+        os.fsync(f.fileno())
+
+
+# Several of them
+
+
+@contextlib.contextmanager
+def rovers(names: Sequence[str], layers: Sequence[Path], artifacts: Mapping[str, Path]) -> Iterator[list[Bench]]:
+    """Rovers that are on. Whatever ends the block, nothing of them is left."""
+    stop = threading.Event()
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rover-breaks-")))
+        benches = []
+        for name in names:
+            pi = stack.enter_context(Container(name, layers=layers))
+            benches.append(stack.enter_context(Bench(pi, artifacts, folder, stop)))
+            pi.boot()
+        try:
+            yield benches
+        finally:
+            stop.set()
+
+
+def in_parallel(task: Callable[[Bench], Any], benches: Sequence[Bench]) -> list[Any]:
+    with ThreadPoolExecutor(len(benches)) as pool:
+        futures = [pool.submit(task, bench) for bench in benches]
+        try:
+            wait(futures, return_when=FIRST_EXCEPTION)
+            return [future.result() for future in futures]
+        except BaseException:  # ^C too: what waits for a rover that is off does not wait for long
+            for bench in benches:
+                bench.stop.set()
+                bench.pi.cut_power()
+            raise
+
+
+def give_first_model(benches: Sequence[Bench]) -> None:
+    without = [bench for bench in benches if bench.mode_in_use()[0] not in bench.artifacts]
+    if not without:
+        return
+    first = without[0]
+    artifact = next(iter(first.artifacts.values()))
+    play = first.play("deploy", others=[bench.wire for bench in without[1:]], rover_artifact=str(artifact))
+    if not play.ok:
+        raise EmulationError(f"{first.pi.name}: the first model cannot be deployed: {play.end}")
+
+
+def _faketime() -> Path:
+    """Debian's libfaketime for aarch64, unpacked, from the cache or made now."""
+
+    def make(folder: Path) -> None:
+        with tempfile.TemporaryDirectory() as scratch:
+            for package in fetch_packages(Path(scratch), ["libfaketime"]):
+                if package.name.startswith("libfaketime_"):
+                    run(["dpkg-deb", "--extract", package, folder], f"{package.name} cannot be unpacked")
+
+    return cached_folder("pi-faketime", key_of({"library": LIBRARY}), make)

@@ -1,0 +1,542 @@
+"""What can go wrong with a deployment, on emulated Pis: `make pi-fast` writes the rows to runs/pi-fast.json.
+
+    artifacts = {"static": Path("policy_static.pt"), "mixed": Path("policy_mixed.pt")}
+    rows = break_deployments(pi.layers, artifacts)      # of a Container that was provisioned, and is off
+
+Each fault meets ansible/deploy.yml (or rollback.yml) as a human runs it, against real systemd and sshd, and there is no
+hook for it in what runs: when a deployment has come to a certain point is seen on the rover's disk, looked at from this
+machine every millisecond or so. A row in which the moment was missed is done again. After each fault the rover is
+asked for three things. Its model still passes its parity vectors, in the service's sandbox. What status.yml shows is
+what is on the disk. And deploy.yml, run again, leaves the rover with the new model.
+
+A power cut ends every program of the rover at one moment and leaves its disk as it was. What a real one also takes
+away, writes that were not synced, a container cannot show, because its disk is a layer over a folder of this machine:
+tests/onboard/test_release.py cuts the same commands after every system call that changes something, and there what was
+not synced is lost.
+"""
+
+import contextlib
+import json
+import re
+import shutil
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lab.pi.bench import (
+    STATE,
+    Bench,
+    Disk,
+    Missed,
+    changed_artifact,
+    flip,
+    give_first_model,
+    in_parallel,
+    rovers,
+)
+from lab.pi.system import EmulationError
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.release import ORIGIN, POLICY, SPARE_BYTES
+
+ROOM = 4 << 20  # bytes free on a full disk
+TRIES = 2  # of a row whose moment was missed
+WORKERS = 2  # rovers that are broken at the same time; each keeps a core busy
+RETRY_S = 30  # of trying to reach a rover that does not answer
+NOBODY = 9  # a port on which no sshd listens
+
+Say = Callable[[str], None]
+
+
+# The faults
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A row. inject: makes a deployment meet it. says: what must be said of it, a regular expression. how: it is made.
+
+    heal: what a human does about the cause before deploying again. fresh: the model to be deployed is not on the rover
+    yet, so that it travels; otherwise it is there from before, which is quicker.
+    """
+
+    name: str
+    inject: Callable[[Bench], object]
+    says: str
+    how: str
+    fresh: bool = False
+    heal: Callable[[Bench], object] = lambda bench: None
+
+
+FAULTS: list[Fault] = []
+LOST = "UNREACHABLE!|does not answer any more"  # when ssh ends
+
+
+def _fault(name: str, says: str, how: str, **more: Any) -> Callable[[Callable], Callable]:
+    def add(inject: Callable[[Bench], object]) -> Callable[[Bench], object]:
+        FAULTS.append(Fault(name, inject, says, how, **more))
+        return inject
+
+    return add
+
+
+def _power_cut(
+    when: str, moment: Callable[[Bench, Disk], bool], how: str, *, in_check: bool = False, fresh: bool = True
+) -> None:
+    """in_check: not at that moment, but in the health check that it begins with."""
+
+    @_fault(f"power cut {when}", LOST, how, fresh=fresh)
+    def inject(bench: Bench) -> None:
+        cut = bench.cut_power(lambda disk: moment(bench, disk))
+
+        def strike() -> None:
+            if in_check:
+                bench.wait_for_check()
+            cut()
+
+        bench.deploy_until(lambda disk: moment(bench, disk) and (not in_check or bench.proves()), strike)
+
+
+def _arriving(bench: Bench, disk: Disk) -> bool:
+    return any(name.startswith("part-") for name in disk.arrived) and not disk.complete(bench.about)
+
+
+def _written_in_part(bench: Bench, disk: Disk) -> bool:
+    return 0 < disk.staging.get(POLICY, 0) < bench.about["bytes"]
+
+
+_power_cut(
+    "before the transfer", lambda b, d: d.ready and not d.arrived, "once there is a folder for it, and nothing in it"
+)
+_power_cut("in the transfer", _arriving, "once a part of it is there")
+_power_cut(
+    "after the transfer",
+    lambda b, d: d.complete(b.about) and not d.staging,
+    "once all is there, and nothing made of it",
+)
+_power_cut("before fsync", _written_in_part, "while the new release's policy.pt is written")
+_power_cut(
+    "before the release has its name",
+    lambda b, d: d.staging.get(POLICY) == b.about["bytes"] and not d.released,
+    "once all its bytes are written, while they are looked at",
+)
+_power_cut("after fsync and rename", lambda b, d: d.released and not d.switched, "once its folder has its name")
+_power_cut(
+    "in the health check before the switch",
+    lambda b, d: d.released and not d.switched,
+    "a second into its parity vectors",
+    in_check=True,
+    fresh=False,
+)
+_power_cut(
+    "right after the switch", lambda b, d: d.switched and not d.remembered, "once current points to it", fresh=False
+)
+_power_cut(
+    "in the health check after the switch",
+    lambda b, d: d.switched and not d.remembered,
+    "a second into its parity vectors",
+    in_check=True,
+    fresh=False,
+)
+_power_cut(
+    "between switch and restart",
+    lambda b, d: d.remembered,
+    "once it was proven again; a power cut ends a service too, which then loads what current points to",
+    fresh=False,
+)
+
+
+@_fault(
+    "disk full in the transfer",
+    "No space left on device",
+    f"{ROOM >> 20} MB are free",
+    heal=Bench.make_room,
+    fresh=True,
+)
+def _no_room_to_arrive(bench: Bench) -> None:
+    bench.small_disk(ROOM)
+    bench.deploy()
+
+
+@_fault(
+    "too little room for a release",
+    r"\d+ MB free, \d+ are needed; prune releases",
+    "it can arrive, but the release does not fit beside it",
+    heal=Bench.make_room,
+    fresh=True,
+)
+def _no_room_to_stage(bench: Bench) -> None:
+    bench.small_disk(2 * bench.about["bytes"] + ROOM)
+    bench.deploy()
+
+
+@_fault(
+    "disk full while the release is written",
+    "the disk is full; what was in use still is",
+    "something else takes all that is free, once there was room enough",
+    heal=Bench.make_room,
+    fresh=True,
+)
+def _fill_while_staging(bench: Bench) -> None:
+    bench.small_disk(2 * bench.about["bytes"] + SPARE_BYTES + 2 * ROOM)
+
+    def fill() -> None:
+        with contextlib.suppress(OSError), (bench.state / "ballast").open("wb", buffering=0) as f:
+            while True:
+                f.write(bytes(1 << 20))
+
+    bench.deploy_until(lambda disk: disk.complete(bench.about) and bool(disk.staging), fill)
+
+
+@_fault(
+    "a byte flipped on the way",
+    f"transfer mechanism failed|{LOST}",
+    "in the network, once a part has come through: ssh notices and ends, and Ansible may send it again",
+    fresh=True,
+)
+def _flip_on_the_wire(bench: Bench) -> None:
+    bench.deploy_until(lambda disk: _arriving(bench, disk), lambda: bench.wire.flip(after=1 << 20))
+
+
+@_fault(
+    "a byte flipped in what has arrived",
+    "arrived damaged .* send it again",
+    "in a part on the rover's disk",
+    fresh=True,
+)
+def _flip_on_disk(bench: Bench) -> None:
+    bench.deploy_until(lambda disk: disk.complete(bench.about), lambda: flip(bench.incoming / "part-0000"))
+
+
+@_fault(
+    "ssh lost in the transfer",
+    LOST,
+    "the network is cut a megabyte after the first part; the transfer goes on",
+    fresh=True,
+)
+def _lose_ssh_in_transfer(bench: Bench) -> dict[str, Any]:
+    def strike() -> None:
+        until = bench.wire.sent + (1 << 20)
+        while bench.wire.sent < until and not bench.disk.complete(bench.about) and not bench.stop.is_set():
+            time.sleep(0.001)
+        bench.wire.cut()
+
+    sent = bench.wire.sent
+    bench.deploy_until(lambda disk: _arriving(bench, disk), strike)
+    first = bench.wire.sent - sent
+    bench.wire.mend()
+    arrived = {p.name: p.stat().st_ino for p in bench.incoming.glob("part-*")}
+    kept: dict[str, int] = {}
+    sent = bench.wire.sent
+
+    def look() -> None:
+        kept.update({p.name: p.stat().st_ino for p in bench.incoming.glob("part-*")})
+
+    bench.deploy_until(lambda disk: disk.complete(bench.about), look)
+    travelled = [name for name, inode in kept.items() if arrived.get(name) != inode]
+    if not arrived or set(arrived) & set(travelled):
+        raise EmulationError(f"{bench.pi.name}: {sorted(arrived)} had arrived, and {travelled} travelled again")
+    # All that Ansible sends is in these, its modules too.
+    return {
+        "had_arrived": sorted(arrived),
+        "travelled_then": travelled,
+        "sent_mb": [round(first / 1e6, 1), round((bench.wire.sent - sent) / 1e6, 1)],
+    }
+
+
+@_fault("ssh lost in the health check", LOST, "the network is cut while the rover proves the new model; it goes on")
+def _lose_ssh_in_check(bench: Bench) -> None:
+    bench.deploy_until(lambda disk: bench.proves(), lambda: (bench.wait_for_check(), bench.wire.cut()))
+
+
+@_fault(
+    "network silent in the transfer", LOST, "out of reach: no packet comes through, and no connection ends", fresh=True
+)
+def _go_silent(bench: Bench) -> None:
+    # Of each try to reach it again; ssh's own limit is that of inventory.ini.
+    bench.deploy_until(lambda disk: _arriving(bench, disk), bench.wire.silence, ansible_ssh_timeout=RETRY_S)
+
+
+@_fault(
+    "artifact with a wrong hash",
+    "contains [0-9a-f]{12}, not [0-9a-f]{12}; pack it again",
+    "what describes the parts names another artifact",
+    fresh=True,
+)
+def _wrong_hash(bench: Bench) -> None:
+    def strike() -> None:
+        path = bench.incoming / ORIGIN
+        other = bench.packed[bench.before]["name"]
+        path.write_text(json.dumps({**json.loads(path.read_text()), "name": other[::-1]}))
+
+    bench.deploy_until(lambda disk: disk.complete(bench.about), strike)
+
+
+def _refused(bench: Bench, artifact: Path, says: str) -> None:
+    """By the laptop, before anything travels; and by the rover, brought there by hand."""
+    if bench.deploy(artifact).ok:
+        raise EmulationError(f"{bench.pi.name}: {artifact.name} was deployed")
+    there = bench.state / "by-hand.pt"
+    shutil.copy(artifact, there)
+    bench.undo.callback(there.unlink, missing_ok=True)
+    if not re.search(says, bench.rover("release", "stage", f"/{STATE}/by-hand.pt")):
+        raise EmulationError(
+            f"{bench.pi.name}: the rover took {artifact.name}, or said another thing: {bench.said[-1]}"
+        )
+
+
+OTHER_TORCH = r"made with torch 9\.9\.9, rovers have"
+
+
+@_fault("artifact of another torch", OTHER_TORCH, "its manifest says so; refused by laptop and rover")
+def _other_torch(bench: Bench) -> None:
+    versions = {"torch": "9.9.9", "rover_lib": ""}
+    bad = changed_artifact(bench.artifacts[bench.target], bench.folder / "torch.pt", versions=versions)
+    _refused(bench, bad, OTHER_TORCH)
+
+
+A_LIE = "its manifest says dynamic, its code is not"
+
+
+@_fault("manifest that lies", A_LIE, "it says dynamic of INT8 convolutions; refused by laptop and rover")
+def _lie(bench: Bench) -> None:
+    bad = changed_artifact(bench.artifacts[bench.target], bench.folder / "lie.pt", mode="dynamic")
+    _refused(bench, bad, A_LIE)
+
+
+@_fault("parity vectors that fail", "computes something else here", "the manifest tolerates less than no difference")
+def _fail_parity(bench: Bench) -> None:
+    with zipfile.ZipFile(bench.artifacts[bench.target]) as z:
+        manifest = json.loads(z.read(next(n for n in z.namelist() if n.endswith("/extra/manifest.json"))))
+    parity = {"tolerance": dict.fromkeys(manifest["action_names"], -1.0), "reason": "to fail"}
+    bench.deploy(changed_artifact(bench.artifacts[bench.target], bench.folder / "parity.pt", parity=parity))
+
+
+@_fault(
+    "two deployments at once",
+    "another deployment is at work",
+    "the second is of the model in use, and begins while the first one's is proven",
+)
+def _two_at_once(bench: Bench) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        second: list[Any] = []
+
+        def strike() -> None:
+            bench.wait_for_check()
+            second.append(pool.submit(bench.deploy, bench.artifacts[bench.before], name="second"))
+
+        bench.deploy_until(lambda disk: bench.proves(), strike)
+        second[0].result()
+
+
+def _wrong_clock(years: int) -> None:
+    @_fault(
+        f"clock wrong by {years:+d} years", ": deployed", "libfaketime is loaded into all that systemd and sshd start"
+    )
+    def inject(bench: Bench) -> dict[str, str]:
+        bench.set_clock(years)
+        bench.deploy()
+        return {"date": bench.pi.ssh("sudo date +%Y").stdout.decode().strip()}
+
+
+@_fault(
+    "release tampered with before it was proven",
+    r"is not what policy\.pt\.sha256 says",
+    "a byte of it, as its health check begins",
+)
+def _tamper_before(bench: Bench) -> None:
+    bench.deploy_until(lambda disk: bench.proves(), lambda: flip(bench.released))
+
+
+@_fault(
+    "release tampered with after the switch",
+    "failed after the switch, [0-9a-f]{12} is in use again",
+    "a byte of it, once it is in use: the health check fails, and the rover goes back by itself",
+)
+def _tamper_after(bench: Bench) -> None:
+    bench.deploy_until(lambda disk: disk.switched, lambda: flip(bench.released))
+
+
+@_fault(
+    "release in use tampered with",
+    ": deployed",
+    "a byte of it; status says so, its health check fails, and the next deployment replaces it",
+)
+def _tamper_in_use(bench: Bench) -> dict[str, Any]:
+    flip(bench.releases.policy)
+    shown, wrong = bench.status(bench.healthy())
+    bench.deploy(bench.artifacts[bench.before])
+    return {"status_before": shown, "status_before_true": not wrong}
+
+
+@_fault(
+    "rollback with nothing to roll back to",
+    "there is no release to roll back to",
+    "rollback.yml on a rover with one release, then deploy.yml",
+    fresh=True,
+)
+def _roll_back(bench: Bench) -> None:
+    play = bench.play("rollback")
+    bench.said.append(play.output)
+    if play.ok:
+        raise EmulationError(f"{bench.pi.name}: rolled back to nothing")
+
+
+for years in (-20, 20):
+    _wrong_clock(years)
+
+
+class Nobody(NamedTuple):
+    """A line of the inventory behind which no rover is."""
+
+    name: str
+    key: Path
+    port: int = NOBODY
+
+
+@_fault("a host in the inventory that does not exist", r"nobody: unreachable", "after this one, which gets its model")
+def _nobody_there(bench: Bench) -> dict[str, Any]:
+    nobody = Nobody("nobody", bench.pi.key)
+    play = bench.deploy(others=[nobody])
+    table = bench.play("status", others=[nobody]).output
+    if f"{bench.pi.name}: deployed" not in play.output or play.code == 0 or "does not answer" not in table:
+        raise EmulationError(
+            f"{bench.pi.name} was not deployed to or reported, because nobody is not there: {play.end}"
+        )
+    return {"status_of_nobody": "does not answer"}
+
+
+# Rows
+
+
+def break_deployments(
+    layers: Sequence[Path],
+    artifacts: Mapping[str, Path],
+    *,
+    only: str = "",
+    workers: int = WORKERS,
+    done: Callable[[dict[str, Any]], object] = lambda row: None,
+    say: Say = lambda text: None,
+) -> list[dict[str, Any]]:
+    """Every fault whose name contains `only`, each on one of so many rovers; their rows, in the order of FAULTS.
+
+    layers: of a Container that was provisioned, and is off. A rover with another model gets the first of the artifacts.
+    done: gets each row once it is there, one at a time.
+    Raises EmulationError if no row can be made at all.
+    """
+    waiting = [fault for fault in FAULTS if only in fault.name]
+    if not waiting:
+        raise EmulationError(f"no fault has '{only}' in its name; there are: {', '.join(f.name for f in FAULTS)}")
+    rows: dict[str, dict[str, Any]] = {}
+    telling = threading.Lock()
+    with rovers([f"breaks{i + 1}" for i in range(min(workers, len(waiting)))], layers, artifacts) as benches:
+
+        def work(bench: Bench) -> None:
+            give_first_model([bench])
+            while waiting and not bench.stop.is_set():
+                fault = waiting.pop(0)
+                row = _row(fault, bench)
+                with telling:
+                    rows[fault.name] = row
+                    done(row)
+                    say(_told(row))
+
+        in_parallel(work, benches)
+    return [rows[fault.name] for fault in FAULTS if fault.name in rows]
+
+
+def wrong_rows(rows: Sequence[Mapping[str, Any]], at_least: int) -> list[str]:
+    """What is not as it must be, in sentences. at_least: so many rows must be there."""
+    found = [f"{r['fault']}: {r['error']}" for r in rows if r.get("error")]
+    for key, what in (
+        ("healthy", "the rover has no model that passes its parity vectors"),
+        ("status_true", "status.yml does not show what is"),
+        ("healed_by_rerun", "running deploy.yml again does not heal it"),
+    ):
+        found += [f"{row['fault']}: {what}" for row in rows if not row.get("error") and not row[key]]
+    if len(rows) < at_least:
+        found.append(f"{len(rows)} faults of a deployment were made, at least {at_least} are wanted")
+    return found
+
+
+def _row(fault: Fault, bench: Bench) -> dict[str, Any]:
+    started = time.monotonic()
+    row: dict[str, Any] = {"fault": fault.name, "how": fault.how}
+    try:
+        for left in reversed(range(TRIES)):
+            try:
+                row |= _after(fault, bench)
+                break
+            except Missed:
+                if not left:
+                    raise
+                _restore(bench)
+                row["missed"] = row.get("missed", 0) + 1
+    except RoverError as error:
+        nothing = {"model_after": None, "healthy": False, "status_true": False, "healed_by_rerun": False}
+        row |= {**nothing, "error": str(error)[-2000:]}
+        if bench.stop.is_set():
+            raise
+        _restore(bench)
+    return {**row, "seconds": round(time.monotonic() - started, 1)}
+
+
+def _after(fault: Fault, bench: Bench) -> dict[str, Any]:
+    """A fault, and what the rover is like after it."""
+    bench.begin(fault.fresh)
+    with bench.timed("fault"):
+        details = fault.inject(bench)
+    row = details if isinstance(details, dict) else {}
+    if not bench.pi.on:
+        row["disk"] = bench.found.row()
+        with bench.timed("boot"):
+            bench.pi.boot()
+    bench.wire.mend()
+    said = " ".join(" ".join(bench.said).replace("\\n", " ").split())
+    match = re.search(fault.says, said)
+    if not match:
+        raise Missed(f"{bench.pi.name}: nobody said '{fault.says}', but: {said[-800:]}")
+    with bench.timed("health"):
+        healthy = bench.healthy()
+    with bench.timed("status"):
+        shown, untrue = bench.status(healthy)
+    model, whole = bench.mode_in_use()
+    row |= {
+        "model_before": bench.before,
+        "model_after": model,
+        "model_after_hash": bench.releases.current,
+        "healthy": healthy and whole,
+        "status": shown,
+        "status_true": not untrue,
+        **({"status_lies": untrue} if untrue else {}),
+        "said": said[max(0, match.start() - 60) : match.end() + 100],
+    }
+    fault.heal(bench)
+    with bench.timed("rerun"):
+        again = bench.deploy()
+    model, whole = bench.mode_in_use()
+    row["healed_by_rerun"] = again.ok and whole and model == bench.target
+    if not row["healed_by_rerun"]:
+        row["rerun"] = again.end[-1500:]
+    bench.clean()
+    return {**row, "seconds_of": {k: round(v, 1) for k, v in bench.seconds.items()}}
+
+
+def _restore(bench: Bench) -> None:
+    """After a row that did not come to its end."""
+    bench.clean()
+    bench.wire.mend()
+    if not bench.pi.on:
+        bench.pi.boot()
+    bench.begin()
+    bench.deploy()
+
+
+def _told(row: Mapping[str, Any]) -> str:
+    if row.get("error"):
+        return f"{row['fault']}: {row['error']}"
+    good = row["healthy"] and row["status_true"] and row["healed_by_rerun"]
+    return f"{row['fault']}: {row['model_after']} {'healthy, healed' if good else 'NOT WELL'} ({row['seconds']:.0f} s)"

@@ -1,0 +1,487 @@
+"""A whole emulated Pi in QEMU: four Cortex-A76, a kernel of its own, systemd, sshd, a camera and USB.
+
+    with Machine(card(), folder, slow=20) as pi:
+        pi.wait_for_ssh()
+        pi.ssh("uname -a")
+        pi.plug(arduino.port)
+
+Nothing on the host is changed: ssh is on a port of the loopback, the machine reaches no network, and what it writes
+goes to a file of its own over the card, which stays as it was.
+
+The machine is many times slower than a Pi. So its clock runs `slow` times slower than the host's: the device tree
+tells its kernel that the counter of all its clocks and timers counts `slow` times faster than it does. Then a rate of
+30 Hz, a watchdog's 2 s and an Arduino's 150 ms (slowed down alike) stand in a Pi's proportion to its speed, and nothing
+of the rover's has to be told other times. What takes a second for the machine takes `slow` seconds here.
+"""
+
+import contextlib
+import ctypes
+import gzip
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lab.a76.count import fetch_packages
+from lab.pi.system import USER, System, emulation, free_port, make_sure, system
+from rover_lib.onboard.errors import RoverError
+from rover_lib.workshop.cache import cached_folder, key_of
+
+PACKAGES = {  # commands, and the Debian packages that have them
+    "qemu-system-aarch64": "qemu-system-arm",
+    "qemu-img": "qemu-utils",
+    "mke2fs": "e2fsprogs",
+    "depmod": "kmod",
+    "cpio": "cpio",
+    "fdtput": "device-tree-compiler",
+    "ssh": "openssh-client",
+}
+RECIPE = 1  # one more when the card is made in another way: older ones are then not used
+CARD_GB = 6  # sparse: it takes what is in it
+MEMORY_MB, CORES, CPU = 3072, 4, "cortex-a76"
+TIMER_HZ = 62_500_000  # of QEMU's Cortex-A76
+SLOWEST = 60  # the device tree has 32 bits for the frequency
+DEBS = "/var/lib/rover-debs"  # on the card: the Debian packages that a rover without internet must have
+ROVER_PACKAGES = ("python3-venv", "python3-packaging", "avrdude", "v4l-utils")  # as roles/rover/tasks/system.yml
+KERNEL_PACKAGES = ("linux-image-arm64", "busybox-static")
+# Of the kernel's modules those that the machine has devices for.
+MODULES = (
+    *("fs", "lib", "crypto", "arch", "net/core", "net/packet", "net/ipv6", "net/unix"),
+    *("drivers/virtio", "drivers/block", "drivers/net/virtio_net.ko", "drivers/net/net_failover.ko", "drivers/char"),
+    *("drivers/usb", "drivers/media", "drivers/video", "drivers/i2c"),
+)
+FIRST_MODULES = ("virtio_pci", "virtio_blk", "virtio_net", "virtio_rng", "ext4", "crc32c_generic")
+INIT = """#!/bin/busybox sh
+B=/bin/busybox
+$B mount -t proc p /proc; $B mount -t sysfs s /sys; $B mount -t devtmpfs d /dev
+while read -r m; do $B insmod /m/$m; done < /m/order
+n=0; while [ ! -b /dev/vda ] && [ $n -lt 100 ]; do $B sleep 0.1; n=$((n+1)); done
+$B mount -t ext4 -o rw,noatime /dev/vda /new || { echo "no file system on the card"; $B poweroff -f; }
+$B mount --move /dev /new/dev; $B mount --move /proc /new/proc; $B mount --move /sys /new/sys
+exec $B switch_root /new /lib/systemd/systemd
+"""
+NETWORK = "[Match]\nName=e*\n[Network]\nDHCP=ipv4\nLinkLocalAddressing=no\nIPv6AcceptRA=no\n[DHCPv4]\nUseDNS=no\n"
+# They want the network, or work that nobody waits for.
+MASKED = (
+    *("apt-daily.timer", "apt-daily-upgrade.timer", "man-db.timer", "e2scrub_all.timer", "e2scrub_reap.service"),
+    *("fstrim.timer", "dpkg-db-backup.timer", "systemd-networkd-wait-online.service", "systemd-timesyncd.service"),
+)
+ADAPTER, CAMERA = "adapter", "camera"  # what can be plugged in
+KERNEL_LINE = "console=ttyAMA0 root=/dev/vda rw quiet mitigations=off systemd.show_status=0 audit=0"
+BOOT_S = 600.0
+OFF_S = 120.0
+QMP_S = 30.0
+PR_SET_PDEATHSIG = 1
+
+
+class MachineError(RoverError):
+    """The emulated machine cannot be made here, does not start, or does not do what it is told."""
+
+
+def missing_packages() -> list[str]:
+    """Debian packages that the machine needs and this host lacks."""
+    return sorted({package for command, package in PACKAGES.items() if not _which(command)})
+
+
+def _which(command: str) -> str | None:
+    return shutil.which(command) or shutil.which(command, path="/usr/sbin:/sbin")
+
+
+# ---- the card
+
+
+@dataclass(frozen=True)
+class Card:
+    """A card as flashed, and what boots it: kernel, initramfs, the file system, and the key that opens it."""
+
+    folder: Path
+
+    kernel = property(lambda self: self.folder / "vmlinuz")
+    initramfs = property(lambda self: self.folder / "initramfs.gz")
+    disk = property(lambda self: self.folder / "card.ext4")
+    key = property(lambda self: self.folder / "id")
+
+
+def card() -> Card:
+    """The card with system()'s Debian on it, from the cache or made now (a minute, and what system() takes).
+
+    Debian packages that are missing are installed when this runs as root. Raises RoverError where no card can be made.
+    """
+    why = "an emulated Pi's card is written with its owner's rights"
+    make_sure(missing_packages(), "the emulated machine", why, MachineError)
+    with emulation():
+        flashed = system()
+    made = [RECIPE, CARD_GB, MODULES, FIRST_MODULES, INIT, NETWORK, MASKED, ROVER_PACKAGES, KERNEL_PACKAGES]
+    key = key_of({"system": str(flashed.root), "made": made})
+    return Card(cached_folder("pi-card", key, lambda folder: _make_card(flashed, folder)))
+
+
+def _make_card(flashed: System, folder: Path) -> None:
+    made = Card(folder)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".pi-card.") as scratch:
+        work, root = Path(scratch), Path(scratch) / "root"
+        _run(["cp", "-a", "--reflink=auto", flashed.root, root])
+        kernel, debs = work / "kernel", root / DEBS.lstrip("/")
+        debs.mkdir(parents=True)
+        for package in fetch_packages(work / "rover", ROVER_PACKAGES, flashed.root):
+            shutil.move(package, debs)
+        for package in fetch_packages(work / "linux", KERNEL_PACKAGES, flashed.root):
+            if package.name.startswith(("linux-image-", "busybox-static_")):
+                _run(["dpkg-deb", "--extract", package, kernel])
+        version = next((kernel / "lib/modules").iterdir()).name
+        shutil.copy(kernel / f"boot/vmlinuz-{version}", made.kernel)
+        _modules(kernel, root, version)
+        _initramfs(kernel / "bin/busybox", root, version, made.initramfs, work)
+        _configure(root)
+        shutil.copy(flashed.key, made.key)
+        made.key.chmod(0o600)
+        # Without checksums of its own: the kernel would need modules for them before it has the card.
+        options = ["-t", "ext4", "-E", "lazy_itable_init=1,lazy_journal_init=1", "-O", "^metadata_csum"]
+        _run(["mke2fs", "-q", *options, "-d", root, made.disk, f"{CARD_GB}G"])
+
+
+def _modules(kernel: Path, root: Path, version: str) -> None:
+    source, target = kernel / "lib/modules" / version, root / "lib/modules" / version
+    (target / "kernel").mkdir(parents=True)
+    for file in (*source.glob("modules.builtin*"), source / "modules.order"):
+        shutil.copy(file, target)
+    for name in MODULES:
+        if (found := source / "kernel" / name).is_dir():
+            shutil.copytree(found, target / "kernel" / name, dirs_exist_ok=True)
+        elif found.exists():
+            (target / "kernel" / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(found, target / "kernel" / name)
+    _run(["depmod", "--basedir", root, version])
+
+
+def _initramfs(busybox: Path, root: Path, version: str, output: Path, scratch: Path) -> None:
+    """A busybox that loads what is needed to mount the card, and hands over to systemd."""
+    tree = scratch / "initramfs"
+    for name in ("bin", "proc", "sys", "dev", "new", "m"):
+        (tree / name).mkdir(parents=True)
+    shutil.copy(busybox, tree / "bin")
+    (tree / "bin/sh").symlink_to("busybox")
+    order: list[str] = []
+    for module in FIRST_MODULES:
+        shown = ["modprobe", "--dirname", root, "--set-version", version, "--show-depends", module]
+        for line in _run(shown).splitlines():
+            word, _, path = line.partition(" ")
+            path = Path(path.strip())
+            if word == "insmod" and path.name not in order:
+                order.append(path.name)
+                shutil.copy(path, tree / "m")
+    (tree / "m/order").write_text("".join(f"{name}\n" for name in order))
+    (tree / "init").write_text(INIT)
+    (tree / "init").chmod(0o755)
+    names = "".join(f"{p.relative_to(tree)}\n" for p in (tree, *sorted(tree.rglob("*"))))
+    archive = subprocess.run(
+        ["cpio", "--create", "--format=newc", "--quiet"],
+        cwd=tree,
+        input=names.encode(),
+        capture_output=True,
+        check=True,
+    )
+    output.write_bytes(gzip.compress(archive.stdout, 1))
+
+
+def _configure(root: Path) -> None:
+    """What this machine has and a container has not."""
+    (root / "etc/fstab").write_text("/dev/vda / ext4 noatime 0 1\n")
+    (root / "etc/systemd/network").mkdir(parents=True, exist_ok=True)
+    (root / "etc/systemd/network/20-wired.network").write_text(NETWORK)
+    units = root / "etc/systemd/system"
+    (units / "multi-user.target.wants").mkdir(parents=True, exist_ok=True)
+    for name, target in [
+        ("multi-user.target.wants/systemd-networkd.service", "/lib/systemd/system/systemd-networkd.service"),
+        *((name, "/dev/null") for name in MASKED),
+    ]:
+        (units / name).unlink(missing_ok=True)
+        (units / name).symlink_to(target)
+    for kind in ("ed25519", "rsa"):
+        host_key = root / f"etc/ssh/ssh_host_{kind}_key"
+        if not host_key.exists():
+            _run(["ssh-keygen", "-q", "-t", kind, "-N", "", "-C", "emulated Pi", "-f", host_key])
+
+
+def _run(command: Sequence[object], **options: Any) -> str:
+    """Run a command and return its stdout; MachineError with the end of what it said if it fails."""
+    words = [str(word) for word in command]
+    words[0] = _which(words[0]) or words[0]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, **options)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise MachineError(f"{command[0]} failed: {error}") from None
+    if done.returncode:
+        said = " ".join((done.stderr or done.stdout).split())[-400:] or f"exit code {done.returncode}"
+        raise MachineError(f"{command[0]} failed: {said}")
+    return done.stdout
+
+
+# ---- QEMU's own console
+
+
+class Qmp:
+    """QEMU's machine protocol on a Unix socket: a command, its answer, and what it reports in between."""
+
+    def __init__(self, path: Path | str, timeout_s: float = QMP_S):
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.settimeout(timeout_s)
+        self._events: list[dict[str, Any]] = []
+        try:
+            self._socket.connect(str(path))
+            self._file = self._socket.makefile("rwb")
+            self._next()  # its greeting
+            self.command("qmp_capabilities")
+        except BaseException as error:
+            self._socket.close()
+            if isinstance(error, OSError):
+                raise MachineError(f"{path}: QEMU does not answer ({error}); has it ended?") from None
+            raise
+
+    def command(self, name: str, **arguments: Any) -> Any:
+        """What QEMU returns. Raises MachineError if it refuses, or says nothing any more."""
+        self._file.write(json.dumps({"execute": name, "arguments": arguments}).encode() + b"\n")
+        self._file.flush()
+        while True:
+            answer = self._next()
+            if "return" in answer:
+                return answer["return"]
+            if "error" in answer:
+                raise MachineError(f"QEMU refused {name}: {answer['error'].get('desc', answer['error'])}")
+
+    def wait_for(self, event: str, **data: Any) -> None:
+        """Until QEMU has reported this event, with these data. Raises MachineError if it does not."""
+
+        def fits(found: dict[str, Any]) -> bool:
+            return found["event"] == event and data.items() <= found.get("data", {}).items()
+
+        while not (found := next(filter(fits, self._events), None)):
+            self._next()
+        self._events.remove(found)
+
+    def close(self) -> None:
+        """Raises nothing."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+        self._socket.close()
+
+    def _next(self) -> dict[str, Any]:
+        try:
+            line = self._file.readline()
+        except OSError as error:
+            raise MachineError(f"QEMU does not answer ({error}); is this host busy?") from None
+        if not line:
+            raise MachineError("QEMU has ended in the middle of a conversation; its console log may say why")
+        said = json.loads(line)
+        if "event" in said:
+            self._events.append(said)
+        return said
+
+
+# ---- the machine
+
+
+class Machine:
+    """An emulated Pi that runs; a context manager. name, port, key: for plays.run(), and whoever logs in.
+
+    card: what it boots from. folder: for its console, its own disk and sockets; emptied of the last two at the end.
+    layer: a disk to build on, of an earlier machine on the same card, instead of the card itself. slow: so many times
+    slower than this host's its clock runs, 1 to 60. drives: more disks, read only: /dev/vdb, /dev/vdc, ...
+    """
+
+    def __init__(
+        self,
+        card: Card,
+        folder: Path | str,
+        *,
+        layer: Path | None = None,
+        slow: float = 1.0,
+        drives: Sequence[Path] = (),
+    ):
+        if not 1 <= slow <= SLOWEST:
+            raise MachineError(f"the machine's clock can run 1 to {SLOWEST} times slower, found {slow:g}")
+        self.card, self.slow = card, slow
+        self.name, self.port, self.key = "rover-pi", free_port(), card.key
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.console = self.folder / "console.log"
+        self.disk = self.folder / "disk.qcow2"
+        self._work = Path(tempfile.mkdtemp(prefix="rover-pi-"))  # a socket's path must be short
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115, open as long as the process
+        self._process: subprocess.Popen | None = None
+        self._qmp: Qmp | None = None
+        try:
+            base, kind = (layer, "qcow2") if layer else (card.disk, "raw")
+            _run(["qemu-img", "create", "-q", "-f", "qcow2", "-b", base.resolve(), "-F", kind, self.disk])
+            self._start(drives)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "Machine":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    @property
+    def pid(self) -> int | None:
+        """Of QEMU's process."""
+        return self._process.pid if self._process else None
+
+    def _start(self, drives: Sequence[Path]) -> None:
+        machine = ["-cpu", CPU, "-smp", str(CORES), "-m", str(MEMORY_MB), "-display", "none", "-nodefaults"]
+        tree = self._work / "tree.dtb"
+        _run(["qemu-system-aarch64", "-machine", f"virt,dumpdtb={tree}", *machine])
+        _run(["fdtput", "-t", "u", tree, "/timer", "clock-frequency", round(TIMER_HZ * self.slow)])
+        command = ["qemu-system-aarch64", "-machine", "virt", *machine, "-accel", "tcg,thread=multi,tb-size=512"]
+        command += ["-kernel", self.card.kernel, "-initrd", self.card.initramfs, "-dtb", tree, "-append", KERNEL_LINE]
+        # Nothing is synchronized to the host's disk: a machine that ends early is thrown away.
+        for i, (file, options) in enumerate(
+            [(self.disk, "format=qcow2,cache=unsafe"), *((d, "format=raw,readonly=on") for d in drives)]
+        ):
+            command += ["-drive", f"if=none,id=d{i},file={_comma(file)},{options}"]
+            command += ["-device", f"virtio-blk-pci,drive=d{i},romfile="]
+        # restrict: it reaches nothing, as at a track; only its ssh is reached.
+        command += ["-netdev", f"user,id=n,restrict=on,hostfwd=tcp:127.0.0.1:{self.port}-:22"]
+        command += [
+            "-device",
+            "virtio-net-pci,netdev=n,romfile=",
+            "-device",
+            "virtio-rng-pci",
+            "-device",
+            "qemu-xhci,id=xhci",
+        ]
+        command += ["-serial", f"file:{_comma(self.console)}", "-qmp", f"unix:{self._work}/qmp,server=on,wait=off"]
+        self._process = subprocess.Popen(
+            [str(word) for word in command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._errors,
+            start_new_session=True,  # a terminal's ^C is not for it
+            preexec_fn=_end_with_parent,
+        )
+        end = time.monotonic() + QMP_S
+        while self._qmp is None:
+            try:
+                self._qmp = Qmp(self._work / "qmp")
+            except MachineError:
+                self._check()
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.05)
+
+    def _check(self) -> None:
+        if self._process.poll() is not None:
+            self._errors.seek(0)
+            said = " ".join(self._errors.read()[-600:].decode(errors="replace").split())
+            raise MachineError(f"QEMU has ended (exit code {self._process.returncode}): {said or 'it said nothing'}")
+
+    # -- ssh
+
+    @property
+    def ssh_options(self) -> list[str]:
+        """For ssh, scp and Ansible; without the port."""
+        return [
+            *("-i", str(self.card.key), "-o", "IdentitiesOnly=yes", "-o", "BatchMode=yes", "-o", "LogLevel=ERROR"),
+            *("-o", "StrictHostKeyChecking=no", "-o", "UserKnownHostsFile=/dev/null", "-o", "ConnectTimeout=60"),
+            *("-o", "ControlMaster=auto", "-o", f"ControlPath={self._work}/ssh", "-o", "ControlPersist=120"),
+        ]
+
+    def wait_for_ssh(self, timeout_s: float = BOOT_S) -> float:
+        """Seconds until somebody could log in. Raises MachineError if nobody can in time."""
+        start = time.monotonic()
+        while time.monotonic() - start < timeout_s:
+            self._check()
+            with contextlib.suppress(MachineError, subprocess.TimeoutExpired):
+                self.ssh("true", timeout_s=90)
+                return time.monotonic() - start
+            time.sleep(0.5)
+        raise MachineError(f"no ssh within {timeout_s:g} s; the machine's console is in {self.console}")
+
+    def ssh(self, command: str, *, timeout_s: float = 600, check: bool = True, text: str | None = None) -> str:
+        """Runs a shell command as the login user; its stdout, with stderr behind it. MachineError if it fails."""
+        words = ["ssh", *self.ssh_options, "-p", str(self.port), f"{USER}@127.0.0.1", command]
+        try:
+            done = subprocess.run(
+                words, capture_output=True, text=True, timeout=timeout_s, input=text or "", errors="replace"
+            )
+        except subprocess.TimeoutExpired:
+            raise MachineError(f"'{command}' took more than {timeout_s:g} s in the emulated machine") from None
+        if check and done.returncode:
+            said = " ".join((done.stderr or done.stdout).split())[-400:]
+            raise MachineError(f"'{command}' failed in the emulated machine ({done.returncode}): {said}")
+        return done.stdout + done.stderr
+
+    # -- USB
+
+    def plug(self, port: Path | str) -> None:
+        """Plugs in a USB serial adapter (an FTDI's ids) with what is at a serial port of the host behind it."""
+        device = {"device": str(Path(port).resolve())}
+        self._plug(ADAPTER, "usb-serial", {"type": "serial", "data": device})
+
+    def plug_camera(self, socket: Path | str) -> None:
+        """Plugs in the USB device that speaks the usbredir protocol on a Unix socket."""
+        address = {"type": "unix", "data": {"path": str(socket)}}
+        self._plug(CAMERA, "usb-redir", {"type": "socket", "data": {"addr": address, "server": False}})
+
+    def unplug(self, what: str = ADAPTER) -> None:
+        """Pulls it out: ADAPTER or CAMERA."""
+        self._qmp.command("device_del", id=what)
+        self._qmp.wait_for("DEVICE_DELETED", device=what)
+        if what == ADAPTER:  # usb-redir takes its wire along
+            self._qmp.command("chardev-remove", id=f"{what}-wire")
+
+    def _plug(self, what: str, driver: str, backend: dict[str, Any]) -> None:
+        self._qmp.command("chardev-add", id=f"{what}-wire", backend=backend)
+        self._qmp.command("device_add", driver=driver, id=what, chardev=f"{what}-wire", bus="xhci.0")
+
+    # -- the end
+
+    def power_off(self, timeout_s: float = OFF_S) -> None:
+        """Shuts the system down, so that its disk can be a layer for others. Raises MachineError if it does not end."""
+        with contextlib.suppress(MachineError):  # the connection ends with it
+            self.ssh("sudo sync; sudo systemctl poweroff", timeout_s=60)
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise MachineError(f"the machine was not off after {timeout_s:g} s; see {self.console}") from None
+
+    def close(self) -> None:
+        """Cuts its power, and removes its disk. Raises nothing."""
+        if self._process and self._process.poll() is None:
+            if self._qmp:
+                with contextlib.suppress(MachineError, OSError, ValueError):
+                    self._qmp.command("quit")
+            try:
+                self._process.wait(5)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        if self._qmp:
+            self._qmp.close()
+        with contextlib.suppress(OSError, subprocess.SubprocessError):
+            options = [*self.ssh_options, "-p", str(self.port), f"{USER}@127.0.0.1"]
+            subprocess.run(["ssh", "-O", "exit", *options], capture_output=True, timeout=10)
+        self._errors.close()
+        self.disk.unlink(missing_ok=True)
+        shutil.rmtree(self._work, ignore_errors=True)
+
+
+def _comma(path: Path) -> str:
+    """A path in one of QEMU's options."""
+    return str(path.resolve()).replace(",", ",,")
+
+
+def _end_with_parent() -> None:
+    """In QEMU's process: it ends with the thread that started it, also when that is killed."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

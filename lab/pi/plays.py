@@ -1,0 +1,147 @@
+"""Runs the playbooks of ansible/ as a human would, on rovers given by where their sshd is.
+
+play = run("provision", [pi], folder=tmp)
+play.ok, play.seconds, play.recap["rover1"]["changed"], play.output
+"""
+
+import configparser
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from lab.pi.system import USER, EmulationError
+
+REPOSITORY = Path(__file__).parents[2]
+INVENTORY = REPOSITORY / "inventory.ini"
+COUNTS = ("ok", "changed", "unreachable", "failed", "skipped", "rescued", "ignored")
+NO_KNOWN_HOSTS = "-o UserKnownHostsFile=/dev/null -o StrictHostKeyChecking=no -o LogLevel=ERROR"
+
+
+class Host(Protocol):
+    """What the inventory says of a rover: sshd on a port of the loopback, and the key of its user."""
+
+    name: str
+    port: int
+    key: Path
+
+
+@dataclass(frozen=True)
+class Play:
+    """What a playbook did. recap: Ansible's counts by host, {"rover1": {"ok": 12, "changed": 0, ...}}."""
+
+    book: str
+    code: int
+    seconds: float
+    recap: dict[str, dict[str, int]]
+    output: str
+
+    @property
+    def ok(self) -> bool:
+        """Nothing failed, nobody was unreachable."""
+        return self.code == 0 and bool(self.recap)
+
+    @property
+    def changed(self) -> int:
+        """Tasks that changed something, on all hosts."""
+        return sum(row.get("changed", 0) for row in self.recap.values())
+
+    @property
+    def recap_lines(self) -> list[str]:
+        """Ansible's own last lines."""
+        return [line for line in self.output.partition("PLAY RECAP")[2].splitlines()[1:] if line.strip()]
+
+    @property
+    def end(self) -> str:
+        """The last that it said before the recap: the failed task, if one failed."""
+        return self.output.partition("PLAY RECAP")[0].strip()[-3000:]
+
+    def row(self) -> dict[str, Any]:
+        """For the report."""
+        return {"play": self.book, "ok": self.ok, "seconds": round(self.seconds, 1), "recap": self.recap}
+
+
+def run(
+    book: str,
+    hosts: Sequence[Host],
+    *,
+    folder: Path,
+    check: bool = False,
+    variables: Mapping[str, Any] | None = None,
+    options: Sequence[str] = (),
+    timeout_s: float = 3600,
+) -> Play:
+    """Runs ansible/<book>.yml on hosts, in this order.
+
+    folder: for the inventory and Ansible's own files; one for several plays lets them share ssh connections. check: as
+    --check --diff. variables: as -e. A play that fails is no error. Raises EmulationError if there is no Ansible, or if
+    it takes longer than timeout_s.
+    """
+    program = Path(sys.executable).with_name("ansible-playbook")
+    if not program.exists():
+        raise EmulationError(f"no {program.name} beside {sys.executable}: pip install -e '.[dev]', or 'make pi-fast'")
+    listed = inventory(hosts)
+    (folder / "inventory.ini").write_text(listed)
+    command = [program, "-i", folder / "inventory.ini", REPOSITORY / "ansible" / f"{book}.yml"]
+    command += [*(["--check", "--diff"] if check else []), *options, "-e", json.dumps(dict(variables or {}))]
+    started = time.monotonic()
+    with (folder / "output").open("w+b") as output:
+        process = subprocess.Popen(
+            [str(c) for c in command],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            cwd=REPOSITORY,
+            env=environment(folder),
+            start_new_session=True,
+        )
+        try:
+            code = process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise EmulationError(f"{book}.yml took more than {timeout_s:g} s") from None
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, 15)
+                process.wait()
+        output.seek(0)
+        text = output.read().decode(errors="replace")
+    return Play(book, code, time.monotonic() - started, recap(text), text)
+
+
+def inventory(hosts: Sequence[Host]) -> str:
+    """The repository's inventory.ini with these hosts in it."""
+    given = configparser.RawConfigParser(allow_no_value=True, delimiters=("=",))
+    given.optionxform = str
+    given.read(INVENTORY)
+    lines = ["[rovers]"]
+    for host in hosts:
+        where = {"ansible_host": "127.0.0.1", "ansible_port": host.port, "ansible_ssh_private_key_file": host.key}
+        lines.append(" ".join([host.name, *(f"{k}={v}" for k, v in where.items())]))
+    lines += ["[rovers:vars]", *(f"{k}={v}" for k, v in given["rovers:vars"].items()), f"ansible_user={USER}"]
+    lines.append(f"ansible_ssh_extra_args={NO_KNOWN_HOSTS}")
+    return "\n".join(lines) + "\n"
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Of Ansible: nothing of the user's own settings, and its files in a folder."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("ANSIBLE")}
+    own = {"ANSIBLE_HOME": str(folder), "ANSIBLE_NOCOLOR": "1", "ANSIBLE_LOCAL_TEMP": str(folder / "local")}
+    own["ANSIBLE_TIMEOUT"] = "120"  # sudo, emulated on a busy machine, took more than the usual 10 s
+    return {**kept, **own, "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}"}
+
+
+def recap(output: str) -> dict[str, dict[str, int]]:
+    """The counts of Ansible's last lines, by host; empty if it did not come so far."""
+    found = {}
+    for line in output.partition("PLAY RECAP")[2].splitlines()[1:]:
+        name, colon, counts = line.partition(" : ")
+        pairs = dict(re.findall(r"(\w+)=(\d+)", counts))
+        if colon and set(COUNTS[:4]) <= set(pairs):
+            found[name.strip()] = {key: int(pairs.get(key, 0)) for key in COUNTS}
+    return found

@@ -1,0 +1,110 @@
+"""What an emulated Arduino's servo pins did, against what was commanded on another machine with another clock."""
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from lab.arduino.emulator import Arduino
+from lab.driving.pins import NEUTRAL_US, PERIOD_US, STEP_US
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.telemetry import Flight
+from rover_lib.world.standin import PinEvent
+
+# A command counts from the next pulse that begins after it has come, sent anew if need be (drive.RESEND_S), until that
+# of the next command. So a pulse is one of the commands of the last 33 + 18 + 21 ms and some for the serial line.
+HELD_S = 0.1
+ERROR_S = 0.02  # of one clock seen from the other, over ssh: 5 ms by what is read, and half of how long that takes
+READ_S = 0.2  # between readings of the pins
+
+
+class Pins:
+    """Everything that an Arduino's pins do, from now on; a context manager."""
+
+    def __init__(self, board: Arduino):
+        self._board = board
+        self._events: list[PinEvent] = []
+        self._done = threading.Event()
+        self._failure: RoverError | None = None
+        self._thread = threading.Thread(target=self._run, name="pins", daemon=True)
+
+    def __enter__(self) -> "Pins":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def since(self, at_s: float) -> list[PinEvent]:
+        """What happened since then. Raises ArduinoError if it has ended."""
+        if self._failure:
+            raise self._failure
+        return [e for e in self._events[:] if e.monotonic_s >= at_s]
+
+    def _run(self) -> None:
+        while not self._done.wait(READ_S):
+            try:
+                self._events += self._board.pulses()
+            except RoverError as error:
+                self._failure = error
+                return
+
+
+def compare(
+    flight: Flight, events: Sequence[PinEvent], host_s: Callable[[np.ndarray], np.ndarray], slow: float
+) -> dict[str, Any]:
+    """Each pulse of a drive against the commands that it may be, and each command against the pulses that it caused.
+
+    host_s: the rover's monotonic seconds as the host's, by which the events are. slow: seconds of the host in one of
+    the rover's and the Arduino's. worst_us: the largest difference of any pulse from the nearest of its commands, and
+    of any command from the nearest of its pulses; None where there is nothing to compare. unseen: commands without any
+    pulse in their time. distinct: values among the commands: a servo that stands still proves little.
+    """
+    sent_s = host_s(flight.ticks["t_s"] + float(flight.header["start_monotonic_s"]))
+    held_s, error_s = HELD_S * slow, ERROR_S * slow
+    result: dict[str, Any] = {"commands": len(sent_s), "pulses": 0, "worst_us": None, "unseen": 0, "distinct": {}}
+    worst: list[float] = []
+    for pin in PERIOD_US:
+        commanded = flight.ticks[f"{pin}_us"]
+        pulses = [e for e in events if e.pin == pin and e.kind == "pulse"]
+        rose_s, us = np.array([e.monotonic_s for e in pulses]), np.array([e.pulse_us for e in pulses])
+        result["distinct"][pin] = len(np.unique(commanded))
+        if not len(sent_s) or not len(pulses):
+            return result
+        # From the first command until the last; before and after, the pins are in neutral.
+        driven = np.flatnonzero((rose_s > sent_s[0] + held_s) & (rose_s < sent_s[-1]))
+        for i in driven:
+            choice = commanded[(sent_s > rose_s[i] - held_s) & (sent_s <= rose_s[i] + error_s)]
+            worst.append(float(np.abs(choice - us[i]).min()) if len(choice) else np.inf)
+        result["pulses"] += len(driven)
+        for at_s, wanted in zip(sent_s[:-3], commanded[:-3], strict=True):
+            caused = us[(rose_s > at_s - error_s) & (rose_s <= at_s + held_s)]
+            result["unseen"] += not len(caused)
+            worst.append(float(np.abs(caused - wanted).min()) if len(caused) else np.inf)
+    result["worst_us"] = round(max(worst), 2) if worst and np.isfinite(max(worst)) else None
+    return result
+
+
+def stopped(events: Sequence[PinEvent], at_s: float, slow: float, throttle_max_us: float) -> dict[str, Any]:
+    """How the pins went to neutral after `at_s` (by the host's clock), in the Arduino's milliseconds.
+
+    after_line_ms: from the last whole line of the rover until the throttle was off, which the firmware promises after
+    150. after_ms: the same since it happened. steering_us: at the end. Each None if it did not happen.
+    """
+    lines = [e.monotonic_s for e in events if e.kind == "line"]
+    throttle = [e for e in events if e.pin == "throttle" and e.kind == "pulse"]
+    steering = [e for e in events if e.pin == "steering" and e.kind == "pulse"]
+    moving = [i for i, e in enumerate(throttle) if e.pulse_us > throttle_max_us]
+    drove = any(at_s - slow < throttle[i].monotonic_s <= at_s for i in moving)
+    off = throttle[moving[-1] + 1].monotonic_s if moving and moving[-1] + 1 < len(throttle) else None
+    last_line = max((s for s in lines if off is None or s < off), default=None)
+    centred = bool(steering) and abs(steering[-1].pulse_us - NEUTRAL_US["steering"]) <= STEP_US
+    return {
+        "drove": drove,
+        "after_ms": None if off is None else round((off - at_s) / slow * 1e3, 1),
+        "after_line_ms": None if off is None or last_line is None else round((off - last_line) / slow * 1e3, 1),
+        "steering_us": round(steering[-1].pulse_us, 1) if steering else None,
+        "neutral": off is not None and centred,
+    }

@@ -1,0 +1,368 @@
+"""`make pi`: from a flashed card to servo pulses, on a whole emulated Pi.
+
+A camera frame goes in at the kernel's /dev/video0, the INT8 policy runs on four emulated Cortex-A76, commands leave by
+a USB serial adapter, and the project's firmware on an emulated Arduino makes servo pulses of them, each of which is
+held against what the rover says that it commanded. Then cables are pulled while it drives.
+
+What it says about time: nothing about a Pi. The machine's clock and the Arduino's run SLOW times slower than the host's
+(machine.py), which makes the machine about as fast as a Pi by its own clock.
+"""
+
+import contextlib
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from lab.arduino.emulator import Arduino
+from lab.pi import machine, plays
+from lab.pi.machine import DEBS, Card, Machine, card
+from lab.pi.outcome import Outcome
+from lab.pi.pulses import READ_S, Pins, compare, stopped
+from lab.pi.system import interruptible, require_arduino
+from lab.pi.usb_camera import UsbCamera
+from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.service import UNIT
+from rover_lib.onboard.telemetry import Flight, read_log
+from rover_lib.workshop.cache import cache_root, cached_folder, key_of
+from rover_lib.world.standin import REST_US
+
+STAGE = "pi"
+REPOSITORY = Path(__file__).parents[2]
+ANSIBLE = REPOSITORY / "ansible"
+PORT, CAMERA, MODEL = "/dev/rover-arduino", "/dev/video0", "/var/lib/rover/models/current/policy.pt"
+SIZE = (640, 360)
+FRAMES = 150  # of the recordings, 5 s
+TWICE = 2  # each: vivid's HDMI has no 30 Hz at this size, only 60
+# The camera: frames that are written to vivid's output come out of its input, as through an HDMI cable.
+SCREEN = "rover-screen"
+SHOW = f"""set -e
+modprobe vivid n_devs=1 node_types=0x101 num_inputs=1 input_types=0x3 num_outputs=1 output_types=0x1
+udevadm settle
+test -e {CAMERA} -a -e /dev/video1
+for d in {CAMERA} /dev/video1; do v4l2-ctl -d $d --set-dv-bt-timings cvt,width={SIZE[0]},height={SIZE[1]},fps=60; done
+v4l2-ctl -d {CAMERA} --set-fmt-video=width={SIZE[0]},height={SIZE[1]},pixelformat=YUYV
+v4l2-ctl -d /dev/video1 --set-fmt-video-out=width={SIZE[0]},height={SIZE[1]},pixelformat=YUYV
+v4l2-ctl -d {CAMERA} -c loop_video=1
+systemctl reset-failed {SCREEN} 2> /dev/null || true
+systemd-run --quiet --unit={SCREEN} v4l2-ctl -d /dev/video1 --stream-out-mmap --stream-from=/dev/vdb --stream-loop
+"""
+HIDE = f"systemctl stop {SCREEN}; modprobe -r vivid"
+WATCH_S = 2.0  # of the rover's time, after a fault
+
+
+class WholeError(RoverError):
+    """A step of the whole machine that did not do what it should."""
+
+
+def run_whole(
+    output: Path | str,
+    artifact: Path | str,
+    recordings: Path | str,
+    *,
+    fresh: bool = False,
+    say: Callable[[str], None] = print,
+) -> Outcome:
+    """All of it; what was found, which is written to `output` even where a step fails.
+
+    artifact: to deploy. recordings: episodes, whose frames the camera shows. fresh: provision anew, even if a card that
+    was provisioned with just this role and these wheels is in the cache. say: told each step. Raises RoverError where
+    it cannot be begun. The machine's console and Ansible's words are beside `output` afterwards if anything failed.
+    """
+    output, artifact, recordings = Path(output), Path(artifact), Path(recordings)
+    require_arduino()
+    if not artifact.is_file():
+        raise WholeError(f"{artifact}: no artifact to deploy; make demo leaves one")
+    outcome = Outcome(STAGE, output, say, {artifact.name: content_hash(artifact)})
+    kept = output.with_suffix("")
+    shutil.rmtree(kept, ignore_errors=True)
+    with (
+        interruptible(),
+        tempfile.TemporaryDirectory(prefix=".pi-whole.", dir=_cache()) as scratch,  # large, so not in /tmp
+        tempfile.TemporaryDirectory(prefix="rover-plays-") as ansible,  # ssh's sockets want a short path
+    ):
+        run = _Run(outcome, Path(scratch), Path(ansible))
+        try:
+            run.all(artifact, recordings, fresh)
+        except RoverError as error:
+            outcome.wrong.append(str(error))
+        if outcome.wrong:
+            kept.mkdir(parents=True)
+            for file in Path(scratch).rglob("*.log"):
+                shutil.copy(file, kept / "-".join(file.relative_to(scratch).parts))
+            outcome.metrics["kept"] = str(kept)
+    outcome.write()
+    return outcome
+
+
+def _cache() -> Path:
+    cache_root().mkdir(parents=True, exist_ok=True)
+    return cache_root()
+
+
+class _Run:
+    def __init__(self, outcome: Outcome, folder: Path, ansible: Path):
+        self.outcome, self.folder, self.ansible = outcome, folder, ansible
+        self.gates = outcome.gates
+        self.slow = float(self.gates["slow"])
+        self.zero_s = 0.0
+        outcome.metrics |= {"slow": self.slow, "faults": []}
+        self.pi: Machine
+        self.pins: Pins
+
+    def all(self, artifact: Path, recordings: Path, fresh: bool) -> None:
+        start = time.monotonic()
+        metrics = self.outcome.metrics
+        with self.outcome.step("the card, as flashed"):
+            flashed = card()
+        layer = self.provisioned(flashed, fresh)
+        with self.outcome.step("the frames that the camera will show"):
+            frames = _frames(recordings, self.folder / "frames.yuyv")
+        with contextlib.ExitStack() as on:
+            self.pi = on.enter_context(Machine(flashed, self.folder, layer=layer, slow=self.slow, drives=[frames]))
+            board = on.enter_context(Arduino(transmitter=REST_US, slow=self.slow, nice=-5))
+            self.pins = on.enter_context(Pins(board))
+            self.pi.plug(board.port)
+            with self.outcome.step("boot, until ssh answers"):
+                self.pi.wait_for_ssh()
+            self.zero_s = self.clock()
+            metrics["machine"] = self.machine()
+            with self.outcome.step("camera and Arduino"):
+                self.sudo(SHOW)
+                self.until(f"test -e {PORT}", f"no {PORT} although the adapter is plugged in")
+            with self.outcome.step("provision.yml again") as row:
+                row["recap"] = self.provision()
+            with self.outcome.step("deploy.yml") as row:
+                row["recap"] = self.play(
+                    "deploy", rover_artifact=artifact.resolve(), rover_packed=self.folder / "packed"
+                )
+            with self.outcome.step("drive.yml: doctor, start, arm, drive, stop, fetch") as row:
+                row["recap"] = self.drive(metrics)
+            self.fault("USB serial unplugged while driving, by QMP", self.pi.unplug, lambda: self.pi.plug(board.port))
+            with self.outcome.step("another camera, on USB"):
+                self.sudo(HIDE)
+                usb = on.enter_context(UsbCamera([p.read_bytes() for p in _pictures(recordings)], slow=self.slow))
+                self.pi.plug_camera(usb.path)
+                self.until(f"test -e {CAMERA}", f"no {CAMERA} although the USB camera is plugged in")
+            self.fault(
+                "USB camera unplugged while driving, by QMP",
+                lambda: self.pi.unplug(machine.CAMERA),
+                lambda: self.pi.plug_camera(usb.path),
+            )
+        metrics["seconds"] = round(time.monotonic() - start, 1)
+        if metrics["provisioned"] != "now" and metrics["seconds"] > self.gates["minutes"] * 60:
+            self.wrong(f"it took {metrics['seconds'] / 60:.0f} minutes, {self.gates['minutes']} are allowed")
+
+    # -- provisioning
+
+    def provisioned(self, flashed: Card, fresh: bool) -> Path:
+        """The card as provision.yml left it once, with these requirements: from the cache or made now.
+
+        What else is in the role may have changed since, and the rover's own wheel: provision.yml runs on it each time.
+        """
+        requirements = REPOSITORY / "requirements_pi.txt"
+        key = key_of({"card": str(flashed.folder)}, requirements)
+        if fresh:
+            shutil.rmtree(cache_root() / f"pi-provisioned-{key}", ignore_errors=True)
+        made: list[bool] = []
+
+        def make(folder: Path) -> None:
+            made.append(True)
+            with Machine(flashed, self.folder / "first", slow=self.slow) as self.pi:
+                with self.outcome.step("first boot, until ssh answers"):
+                    self.pi.wait_for_ssh()
+                with self.outcome.step("Debian packages for a rover without internet"):
+                    self.sudo(f"DEBIAN_FRONTEND=noninteractive dpkg --install {DEBS}/*.deb")
+                with self.outcome.step("provision.yml, from a flashed card") as row:
+                    row["recap"] = self.provision()
+                with self.outcome.step("shut down"):
+                    self.pi.power_off()
+                shutil.move(self.pi.disk, folder / "disk.qcow2")
+
+        folder = cached_folder("pi-provisioned", key, make)
+        self.outcome.metrics["provisioned"] = "now" if made else "from the cache, and again"
+        return folder / "disk.qcow2"
+
+    def provision(self) -> dict[str, int]:
+        # Offline: the machine reaches nothing, as at a track, and wheels come from a folder that is fetched once.
+        return self.play("provision", rover_offline=True, rover_wheels=cache_root() / "wheels")
+
+    # -- driving
+
+    def drive(self, metrics: dict[str, Any]) -> dict[str, int]:
+        began = time.monotonic()
+        seconds = float(self.gates["drive_s"]) * self.slow
+        recap = self.play("drive", rover_arm=True, rover_seconds=round(seconds), rover_fetched=self.folder / "fetched")
+        time.sleep(2 * READ_S)
+        flight = self.fetched()
+        events = self.pins.since(began)
+        summary = flight.summary()
+        pulses = compare(flight, events, lambda s: self.zero_s + self.slow * s, self.slow)
+        frame, plan = flight.ticks["frame"], flight.ticks["plan"]
+        metrics["drive"] = {
+            **{k: v for k, v in summary.items() if k != "events"},
+            "frames": int(frame[-1] - frame[0]) if len(frame) else 0,
+            "inferences": len(np.unique(plan[plan > 0])),
+            "events": [str(e) for e in flight.events],
+            "stalled_ms": round(sum(e.pulse_us for e in events if e.kind == "stall") / 1e3, 1),
+            "lost": sum(e.kind == "lost" for e in events),
+        }
+        metrics["pulses"] = pulses
+        g = self.gates
+        if pulses["worst_us"] is None or pulses["worst_us"] > g["pulse_us"] or pulses["unseen"]:
+            self.wrong(f"pulses are not as commanded within {g['pulse_us']} us: {pulses}")
+        for name, found in (("ticks", summary["ticks"]), *((n, metrics["drive"][n]) for n in ("inferences", "frames"))):
+            if found < g[name]:
+                self.wrong(f"{found} {name} in the drive, at least {g[name]} are wanted")
+        if any(pulses["distinct"].get(pin, 0) < wanted for pin, wanted in g["distinct"].items()):
+            self.wrong(f"the servos hardly moved: {pulses['distinct']} different pulses were commanded")
+        return recap
+
+    def fetched(self) -> Flight:
+        logs = sorted((self.folder / "fetched").rglob("flight.log"))
+        if not logs:
+            raise WholeError("drive.yml fetched no flight log; its words are in drive.log")
+        return read_log(logs[-1])
+
+    def fault(self, name: str, pull: Callable[[], object], put_back: Callable[[], object]) -> None:
+        """Pulls something while the car drives: pins, service, and whether all is well once it is back."""
+        with self.outcome.step(name):
+            self.sudo(f"systemctl reset-failed {UNIT}; systemctl start {UNIT}", timeout_s=900)
+            self.sudo("rover arm-car --yes")
+            began = time.monotonic()
+            while not (moving := self.moving(began)):
+                if time.monotonic() - began > 5 * self.slow:
+                    raise WholeError(f"{name}: the car did not begin to drive within 5 s of its clock")
+                time.sleep(READ_S)
+            time.sleep(1.0 * self.slow)
+            at_s = time.monotonic()
+            pull()
+            time.sleep(WATCH_S * self.slow)
+            row = {"fault": name, **stopped(self.pins.since(moving), at_s, self.slow, self.gates["throttle_max_us"])}
+            row |= {"service": self.service(), "says": self.journal()}
+            put_back()
+            self.sudo(f"systemctl stop {UNIT}")
+            self.until(f"test -e {PORT} -a -e {CAMERA}", f"{PORT} or {CAMERA} is not back")
+            self.outcome.metrics["doctor"] = self.doctor()
+            row["doctor"] = self.outcome.metrics["doctor"]["drives"]
+            self.outcome.metrics["faults"].append(row)
+            if not row["drove"] or not row["neutral"] or row["after_line_ms"] > self.gates["neutral_ms"]:
+                self.wrong(f"{name}: the pins did not go to neutral as promised: {row}")
+            if row["service"].get("StatusText", "").startswith("driving"):
+                self.wrong(f"{name}: the service says that it drives on")
+            if not row["says"]:
+                self.wrong(f"{name}: the service said nothing about it")
+            if not row["doctor"]:
+                self.wrong(f"{name}: rover doctor is not content after it was put back")
+
+    def moving(self, since_s: float) -> float | None:
+        """When the throttle rose above neutral."""
+        limit = self.gates["throttle_max_us"]
+        return next(
+            (e.monotonic_s for e in self.pins.since(since_s) if e.pin == "throttle" and e.pulse_us > limit), None
+        )
+
+    def service(self) -> dict[str, str]:
+        """What systemd knows of it."""
+        told = self.pi.ssh(f"systemctl show --property=ActiveState,SubState,Result,NRestarts,StatusText {UNIT}")
+        return dict(line.partition("=")[::2] for line in told.splitlines() if "=" in line)
+
+    def journal(self) -> list[str]:
+        """What the service said last."""
+        told = self.sudo(f"journalctl --unit={UNIT} --output=cat --no-pager --lines=60")
+        return [
+            line
+            for line in told.splitlines()
+            if "unplugged" in line or "plugged in" in line or "no such camera" in line
+        ][-4:]
+
+    def doctor(self) -> dict[str, Any]:
+        """`rover doctor` on the rover: whether the car would drive, and each check."""
+        told = self.pi.ssh(
+            f"sudo rover doctor {MODEL} --camera {CAMERA} --port {PORT} --json", check=False, timeout_s=900
+        )
+        try:
+            found = json.loads(told[told.index("{") : told.rindex("}") + 1])
+        except ValueError:
+            raise WholeError(f"rover doctor gave no JSON: {' '.join(told.split())[-400:]}") from None
+        if not found["drives"]:
+            failed = [f"{c['name']}: {c['found']}" for c in found["checks"] if c["verdict"] == "fail"]
+            self.wrong(f"rover doctor: {'; '.join(failed)}")
+        return found
+
+    # -- the machine
+
+    def machine(self) -> dict[str, Any]:
+        """What it says that it is."""
+        told = self.pi.ssh(
+            "uname -rm; nproc; grep -m1 ^Features /proc/cpuinfo; head -1 /proc/meminfo; cat /etc/debian_version"
+        )
+        kernel, cores, features, memory, debian = told.splitlines()[:5]
+        if "asimddp" not in features:
+            self.wrong(f"the machine has no SDOT, which INT8 policies use: {features}")
+        return {
+            "kernel": kernel,
+            "cores": int(cores),
+            "sdot": "asimddp" in features,
+            "memory": memory.split()[1],
+            "debian": debian,
+        }
+
+    def clock(self) -> float:
+        """The host's monotonic time at which the machine's was 0, within some milliseconds of the machine's."""
+        best = (float("inf"), 0.0)
+        for _ in range(10):
+            before = time.monotonic()
+            uptime = float(self.pi.ssh("cat /proc/uptime").split()[0]) + 0.005  # it is cut to hundredths
+            after = time.monotonic()
+            best = min(best, (after - before, (before + after) / 2 - self.slow * uptime))
+        return best[1]
+
+    def sudo(self, script: str, timeout_s: float = 600) -> str:
+        return self.pi.ssh("sudo sh -s", text=script, timeout_s=timeout_s)
+
+    def until(self, test: str, otherwise: str, timeout_s: float = 120) -> None:
+        end = time.monotonic() + timeout_s
+        while self.pi.ssh(f"{test} && echo yes", check=False).strip() != "yes":
+            if time.monotonic() > end:
+                raise WholeError(otherwise)
+            time.sleep(1)
+
+    def play(self, name: str, **variables: object) -> dict[str, int]:
+        """Runs one of ansible/'s playbooks on the machine; its recap. Raises WholeError if it fails."""
+        given = {k: str(v) if isinstance(v, Path) else v for k, v in variables.items()}
+        play = plays.run(name, [self.pi], folder=self.ansible, variables=given)
+        (self.folder / f"{name}.log").write_text(play.output)
+        if not play.ok:
+            raise WholeError(f"{name}.yml failed: {' '.join(play.end.split())[-500:]}")
+        return play.recap[self.pi.name]
+
+    def wrong(self, sentence: str) -> None:
+        self.outcome.wrong.append(sentence)
+
+
+def _pictures(recordings: Path) -> list[Path]:
+    """The first frames of the recordings."""
+    pictures = sorted(recordings.glob("*/frames/*.jpg"))[:FRAMES]
+    if not pictures:
+        raise WholeError(f"{recordings}: no recorded frames in it; make demo leaves some")
+    return pictures
+
+
+def _frames(recordings: Path, file: Path) -> Path:
+    """The same as vivid takes them: YUYV, one after another."""
+    with file.open("wb") as out:
+        for path in _pictures(recordings):
+            image = cv2.imread(str(path))
+            if image is None or image.shape[1::-1] != SIZE:
+                found = None if image is None else image.shape
+                raise WholeError(f"{path}: a frame must be {SIZE[0]}x{SIZE[1]}, found {found}")
+            out.write(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_YUY2).tobytes() * TWICE)
+    return file

@@ -1,0 +1,112 @@
+"""The network between the laptop and a rover's sshd, so that it can be cut, go silent and garble what it carries.
+
+with Wire(pi) as wire:
+    plays.run("deploy", [wire], ...)    # a host like the rover itself, by another port
+    wire.cut()
+"""
+
+import contextlib
+import socket
+import threading
+from pathlib import Path
+
+from lab.pi.plays import Host
+
+AT_ONCE = 1 << 15  # bytes
+CONNECT_S = 5.0
+
+
+class Wire:
+    """Forwards a port of the loopback to a rover's; a context manager.
+
+    name, port, key: of a plays.Host. sent: bytes that went to the rover so far, by all connections.
+    """
+
+    def __init__(self, pi: Host):
+        self.name: str = pi.name
+        self.key: Path = pi.key
+        self.sent = 0
+        self._pi = pi
+        self._lock = threading.Lock()
+        self._open: set[socket.socket] = set()
+        self._cut = self._silent = False
+        self._flip_after: int | None = None
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+
+    def __enter__(self) -> "Wire":
+        threading.Thread(target=self._accept, name=f"wire of {self.name}", daemon=True).start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        self._end_all()
+
+    def cut(self) -> None:
+        """Every connection ends now, and there is no new one until it is mended."""
+        self._cut = True
+        self._end_all()
+
+    def silence(self) -> None:
+        """Nothing comes through any more, and nobody is told."""
+        self._silent = True
+
+    def flip(self, after: int = 0) -> None:
+        """Turns one bit of what goes to the rover, so many bytes from now; once."""
+        self._flip_after = self.sent + after
+
+    def mend(self) -> None:
+        """As new; connections of before are over."""
+        self._cut = self._silent = False
+        self._flip_after = None
+        self._end_all()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            try:
+                if self._cut:
+                    raise OSError
+                far = socket.create_connection(("127.0.0.1", self._pi.port), CONNECT_S)
+            except OSError:
+                near.close()
+                continue
+            far.settimeout(None)
+            with self._lock:
+                self._open |= {near, far}
+            for source, target in ((near, far), (far, near)):
+                threading.Thread(target=self._carry, args=(source, target, target is far), daemon=True).start()
+
+    def _carry(self, source: socket.socket, target: socket.socket, to_rover: bool) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(AT_ONCE):
+                if self._silent:
+                    continue
+                target.sendall(self._counted(data) if to_rover else data)
+        self._end(source, target)
+
+    def _counted(self, data: bytes) -> bytes:
+        with self._lock:
+            self.sent += len(data)
+            if self._flip_after is None or self.sent <= self._flip_after:
+                return data
+            self._flip_after = None
+        return data[:-1] + bytes([data[-1] ^ 1])
+
+    def _end_all(self) -> None:
+        with self._lock:
+            ended = list(self._open)
+        self._end(*ended)
+
+    def _end(self, *connections: socket.socket) -> None:
+        for connection in connections:
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)  # wakes who waits for it, which close() would not
+            with self._lock:
+                self._open.discard(connection)
+            connection.close()

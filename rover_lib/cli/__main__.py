@@ -1,0 +1,3 @@
+from rover_lib.cli import main
+
+main()

@@ -1,0 +1,54 @@
+"""Driving on a workstation: in the balloon world too, and flight logs as figures."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rover_lib.onboard.cli import FILE, LOG_DRIVE, drive_options, run_drive, sum_up
+
+
+@click.command()
+@drive_options
+@click.option("--world", "in_world", is_flag=True, help="The balloon world instead of a car, in real time.")
+@click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="With --world: a plan takes so long.")
+@click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="With --world: its first.")
+@click.pass_context
+def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **options: Any) -> None:
+    """Drive ARTIFACT: arms the car once camera, plan and Arduino are ready, and stops it whatever fails.
+
+    Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP); 1 could not begin;
+    2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start.
+    """
+    from rover_lib.world.car import VirtualCar
+
+    if latency_ms and not in_world:
+        raise click.UsageError("--latency-ms belongs to --world")
+    ctx.exit(run_drive(car=partial(VirtualCar, seed=seed) if in_world else None, latency_ms=latency_ms, **options))
+
+
+@click.command()
+@click.argument("file", type=FILE)
+@click.option("-o", "--output", type=FILE, help="The figure to write [default: FILE.png].")
+@LOG_DRIVE
+@click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")
+def log(file: Path, output: Path | None, drive: int, as_json: bool) -> None:
+    """Sum up the flight log FILE of `rover drive`, and draw it.
+
+    Missed ticks, jitter, ages and latencies of plans, who drove, temperature, and what happened. Older parts of the
+    same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation, the summary does not.
+    """
+    flight = sum_up(file, drive, as_json)
+    if output or not as_json:
+        from rover_lib.onboard.stage import atomic_path
+        from rover_lib.workshop.flight import flight_figure
+
+        output = output or file.with_name(f"{file.name}.png")
+        figure = flight_figure(flight)
+        with atomic_path(output) as temporary:
+            figure.savefig(temporary)
+        click.echo(f"drawn: {output}", err=as_json)
+
+
+COMMANDS = (drive, log)

@@ -1,0 +1,138 @@
+"""Commands that make artifacts of a checkpoint, and look at them."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rover_lib.cli.progress import progress
+from rover_lib.onboard.cli import FILE, show
+
+
+@click.command()
+@click.argument("checkpoint", type=FILE)
+@click.argument("episodes", type=FILE)
+@click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
+@click.option("--runs-dir", type=FILE, default="runs", show_default=True)
+@click.option("--samples", type=click.IntRange(min=1), help="Calibration samples [default: params.yml].")
+@click.option("--worlds", type=click.IntRange(min=0), default=0, show_default=True, help="Balloon worlds to drive in.")
+@click.option("--iterations", type=click.IntRange(min=1), help="Timed inferences per mode [default: params.yml].")
+def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
+    """Load, calibrate, quantize, compare and benchmark CHECKPOINT with the recordings in EPISODES.
+
+    Executes the five notebooks; reports, artifacts, figures and the executed notebooks are left in the run's folder.
+    """
+    from rover_lib.workshop.run import run as run_notebooks
+
+    chosen = {k: v for k, v in options.items() if v is not None}
+    folder = run_notebooks(checkpoint, episodes, progress=progress(), **chosen)
+    click.echo(f"done: {folder}")
+
+
+@click.command()
+@click.argument("file", type=FILE)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def inspect(file: Path, as_json: bool) -> None:
+    """Say what FILE is: an artifact, a checkpoint, or a folder of recordings."""
+    import zipfile
+
+    from rover_lib.onboard.artifact import check_integrity, content_hash, read_manifest
+
+    if file.is_file() and zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as z:
+            scripted = any("/code/" in name for name in z.namelist())
+        if scripted:
+            check_integrity(file)
+            return show({"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}, as_json)
+    if file.is_dir() and not (file / "config.json").exists():
+        from rover_lib.workshop.episodes import load_recordings
+
+        return show({"recordings": load_recordings(file, progress=progress()).summary()}, as_json)
+    from rover_lib.workshop.checkpoint import load_checkpoint
+
+    checkpoint = load_checkpoint(file)
+    return show({"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}, as_json)
+
+
+@click.command()
+@click.argument("checkpoint", type=FILE)
+@click.argument("episodes", type=FILE)
+@click.option("-o", "--output", type=FILE, required=True, help="The artifact to write.")
+@click.option("--mode", type=click.Choice(["fp32", "dynamic", "static"]), default="static", show_default=True)
+@click.option("--kind", type=click.Choice(["symmetric", "affine"]), default="symmetric", show_default=True)
+@click.option(
+    "--observer", type=click.Choice(["histogram", "minmax", "percentile"]), default="histogram", show_default=True
+)
+@click.option("--float-block", "float_blocks", multiple=True, help="A block to leave in float; makes static mixed.")
+@click.option("--samples", type=click.IntRange(min=1), help="Calibration samples [default: params.yml].")
+def quantize(checkpoint: Path, episodes: Path, output: Path, mode: str, samples: int | None, **how: Any) -> None:
+    """Quantize CHECKPOINT, calibrated on the recordings in EPISODES, to one artifact.
+
+    `rover run` does this for all modes, chooses the observer and the blocks by measurement, and compares.
+    """
+    from rover_lib.onboard.params import params
+    from rover_lib.workshop import quantize as q
+    from rover_lib.workshop.act import ACT
+    from rover_lib.workshop.checkpoint import load_checkpoint
+    from rover_lib.workshop.episodes import choose_calibration, load_recordings, split
+
+    p = params()
+    how_many, seed = samples or p["calibration"]["samples"], p["calibration"]["seed"]
+    ck = load_checkpoint(checkpoint)
+    recordings = load_recordings(episodes, ck.config.chunk, p["calibration"]["sync_s"], progress())
+    parts = split(recordings, p["calibration"]["held_out_share"], seed)
+    chosen, note = choose_calibration(parts.calibration, how_many, seed)
+    if note:
+        click.echo(f"rover: note: {note}", err=True)
+    vectors = parts.choosing[:: max(1, len(parts.choosing) // 16)] or chosen[:16]
+    options = {"samples": vectors, "tolerance": p["parity"]["fp32"], "int8_errors": p["parity"]["int8_errors"]}
+    if mode == "fp32":
+        digest = q.export(ACT(ck.config, ck.weights), ck, output, **options)
+    else:
+        mode = "mixed" if mode == "static" and how["float_blocks"] else mode
+        smooth = p["quantization"]["smooth"]
+        scheme = q.Scheme(mode, smooth=smooth, percentile=p["quantization"]["percentile"], **how)
+        calibration = q.calibrate(ck, chosen, smooth=smooth, progress=progress())
+        quantized = q.quantize(ck, scheme, calibration)
+        for warning in quantized.report["warnings"]:
+            click.echo(f"rover: warning: {warning}", err=True)
+        digest = q.export(quantized, ck, output, calibration=calibration, **options)
+    click.echo(f"{output}: {mode}, {output.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
+
+
+@click.command()
+@click.argument("reference", type=FILE)
+@click.argument("artifacts", type=FILE, nargs=-1, required=True)
+@click.option("--episodes", type=FILE, required=True, help="Recordings; their held-out part judges.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_json: bool) -> None:
+    """Compare ARTIFACTS with REFERENCE (the FP32 artifact) on recorded frames.
+
+    Errors are shares of the recorded range and microseconds of servo pulse.
+    """
+    from rover_lib.onboard.params import params
+    from rover_lib.onboard.policy import load_policy
+    from rover_lib.workshop import compare as c
+    from rover_lib.workshop.episodes import load_recordings, split
+
+    p = params()["calibration"]
+    fp32 = load_policy(reference)
+    recordings = load_recordings(episodes, fp32.chunk, p["sync_s"], progress())
+    held_out = split(recordings, p["held_out_share"], p["seed"]).held_out
+    others = {a.stem.removeprefix("policy_"): load_policy(a) for a in artifacts}
+    report = c.fidelity(fp32, others, held_out, recordings.action_range(), progress())
+    show({name: report.summary(name) for name in others}, as_json)
+
+
+@click.command()
+@click.argument("folder", type=FILE, default="wheels")
+@click.option("--python", "pythons", multiple=True, help="A Pi's Python [default: 3.11 and 3.13].")
+@click.option("--only-rover", is_flag=True, help="Only rover_lib's own wheel: Pis with internet fetch the others.")
+def wheelhouse(folder: Path, pythons: tuple[str, ...], only_rover: bool) -> None:
+    """Put all that a Pi installs into FOLDER, for a rover without internet (154 MB for each Python)."""
+    from rover_lib.workshop.wheelhouse import PYTHONS, make
+
+    show(vars(make(folder, pythons=pythons or PYTHONS, only_rover=only_rover)), True)
+
+
+COMMANDS = (run, inspect, quantize, compare, wheelhouse)

@@ -1,0 +1,508 @@
+"""The rover's own command line: what works where only rover_lib.onboard is installed.
+
+Thin: it parses, calls the library and prints.
+"""
+
+import json
+import sys
+import traceback
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, Protocol
+
+import click
+
+import rover_lib
+from rover_lib.onboard.errors import RoverError
+
+FILE = click.Path(path_type=Path)
+LONG_LIST = 12  # longer ones are for programs
+# Of every command that works with the car:
+CAMERA = click.option(
+    "--camera", default="0", show_default=True, help="Number, /dev/videoN, video, folder or FIFO of JPEGs."
+)
+PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
+LOG_DRIVE = click.option(
+    "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
+)
+
+
+class Rover(click.Group):
+    """A bad input ends in one sentence and exit code 1; --debug adds the traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except RoverError as e:
+            if ctx.params.get("debug"):
+                raise
+            click.echo(f"rover: {e}", err=True)
+        except ModuleNotFoundError as e:
+            if ctx.params.get("debug") or (e.name or "").startswith("rover_lib"):
+                raise
+            click.echo(
+                f"rover: this command needs {e.name}, which only a workstation has: make demo sets one up", err=True
+            )
+        except (OSError, MemoryError) as e:
+            if ctx.params.get("debug") or isinstance(
+                e, BrokenPipeError
+            ):  # click ends quietly when `head` has seen enough
+                raise
+            click.echo(f"rover: {type(e).__name__}: {e}", err=True)
+        ctx.exit(1)
+
+
+def show(value: Any, as_json: bool) -> None:
+    """Print a nested dict for people, or as JSON."""
+    from rover_lib.onboard.stage import plain
+
+    value = plain(value)
+    if as_json:
+        click.echo(json.dumps(value, indent=2))
+        return
+
+    def lines(v: Any, indent: str) -> None:
+        for key, inner in v.items() if isinstance(v, dict) else enumerate(v):
+            if isinstance(inner, list) and len(inner) > LONG_LIST:
+                click.echo(f"{indent}{key:<28} {len(inner)} values, see --json")
+            elif isinstance(inner, (dict, list)) and inner:
+                click.echo(f"{indent}{key}")
+                lines(inner, indent + "  ")
+            else:
+                text = f"{inner:.4g}" if isinstance(inner, float) else inner
+                click.echo(f"{indent}{key:<28} {text}")
+
+    lines(value, "")
+
+
+@click.group("rover", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
+@click.version_option(rover_lib.__version__)
+def main(debug: bool) -> None:
+    """Drive a car by a learned policy: what works on the rover. A workstation's `rover` knows more commands."""
+
+
+class Car(Protocol):
+    """A car to drive that is not the one at --camera and --port."""
+
+    camera: str
+    port: str
+
+    def summary(self) -> dict[str, Any]:
+        """What became of it, for the report."""
+
+
+def drive_options(command: Callable) -> Callable:
+    """The options of driving, on the rover and in the world."""
+    for option in reversed(DRIVE_OPTIONS):
+        command = option(command)
+    return command
+
+
+DRIVE_OPTIONS = (
+    click.argument("artifact", type=FILE, required=False),
+    CAMERA,
+    PORT,
+    click.option("--hz", type=click.FloatRange(10, 100), default=30.0, show_default=True, help="Commands a second."),
+    click.option("--dry-run", is_flag=True, help="No Arduino, no motor: logs what would be sent."),
+    click.option("--record", type=FILE, help="Write the drive as an episode into this folder."),
+    click.option("--record-mb", type=click.FloatRange(min=1), help="All in that folder take at most so much."),
+    click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="End after so many."),
+    click.option("--ticks", type=click.IntRange(min=1), help="End after so many commands."),
+    click.option("--throttle-limit", type=click.FloatRange(0, 1), help="[default: params.yml; with --replay: none]"),
+    click.option(
+        "--blend-ticks", type=click.IntRange(min=0), help="Of a fresh plan taking over [default: params.yml]."
+    ),
+    click.option("--ensemble", type=float, help="LeRobot's temporal ensembling with this coefficient, say 0.01."),
+    click.option("--threads", type=click.IntRange(min=1), help="The policy's [default: all cores but one]."),
+    click.option(
+        "--log", "log_file", type=FILE, help="Flight log [default: rover/flight.log in the user's state folder]."
+    ),
+    click.option(
+        "--json", "json_file", type=click.File("w", lazy=True), help="Write what the drive was there; - prints it."
+    ),
+    click.option("--replay", type=FILE, help="Send this episode's pulses; no policy, no camera."),
+    click.option("--service", is_flag=True, help="As a systemd service: disarmed until `rover arm-car`."),
+)
+
+
+@main.command()
+@drive_options
+@click.pass_context
+def drive(ctx: click.Context, **options: Any) -> None:
+    """Drive ARTIFACT: arms the car once camera, plan and Arduino are ready, and stops it whatever fails.
+
+    Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP); 1 could not begin;
+    2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start.
+    """
+    ctx.exit(run_drive(**options))
+
+
+def run_drive(
+    artifact: Path | None,
+    replay: Path | None,
+    json_file: Any,
+    *,
+    car: Callable[[], AbstractContextManager[Car]] | None = None,
+    latency_ms: float = 0.0,
+    **options: Any,
+) -> int:
+    """Drive, print or write what it was, and return the exit code. car: opens another than that of --camera, --port."""
+    from rover_lib.onboard.drive import Report
+    from rover_lib.onboard.errors import DriveFault, TakenOver
+    from rover_lib.onboard.service import NotArmed
+
+    if bool(artifact) == bool(replay):
+        raise click.UsageError("give an ARTIFACT, or --replay EPISODE")
+    if options["service"] and (replay or options["dry_run"]):
+        raise click.UsageError("--service drives a car by an artifact: no --replay, no --dry-run")
+    if options["record_mb"] and not options["record"]:
+        raise click.UsageError("--record-mb belongs to --record")
+    report, more, code = Report(), {}, 0
+    try:
+        _drive(artifact, replay, report, more, car=car, latency_ms=latency_ms, **options)
+    except NotArmed as e:
+        click.echo(f"rover: {e}", err=True)
+    except (DriveFault, TakenOver) as e:
+        click.echo(f"rover: {e}", err=True)
+        code = 4 if isinstance(e, TakenOver) else 3
+    except Exception:  # whatever ended a drive, the summary of what was driven is still written
+        if not report.ticks:
+            raise
+        traceback.print_exc()  # a defect of this program, which has stopped the car too
+        code = 3
+    result = {**report.summary(), **more}
+    if json_file:
+        json_file.write(json.dumps(result, indent=2) + "\n")
+    else:
+        show(result, False)
+    return code
+
+
+def _drive(
+    artifact: Path | None,
+    replay: Path | None,
+    report: Any,
+    more: dict[str, Any],
+    *,
+    camera: str,
+    port: str,
+    hz: float,
+    dry_run: bool,
+    record: Path | None,
+    record_mb: float | None,
+    throttle_limit: float | None,
+    blend_ticks: int | None,
+    ensemble: float | None,
+    threads: int | None,
+    log_file: Path | None,
+    car: Callable[[], AbstractContextManager[Car]] | None,
+    latency_ms: float,
+    service: bool,
+    **ends: Any,
+) -> None:
+    """The drive command's devices, opened in order and closed in reverse; more: what a world adds to the report."""
+    import logging
+    import threading
+    from contextlib import ExitStack
+
+    from rover_lib.onboard import drive as d
+    from rover_lib.onboard import watch as w
+    from rover_lib.onboard.camera import Camera
+    from rover_lib.onboard.host import default_log
+    from rover_lib.onboard.params import params
+    from rover_lib.onboard.pilot import ReplayPilot
+    from rover_lib.onboard.plan import Settings
+    from rover_lib.onboard.recording import read_controls
+    from rover_lib.onboard.service import Service
+    from rover_lib.onboard.servo_link import ServoLink
+    from rover_lib.onboard.telemetry import FlightLog, StatusLine
+
+    p = params()
+    settings = Settings.of(p["drive"], throttle_limit=throttle_limit, blend_ticks=blend_ticks, ensemble=ensemble)
+    controls = read_controls(replay) if replay else None
+    stop = threading.Event()
+    with ExitStack() as stack:
+        header = {"artifact": str(artifact or replay), "hz": hz, **vars(settings)}
+        status = stack.enter_context(StatusLine(lambda: report.status, sys.stderr))
+        logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status.handler], force=True)
+        limits = {"max_bytes": int(p["flight_log"]["max_mb"] * 1e6), "keep": p["flight_log"]["keep"]}
+        path = log_file or default_log()
+        unended = w.unended(path)
+        log = stack.enter_context(FlightLog(path, header=header, **limits))
+        if unended:
+            log.event(unended, level=logging.WARNING)
+        stack.enter_context(w.ended_by_signals(stop, log))
+        stack.enter_context(w.ended_if_hung(report, log))
+        if car:
+            other = stack.enter_context(car())
+            camera, port = other.camera, other.port
+            stack.callback(lambda: more.update(other.summary()))
+        wait = stack.enter_context(Service(report, stop, log.event)).wait if service else d.at_once
+        link = None if dry_run else stack.enter_context(ServoLink(port))
+        common = {"rate_hz": hz, "log": log, "stop": stop, "report": report, **ends}
+        if controls:
+            limit = 1.0 if throttle_limit is None else throttle_limit
+            with w.going_first(log):
+                d.drive(ReplayPilot(controls, throttle_limit=limit), link, watch=w.Troubles(report, link), **common)
+            return
+        frames = stack.enter_context(Camera(camera))
+        recording = {"record": record, "record_mb": record_mb}
+        how = {"threads": threads, "latency_s": latency_ms / 1e3}
+        d.drive_artifact(artifact, frames, link, settings=settings, wait=wait, **recording, **how, **common)
+
+
+@main.command("record")
+@click.argument("out_dir", type=FILE)
+@CAMERA
+@PORT
+@click.option(
+    "--hz", type=click.FloatRange(5, 50), default=30.0, show_default=True, help="Controls and frames a second."
+)
+@click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="End an episode after so many.")
+@click.option("--label", default="", help='What is done, say "hit red balloon".')
+@click.option("--episodes", type=click.IntRange(min=1), default=1, show_default=True, help="One after another.")
+@click.pass_context
+def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -> None:
+    """Record a human who drives with the transmitter: episode folders in OUT_DIR, to train and calibrate with.
+
+    Ctrl-C, SIGTERM and SIGHUP end an episode, and it is kept. Exit code 1 if a fault ended it; what was recorded until
+    then is kept too.
+    """
+    from rover_lib.onboard.recorder import record_episodes
+
+    fault = None
+    for report in record_episodes(
+        folder=out_dir, rate_hz=hz, status=sys.stderr, say=lambda text: click.echo(text, err=True), **options
+    ):
+        click.echo(str(report))
+        fault = report.fault
+    ctx.exit(1 if fault else 0)
+
+
+@main.command()
+@click.argument("artifact", type=FILE, required=False)
+@CAMERA
+@PORT
+@click.option("--hz", type=click.FloatRange(1, 120), default=30.0, show_default=True, help="Frames a second wanted.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.pass_context
+def doctor(ctx: click.Context, artifact: Path | None, camera: str, port: str, hz: float, as_json: bool) -> None:
+    """Look at all that driving needs: camera, Arduino, ARTIFACT, power, disk. Say what to do.
+
+    Nothing is armed and no servo is moved, but opening the port resets the Arduino. Exit code 1 if anything fails that
+    driving cannot do without; warnings do not count.
+    """
+    from rover_lib.onboard.doctor import examine
+    from rover_lib.onboard.host import default_log
+
+    checks = []
+    for check in examine(artifact, camera=camera, port=port, rate_hz=hz, log_folder=default_log().parent):
+        checks.append(check)
+        if not as_json:
+            click.echo(str(check))
+    failed = [c.name for c in checks if c.verdict == "fail"]
+    if as_json:
+        show({"drives": not failed, "checks": [vars(c) for c in checks]}, as_json)
+    elif failed:
+        click.echo(f"rover: this car would not drive: {', '.join(failed)}", err=True)
+    ctx.exit(1 if failed else 0)
+
+
+@main.command()
+@click.argument("artifacts", type=FILE, nargs=-1, required=True)
+@click.option("--warmup", type=click.IntRange(min=0), default=10, show_default=True)
+@click.option("--iterations", type=click.IntRange(min=1), default=100, show_default=True)
+@click.option("--threads", type=click.IntRange(min=0), default=0, show_default=True, help="0: all cores.")
+@click.option("--duration", type=float, help="Soak for so many seconds instead, with a time series.")
+@click.option("--output", type=FILE, help="Write benchmark JSON there, for notebook 05.")
+@click.option("--gates", is_flag=True, help="Hold the first artifact against the original's gates in params.yml.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def benchmark(
+    artifacts: tuple[Path, ...],
+    warmup: int,
+    iterations: int,
+    threads: int,
+    duration: float | None,
+    output: Path | None,
+    gates: bool,
+    as_json: bool,
+) -> None:
+    """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors.
+
+    The first artifact's figures stand at the top level. Needs nothing but the artifact: this is what runs on the Pi.
+    """
+    from rover_lib.onboard.artifact import content_hash, read_parity
+    from rover_lib.onboard.benchmark import benchmark as measure
+    from rover_lib.onboard.benchmark import check_gates
+    from rover_lib.onboard.params import params
+    from rover_lib.onboard.policy import load_policy
+    from rover_lib.onboard.stage import write_stage
+
+    policies = {a.stem: load_policy(a) for a in artifacts}
+    vectors = read_parity(artifacts[0])
+    first = policies[artifacts[0].stem]
+    frames = [
+        {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
+    ]  # stored as RGB; a camera gives BGR
+    options = {"warmup": warmup, "iterations": iterations, "threads": threads, "duration_s": duration}
+    metrics = measure(policies, frames, vectors["state"][0], **options, memory_alone=True)
+    if output:
+        write_stage(
+            output, "benchmark", params=options, metrics=metrics, inputs={a.name: content_hash(a) for a in artifacts}
+        )
+    if gates:
+        metrics["gates"] = check_gates(metrics, params()["gates"]["original"])
+    show(metrics, as_json)
+
+
+@main.command("arm-car")
+@click.option("--yes", is_flag=True, help="Do not ask.")
+def arm_car(yes: bool) -> None:
+    """Arm the car whose service waits for it (rover-drive.service): it drives at once. Needs root.
+
+    The Arduino refuses without the transmitter, and unless its throttle stick is at rest. Moving a stick takes the car
+    back; `sudo systemctl restart rover-drive` stops and disarms it.
+    """
+    from rover_lib.onboard.service import arm_car as arm
+
+    if not yes:
+        click.confirm("The car will drive now. Is the way free, and the transmitter in your hand?", abort=True)
+    click.echo(arm())
+
+
+@main.group()
+@click.option("--models", type=FILE, default="/var/lib/rover/models", show_default=True, help="The rover's models.")
+@click.option("--chunk", type=click.IntRange(min=1), default=32, show_default=True, help="Actions of a plan.")
+@click.option("--camera", default="cam_front", show_default=True, help="The policy's name for this rover's camera.")
+@click.option("--aspect", type=float, default=1.78, show_default=True, help="Of its pictures, width to height.")
+@click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
+@click.pass_context
+def release(ctx: click.Context, models: Path, chunk: int, camera: str, aspect: float, sandboxed: bool) -> None:
+    """Models on the rover: staged, proven, used; what is in use changes at once or not at all.
+
+    `ansible-playbook ansible/deploy.yml` does all of it over a network.
+    """
+    from rover_lib.onboard import release as r
+
+    expected = r.Expected(chunk=chunk, camera=camera, aspect=aspect)
+    ctx.obj = r.Releases(models, check=r.sandboxed if sandboxed else None, expected=expected)
+
+
+ALLOW = click.option(
+    "--allow", multiple=True, type=click.Choice(["mode", "chunk", "camera"]), help="Take one that differs in this."
+)
+
+
+@release.command()
+@click.argument("artifact", type=FILE)
+@click.argument("folder", type=FILE)
+@ALLOW
+@click.pass_obj
+def pack(releases: Any, artifact: Path, folder: Path, allow: tuple[str, ...]) -> None:
+    """Cut ARTIFACT into parts that travel one by one, in FOLDER. Refuses what the rover would refuse."""
+    from rover_lib.onboard.release import pack as pack_parts
+
+    show(pack_parts(artifact, folder, releases.expected, allow), True)
+
+
+@release.command()
+@click.argument("source", type=FILE)
+@click.option("--sha256", help="What the artifact's must be.")
+@ALLOW
+@click.pass_obj
+def stage(releases: Any, source: Path, sha256: str | None, allow: tuple[str, ...]) -> None:
+    """Make a release of SOURCE, an artifact or what `pack` wrote. What is in use stays in use."""
+    show(vars(releases.stage(source, sha256=sha256, allow=allow)), True)
+
+
+@release.command()
+@click.argument("name", default="current")
+@click.pass_obj
+def verify(releases: Any, name: str) -> None:
+    """Prove that a release is whole and computes here what it should: checksums and parity vectors."""
+    releases.verify(name)
+    click.echo(f"{name}: whole, and computes what it should")
+
+
+@release.command()
+@click.argument("name")
+@click.pass_obj
+def switch(releases: Any, name: str) -> None:
+    """Use the release NAME from now on: proven before and after, and back by itself if that fails."""
+    show({"name": name, "changed": releases.switch(name)}, True)
+
+
+@release.command()
+@click.pass_obj
+def rollback(releases: Any) -> None:
+    """Use the release before the one in use, the newest that can be proven."""
+    show({"name": releases.rollback(), "changed": True}, True)
+
+
+@release.command()
+@click.option("--keep", type=click.IntRange(min=1), default=3, show_default=True)
+@click.pass_obj
+def prune(releases: Any, keep: int) -> None:
+    """Remove all but the releases used last; never the one in use."""
+    gone = releases.prune(keep)
+    show({"removed": gone, "changed": bool(gone)}, True)
+
+
+@release.command()
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, with the machine's and the service's state.")
+@click.pass_obj
+def status(releases: Any, as_json: bool) -> None:
+    """What is in use, whether it is whole, what else is there. Exit code 1 if what is in use is not whole."""
+    found = releases.status()
+    if as_json:
+        import socket
+
+        from rover_lib.onboard.host import Host, default_log
+        from rover_lib.onboard.service import ServiceError, state_of
+
+        try:
+            found["service"] = state_of()
+        except ServiceError as e:
+            found["service"] = {"installed": False, "active": "unknown", "state": "", "text": str(e)}
+        log = next((p for p in (Path("/var/lib/rover-drive/flight.log"), default_log()) if p.exists()), None)
+        found |= {"rover": socket.gethostname(), **Host().reading(), "last_drive_s": log and log.stat().st_mtime}
+        return show(found, True)
+    for r in found["releases"]:
+        mark = "*" if r["current"] else " "
+        click.echo(f"{mark} {r['name'][:12]}  {r['mode']:<7} {r['megabytes']:6.1f} MB  {r['wrong'] or r['origin']}")
+    if not found["healthy"]:
+        raise RoverError(found["trouble"])
+
+
+@main.command()
+@click.argument("file", type=FILE)
+@LOG_DRIVE
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def log(file: Path, drive: int, as_json: bool) -> None:
+    """Sum up the flight log FILE of `rover drive`. A workstation's `rover log` draws it too.
+
+    Missed ticks, jitter, ages and latencies of plans, who drove, temperature, and what happened. Older parts of the
+    same log (FILE.1, FILE.2, ...) are read with it.
+    """
+    sum_up(file, drive, as_json)
+
+
+def sum_up(file: Path, drive: int, as_json: bool) -> Any:
+    """Print what a flight log says of one of its drives, and return that drive, a telemetry.Flight."""
+    from rover_lib.onboard.telemetry import read_log
+
+    flight = read_log(file, drive)
+    summary = flight.summary()
+    if as_json:
+        show(summary, as_json)
+    else:
+        show({k: v for k, v in summary.items() if k != "events"}, as_json)
+        for event in flight.events:
+            click.echo(f"{event.t_s:9.2f} s  {event}")
+    return flight
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,408 @@
+"""How late may a plan be? Drives through balloon worlds in virtual time, with an inference as slow as one likes.
+
+    reports = run_latencies([policy], [Condition(0.0, settings), Condition(0.15, settings)], worlds=40)
+
+The very loop of the car drives: `onboard.drive.drive` with its PolicyPilot, on a virtual clock. What stands in are the
+camera and the planner's thread. Nothing waits, and nothing depends on how fast this machine is.
+"""
+
+import copy
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.camera import Frame
+from rover_lib.onboard.drive import drive
+from rover_lib.onboard.errors import DriveFault, RoverError, WorldError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.pilot import Order, PolicyPilot
+from rover_lib.onboard.plan import Commanded, Plan, Settings
+from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.stage import plain, read_stage, write_stage
+from rover_lib.workshop.compare import GATED, gate
+from rover_lib.world.trial import Trajectory, wilson_interval
+from rover_lib.world.world import RATE_HZ, CarState, World
+
+LATENCY_MOST_S = 5.0
+ROUNDING = 1e-6  # of times, in ticks
+ENSEMBLE = 0.01  # LeRobot's coefficient
+JUDGED_MS = 150.0
+SEED = 10_000
+
+Progress = Callable[..., Iterable]
+
+
+class Plans(Protocol):
+    """What can be driven: an artifact's Policy, or anything with these two. rate_hz: of a plan's actions."""
+
+    rate_hz: float
+
+    def predict_unclipped(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What a drive is driven with.
+
+    latency_s: from a look at the newest frame to the plan, 0: within the same tick. pushes: as World's shoves.
+    """
+
+    latency_s: float
+    settings: Settings
+    pushes: int = 0
+
+    def __post_init__(self):
+        if not 0 <= self.latency_s <= LATENCY_MOST_S:
+            raise WorldError(f"a latency must be 0 to {LATENCY_MOST_S:g} s, found {self.latency_s}")
+
+
+@dataclass(frozen=True)
+class LateDrive:
+    """One world's drive. outcome: 'hit', 'left', 'timeout', or 'stopped' if a plan became too old to drive by.
+
+    nearest_m: camera to balloon, at its least. trajectory: one point per tick. orders: what was commanded, at each
+    tick. plans: all that there were, and where the car was when each of them looked.
+    """
+
+    seed: int
+    outcome: str
+    duration_s: float
+    nearest_m: float
+    trajectory: Trajectory
+    orders: list[Order]
+    plans: list[tuple[Plan, CarState]]
+
+
+@dataclass(frozen=True)
+class LatencyReport:
+    """Of one condition. wilson: 95 % interval of the share of hits."""
+
+    condition: Condition
+    hits: int
+    trials: int
+    wilson: tuple[float, float]
+    per_world: list[LateDrive]
+
+    def summary(self) -> dict[str, Any]:
+        """For JSON."""
+        ages_ms = 1e3 * np.array([o.age_s for d in self.per_world for o in d.orders])
+        outcomes = [d.outcome for d in self.per_world]
+        times_s = [d.duration_s for d in self.per_world if d.outcome == "hit"]
+        at = {p: round(float(np.percentile(ages_ms, p)), 3) if len(ages_ms) else None for p in (0, 50, 95, 100)}
+        return {
+            "latency_ms": round(1e3 * self.condition.latency_s, 3),
+            "pushes": self.condition.pushes,
+            "compensate": self.condition.settings.compensate,
+            "ensemble": self.condition.settings.ensemble,
+            "hits": self.hits,
+            "trials": self.trials,
+            "hits_wilson_low": self.wilson[0],
+            "hits_wilson_high": self.wilson[1],
+            **{o: outcomes.count(o) for o in ("left", "timeout", "stopped")},
+            "plan_age_min_ms": at[0],
+            "plan_age_p50_ms": at[50],
+            "plan_age_p95_ms": at[95],
+            "plan_age_max_ms": at[100],
+            "time_to_hit_p50_s": float(np.median(times_s)) if times_s else None,
+        }
+
+
+class _Car:
+    """A world, and what looks at it: the loop's camera, planner, clock and sleep, of which only sleep() moves the time.
+
+    Frames come at the ticks. The car is held until the first plan is there, as that of `rover drive --world` is.
+    """
+
+    wanted_hz = RATE_HZ
+
+    def __init__(self, world: World, policy: Plans, latency_s: float, commanded: Commanded):
+        self.world, self.stop = world, threading.Event()
+        self.command: Order | None = None
+        self.plans: list[tuple[Plan, CarState]] = []
+        self._policy, self._latency_s, self._commanded = policy, latency_s, commanded
+        self._tick, self._looked_at = 0, -1  # time, and that of the newest frame that was looked at
+        self._coming: tuple[Plan, CarState] | None = None
+        self._think(ROUNDING)
+
+    def clock(self) -> float:
+        return self._tick / RATE_HZ
+
+    def sleep(self, seconds: float) -> None:
+        for _ in range(round(seconds * RATE_HZ)):
+            self._think(self._tick + 1 - ROUNDING)
+            if self.command:
+                self.world.step(self.command.steering, self.command.throttle, 1 / RATE_HZ)
+                if self.world.done:
+                    return self.stop.set()
+            self._tick += 1
+            self._think(self._tick + ROUNDING)
+
+    def latest(self) -> Frame:
+        # The loop only asks whether the camera is frozen or black: nothing is drawn for it.
+        return Frame(np.empty((0, 0, 3), np.uint8), self.clock(), self._tick + 1, 0, 255.0)
+
+    @property
+    def asking_s(self) -> float:
+        return self.clock() - (self._coming[0].ready_s - self._latency_s) if self._coming else 0.0
+
+    def newest(self) -> Plan | None:
+        return self.plans[-1][0] if self.plans else None
+
+    def wait(self, timeout_s: float) -> Plan | None:
+        while not self.plans:
+            self.sleep(1 / RATE_HZ)
+        return self.newest()
+
+    def _think(self, until_tick: float) -> None:
+        """What Planner's thread does until then: a plan is there, and at once it looks at the newest frame."""
+        now_s = self.clock()
+        while True:
+            if self._coming:
+                plan = self._coming[0]
+                if plan.ready_s * RATE_HZ > until_tick:
+                    return
+                self.plans.append(self._coming)
+                now_s, self._coming = max(now_s, plan.ready_s), None
+            if self._looked_at == self._tick:
+                return  # it waits for another frame
+            self._looked_at = self._tick
+            state = self._commanded.state(self.clock(), self._policy.rate_hz)
+            actions = self._policy.predict_unclipped(self.world.render(), state)
+            plan = Plan(len(self.plans) + 1, self.clock(), now_s + self._latency_s, actions)
+            self._coming = plan, self.world.state
+
+
+class _Pilot(PolicyPilot):
+    """Whose orders move the car, and are kept."""
+
+    def __init__(self, car: _Car, commanded: Commanded, settings: Settings, rate_hz: float):
+        super().__init__(car, car, commanded, settings, rate_hz)
+        self.orders: list[Order] = []
+        self._car = car
+
+    def sent(self, at_s: float, order: Order) -> None:
+        super().sent(at_s, order)
+        self._car.command = order
+        self.orders.append(order)
+
+
+class _NoLog:
+    """In a flight log's place."""
+
+    start_s = 0.0
+
+    def tick(self, row: Any) -> None: ...
+
+    def event(self, text: str, **fields: Any) -> None: ...
+
+
+def drive_late(policy: Plans, seed: int, condition: Condition) -> LateDrive:
+    """One drive through the world of that seed. Raises PolicyError for a plan that no car may be driven by."""
+    commanded = Commanded()
+    car = _Car(World(seed, condition.pushes), policy, condition.latency_s, commanded)
+    pilot = _Pilot(car, commanded, condition.settings, policy.rate_hz)
+    try:
+        drive(pilot, None, rate_hz=RATE_HZ, log=_NoLog(), stop=car.stop, clock=car.clock, sleep=car.sleep)
+        outcome = car.world.outcome
+    except DriveFault as fault:
+        if fault.__cause__:  # the policy failed: it is not that a plan is too old
+            raise fault.__cause__ from None
+        outcome = "stopped"
+    world, track = car.world, car.world.trajectory
+    balloon = world.balloon.x_m, world.balloon.y_m
+    names = "x_m", "y_m", "steering_command", "throttle_command"
+    trajectory = Trajectory(*(np.array([getattr(s, name) for s in track]) for name in names), balloon)
+    nearest_m = float(np.hypot(trajectory.x_m - balloon[0], trajectory.y_m - balloon[1]).min())
+    return LateDrive(seed, outcome, world.state.time_s, nearest_m, trajectory, pilot.orders, car.plans)
+
+
+def run_latencies(
+    policies: Sequence[Plans],
+    conditions: Sequence[Condition],
+    worlds: int = 40,
+    seed: int = SEED,
+    progress: Progress | None = None,
+) -> list[LatencyReport]:
+    """Drive through `worlds` worlds, of seeds from `seed` on, under each condition; reports in their order.
+
+    policies: the same one, once for each thread that drives: results do not depend on how many there are.
+    progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
+    Raises WorldError for parameters that make no trial, RoverError for what a policy raises.
+    """
+    if worlds < 1 or seed < 0 or not policies:
+        raise WorldError(f"drives need a policy, at least 1 world and a seed from 0, found {worlds} and {seed}")
+    free: queue.SimpleQueue[Plans] = queue.SimpleQueue()
+    for policy in policies:
+        free.put(policy)
+
+    def one(condition: Condition, world_seed: int) -> LateDrive:
+        policy = free.get()
+        try:
+            return drive_late(policy, world_seed, condition)
+        finally:
+            free.put(policy)
+
+    with ThreadPoolExecutor(len(policies)) as pool:
+        running = [[pool.submit(one, c, s) for s in range(seed, seed + worlds)] for c in conditions]
+        every = [future for futures in running for future in futures]
+        try:
+            done = as_completed(every)
+            for future in progress(done, desc="driving", total=len(every)) if progress else done:
+                future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+        drives = [[future.result() for future in futures] for futures in running]
+    hits = [sum(d.outcome == "hit" for d in found) for found in drives]
+    return [
+        LatencyReport(c, n, worlds, wilson_interval(n, worlds), found)
+        for c, n, found in zip(conditions, hits, drives, strict=True)
+    ]
+
+
+def beside_path(drive: LateDrive, other: LateDrive) -> float:
+    """How far, at most, a drive's path is beside another one's, in metres; when it was where does not matter."""
+    a, b = drive.trajectory, other.trajectory
+    return float(np.hypot(a.x_m[:, None] - b.x_m, a.y_m[:, None] - b.y_m).min(1).max())
+
+
+def from_above(drive: LateDrive, condition: Condition) -> dict[str, Any]:
+    """A drive and its plans for a figure, in JSON's types and metres.
+
+    Where a plan leads to: the world's own car follows it from the place where it looked, unpushed.
+    """
+
+    def path(x_m: Iterable[float], y_m: Iterable[float]) -> dict[str, list[float]]:
+        return {"x_m": [round(float(x), 3) for x in x_m], "y_m": [round(float(y), 3) for y in y_m]}
+
+    world, plans = World(drive.seed), []
+    for plan, looked_from in drive.plans:
+        ghost = copy.copy(world)
+        ghost.state, ghost.trajectory = looked_from, [looked_from]
+        for steering, throttle in plan.actions:
+            if not ghost.done:
+                ghost.step(float(steering), float(throttle))
+        plans.append(path((s.x_m for s in ghost.trajectory), (s.y_m for s in ghost.trajectory)))
+    return {
+        "latency_ms": round(1e3 * condition.latency_s, 3),
+        "compensate": condition.settings.compensate,
+        "seed": drive.seed,
+        "outcome": drive.outcome,
+        "balloon_xy_m": list(drive.trajectory.balloon_xy_m),
+        **path(drive.trajectory.x_m, drive.trajectory.y_m),
+        "plans": plans,
+    }
+
+
+def measured(
+    run_dir: Path | str,
+    *,
+    worlds: int,
+    latencies_ms: Sequence[float],
+    pushes: int = 0,
+    pushed_latencies_ms: Sequence[float] = (),
+    shown_ms: float | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """How a run's static policy drives when its plans are late: the content of drive.json, stage 'drive'.
+
+    Each latency with and without compensation, as params.yml's section `drive` has everything else; those of
+    pushed_latencies_ms once more with so many pushes in each world; and LeRobot's temporal ensembling at the first
+    latency. shown_ms: of this latency the world whose drives part most is kept, with its plans.
+    A drive.json that was made of the same policy and parameters is read, not made again.
+    Sets torch to one thread: there is one for each world. Raises WorldError if there is no policy, or nothing to do.
+    """
+    run_dir, p = Path(run_dir), params()
+    artifact, path = run_dir / f"policy_{GATED}.pt", run_dir / "drive.json"
+    if not artifact.is_file():
+        raise WorldError(f"{artifact}: not there; run notebooks 01 to 03, or `make demo`, first")
+    if not latencies_ms:
+        raise WorldError("there is no latency to drive with: give at least one, say latencies_ms=[0]")
+    limit = p["gates"]["hits_lost_at_150_ms"]
+    given = {
+        "worlds": worlds,
+        "seed": SEED,
+        "latencies_ms": latencies_ms,
+        "pushes": pushes,
+        "pushed_latencies_ms": pushed_latencies_ms,
+        "shown_ms": shown_ms,
+        "drive": p["drive"],
+        "hits_lost_at_150_ms": limit,
+    }
+    inputs = {artifact.name: content_hash(artifact)}  # the same policy exported again is the same
+    with suppress(RoverError):
+        there = read_stage(path, "drive")
+        if (there["params"], there["inputs"]) == (plain(given), inputs):
+            return there
+    settings = Settings.of(p["drive"])
+    conditions = [
+        Condition(ms / 1e3, replace(settings, compensate=compensate), many)
+        for many, some_ms in ((0, latencies_ms), (pushes, pushed_latencies_ms))
+        for ms in some_ms
+        for compensate in ((True, False) if ms else (True,))  # of a plan that takes no time there is nothing to make up
+    ]
+    conditions.append(Condition(latencies_ms[0] / 1e3, replace(settings, ensemble=ENSEMBLE)))
+    policies = [load_policy(artifact, threads=1) for _ in range(os.cpu_count() or 1)]
+    reports = run_latencies(policies, conditions, worlds, progress=progress)
+    first: dict[int, LatencyReport] = {}  # by pushes: the first latency's, with compensation
+    rows = []
+    for report in reports:
+        base = first.setdefault(report.condition.pushes, report)
+        aside_cm = [1e2 * beside_path(d, b) for d, b in zip(report.per_world, base.per_world, strict=True)]
+        rows.append(report.summary() | {f"aside_p{q}_cm": float(np.percentile(aside_cm, q)) for q in (50, 90)})
+    metrics = {
+        "policy": {"chunk": policies[0].chunk, "rate_hz": policies[0].rate_hz},
+        "rows": rows,
+        "gates": gates(rows, limit),
+        "from_above": _shown(reports, shown_ms),
+    }
+    return write_stage(path, "drive", params=given, metrics=metrics, inputs=inputs)
+
+
+def _shown(reports: Sequence[LatencyReport], shown_ms: float | None) -> list[dict[str, Any]]:
+    """Of one latency, the world in which the drives with and without compensation part most."""
+    pair = [
+        r
+        for r in reports
+        if not (r.condition.pushes or r.condition.settings.ensemble) and r.condition.latency_s * 1e3 == shown_ms
+    ]
+    if not pair:
+        return []
+    i = max(range(pair[0].trials), key=lambda i: beside_path(pair[0].per_world[i], pair[-1].per_world[i]))
+    return [from_above(r.per_world[i], r.condition) for r in pair]
+
+
+def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]:
+    """What params.yml promises of late plans: hits lost at 150 ms against 0 ms, compensated. rows: of drive.json."""
+
+    def hits(latency_ms: float) -> int | None:
+        found = (r for r in rows if r["latency_ms"] == latency_ms and not r["pushes"] and r["ensemble"] is None)
+        return next((r["hits"] for r in found if r["compensate"]), None)
+
+    before, late = hits(0.0), hits(JUDGED_MS)
+    lost = None if before is None or late is None else before - late
+    return [gate(f"{GATED} hits lost at {JUDGED_MS:g} ms", lost, "<=", limit)]
+
+
+def table(content: Mapping[str, Any]) -> str:
+    """drive.json for a terminal."""
+    lines = [f"{'latency':>10}  {'plan age p95':>12}  {'hits':>9}  {'stopped':>7}"]
+    for r in content["metrics"]["rows"]:
+        how = "" if r["compensate"] else ", not compensated"
+        how += ", ensembling" if r["ensemble"] is not None else ""
+        how += f", {r['pushes']} pushes" if r["pushes"] else ""
+        age = "-" if r["plan_age_p95_ms"] is None else f"{r['plan_age_p95_ms']:.0f} ms"
+        hits = f"{r['hits']} of {r['trials']}"
+        lines.append(f"{r['latency_ms']:>7g} ms  {age:>12}  {hits:>9}  {r['stopped']:>7}{how}")
+    verdict = {True: "pass", False: "FAIL", None: "not measured"}
+    for g in content["metrics"]["gates"]:
+        lines.append(f"{g['gate']}: {g['found']}, at most {g['limit']}: {verdict[g['passed']]}")
+    return "\n".join(lines)

@@ -1,0 +1,128 @@
+"""Episodes of an expert in balloon worlds, in the user's format, and the cache of what was made."""
+
+import inspect
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rover_lib.onboard import pwm as pwm_module
+from rover_lib.onboard import recording
+from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.pwm import ARDUINO_STEP_US, PwmCalibration
+from rover_lib.onboard.recording import EpisodeWriter
+from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.world import world as world_module
+from rover_lib.world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World, expert
+
+LABEL = "hit red balloon"
+JPEG_QUALITY = 85
+SHOVES = 2  # without them an expert never shows how to come back, and the policy never learns to
+MARKER = ".recorded.json"
+# Made up, so that a seed's recording has the same bytes every time.
+FIRST_DRIVE = datetime(2025, 1, 1, 12, tzinfo=UTC)
+BETWEEN_DRIVES = timedelta(seconds=30)
+FIRST_WORLD = 1_000_000  # far from the worlds that trials drive in
+CONTROL_LATENCY_S = 0.004  # the serial line delivers a control a little after the frame that it belongs to
+
+
+def record_episodes(
+    out_dir: Path | str,
+    count: int = 80,
+    seed: int = 0,
+    progress: Callable[..., Iterable] | None = None,
+) -> Path:
+    """Let the expert drive `count` worlds, with shoves that it corrects; one episode folder per drive.
+
+    out_dir: appears complete; if it holds the same recording already it is left as it is.
+    progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
+    Returns out_dir. The same count and seed give the same bytes on one machine.
+    Raises WorldError for a count below 1, a negative seed, or an out_dir with something else in it.
+    """
+    out_dir = Path(out_dir)
+    if count < 1 or seed < 0:
+        raise WorldError(f"a recording needs at least 1 episode and a seed from 0, found {count} and {seed}")
+    params = {
+        "count": count,
+        "seed": seed,
+        "shoves": SHOVES,
+        "jpeg_quality": JPEG_QUALITY,
+        "cv2": cv2.__version__,
+    }
+    key = key_of(params, world_module, recording, pwm_module, inspect.getmodule(record_episodes))
+    if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
+        if _marker_of(out_dir) == key:
+            return out_dir
+        raise WorldError(f"{out_dir}: exists and is not this recording: name another folder, or move it away first")
+    made = cached_folder("episodes", key, lambda folder: _record_all(folder, count, seed, key, progress))
+    out_dir.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(dir=out_dir.parent, prefix=f".{out_dir.name}."))
+    try:
+        # Copied, not linked: who damages an episode to see what happens must not damage the cache.
+        copy = shutil.copytree(made, temporary / "episodes")
+        if out_dir.is_dir():
+            out_dir.rmdir()
+        copy.rename(out_dir)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return out_dir
+
+
+def _marker_of(folder: Path) -> str | None:
+    marker = folder / MARKER
+    if not marker.is_file():
+        return None
+    try:
+        return json.loads(marker.read_text()).get("key")
+    except (ValueError, AttributeError):
+        return None
+
+
+def _record_all(folder: Path, count: int, seed: int, key: str, progress: Callable[..., Iterable] | None) -> None:
+    # OpenCV lets go of the interpreter's lock while it draws and compresses, so threads help.
+    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
+        drives = pool.map(lambda index: record_drive(folder, index, seed), range(count))
+        if progress is not None:
+            drives = progress(drives, desc="recording", total=count)
+        hits = sum(drives)
+    (folder / MARKER).write_text(json.dumps({"key": key, "count": count, "seed": seed, "hits": hits}) + "\n")
+
+
+def record_drive(folder: Path, index: int, seed: int) -> bool:
+    """Record drive number `index` of a seed into folder/episode_YYYYMMDD_HHMMSS. Returns whether it hit."""
+    world = World(FIRST_WORLD * (seed + 1) + index, shoves=SHOVES)
+    start = FIRST_DRIVE + timedelta(days=seed) + index * BETWEEN_DRIVES
+    start_s = start.timestamp()
+    pwm = PwmCalibration()
+    periods = [_measured_us(c.period_us) for c in (pwm.steering, pwm.throttle)]
+    with EpisodeWriter(
+        folder / f"episode_{start:%Y%m%d_%H%M%S}",
+        label=LABEL,
+        fps=RATE_HZ,
+        resolution=(FRAME_WIDTH, FRAME_HEIGHT),
+        start_time_s=start_s,
+        arduino_port="playground",
+        jpeg_quality=JPEG_QUALITY,
+    ) as episode:
+        while not world.done:
+            t_s = world.state.time_s
+            episode.frame(start_s + t_s, world.render())
+            pulses = pwm.pulses(*expert(world))
+            measured = _measured_us(pulses.steering_us), _measured_us(pulses.throttle_us)
+            episode.control(start_s + t_s + CONTROL_LATENCY_S, round(1000 * t_s), measured[0], measured[1], *periods)
+            # The car obeys what was sent, and what was measured of it is what is recorded.
+            sent = pwm.actions_from_pulses(*measured, *periods)
+            world.step(sent.steering, sent.throttle)
+    return world.hit
+
+
+def _measured_us(pulse_us: float) -> int:
+    """A pulse as the Arduino's timer counts it."""
+    return int(np.round(pulse_us / ARDUINO_STEP_US)) * ARDUINO_STEP_US

@@ -1,0 +1,228 @@
+"""A stand-in for the rover's Arduino, in Python: a serial port that a ServoLink opens, and what its servo pins do."""
+
+import contextlib
+import os
+import pty
+import re
+import select
+import threading
+import time
+import tty
+import zlib
+from collections import deque
+from typing import Any, NamedTuple
+
+from rover_lib.onboard.pwm import PwmCalibration
+
+BOOT_S = 0.2  # of the boot loader; a board's takes 1 to 2 s
+REST_US = (1456.0, 120.0)  # a transmitter whose sticks nobody touches
+
+
+class PinEvent(NamedTuple):
+    """Something on the servo pins, or that explains what they do.
+
+    kind: 'pulse'; 'cut', a pulse that a reset ended; 'line', one of the host came in whole; 'reset', the pins float;
+    'open', of the port; 'stall', this machine had no time for the Arduino, pulse_us is for how long; 'lost', so many
+    events (pulse_us) that were not read in time. monotonic_s: time.monotonic() at which the pin rose, or it happened.
+    pin: 'steering', 'throttle' or ''. period_us: since the pin rose before that, 0 for the first after a reset.
+    """
+
+    monotonic_s: float
+    kind: str
+    pin: str
+    pulse_us: float
+    period_us: float
+
+    @property
+    def end_s(self) -> float:
+        """When the pin fell: from then on the servo knows the pulse."""
+        return self.monotonic_s + self.pulse_us * 1e-6 if self.pin else self.monotonic_s
+
+
+_NUMBER = r"(0|[1-9][0-9]{0,9})"
+_COMMAND = re.compile(rf">(?:Q|([AN]) {_NUMBER} {_NUMBER}|(D) {_NUMBER} {_NUMBER} {_NUMBER} {_NUMBER})", re.ASCII)
+_STATUS_S = 0.02
+_TIMEOUT_S = 0.150
+_SEQUENCE_WINDOW = 65535
+_LINE_MAX = 64
+
+
+class StandIn:
+    """A stand-in for the Arduino, for machines without simavr: protocol version 1 of firmware/README.md on a pty.
+
+    It is no firmware and proves nothing about the firmware. Like it, it resets when its port is opened, starts in
+    manual with a transmitter at rest, drives only when armed and within range, rejects what is old or another start's,
+    and is in neutral 150 ms after the last command, until it is armed again. Unlike it, there is no human who could
+    take over, no watchdog, a line may take as long as it likes, and a pulse starts when its command comes.
+    """
+
+    def __init__(self, boot_s: float = BOOT_S):
+        calibration = PwmCalibration()
+        self._channels = (calibration.steering, calibration.throttle)
+        self._neutral = tuple(channel.neutral_us for channel in self._channels)
+        self._ranges = [(c.pulse_us(c.low), c.pulse_us(c.high)) for c in self._channels]
+        self._boot_s = boot_s
+        self._master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.port = os.ttyname(slave)
+        os.close(slave)  # so that POLLHUP tells whether somebody has the port open
+        os.set_blocking(self._master, False)
+        self._events: deque[PinEvent] = deque(maxlen=10_000)
+        self._pins: tuple[int, ...] = ()
+        self._boot = 0
+        self._reset()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="stand-in Arduino", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> "StandIn":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def pulses(self) -> list[PinEvent]:
+        """What changed on the pins since the last call; at most 10,000 events are kept."""
+        return [self._events.popleft() for _ in range(len(self._events))]
+
+    def close(self) -> None:
+        """Unplugs it."""
+        if not self._closing.is_set():
+            self._closing.set()
+            self._thread.join()
+            os.close(self._master)
+
+    def _reset(self) -> None:
+        self._boot = (self._boot + 1) % 65536
+        self._sequence = 0
+        self._result, self._state, self._reason = "-", "M", "r"
+        self._bad = self._old = self._out_of_range = 0
+        self._line: bytes | None = None  # what came since a '>'
+        self._started = time.monotonic()
+        self._commanded = self._status_due = 0.0
+        self._pins = ()
+        self._event("reset")
+        self._set_pins(*self._neutral)
+
+    def _run(self) -> None:
+        poller = select.poll()
+        poller.register(self._master, select.POLLIN)
+        is_open = False
+        while not self._closing.is_set():
+            due = min(self._status_due, self._commanded + _TIMEOUT_S) if self._state == "A" else self._status_due
+            wait_s = min(max(due - time.monotonic(), 0.0), _STATUS_S)
+            said = dict(poller.poll(wait_s * 1000)).get(self._master, 0)
+            was_open, is_open = is_open, not said & select.POLLHUP
+            if not is_open:
+                self._judge_time()
+                time.sleep(0.005)
+                continue
+            if not was_open:
+                self._event("open")
+                self._reset()
+                self._closing.wait(self._boot_s)
+                self._read()  # the boot loader has it
+                self._started = time.monotonic()
+                self._say("")  # ends a line that the reset cut
+                self._hello("e")
+            self._judge_time()
+            for byte in self._read():
+                self._take(byte)
+            if time.monotonic() >= self._status_due:
+                self._status()
+
+    def _read(self) -> bytes:
+        try:
+            return os.read(self._master, 4096)
+        except OSError:  # nothing there, or just closed
+            return b""
+
+    def _say(self, body: str) -> None:
+        line = f"{body}*{zlib.crc32(body.encode()):08X}\n" if body else "\n"
+        with contextlib.suppress(OSError):  # what nobody reads is lost, as on a wire
+            os.write(self._master, line.encode())
+
+    def _hello(self, reset: str = "-") -> None:
+        self._say(f"<H 1 stand-in {self._boot} {self._sequence} {reset}")
+
+    def _status(self) -> None:
+        now = time.monotonic()
+        self._status_due = now + _STATUS_S
+        uptime_ms = int((now - self._started) * 1000) % (1 << 32)
+        receiver = " ".join(
+            f"{us} {channel.period_us}" for us, channel in zip(self._neutral, self._channels, strict=True)
+        )
+        self._say(
+            f"<S {self._boot} {uptime_ms} {self._sequence} {self._result} {self._state} {self._reason} "
+            f"{self._pins[0]} {self._pins[1]} {receiver} {self._bad} {self._old} {self._out_of_range} 0"
+        )
+
+    def _take(self, byte: int) -> None:
+        if byte == ord(">"):
+            self._bad += bool(self._line)
+            self._line = b">"
+        elif byte == ord("\n"):
+            line, self._line = self._line, None
+            if line is not None:
+                self._command(line)
+        elif self._line is not None:
+            self._line += bytes([byte])
+            if len(self._line) > _LINE_MAX:
+                self._bad += 1
+                self._line = None
+
+    def _command(self, line: bytes) -> None:
+        body, _, crc = line.rpartition(b"*")
+        found = _COMMAND.fullmatch(body.decode("ascii", "replace"))
+        if not found or crc != b"%08X" % zlib.crc32(body):
+            self._bad += 1
+            return
+        if body == b">Q":
+            self._hello()
+            return
+        kind = found[1] or found[4]
+        boot, sequence, *pulses = (int(number) for number in found.groups() if number and number.isdigit())
+        if boot != self._boot or not 1 <= (sequence - self._sequence) % (1 << 32) <= _SEQUENCE_WINDOW:
+            self._old += 1
+            self._result = "o"
+        else:
+            self._sequence = sequence
+            self._result = self._obey(kind, pulses)
+        self._status()
+
+    def _obey(self, kind: str, pulses: list[int]) -> str:
+        now = time.monotonic()
+        if kind == "A":
+            if self._state != "A":  # a host that repeats itself renews nothing
+                self._commanded = now
+                self._enter("A", "a")
+            return "k"
+        if kind == "D" and not all(low <= us <= high for us, (low, high) in zip(pulses, self._ranges, strict=True)):
+            self._out_of_range += 1
+            return "r"
+        if self._state != "A":
+            return "i"
+        if kind == "N":
+            self._enter("S", "n")
+        else:
+            self._commanded = now
+            self._set_pins(*pulses)
+        return "k"
+
+    def _judge_time(self) -> None:
+        if self._state == "A" and time.monotonic() - self._commanded >= _TIMEOUT_S:
+            self._enter("S", "t")
+
+    def _enter(self, state: str, reason: str) -> None:
+        self._state, self._reason = state, reason
+        self._set_pins(*self._neutral)
+
+    def _set_pins(self, *pulses: int) -> None:
+        for i, channel in enumerate(self._channels):
+            if not self._pins or pulses[i] != self._pins[i]:
+                self._event("pulse", channel.name, pulses[i], channel.period_us)
+        self._pins = pulses
+
+    def _event(self, kind: str, pin: str = "", *measured: Any) -> None:
+        pulse_us, period_us = measured or (0.0, 0.0)
+        self._events.append(PinEvent(time.monotonic(), kind, pin, float(pulse_us), float(period_us)))

@@ -1,0 +1,147 @@
+"""Drive a policy through balloon worlds that it has not seen, and count."""
+
+import math
+import os
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from rover_lib.onboard.errors import WorldError
+from rover_lib.world.world import RATE_HZ, World
+
+
+class Drives(Protocol):
+    """What can be driven: an artifact's Policy, or anything with these two."""
+
+    chunk: int
+
+    def predict_chunk(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A drive from above, (n,) arrays in metres, with what was commanded; balloon_xy_m: (x, y)."""
+
+    x_m: np.ndarray
+    y_m: np.ndarray
+    steering: np.ndarray
+    throttle: np.ndarray
+    balloon_xy_m: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class WorldResult:
+    """One world's drive. outcome: 'hit', 'left' or 'timeout'. nearest_m: camera to balloon, at its least."""
+
+    seed: int
+    outcome: str
+    hit: bool
+    duration_s: float
+    nearest_m: float
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True)
+class TrialReport:
+    """wilson: 95 % interval of the share of hits. frames: (frame_bgr, state) pairs from the drives."""
+
+    hits: int
+    trials: int
+    wilson: tuple[float, float]
+    per_world: list[WorldResult]
+    frames: list[tuple[np.ndarray, np.ndarray]]
+
+
+def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
+    """Where the true share of hits lies, by Wilson's score interval (95 % with the default z).
+
+    Raises WorldError for counts that are no counts.
+    """
+    if not 0 <= hits <= trials or trials < 1:
+        raise WorldError(f"an interval needs 0 <= hits <= trials and a trial, found {hits} of {trials}")
+    share = hits / trials
+    centre = share + z * z / (2 * trials)
+    half = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
+    scale = 1 + z * z / trials
+    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
+
+
+def run_trials(
+    policy: Drives,
+    worlds: int = 40,
+    seed: int = 10_000,
+    replan_every: int = 8,
+    progress: Callable[..., Iterable] | None = None,
+    keep_frames: int = 200,
+) -> TrialReport:
+    """Drive through `worlds` worlds, of seeds from `seed` on, in closed loop at 30 Hz.
+
+    replan_every: so many actions of each chunk are driven before the next frame is looked at. The state is
+    the action commanded before, neutral at the start. keep_frames: at most so many (frame_bgr, state) pairs,
+    evenly from all that the policy was shown.
+    progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
+    Raises WorldError for parameters that make no trial, or for actions that are not finite.
+    """
+    if worlds < 1 or seed < 0 or keep_frames < 0:
+        raise WorldError(f"trials need at least 1 world and a seed from 0, found {worlds} and {seed}")
+    if not 1 <= replan_every <= policy.chunk:
+        raise WorldError(f"replan_every must be 1 to {policy.chunk}, the policy's chunk, found {replan_every}")
+    seeds = range(seed, seed + worlds)
+    results: list[WorldResult] = []
+    seen: list[tuple[np.ndarray, np.ndarray]] = []
+    stride = 1  # doubled when too many are kept, so that memory is bounded and all drives are in it
+    shown = 0
+    for world_seed in progress(seeds, desc="driving", total=worlds) if progress else seeds:
+        result, pairs = _drive(policy, World(world_seed), replan_every)
+        results.append(result)
+        for pair in pairs:
+            if shown % stride == 0 and keep_frames:
+                seen.append(pair)
+            shown += 1
+            if len(seen) > keep_frames:
+                seen = seen[::2]
+                stride *= 2
+    hits = sum(r.hit for r in results)
+    return TrialReport(hits, worlds, wilson_interval(hits, worlds), results, seen)
+
+
+def run_trials_of(policies: Mapping[str, Drives], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
+    """`run_trials` for several policies at once, a thread for each core; the same worlds and results as one by one."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        running = {name: pool.submit(run_trials, policy, worlds, **options) for name, policy in policies.items()}
+        return {name: trial.result() for name, trial in running.items()}
+
+
+def _drive(policy: Drives, world: World, replan_every: int) -> tuple[WorldResult, list[tuple[np.ndarray, np.ndarray]]]:
+    state = np.zeros(2, np.float32)
+    pairs = []
+    nearest = world.balloon_seen()[0]
+    while not world.done:
+        frame = world.render()
+        pairs.append((frame, state))
+        chunk = np.asarray(policy.predict_chunk(frame, state))
+        if chunk.ndim != 2 or chunk.shape[0] < replan_every or chunk.shape[1] != 2 or not np.isfinite(chunk).all():
+            raise WorldError(
+                f"the policy must plan finite (steps, 2) actions, found {chunk.shape} in world {world.seed}"
+            )
+        for steering, throttle in chunk[:replan_every]:
+            world.step(float(np.clip(steering, -1, 1)), float(np.clip(throttle, 0, 1)), 1 / RATE_HZ)
+            state = np.array([steering, throttle], np.float32)
+            nearest = min(nearest, world.balloon_seen()[0])
+            if world.done:
+                break
+    track = world.trajectory
+    trajectory = Trajectory(
+        np.array([s.x_m for s in track]),
+        np.array([s.y_m for s in track]),
+        np.array([s.steering_command for s in track]),
+        np.array([s.throttle_command for s in track]),
+        (world.balloon.x_m, world.balloon.y_m),
+    )
+    return (
+        WorldResult(world.seed, world.outcome, world.hit, world.state.time_s, nearest, trajectory),
+        pairs,
+    )

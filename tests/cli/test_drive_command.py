@@ -1,0 +1,181 @@
+"""`rover drive` whole, as a user calls it: a car of its own process, a camera, a serial line, exit codes, files."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lab.driving.bench import make_artifact, pictures
+from rover_lib.cli import main
+from rover_lib.onboard.pilot import SLACK_S
+from rover_lib.onboard.recording import read_controls
+from rover_lib.onboard.servo_link import ServoLink
+from rover_lib.onboard.telemetry import read_log
+from rover_lib.workshop.episodes import load_recordings
+from rover_lib.world.car import VirtualCar
+
+ROVER = [str(Path(sys.executable).parent / "rover"), "drive"]
+
+
+@pytest.fixture(scope="module")
+def artifact(tmp_path_factory):
+    """A policy with one plan, for `pictures`."""
+    path = tmp_path_factory.mktemp("artifact") / "policy_constant.pt"
+    make_artifact(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def world_drive(demo_run, tmp_path_factory):
+    """One drive in the balloon world, recorded."""
+    folder = tmp_path_factory.mktemp("drive")
+    options = ["--world", "--ticks", "60", "--latency-ms", "50", "--log", folder / "flight.log"]
+    options += ["--json", folder / "drive.json", "--record", folder / "episodes"]
+    policy = demo_run / "policy_static.pt"
+    done = subprocess.run([*ROVER, policy, *map(str, options)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return folder, done.stderr
+
+
+def test_a_drive_leaves_its_report(world_drive):
+    found = json.loads((world_drive[0] / "drive.json").read_text())
+    assert (found["ticks"], found["ended"]) == (60, "60 ticks")
+    assert {"missed", "jitter_p50_ms", "jitter_p99_ms", "jitter_max_ms", "plan_age_p95_ms", "hits", "trials"} <= set(
+        found
+    )
+    assert 50 <= found["latency_p50_ms"] < 150
+    assert found["memory_mb"] > 50
+
+
+def test_a_drive_leaves_its_log(world_drive):
+    flight = read_log(world_drive[0] / "flight.log")
+    assert len(flight.ticks["t_s"]) == 60
+    assert set(flight.ticks["state"]) == {"A"}
+    assert any(e.text == "armed" for e in flight.events)
+    assert any("neutral: stopped" in e.text for e in flight.events)
+    assert "armed" in world_drive[1]
+
+
+def test_a_recorded_drive_is_an_episode(world_drive):
+    recordings = load_recordings(world_drive[0] / "episodes")
+    (episode,) = recordings.episodes
+    assert len(episode.samples) > 30
+    controls = read_controls(next((world_drive[0] / "episodes").iterdir()))
+    assert len(controls.times_s) == 60
+    data = json.loads(next((world_drive[0] / "episodes").glob("*/episode_data.json")).read_text())
+    assert {"mode", "plan_age_ms"} <= set(data["control_samples"][0])
+
+
+def test_its_replay_sends_the_same_pulses(world_drive, tmp_path):
+    episode = next((world_drive[0] / "episodes").iterdir())
+    options = ["--replay", episode, "--world", "--log", tmp_path / "flight.log", "--json", "-"]
+    done = subprocess.run([*ROVER, *map(str, options)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["ended"] == "done"
+    sent, recorded = read_log(tmp_path / "flight.log").ticks, read_controls(episode)
+    # At each tick the newest control that is due: of two that a busy machine recorded within one tick, one is left out.
+    # The log's times have four decimals.
+    since_s = sent["t_s"] - sent["t_s"][0] + SLACK_S
+    early, late = (np.searchsorted(recorded.times_s, since_s + e, side="right") - 1 for e in (-1e-4, 1e-4))
+    assert (early[0], late[-1]) == (0, len(recorded.times_s) - 1)
+    for name, pulses in (("steering_us", recorded.steering_us), ("throttle_us", recorded.throttle_us)):
+        assert np.all((sent[name] == pulses[early]) | (sent[name] == pulses[late]))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number):
+    command = [
+        *ROVER,
+        str(demo_run / "policy_static.pt"),
+        "--world",
+        "--log",
+        str(tmp_path / "flight.log"),
+        "--json",
+        str(tmp_path / "drive"),
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    for line in process.stderr:
+        if line.strip() == "rover: armed":
+            break
+    time.sleep(0.5)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=20)
+    assert process.returncode == 0, said
+    assert f"{number.name}: stopping" in said
+    assert json.loads((tmp_path / "drive").read_text())["ended"] == "told to stop"
+
+
+def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
+    """A camera of eight seconds, the car being another world's."""
+    (tmp_path / "short.mjpeg").write_bytes(b"".join(pictures(0) * 16))
+    with VirtualCar() as car:
+        options = [
+            "--camera",
+            tmp_path / "short.mjpeg",
+            "--port",
+            car.port,
+            "--log",
+            tmp_path / "l",
+            "--json",
+            tmp_path / "j",
+        ]
+        done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
+    assert done.returncode == 3, done.stderr
+    assert "is the camera unplugged?" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert "unplugged" in json.loads((tmp_path / "j").read_text())["ended"]
+
+
+def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
+    (tmp_path / "drive.mjpeg").write_bytes(b"".join(pictures(0) * 20))
+    options = [
+        "--camera",
+        tmp_path / "drive.mjpeg",
+        "--dry-run",
+        "--ticks",
+        "30",
+        "--log",
+        tmp_path / "l",
+        "--json",
+        "-",
+    ]
+    done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["ticks"] == 30
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "says"),
+    [
+        ([], 2, "give an ARTIFACT, or --replay"),
+        (["policy.pt", "--replay", "episode"], 2, "give an ARTIFACT, or --replay"),
+        (["policy.pt", "--firmware"], 2, "belong to --world"),
+        (["policy.pt", "--hz", "5"], 2, "--hz"),
+        (["policy.pt", "--throttle-limit", "1.5"], 2, "--throttle-limit"),
+        (["policy.pt", "--port", "/dev/nothing"], 1, "/dev/nothing: cannot be opened"),
+        (["policy.pt", "--dry-run", "--camera", "/dev/video77"], 1, "/dev/video77: no such camera"),
+        (["--replay", "nothing"], 1, "nothing"),
+    ],
+)
+def test_what_cannot_begin(options, code, says, tmp_path):
+    result = CliRunner().invoke(main, ["drive", *options, "--log", str(tmp_path / "flight.log")])
+    assert result.exit_code == code
+    assert says in result.output
+    assert "Traceback" not in result.output
+
+
+def test_the_car_stands_after_it(artifact, tmp_path):
+    with VirtualCar() as car:
+        (tmp_path / "drive.mjpeg").write_bytes(b"".join(pictures(0) * 20))
+        options = ["--camera", tmp_path / "drive.mjpeg", "--port", car.port, "--ticks", "20", "--log", tmp_path / "l"]
+        done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        with ServoLink(car.port) as link:
+            time.sleep(0.1)
+            assert link.latest().throttle_us == 120

@@ -1,0 +1,295 @@
+"""The ruler against what is known: a program whose instructions can be counted by hand, and itself."""
+
+import os
+import struct
+import subprocess
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import needs
+import numpy as np
+import pytest
+import torch
+from policies import memory_samples
+
+from lab.a76 import count as arm
+from lab.a76.count import ArmError, Machine, count_artifact, count_run, emulate, prepare
+from rover_lib.onboard.params import params
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from rover_lib.workshop import quantize as q
+from rover_lib.workshop.act import ACT
+from rover_lib.workshop.checkpoint import load_checkpoint
+
+pytestmark = [pytest.mark.emulated, needs.qemu]
+
+SVC = 0xD4000001
+START, ROUNDS, SECTION = 0x400000, 1000, 7
+
+
+def mov(register: int, value: int) -> list[int]:
+    """movz, and movk for the upper half of 32 bits if there is one."""
+    low, high = value & 0xFFFF, value >> 16
+    return [0xD2800000 | low << 5 | register] + ([0xF2A00000 | high << 5 | register] if high else [])
+
+
+def mark(starts: int) -> list[int]:
+    return [*mov(8, 173), *mov(0, 0xC0FFEE), *mov(1, starts), *mov(2, SECTION), SVC]
+
+
+LOOP = [
+    0x4E829420,  # sdot v0.4s, v1.16b, v2.16b
+    0x4EA38463,  # add v3.4s, v3.4s, v3.4s
+    0xF1000529,  # subs x9, x9, #1
+    0x54000001 | (-3 & 0x7FFFF) << 5,  # b.ne to the sdot
+]
+
+
+def program(path: Path, code: list[int]) -> Path:
+    """A static aarch64 ELF file of one segment."""
+    words = struct.pack(f"<{len(code)}I", *code)
+    size = 64 + 56 + len(words)
+    header = struct.pack(
+        "<16sHHIQQQIHHHHHH", b"\x7fELF\x02\x01\x01", 2, 183, 1, START + 120, 64, 0, 0, 64, 56, 1, 64, 0, 0
+    )
+    path.write_bytes(header + struct.pack("<IIQQQQQQ", 1, 5, 0, START, START, size, size, 4096) + words)
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture(scope="module")
+def plugin_only(tmp_path_factory) -> Machine:
+    """Enough for a static program: no userland."""
+    return Machine(tmp_path_factory.mktemp("root"), arm._plugin())
+
+
+def test_a_known_program_is_counted_exactly(plugin_only, tmp_path):
+    code = [*mark(1), *mov(9, ROUNDS), *LOOP, *mark(0), *mov(8, 93), *mov(0, 0), SVC]
+    done = emulate(plugin_only, [program(tmp_path / "loop", code)], tmp_path)
+    assert set(done.sections) == {SECTION}
+    assert done.total(SECTION) == 1 + ROUNDS * len(LOOP) + len(mark(0))
+    assert done.total(SECTION, "simd") == 2 * ROUNDS
+    assert done.total(SECTION, "sdot") == ROUNDS
+
+
+def test_a_program_that_fails_ends_in_a_sentence(plugin_only, tmp_path):
+    with pytest.raises(ArmError, match=r"ended with 3 after its start: it said nothing"):
+        emulate(plugin_only, [program(tmp_path / "fails", [*mov(8, 93), *mov(0, 3), SVC])], tmp_path)
+
+
+def test_what_hangs_is_ended(plugin_only, tmp_path, monkeypatch):
+    monkeypatch.setattr(arm, "SILENCE_S", 0.5)
+    hangs = program(tmp_path / "hangs", [0x14000000])  # a branch to itself
+    with pytest.raises(ArmError, match=r"said nothing for 0\.5 s"):
+        emulate(plugin_only, [hangs], tmp_path)
+    running = [p / "cmdline" for p in Path("/proc").iterdir() if p.name.isdigit()]
+    assert not any(str(hangs).encode() in p.read_bytes() for p in running if os.access(p, os.R_OK))
+
+
+def test_functions_are_named_by_address(tmp_path):
+    source = tmp_path / "two.c"
+    source.write_text("int first(int a) { return a * 3; }\nint second(int a) { return first(a) - 1; }\n")
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", tmp_path / "two.so", source], check=True)
+    listing = subprocess.run(["nm", tmp_path / "two.so"], capture_output=True, text=True, check=True).stdout
+    at = {name: int(address, 16) for address, kind, name in (x.split() for x in listing.splitlines() if x[0] == "0")}
+    library = tmp_path / "two.so"
+    names = arm.Names(
+        f"5000000000-5000010000 r-xp 00000000 08:01 1234    {library}\n5000010000-5000011000 rw-p 0 0:0 0\n"
+    )
+    assert names[0x5000000000 + at["first"]] == names[0x5000000000 + at["second"] - 1] == "first"
+    assert names[0x5000000000 + at["second"] + 4] == "second"
+    assert names[0x5000010010] == names[0x10] == "[unknown]"
+    with pytest.raises(ArmError, match="not a 64-bit ELF"):
+        arm.Binary(source)
+
+
+def test_kernels_are_summed_and_the_rest_is_other():
+    rows = [(1, 10, 5, 2, 1), (2, 1, 5, 0, 0), (3, 100, 1, 1, 0), (4, 1, 1, 0, 0)]
+    names = {1: "_Z3fooi", 2: "_Z3fooi", 3: "bar", 4: "baz"}
+    found = arm.by_kernel(np.array(rows, arm.BLOCK), names, at_most=2)
+    assert found == {"bar": (100, 100, 0), "foo": (55, 20, 10), "other": (1, 0, 0)}
+
+
+def test_packages_are_named_when_they_cannot_be_installed(monkeypatch):
+    monkeypatch.setattr(arm, "missing_packages", lambda: ["qemu-user"])
+    monkeypatch.setattr(arm.os, "geteuid", lambda: 1000)
+    with pytest.raises(ArmError, match=r"Debian packages qemu-user, .*: sudo apt-get install"):
+        arm._install_missing()
+
+
+@pytest.fixture(scope="module")
+def machine() -> Machine:
+    return prepare()
+
+
+@pytest.fixture(scope="module")
+def tiny_run(tiny_file, tmp_path_factory) -> Path:
+    """A run's folder with two artifacts of the tests' small policy, always the same."""
+    folder = tmp_path_factory.mktemp("run")
+    checkpoint, samples = load_checkpoint(tiny_file), memory_samples(16)
+    scheme, options = q.Scheme("static"), {"samples": samples[:3]}
+    # Another image size, without an FP32 of its own.
+    small = checkpoint.at_size(54, 96)
+    calibration = q.calibrate(small, samples[:4])
+    static = q.quantize(small, scheme, calibration)
+    q.export(static, small, folder / "policy_static_54x96.pt", calibration=calibration, **options)
+    calibration = q.calibrate(checkpoint, samples)
+    calibration.save(folder / "calibration.pt")
+    q.export(ACT(checkpoint.config, checkpoint.weights), checkpoint, folder / "policy_fp32.pt", **options)
+    static = q.quantize(checkpoint, scheme, calibration)
+    digest = q.export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
+    modes = {"static": {"scheme": asdict(scheme), "content_hash": digest}}
+    inputs = {"calibration.pt": sha256_of(folder / "calibration.pt")}
+    write_stage(folder / "quantize.json", "quantize", params={}, metrics={"modes": modes}, inputs=inputs)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def again(tiny_file) -> SimpleNamespace:
+    """What `opened` would give: held-out frames from memory."""
+    recordings = SimpleNamespace(action_range=lambda: {"steering": (-0.5, 0.5), "throttle": (0.0, 0.1)})
+    parts = SimpleNamespace(held_out=memory_samples(12, seed=1))
+    return SimpleNamespace(checkpoint=load_checkpoint(tiny_file), parts=parts, recordings=recordings)
+
+
+@pytest.fixture(scope="module")
+def counts() -> dict[str, arm.Counted]:
+    """What the emulated Pi said of each artifact of `report`."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def report(machine, tiny_run, again, counts) -> dict:
+    """count_run on held-out frames from memory."""
+    count_all = arm._count_all
+
+    def keep(*args):
+        counts.update(count_all(*args))
+        return counts
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(arm, "opened", lambda run_dir: again)
+        patch.setattr(arm, "_count_all", keep)
+        return count_run(tiny_run, frames=12)
+
+
+def test_a_run_is_counted(report, tiny_run):
+    assert read_stage(tiny_run / "arm.json", "arm") == report
+    assert report["metrics"]["label"] == "counted on an emulated Cortex-A76"
+    fp32, static = (report["metrics"]["artifacts"][stem] for stem in ("policy_fp32", "policy_static"))
+    assert fp32["sdot_g"] == 0 < static["sdot_g"] < static["simd_g"] < static["instructions_g"] < fp32["instructions_g"]
+    assert sum(static["instructions_by_kernel"].values()) == pytest.approx(static["instructions_g"])
+    assert any("neondot" in kernel for kernel in static["instructions_by_kernel"])
+    assert static["reference_max_difference"] < 1e-4
+    assert fp32["workstation_steering_mae_pct"] == fp32["workstation_throttle_mae_pct"] == 0
+    assert fp32["steering_mae_pct"] < 1e-3 and fp32["throttle_mae_pct"] < 1e-2  # another order of sums
+    assert fp32["frames_on_the_core"] == 10
+    assert 0 < static["steering_mae_pct"] < 2 * static["workstation_steering_mae_pct"]
+    assert 100 < static["peak_memory_mb"] < 500
+    assert static["threads"] == 1 and static["frames_on_the_core"] == 12
+    low_ms, high_ms = arm.predicted_ms(static["simd_g"], static["instructions_g"])
+    assert static["computed_pi5_ms"] == {"low": low_ms, "high": high_ms, "formula": arm.PREDICTED}
+    assert "policy_static" in arm.table(report)
+
+
+def test_an_image_size_without_fp32_is_only_counted(report):
+    static, small = (report["metrics"]["artifacts"][f"policy_static{size}"] for size in ("", "_54x96"))
+    assert (small["image_height"], small["image_width"]) == (54, 96)
+    assert 0 < small["sdot_g"] < static["sdot_g"] and small["instructions_g"] < static["instructions_g"]
+    assert small["tenth_g"] is None and not [key for key in small if "mae" in key or "reference" in key]
+
+
+def test_gates_are_of_what_drives(report):
+    rows = {row["gate"]: row for row in report["metrics"]["gates"]}
+    assert not [name for name in rows if "instructions" in name or "54x96" in name or "fp32" in name]
+    assert not rows["policy_static frames judged on the core"]["passed"]
+    assert rows["policy_static peak_memory_mb"]["passed"] and rows["policy_static peak_memory_loading_mb"]["passed"]
+    assert rows["policy_static tenth off the third, %"]["passed"]
+
+
+def test_the_int8_backbone_is_the_same_bit_for_bit(report):
+    bits = report["metrics"]["backbone_bits"]
+    assert bits == {"frames": 4, "values": 4 * 64 * 3 * 4, "differing": 0}
+
+
+def test_bits_that_differ_are_found(machine, tiny_run, again, monkeypatch):
+    def flipped(_: Machine, script: Path, arguments: list[str], folder: Path) -> None:
+        torch.backends.quantized.engine = q.ENGINE
+        with np.load(folder / "inputs.npz") as seen, torch.inference_mode():
+            frame = torch.from_numpy(seen["frame_0000"])
+            found = torch.jit.load(folder / "backbone.pt")(torch.from_numpy(seen["state"]), frame).numpy()
+        found[0, 0, 0, 0] += 1
+        np.save(folder / "backbone.npy", found)
+
+    monkeypatch.setattr(arm, "emulate_script", flipped)
+    bits = arm.backbone_bits(tiny_run, machine, again.checkpoint, memory_samples(1))
+    assert bits == {"frames": 1, "values": 64 * 3 * 4, "differing": 1}
+
+
+def test_another_calibration_has_no_bits_to_compare(machine, tiny_run, again, tmp_path):
+    for name in ("policy_static.pt", "quantize.json"):
+        (tmp_path / name).write_bytes((tiny_run / name).read_bytes())
+    q.calibrate(again.checkpoint, memory_samples(4, seed=5)).save(tmp_path / "calibration.pt")
+    with pytest.raises(ArmError, match=r"calibration\.pt are not those of quantize\.json"):
+        arm.backbone_bits(tmp_path, machine, again.checkpoint, memory_samples(1))
+
+
+def test_a_slow_fp32_is_held_against_this_machines(report, tiny_run, again, counts, tmp_path, monkeypatch):
+    for path in tiny_run.glob("policy_*.pt"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+
+    def fewer(_, artifacts, plans, *args):
+        """The same emulated inferences, as many as are asked for."""
+        return {
+            stem: replace(c, chunks=c.chunks[: len(plans[stem][0])], inferences=c.inferences[: plans[stem][1]])
+            for stem, c in counts.items()
+        }
+
+    monkeypatch.setattr(arm, "opened", lambda run_dir: again)
+    monkeypatch.setattr(arm, "_count_all", fewer)
+    monkeypatch.setattr(arm, "backbone_bits", lambda *args: report["metrics"]["backbone_bits"])
+    monkeypatch.setattr(arm, "SLOW_GMAC", 0.0)
+    found = count_run(tmp_path, frames=12)["metrics"]["artifacts"]
+    fp32, static, before = found["policy_fp32"], found["policy_static"], report["metrics"]["artifacts"]["policy_static"]
+    assert (fp32["frames_on_the_core"], fp32["tenth_g"]) == (arm.STEADY, None)
+    assert 0 < static["reference_max_difference"] < 1e-4
+    same = ("instructions_g", "tenth_g", "frames_on_the_core", "steering_mae_pct", "throttle_mae_pct")
+    assert {key: static[key] for key in same} == {key: before[key] for key in same}
+
+
+def test_an_fp32_that_differs_on_the_core_is_no_reference(machine, tiny_run, again, monkeypatch):
+    monkeypatch.setattr(arm, "opened", lambda run_dir: again)
+    monkeypatch.setattr(arm, "SLOW_GMAC", 0.0)
+    fake = SimpleNamespace(chunks=np.full((arm.STEADY, 32, 2), 0.5, np.float32))
+    monkeypatch.setattr(arm, "_count_all", lambda _, artifacts, *args: dict.fromkeys(artifacts, fake))
+    monkeypatch.setattr(arm, "artifact_metrics", lambda counted, manifest: {})
+    with pytest.raises(ArmError, match=r"policy_fp32\.pt: differs by .* on the core"):
+        count_run(tiny_run, frames=4)
+
+
+def test_a_count_is_repeatable(report, machine, tiny_run):
+    again = count_artifact(machine, tiny_run / "policy_static.pt", memory_samples(12, seed=1)[:3], counted=3)
+    assert again.steady / 1e9 == pytest.approx(
+        report["metrics"]["artifacts"]["policy_static"]["instructions_g"], rel=0.002
+    )
+
+
+def test_a_loaded_policy_is_warm(report):
+    static = report["metrics"]["artifacts"]["policy_static"]
+    for which in ("first_g", "second_g", "tenth_g"):
+        assert static[which] == pytest.approx(static["instructions_g"], rel=0.01), which
+
+
+def test_counts_stay_within_their_budget(report):
+    budgets = params()["arm"]["budget_m"]
+    assert budgets
+    for stem, budget_m in budgets.items():
+        found_m = report["metrics"]["artifacts"][stem]["instructions_g"] * 1e3
+        assert found_m == pytest.approx(budget_m, rel=0.02), f"{stem}: set params.yml's arm.budget_m if it is meant"
+
+
+def test_what_the_guest_refuses_is_said_in_its_words(machine, tiny_run, tmp_path):
+    broken = tmp_path / "broken.pt"
+    broken.write_bytes((tiny_run / "policy_static.pt").read_bytes()[:-1000])
+    with pytest.raises(ArmError, match=r"ended with 1 after load: error: .*broken\.pt: not an artifact, or cut short"):
+        count_artifact(machine, broken, memory_samples(1), counted=3)

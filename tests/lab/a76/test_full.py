@@ -1,0 +1,60 @@
+"""The ruler's own policy, at the small size: what `rover arm` needs of it is there, and is one policy."""
+
+import json
+
+import pytest
+
+from lab.a76.full import NOTE, SIZES, STEPS, full_run
+from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from rover_lib.workshop.compare import thinned
+from rover_lib.workshop.quantize import Calibration, Scheme, quantize
+from rover_lib.workshop.session import opened
+
+SIZE = {"size": "small", "drives": 5, "samples": 6, "sizes": ((54, 96),), "curve": ((36, 64),)}
+
+
+@pytest.fixture(scope="module")
+def run_dir(cache, tmp_path_factory):
+    return full_run(tmp_path_factory.mktemp("runs") / "full", steps=5, **SIZE)
+
+
+def test_leaves_what_the_ruler_needs(run_dir):
+    artifacts = {p.stem: load_policy(p) for p in run_dir.glob("policy_*.pt")}
+    assert {name: p.image_size for name, p in artifacts.items()} == {
+        "policy_fp32": (72, 128),
+        "policy_static": (72, 128),
+        "policy_fp32_54x96": (54, 96),
+        "policy_static_54x96": (54, 96),
+        "policy_static_36x64": (36, 64),
+    }
+    assert len({p.manifest["checkpoint"]["sha256"] for p in artifacts.values()}) == 1
+    again = opened(run_dir)
+    assert len(thinned(again.parts.held_out, 50)) == 50
+    assert read_stage(run_dir / "load.json", "load")["metrics"]["note"] == NOTE and "does not drive" in NOTE
+    assert read_stage(run_dir / "calibrate.json", "calibrate")["metrics"]["samples"] == 6
+    assert STEPS < 100 and (180, 320) in SIZES
+
+
+@pytest.mark.parametrize("suffix", ["", "_54x96"])
+def test_quantize_json_says_how_to_make_it_again(run_dir, suffix):
+    made = read_stage(run_dir / "quantize.json", "quantize")["metrics"]["modes"][f"static{suffix}"]
+    scheme = Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
+    checkpoint = opened(run_dir).checkpoint
+    checkpoint = checkpoint.at_size(54, 96) if suffix else checkpoint
+    again = quantize(checkpoint, scheme, Calibration.load(run_dir / f"calibration{suffix}.pt"))
+    assert json.loads(json.dumps(again.report["layers"])) == made["layers"]
+
+
+def test_what_was_made_before_is_taken_from_the_cache(run_dir, tmp_path):
+    again = full_run(tmp_path / "full", steps=5, **SIZE | {"sizes": (), "curve": ()})
+    assert sha256_of(again / "best_model.pth") == sha256_of(run_dir / "best_model.pth")
+
+
+def test_another_run_of_that_name_is_left_alone(tmp_path):
+    metrics = {"checkpoint": {}, "split": {}}
+    write_stage(tmp_path / "load.json", "load", params={"checkpoint": "mine.pth"}, metrics=metrics)
+    with pytest.raises(WorldError, match="holds a run on another checkpoint"):
+        full_run(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["load.json"]

@@ -1,0 +1,323 @@
+"""Other engines: what needs none of them is tested always, the engines themselves with ROVER_PEERS=1."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import needs
+import numpy as np
+import pytest
+import torch
+from policies import memory_samples
+
+from lab.a76 import count as arm
+from lab.a76 import peers
+from lab.a76.count import ArmError, Counted
+from lab.a76.peers import ENGINES
+from rover_lib.onboard.artifact import read_manifest
+from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from rover_lib.workshop import quantize as q
+from rover_lib.workshop.act import ACT
+
+pytestmark = pytest.mark.emulated
+RANGES = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.1)}
+needs_engines = pytest.mark.skipif(
+    os.environ.get("ROVER_PEERS") != "1" or bool(needs.QEMU_MISSING),
+    reason="fetches 2 GB of other engines and takes minutes: ROVER_PEERS=1"
+    + (f", and the Debian packages {' '.join(needs.QEMU_MISSING)}" if needs.QEMU_MISSING else ""),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FileSample:
+    """A recorded sample: the picture is in a file."""
+
+    state: np.ndarray
+    frame_path: Path
+
+    def frame_bgr(self) -> np.ndarray:
+        return cv2.imread(str(self.frame_path))
+
+
+def file_samples(folder: Path, count: int, seed: int) -> tuple[FileSample, ...]:
+    found = []
+    for i, sample in enumerate(memory_samples(count, seed=seed)):
+        path = folder / f"{seed}_{i:03d}.png"
+        cv2.imwrite(str(path), sample.frame_bgr())
+        found.append(FileSample(sample.state, path))
+    return tuple(found)
+
+
+@pytest.fixture(scope="module")
+def tiny_run(tiny, tmp_path_factory) -> SimpleNamespace:
+    """A run's folder with FP32 and static artifacts, and what session.opened would give of it."""
+    folder = tmp_path_factory.mktemp("run")
+    pictures = tmp_path_factory.mktemp("pictures")
+    calibrating, held_out = file_samples(pictures, 16, seed=0), file_samples(pictures, 12, seed=1)
+    calibration = q.calibrate(tiny, calibrating)
+    calibration.save(folder / "calibration.pt")
+    write_stage(folder / "calibrate.json", "calibrate", params={"samples": 16, "seed": 0, "smooth": 0.5}, metrics={})
+    q.export(ACT(tiny.config, tiny.weights), tiny, folder / "policy_fp32.pt", samples=calibrating[:3])
+    static = q.quantize(tiny, q.Scheme("static"), calibration)
+    q.export(static, tiny, folder / "policy_static.pt", samples=calibrating[:3], calibration=calibration)
+    parts = SimpleNamespace(calibration=calibrating, choosing=calibrating[:4], held_out=held_out)
+    opened = SimpleNamespace(
+        checkpoint=tiny, parts=parts, recordings=SimpleNamespace(action_range=lambda: dict(RANGES))
+    )
+    return SimpleNamespace(folder=folder, opened=opened)
+
+
+def counted(chunks: np.ndarray, steady: int = 3_000_000) -> Counted:
+    versions = {"threads": 1}
+    return Counted(9, (5, 4, steady), 2_000_000, 1_000_000, {"k": (steady, 2, 1)}, 70.0, 80.0, 60.0, chunks, versions)
+
+
+def arm_json(folder: Path, **artifacts: dict) -> dict:
+    metrics = {"label": arm.LABEL, "artifacts": {"policy_fp32": {"instructions_g": 0.2}, **artifacts}, "gates": [1]}
+    inputs = {"policy_fp32.pt": sha256_of(folder / "policy_fp32.pt")}
+    return write_stage(folder / "arm.json", "arm", params={"frames": 6}, metrics=metrics, inputs=inputs)
+
+
+# --- what needs no engine ---------------------------------------------------------------------------------------------
+
+
+def test_a_peer_is_judged_by_its_distance_from_fp32(tiny_run):
+    manifest = read_manifest(tiny_run.folder / "policy_fp32.pt")
+    reference = np.random.default_rng(0).uniform(0.01, 0.09, (6, 32, 2)).astype(np.float32)
+    off = reference + np.float32([0.02, -0.001])
+    found = peers.peer_metrics(counted(off), manifest, reference, RANGES)
+    assert found["steering_mae_pct"] == pytest.approx(2, rel=1e-4)  # of a range of 1
+    assert found["throttle_mae_pct"] == pytest.approx(1, rel=1e-4)  # of a range of 0.1
+    assert found["instructions_g"] == 0.003
+    assert found["x_floor"] == pytest.approx(0.003 / (manifest["gmac"] / 16))
+    assert (found["first_g"], found["peak_memory_mb"], found["threads"]) == (5e-9, 70.0, 1)
+    beyond = peers.peer_metrics(counted(np.full_like(off, [1.5, -0.2])), manifest, np.full_like(off, [1, 0]), RANGES)
+    assert beyond["steering_mae_pct"] == beyond["throttle_mae_pct"] == 0, "no pulse can say more"
+    for wrong in (off[:, :16], np.where(off > 0.08, np.nan, off)):
+        with pytest.raises(ArmError, match="a peer gave"):
+            peers.peer_metrics(counted(wrong), manifest, reference, RANGES)
+
+
+def test_as_many_layers_are_int8_as_in_ours(tiny, tiny_run):
+    ours = q.quantize(tiny, q.Scheme("static"), q.Calibration.load(tiny_run.folder / "calibration.pt"))
+    expected = peers.int8_layers(tiny)
+    assert expected == ours.report["int8_modules"] > 20
+    peers.check_int8("engine", {"int8_layers": expected, "float_layers": ["head"]}, expected)
+    with pytest.raises(ArmError, match=rf"engine: 3 .* became INT8, ours has {expected}; float are \['a', 'b'\]"):
+        peers.check_int8("engine", {"int8_layers": 3, "float_layers": ["a", "b"]}, expected)
+
+
+def test_their_float_policy_is_ours(tiny, tiny_file, monkeypatch):
+    monkeypatch.syspath_prepend(str(peers.FOLDER))
+    from float_policy import float_policy, observations
+
+    sample = memory_samples(1, seed=5)[0]
+    frame = prepare_frame(sample.frame_bgr(), *tiny.config.image_sizes[0])
+    npz = tiny_file.parent / "calibration.npz"
+    np.savez(npz, state=sample.state[None], frames=frame[None])
+    (observation,) = observations(str(npz))
+    model, example = float_policy(str(tiny_file))
+    assert [x.shape for x in example] == [x.shape for x in observation]
+    with torch.inference_mode():
+        found = model(*map(torch.from_numpy, observation))
+        expected = ACT(tiny.config, tiny.weights)(torch.from_numpy(sample.state[None]), torch.from_numpy(frame))
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+
+
+@pytest.fixture
+def tools(tiny, monkeypatch):
+    """Instead of an engine's tools: what they were asked for, and files as they would leave them."""
+    seen = SimpleNamespace(calls=[], int8_layers=peers.int8_layers(tiny))
+
+    def call(command, what, **options):
+        _, calibration, artifact = command[2:]
+        with np.load(calibration) as given:
+            seen.calls.append((Path(command[1]).name, {k: given[k] for k in given}, options["env"]["PYTHONPATH"]))
+        artifact.write_bytes(b"made")
+        return json.dumps({"int8_layers": seen.int8_layers, "float_layers": ["head"], "versions": {"tool": "1"}})
+
+    monkeypatch.setattr(peers, "packages_here", lambda engine: Path("/packages") / engine.name)
+    monkeypatch.setattr(arm, "_call", call)
+    return seen
+
+
+def test_an_engine_gets_the_calibration_frames_and_is_asked_once(tiny, tools, tmp_path):
+    engine, samples = ENGINES[0], file_samples(tmp_path, 4, seed=2)
+    out = tmp_path / "peers"
+    path, made = peers.made_by(engine, tiny, samples, out)
+    assert (path.name, path.read_bytes(), made["versions"]) == ("onnxruntime.onnx", b"made", {"tool": "1"})
+    ((script, given, python_path),) = tools.calls
+    assert (script, python_path) == ("make_onnxruntime.py", "/packages/onnxruntime")
+    np.testing.assert_array_equal(given["state"], [s.state for s in samples])
+    np.testing.assert_array_equal(given["frames"][2], prepare_frame(samples[2].frame_bgr(), 72, 128))
+    assert peers.made_by(engine, tiny, samples, out) == (path, made)
+    assert len(tools.calls) == 1
+    peers.made_by(engine, tiny, samples[:3], out)
+    assert len(tools.calls) == 2, "other frames"
+    path.write_bytes(b"damaged")
+    peers.made_by(engine, tiny, samples[:3], out)
+    assert (len(tools.calls), path.read_bytes()) == (3, b"made")
+
+
+def test_a_layer_left_in_float_is_no_peer(tiny, tools, tmp_path):
+    tools.int8_layers -= 1
+    with pytest.raises(ArmError, match=r"executorch: .* became INT8, ours has"):
+        peers.made_by(ENGINES[1], tiny, file_samples(tmp_path, 2, seed=2), tmp_path / "peers")
+    assert not list((tmp_path / "peers").iterdir())
+
+
+def test_what_cannot_be_fetched_is_said(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))
+    monkeypatch.setenv("UV_OFFLINE", "1")
+    for get in (peers.packages_here, peers.packages_there):
+        with pytest.raises(ArmError, match=r"uv cannot fetch onnxruntime==\S+ and what it needs: .*onnxruntime"):
+            get(ENGINES[0])
+    assert not list((tmp_path / "cache").iterdir())
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ArmError, match="no uv to fetch"):
+        peers.packages_here(ENGINES[0])
+
+
+def test_the_compiler_is_named_when_it_cannot_be_installed(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(peers.os, "geteuid", lambda: 1000)
+    with pytest.raises(ArmError, match=r"Debian package g\+\+-aarch64-linux-gnu: sudo apt-get install"):
+        peers._compile(tmp_path)
+
+
+def test_counts_of_another_policy_are_refused(tiny_run, tmp_path):
+    with pytest.raises(ArmError, match=r"arm\.json: not found; count the run's own artifacts first"):
+        peers.count_peers(tmp_path)
+    (tmp_path / "policy_fp32.pt").write_bytes(b"one")
+    arm_json(tmp_path)
+    (tmp_path / "policy_fp32.pt").write_bytes(b"another")
+    with pytest.raises(ArmError, match=r"counted from another policy_fp32\.pt; count the run again"):
+        peers.count_peers(tmp_path)
+
+
+@needs.qemu
+def test_blocks_of_a_stripped_library_are_told_apart(tmp_path):
+    source = tmp_path / "one.c"
+    source.write_text("int one(int a) { return a * 3; }\n")
+    subprocess.run(
+        ["gcc", "-shared", "-fPIC", "-fvisibility=hidden", "-s", "-o", tmp_path / "one.so", source], check=True
+    )
+    blocks = np.array([(0x5000001100, 2, 8, 4, 4), (0x5000001140, 1, 5, 0, 0)], arm.BLOCK)
+    names = arm.Names(f"5000000000-5000010000 r-xp 0 08:01 1    {tmp_path / 'one.so'}\n")
+    assert arm.by_kernel(blocks, names) == {"[one.so] loops with SDOT": (16, 8, 8), "[one.so]": (5, 0, 0)}
+
+
+@pytest.fixture
+def without_engines(tiny_run, monkeypatch):
+    """count_peers with the engines' part left out: their chunks are our FP32's, steering off by a hundredth."""
+    samples = tiny_run.opened.parts.held_out
+    monkeypatch.setattr(peers, "opened", lambda run_dir: tiny_run.opened)
+    monkeypatch.setattr(peers, "thinned", lambda given, n: tuple(given[:n]))
+    monkeypatch.setattr(arm, "prepare", lambda progress: None)
+    monkeypatch.setattr(peers, "packages_here", lambda engine: None)
+    monkeypatch.setattr(peers, "packages_there", lambda engine: None)
+
+    def made_by(engine, checkpoint, calibrating, folder):
+        folder.mkdir(exist_ok=True)
+        path = folder / f"{engine.name}{engine.suffix}"
+        path.write_bytes(b"x" * 1_500_000)
+        assert calibrating == tiny_run.opened.parts.calibration
+        return path, {"int8_layers": 7, "float_layers": [], "versions": {"tool": "1"}}
+
+    def count(machine, *rest, **how):
+        given = rest[-1] if isinstance(rest[-1], tuple) and isinstance(rest[-1][0], FileSample) else rest[-2]
+        assert given in (samples[:6], samples[:6:2])
+        policy = load_policy(tiny_run.folder / "policy_fp32.pt", threads=1)
+        how["on_step"]()
+        return counted(np.stack([policy.predict_chunk(s.frame_bgr(), s.state) for s in given]) + np.float32([0.01, 0]))
+
+    monkeypatch.setattr(peers, "made_by", made_by)
+    monkeypatch.setattr(peers, "count_peer", count)
+    monkeypatch.setattr(arm, "count_artifact", count)
+
+
+def test_peers_join_what_was_counted(without_engines, tiny_run):
+    before = arm_json(tiny_run.folder)
+    found = peers.count_peers(tiny_run.folder, frames=6)
+    assert read_stage(tiny_run.folder / "arm.json", "arm") == found
+    assert {k: v for k, v in found["metrics"].items() if k != "peers"} == before["metrics"]
+    assert (found["params"], before["inputs"].items() <= found["inputs"].items()) == (before["params"], True)
+    rows = found["metrics"]["peers"]
+    assert set(rows) == {"torch_fp32", "torch_affine", "onnxruntime", "executorch"}
+    assert rows["torch_fp32"]["artifact"] == "policy_fp32"
+    assert rows["torch_fp32"]["instructions_g"] == 0.2
+    for name in ("torch_affine", "onnxruntime", "executorch"):
+        assert rows[name]["steering_mae_pct"] == pytest.approx(1, rel=1e-3), name
+        assert rows[name]["throttle_mae_pct"] == pytest.approx(0, abs=1e-3), name
+        assert rows[name]["frames_on_the_core"] == (3 if name == "torch_affine" else 6)
+    assert rows["executorch"]["file_mb"] == 1.5
+    assert rows["executorch"]["made_with"] == {"tool": "1"}
+    assert read_manifest(tiny_run.folder / "peers" / "policy_static_affine.pt")["scheme"] == "affine"
+    assert peers.count_peers(tiny_run.folder, frames=6)["metrics"] == found["metrics"], "again, over itself"
+
+
+def test_an_affine_artifact_of_the_run_is_not_counted_twice(without_engines, tiny_run, monkeypatch):
+    def count_artifact(*rest, **how):
+        raise AssertionError("counted twice")
+
+    monkeypatch.setattr(arm, "count_artifact", count_artifact)
+    (tiny_run.folder / "policy_static_affine.pt").write_bytes(b"x" * 2_000_000)
+    arm_json(tiny_run.folder, policy_static_affine={"instructions_g": 0.15})
+    rows = peers.count_peers(tiny_run.folder, frames=6)["metrics"]["peers"]
+    (tiny_run.folder / "policy_static_affine.pt").unlink()
+    assert rows["torch_affine"] == {"artifact": "policy_static_affine", "file_mb": 2.0, "instructions_g": 0.15}
+
+
+def test_a_peer_that_fails_leaves_arm_json_as_it_was(without_engines, tiny_run, monkeypatch):
+    def fails(*rest, **how):
+        raise ArmError("the emulated program ended with 1")
+
+    arm_json(tiny_run.folder)
+    before = (tiny_run.folder / "arm.json").read_bytes()
+    monkeypatch.setattr(peers, "count_peer", fails)
+    with pytest.raises(ArmError, match="ended with 1"):
+        peers.count_peers(tiny_run.folder, frames=6)
+    assert (tiny_run.folder / "arm.json").read_bytes() == before
+
+
+# --- the engines ------------------------------------------------------------------------------------------------------
+
+
+@needs_engines
+def test_the_engines_run_the_policy_in_int8(tiny, tiny_run, monkeypatch):
+    for module in (arm, peers):
+        monkeypatch.setattr(module, "opened", lambda run_dir: tiny_run.opened)
+    machine, samples = arm.prepare(), tiny_run.opened.parts.held_out[:6]
+    ours = arm.count_artifact(machine, tiny_run.folder / "policy_static.pt", samples, counted=3)
+    fp32 = arm.count_artifact(machine, tiny_run.folder / "policy_fp32.pt", samples, counted=3)
+    manifest = read_manifest(tiny_run.folder / "policy_fp32.pt")
+    metrics = {"artifacts": {"policy_fp32": arm.artifact_metrics(fp32, manifest)}}
+    inputs = {"policy_fp32.pt": sha256_of(tiny_run.folder / "policy_fp32.pt")}
+    write_stage(tiny_run.folder / "arm.json", "arm", params={"frames": 6}, metrics=metrics, inputs=inputs)
+    rows = peers.count_peers(tiny_run.folder, frames=6)["metrics"]["peers"]
+    our_error = arm.errors_pct(fp32.chunks, ours.chunks, manifest["action_names"], RANGES)  # throttle: all clipped to 0
+    for engine in ENGINES:
+        row = rows[engine.name]
+        assert 0 < row["sdot_g"] < row["simd_g"] < row["instructions_g"] < fp32.steady / 1e9, engine.name
+        assert row["sdot_g"] == pytest.approx(ours.sdot / 1e9, rel=0.1), "the same layers are INT8"
+        assert sum(row["instructions_by_kernel"].values()) == pytest.approx(row["instructions_g"])
+        assert any("loops with SDOT" in kernel for kernel in row["instructions_by_kernel"])
+        assert row["int8_layers"] == peers.int8_layers(tiny)
+        assert row["threads"] == 1
+        assert 0 < row["steering_mae_pct"] < 5 * our_error["steering_mae_pct"], engine.name
+        assert row["versions"][engine.name] in engine.guest_packages[0]
+    assert rows["torch_affine"]["sdot_g"] == 0 < rows["torch_affine"]["steering_mae_pct"]
+    made = {p.name: p.stat().st_mtime_ns for e in ENGINES for p in (tiny_run.folder / "peers").glob(f"{e.name}.*")}
+    again = peers.count_peers(tiny_run.folder, frames=6)["metrics"]["peers"]
+    assert made == {name: (tiny_run.folder / "peers" / name).stat().st_mtime_ns for name in made}
+    for name, row in rows.items():
+        assert again[name]["instructions_g"] == pytest.approx(row["instructions_g"], rel=0.01), name

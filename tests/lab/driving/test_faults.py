@@ -1,0 +1,391 @@
+"""How faults are judged, by made-up pulses, each gate by what it must not let pass; the cable; and some real rows."""
+
+import errno
+import os
+import pty
+import random
+import select
+import statistics
+import time
+import tty
+
+import cv2
+import needs
+import numpy as np
+import pytest
+import serial
+from click.testing import CliRunner
+
+from lab.driving import bench, faults
+from lab.driving.bench import Cable, FaultError
+from lab.driving.pins import CONTINUES, HUMAN, PERIOD_US, STOPPED, Command, Gates, Seen, judge
+from rover_lib.cli import main
+from rover_lib.onboard.errors import PolicyError
+from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.servo_link import frame
+from rover_lib.world.standin import PinEvent
+
+GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50, rows=25, stopped_rows=18, bytes_us=4)
+AT, START, END = 100.0, 99.5, 102.0
+DRIVEN = (1567, 209)
+
+
+def pulses(what, start=START, end=END, pins=PERIOD_US):
+    """Events of both pins; what(seconds since the fault) gives steering_us, throttle_us, None for no pulse."""
+    events = []
+    for i, pin in enumerate(PERIOD_US):
+        at, last = start, start - PERIOD_US[pin] * 1e-6
+        while at < end and pin in pins:
+            us = what(at - AT)[i]
+            if us is not None:
+                events.append(PinEvent(at, "pulse", pin, us, (at - last) * 1e6))
+                last = at
+            at += PERIOD_US[pin] * 1e-6
+    return sorted(events, key=lambda e: e.end_s)
+
+
+def commanded(what, start=START - 0.5, end=END):
+    return [Command(float(t), *what(t - AT)) for t in np.arange(start, end, 1 / 30)]
+
+
+def verdict(expected, what, *, commands=None, end=END, **more):
+    seen = Seen(pulses(what, end=end), commanded(what) if commands is None else commands, AT, end)
+    return judge(expected, seen, GATES, **more)
+
+
+def then(*steps):
+    """What is done from a time on: (seconds since the fault, steering_us, throttle_us); driven before."""
+
+    def what(t):
+        now = DRIVEN
+        for since, *us in steps:
+            now = tuple(us) if t >= since else now
+        return now
+
+    return what
+
+
+# ---- stopped
+
+
+def test_stopped():
+    found = verdict(STOPPED, then((0.1, 1456, 120)))
+    assert found.wrong == []
+    assert found.figures["stopped_after_ms"] == pytest.approx(100, abs=2)
+    assert found.figures["max_throttle_us_after"] == 120
+    assert found.figures["steering_us_after"] == 1456
+
+
+def test_after_a_reset_the_resting_stick_counts_as_neutral():
+    assert verdict(STOPPED, then((0.1, 1460, 123)), human_us=(1460, 120)).wrong == []
+
+
+@pytest.mark.parametrize(
+    ("what", "sentence"),
+    [
+        (then((0.26, 1456, 120)), "throttle off 26"),
+        (then((0.1, 1456, 120), (1.0, 1456, 209), (1.005, 1456, 120)), "throttle off 100"),
+        (then((0.1, 1456, 120), (1.0, 1456, 128), (1.005, 1456, 120)), "throttle at 128 us"),
+        (then((0.1, 1456, 128)), "throttle at 128 us"),
+        (then((0.1, 1500, 120)), "steering at 1500 us"),
+        (lambda t: (1456, 120), "not driving"),
+        (then((0.1, 1456, 120), (1.5, 1456, None)), "0 throttle pulses"),
+        (then((0.1, 1456, 120), (1.5, None, 120)), "0 steering pulses"),
+    ],
+)
+def test_not_stopped(what, sentence):
+    assert any(w.startswith(sentence) or sentence in w for w in verdict(STOPPED, what, commands=[]).wrong)
+
+
+def test_a_pulse_that_a_reset_cut_is_a_pulse():
+    events = pulses(then((0.1, 1456, 120)))
+    events.append(PinEvent(AT + 0.5, "cut", "throttle", 300.0, 0.0))
+    found = judge(STOPPED, Seen(events, [], AT, END), GATES)
+    assert found.figures["max_throttle_us_after"] == 300
+    assert found.wrong
+
+
+# ---- human
+
+
+def test_human():
+    found = verdict(HUMAN, then((0.02, 1600, 140)), human_us=(1600, 140))
+    assert found.wrong == []
+    assert 20 < found.figures["takeover_ms"] < 45
+
+
+@pytest.mark.parametrize(
+    ("what", "sentence"),
+    [
+        (then((0.06, 1600, 140)), "the human's pulses after"),
+        (then((0.02, 1600, 140), (1.0, *DRIVEN), (1.05, 1600, 140)), "the human's pulses after 10"),
+        (then((0.02, 1600, 209)), "throttle was never the human's"),
+        (then(), "steering was never the human's"),
+    ],
+)
+def test_not_human(what, sentence):
+    assert any(w.startswith(sentence) for w in verdict(HUMAN, what, human_us=(1600, 140)).wrong)
+
+
+# ---- continues
+
+
+def test_continues():
+    before = commanded(then((0.48, 1500, 180), (0.98, *DRIVEN)))
+    found = verdict(CONTINUES, then((0.5, 1500, 180), (1.0, *DRIVEN)), commands=before)
+    assert found.wrong == []
+    assert found.figures["stopped_after_ms"] is None
+
+
+def test_what_is_commanded_may_be_a_step_of_the_timer_away():
+    assert verdict(CONTINUES, lambda t: (1567.4, 208.1), commands=commanded(lambda t: DRIVEN)).wrong == []
+    assert verdict(CONTINUES, lambda t: (1567.4, 212.1), commands=commanded(lambda t: DRIVEN)).wrong
+
+
+@pytest.mark.parametrize(
+    ("what", "commands", "sentence"),
+    [
+        (then((1.0, 1700, 209), (1.02, *DRIVEN)), commanded(lambda t: DRIVEN), "steering at 1700 us"),
+        (then((1.0, 1567, 400), (1.002, *DRIVEN)), commanded(lambda t: DRIVEN), "throttle at 400 us"),
+        (then((1.0, 1567, 120), (1.01, *DRIVEN)), commanded(lambda t: DRIVEN), "throttle at 120 us"),
+        (then((1.0, 1567, 120), (1.1, *DRIVEN)), commanded(then((0.95, 1567, 120), (1.05, *DRIVEN))), "the throttle"),
+        (then((1.0, None, 209), (1.03, *DRIVEN)), commanded(lambda t: DRIVEN), "a steering pulse out of time"),
+        (then((1.0, 1567, None), (1.002, *DRIVEN)), commanded(lambda t: DRIVEN), "a throttle pulse out of time"),
+        (then(), commanded(lambda t: DRIVEN, end=AT + 1), "steering at 1567 us"),
+        # Commanded, but long ago:
+        (then((1.0, 1500, 180), (1.1, *DRIVEN)), commanded(then((0.3, 1500, 180), (0.4, *DRIVEN))), "steering at 1500"),
+    ],
+)  # fmt: skip
+def test_not_continued(what, commands, sentence):
+    found = verdict(CONTINUES, what, commands=commands)
+    assert any(w.startswith(sentence) for w in found.wrong), found.wrong
+
+
+def fading(begin=0.48, end=0.97):
+    def what(t):
+        t = int(t * 30 + 100) / 30 - 100 / 30  # a tick's
+        share = min(max((t - begin) / (end - begin), 0), 1)
+        return (1567 if share < 1 else 1456, round(209 - 89 * share))
+
+    return what
+
+
+def test_continues_until_a_limit():
+    commands = commanded(lambda t: fading()(t + 0.002))
+    found = verdict(CONTINUES, fading(), commands=commands, until_limit=True)
+    assert found.wrong == []
+    assert 480 < found.figures["fades_after_ms"] < 560
+    assert 900 < found.figures["stopped_after_ms"] < 980
+
+
+@pytest.mark.parametrize(
+    ("what", "sentence"),
+    [
+        (fading(0.1), "the throttle fades after"),
+        (then((0.98, 1456, 120)), "the throttle fades after"),
+        (fading(end=1.4), "throttle off after"),
+        (then(), "the car was never stopped"),
+    ],
+)
+def test_not_limited(what, sentence):
+    commands = commanded(lambda t: what(t + 0.002))
+    found = verdict(CONTINUES, what, commands=commands, until_limit=True)
+    assert any(w.startswith(sentence) for w in found.wrong), found.wrong
+
+
+def test_a_machine_that_stalled_is_known():
+    events = pulses(then((0.1, 1456, 120)))
+    assert Seen(events, [], AT, END).stalled_ms() == 0
+    assert Seen([*events, PinEvent(AT + 1, "stall", "", 30_000.0, 0.0)], [], AT, END).stalled_ms() == 30
+    assert Seen([*events, PinEvent(AT - 1, "stall", "", 30_000.0, 0.0)], [], AT, END).stalled_ms() == 0
+    assert Seen([*events, PinEvent(AT + 1, "lost", "", 5.0, 0.0)], [], AT, END).stalled_ms() > 1e6
+
+
+def test_the_gates_are_those_of_params():
+    assert Gates.of_params() == GATES
+
+
+def test_every_row_is_one_of_a_kind_and_there_are_enough():
+    names = [f.name for f in faults.FAULTS]
+    assert len(set(names)) == len(names) >= GATES.rows
+    assert sum(f.expected == STOPPED for f in faults.FAULTS) >= GATES.stopped_rows
+    assert all(f.says and (f.how or f.start == "disk") for f in faults.FAULTS)
+    assert all(f.limits or f.until_limit for f in faults.FAULTS if f.expected == CONTINUES)
+
+
+# ---- bytes
+
+
+def steps_of(values, step_s=0.2, start=10.0):
+    def what(t):
+        return values[min(int((t + AT - start) / step_s), len(values) - 1)]
+
+    return pulses(what, start, start + step_s * len(values))
+
+
+def test_steps_that_come_out_as_they_went_in():
+    sent = [(1456, 120), (1600, 300), (1100, 160), (1456, 120)]
+    times = [5.0 + 0.2 * i for i in range(4)]
+    found = faults.compare_steps(steps_of(sent), sent, times)
+    assert (found["steering_steps"], found["throttle_steps"], found["worst_us"]) == (4, 4, 0)
+    assert found["worst_ms"] < 25
+    off = [(1456, 120), (1600, 308), (1100, 160), (1456, 120)]
+    assert faults.compare_steps(steps_of(off), sent, times)["worst_us"] == 8
+    assert faults.compare_steps(steps_of(sent[:2] + sent[3:]), sent, times)["worst_us"] is None
+
+
+# ---- the policy
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    path = tmp_path_factory.mktemp("faults") / "policy.pt"
+    bench.make_artifact(path)
+    return load_policy(path)
+
+
+def told(policy, what):
+    jpegs = bench.pictures(what)
+    assert len(set(jpegs)) == len(jpegs)
+    found = [
+        policy.predict_unclipped(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), np.zeros(2))
+        for jpeg in jpegs[:3]
+    ]
+    assert all(np.array_equal(found[0], other) for other in found)
+    return found[0]
+
+
+def test_the_policy_does_what_the_picture_tells_it_to(policy):
+    assert np.allclose(told(policy, bench.PLAIN), bench.PLAN)
+    assert np.allclose(told(policy, bench.OTHER), bench.OTHER_PLAN)
+    assert np.allclose(told(policy, bench.BEYOND), 5.0)
+    start = time.monotonic()
+    assert np.allclose(told(policy, bench.SLOW), bench.PLAN)
+    assert 0.85 < time.monotonic() - start < 3
+    with pytest.raises(PolicyError, match="NaN"):
+        told(policy, bench.NAN)
+    with pytest.raises(Exception, match="told to fail by the picture"):
+        told(policy, bench.RAISE)
+
+
+# ---- the cable
+
+
+class Pty:
+    """An Arduino's end."""
+
+    def __init__(self):
+        self.master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.port = os.ttyname(slave)
+        os.close(slave)
+
+    def read(self, wanted, within_s=2.0):
+        data, end = b"", time.monotonic() + within_s
+        while len(data) < wanted and select.select([self.master], [], [], max(0, end - time.monotonic()))[0]:
+            try:
+                data += os.read(self.master, 4096)
+            except OSError as error:  # until the cable opens it
+                assert error.errno == errno.EIO
+                time.sleep(0.002)
+        return data
+
+
+@pytest.fixture
+def ends():
+    """The Arduino's end, the cable, and the host's, open."""
+    board = Pty()
+    cable = Cable(board.port)
+    host = serial.Serial(cable.port, 115200, timeout=1, write_timeout=0.01, exclusive=True)
+    host.write(b"x")
+    assert board.read(1) == b"x"
+    yield board, cable, host
+    host.close()
+    cable.unplug()
+    os.close(board.master)
+
+
+def test_a_cable_carries_both_ways_without_delay(ends):
+    board, cable, host = ends
+    took = []
+    for i in range(200):
+        line = frame(f">D 1 {i} 1500 200")
+        start = time.perf_counter()
+        host.write(line)
+        assert board.read(len(line)) == line
+        took.append(time.perf_counter() - start)
+        os.write(board.master, line)
+        assert host.read(len(line)) == line
+    assert statistics.median(took) < 0.001
+    assert cable.commands[7][1:] == (1500, 200)
+    assert len(cable.commands) == 200
+    assert all(a.at_s <= b.at_s for a, b in zip(cable.commands, cable.commands[1:], strict=False))
+
+
+def test_only_the_drives_own_whole_lines_are_commands(ends):
+    board, cable, host = ends
+    good, other = frame(">D 1 7 1500 200"), frame(">D 1 8 1600 300")
+    cable.not_ours.add(other[:-1])
+    cable.to_arduino = lambda data: b""
+    host.write(b">D 1 6 15" + good + other + good.replace(b"1500", b"1501") + b"AT\r\n")
+    time.sleep(0.1)
+    assert [c[1:] for c in cable.commands] == [(1500, 200)]
+    assert board.read(1, 0.1) == b""
+    cable.inject(good)
+    assert board.read(len(good)) == good
+
+
+def test_a_stuck_cable_blocks_and_an_unplugged_one_fails(ends):
+    _, cable, host = ends
+    cable.stick()
+    with pytest.raises(serial.SerialTimeoutException):
+        host.write(b"abc")
+    cable.unplug()
+    with pytest.raises(serial.SerialException):
+        host.read(1)
+
+
+def test_spoiling():
+    rng = random.Random(1)
+    data = bytes(range(256)) * 100
+    changed = bench.flipping(rng, 0.01)(data)
+    bits = [bin(a ^ b).count("1") for a, b in zip(data, changed, strict=True)]
+    assert max(bits) == 1
+    assert 0.008 < sum(bits) / len(data) < 0.012
+    lines = [b"%d\n" % i for i in range(1000)]
+    drop = bench.dropping(rng, 0.3)
+    kept = b"".join(drop(line[:2]) + drop(line[2:]) for line in lines).splitlines(keepends=True)
+    assert set(kept) < set(lines)
+    assert 650 < len(kept) < 750
+
+
+# ---- the command
+
+
+def test_a_fault_that_is_none():
+    done = CliRunner().invoke(main, ["faults", "--only", "camera melted"])
+    assert done.exit_code == 1
+    assert "no fault ['camera melted']" in done.output
+    with pytest.raises(FaultError):
+        faults.run_faults(["camera melted"])
+
+
+@pytest.mark.emulated
+@needs.simavr
+def test_some_faults_on_the_pins(tmp_path):
+    """One of each kind, and one whose line only the next start writes; `make faults` has all."""
+    names = [
+        "camera frozen",
+        "SIGKILL",
+        "human takes over by steering",
+        "lines dropped at 30 %",
+        "old line replayed",
+    ]
+    outcome = faults.run_faults(names)
+    assert outcome.wrong == []
+    content = outcome.write(tmp_path / "faults.json")
+    rows = {row["fault"]: row for row in content["metrics"]["faults"]}
+    assert set(rows) == set(names)
+    assert all(row["recovered"] and row["log_line"] for row in rows.values())
+    assert rows["SIGKILL"]["stopped_after_ms"] > 50  # it is the Arduino that stops
+    assert 0 < content["metrics"]["summary"]["takeover_ms"] <= 50

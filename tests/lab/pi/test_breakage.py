@@ -1,0 +1,142 @@
+"""What the bench of broken deployments sees and judges, without a Pi: `make pi-fast` has those."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from lab.pi import breakage
+from lab.pi.bench import Bench, Disk, Line, line_of
+from lab.pi.breakage import FAULTS, wrong_rows
+from lab.pi.fleet import results_of, wanted_of
+from lab.pi.system import EmulationError
+from rover_lib.onboard.params import params
+
+ABOUT = {"name": "a" * 64, "sha256": "b" * 64, "bytes": 100, "parts": 2}
+GOOD = {"healthy": True, "status_true": True, "healed_by_rerun": True}
+
+
+def test_every_fault_has_its_own_name_and_there_are_enough():
+    names = [fault.name for fault in FAULTS]
+    assert len(set(names)) == len(names) >= params()["pi_fast"]["rows"]
+    for part in (
+        "power cut",
+        "disk",
+        "flipped",
+        "ssh lost",
+        "wrong hash",
+        "another torch",
+        "parity",
+        "lies",
+        "at once",
+    ):
+        assert any(part in name for name in names), part
+
+
+def test_how_far_a_deployment_has_come_is_on_the_disk(tmp_path):
+    incoming, releases = tmp_path / "incoming" / ABOUT["sha256"], tmp_path / "models" / "releases"
+    assert Disk.seen(tmp_path, ABOUT) == Disk()
+    incoming.mkdir(parents=True)
+    assert Disk.seen(tmp_path, ABOUT) == Disk(ready=True)
+    for name in ("part-0000", "part-0001", ".ansible_tmp"):
+        (incoming / name).touch()
+    seen = Disk.seen(tmp_path, ABOUT)
+    assert seen.arrived == ("part-0000", "part-0001") and not seen.complete(ABOUT)
+    (incoming / "release.json").touch()
+    assert Disk.seen(tmp_path, ABOUT).complete(ABOUT)
+    (releases / ".new").mkdir(parents=True)
+    (releases / ".new" / "policy.pt").write_bytes(b"12345")
+    seen = Disk.seen(tmp_path, ABOUT)
+    assert seen.staging == {"policy.pt": 5} and not seen.released
+    (releases / ".new").rename(releases / ABOUT["name"])
+    seen = Disk.seen(tmp_path, ABOUT)
+    assert seen.released and not seen.switched and not seen.staging
+    (tmp_path / "models" / "current").symlink_to(f"releases/{ABOUT['name']}")
+    seen = Disk.seen(tmp_path, ABOUT)
+    assert seen.switched and not seen.remembered
+    (tmp_path / "models" / "history.json").write_text(json.dumps(["c" * 64, ABOUT["name"]]))
+    assert Disk.seen(tmp_path, ABOUT).remembered
+    assert json.loads(json.dumps(seen.row()))["switched"]
+
+
+STATUS = """
+TASK [Show all rovers in one table] ****
+ok: [rover1] => {
+    "msg": [
+        "rover        healthy  model         mode    since                 deg C throttled    free MB last drive",
+        "rover1       yes      bae35bda44db  static  2026-11-21 20:43:22       ? ?            48391 never   inactive",
+        "rover2       NO       none                  2026-11-21 20:43:22       ? ?            48391 never   inactive",
+        "             no model: deploy one",
+        "             release 0123: damaged",
+        "nobody       does not answer"
+    ]
+}
+"""
+
+
+def test_a_rover_is_found_in_the_table():
+    assert line_of(STATUS, "rover1") == Line(True, "bae35bda44db", "static", "")
+    assert line_of(STATUS, "rover2") == Line(False, "none", "2026-11-21", "no model: deploy one; release 0123: damaged")
+    with pytest.raises(EmulationError, match="no line of rover3"):
+        line_of(STATUS, "rover3")
+
+
+REPORT = """
+TASK [Show what came of each] ****
+ok: [canary] => {
+    "msg": "canary: deployed"
+}
+ok: [second] => {
+    "msg": "second: failed: [Errno 30] \\"Read-only\\""
+}
+
+TASK [Fail if any rover failed] ****
+    "msg": "other: nothing"
+"""
+
+
+def test_the_report_is_read_by_rover():
+    assert results_of(REPORT) == {"canary": "deployed", "second": 'failed: [Errno 30] "Read-only"'}
+
+
+def test_what_a_broken_rover_must_lead_to():
+    before = dict.fromkeys(("canary", "second", "third"), "static")
+    assert wanted_of("second", before, "mixed") == {
+        "canary": ("deployed", "mixed"),
+        "second": ("failed", "static"),
+        "third": ("untouched: second failed", "static"),
+    }
+    assert [start for start, _ in wanted_of("", before, "static").values()] == ["had it already"] * 3
+
+
+def test_what_is_not_well_is_said():
+    rows = [{"fault": "a", **GOOD}, {"fault": "b", **GOOD, "healthy": False}, {"fault": "c", **GOOD, "error": "no Pi"}]
+    assert wrong_rows(rows[:1], 1) == []
+    assert wrong_rows(rows, 4) == [
+        "c: no Pi",
+        "b: the rover has no model that passes its parity vectors",
+        "3 faults of a deployment were made, at least 4 are wanted",
+    ]
+
+
+def test_a_row_may_begin_with_no_release_but_the_one_in_use(tmp_path):
+    bench = object.__new__(Bench)  # its making packs real artifacts
+    bench.pi = SimpleNamespace(on=False, root=tmp_path)
+    bench.artifacts = {"static": Path("a"), "mixed": Path("b")}
+    bench.packed = {"static": {"name": "a" * 64}, "mixed": {"name": "b" * 64}}
+    models = bench.state / "models"
+    names = [letter * 64 for letter in "abc"]
+    for name in names:
+        (models / "releases" / name).mkdir(parents=True)
+    (models / "current").symlink_to(f"releases/{names[0]}")
+    bench.begin()
+    assert sorted(p.name for p in (models / "releases").iterdir()) == names
+    bench.begin(fresh=True)
+    assert [p.name for p in (models / "releases").iterdir()] == names[:1]
+    assert (bench.before, bench.target) == ("static", "mixed")
+
+
+def test_a_fault_that_is_not_there_is_told():
+    with pytest.raises(EmulationError, match="no fault has 'earthquake' in its name; there are: power cut"):
+        breakage.break_deployments([Path("/nowhere")], {}, only="earthquake")

@@ -1,0 +1,344 @@
+"""The virtual car: driven by the link that drives the real one, seen through a pipe of JPEGs."""
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import needs
+import numpy as np
+import pytest
+from needs import until
+
+from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.servo_link import ServoLink
+from rover_lib.world import car as car_module
+from rover_lib.world.car import KEEP_DRIVES, CameraFeed, VirtualCar, _Car, _Pins
+from rover_lib.world.standin import PinEvent
+from rover_lib.world.trial import wilson_interval
+from rover_lib.world.world import World
+
+KINDS = [False, pytest.param(True, marks=[pytest.mark.emulated, needs.simavr], id="firmware")]
+AHEAD = 21783  # a world with its balloon 1.83 m straight ahead
+THROTTLE = 0.3
+
+
+class Eye:
+    """Reads a FIFO of JPEGs as a camera's reader does."""
+
+    def __init__(self, path):
+        self.jpegs, self.ended, self._closing = [], False, False
+        self._path = path
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self):
+        with Path(self._path).open("rb", buffering=0) as pipe:
+            rest = b""
+            while not self._closing:
+                data = pipe.read(1 << 16)
+                if not data:
+                    self.ended = True
+                    return
+                rest += data
+                while (end := rest.find(b"\xff\xd9")) >= 0:
+                    self.jpegs.append(rest[: end + 2])
+                    rest = rest[end + 2 :]
+
+    def frames(self, count):
+        """So many frames, the next that come."""
+        first = len(self.jpegs)
+        until(lambda: len(self.jpegs) >= first + count)
+        return [cv2.imdecode(np.frombuffer(j, np.uint8), cv2.IMREAD_COLOR) for j in self.jpegs[first : first + count]]
+
+    def close(self):
+        self._closing = True
+        self._thread.join(2)
+
+
+def arm(link):
+    until(lambda: link.latest() and link.latest().receiver_steering_us and link.latest().receiver_throttle_us)
+    link.arm()
+
+
+def drive(link, action, condition):
+    needs.keep_sending(lambda: link.send_action(*action), condition=condition)
+
+
+def test_straight_ahead():
+    distance, bearing = World(AHEAD).balloon_seen()
+    assert distance < 2
+    assert abs(bearing) < 0.02
+
+
+@pytest.mark.parametrize("firmware", KINDS)
+def test_the_whole_chain_hits_a_balloon(firmware):
+    with VirtualCar(seed=AHEAD, firmware=firmware, hold_s=0.4) as car, ServoLink(car.port) as link:
+        eye = Eye(car.camera)
+        still = eye.frames(2)
+        assert still[0].shape == (360, 640, 3)
+        before = np.abs(still[0].astype(float) - World(AHEAD).render()).mean()
+        assert before < 4  # it sees that world, but for JPEG and noise
+        assert not np.array_equal(*still)
+        assert (car.report().held, car.report().trials, car.report().wilson) == (True, 0, None)
+        arm(link)
+        drive(link, (0.0, 0.0), lambda: len(eye.jpegs) > 15)
+        assert car.report().held  # nobody asked for motion yet
+        drive(link, (0.0, THROTTLE), lambda: car.report().trials == 1)
+        report = car.report()
+        assert (report.hits, report.outcomes, report.seed, report.held) == (1, [(AHEAD, "hit")], AHEAD + 1, True)
+        assert report.wilson == wilson_interval(1, 1)
+        [hit] = report.drives
+        assert hit.nearest_m < 0.3
+        track = hit.trajectory
+        assert len(track.x_m) == pytest.approx(hit.duration_s * 30, abs=2)
+        assert np.abs(track.y_m).max() < 0.05
+        assert np.diff(track.x_m).min() >= 0
+        assert np.abs(track.throttle[2:] - THROTTLE).max() * PwmCalibration().us_per_unit("throttle") <= 4 + 1
+        # The next world: held for a time, then let go with what is commanded.
+        drive(link, (0.0, THROTTLE), lambda: not car.report().held)
+        drive(link, (0.0, THROTTLE), lambda: car.report().speed_mps > 1)
+        # Nobody drives: the car stops by itself.
+        until(lambda: car.report().speed_mps < 0.05 or car.report().held)
+        assert link.latest().why == "stopped: no valid command for 150 ms"
+        report = car.report()
+        assert report.frames == pytest.approx(len(eye.jpegs), abs=2)
+        eye.close()
+
+
+def test_it_stays_after_the_last_world():
+    with VirtualCar(seed=AHEAD, worlds=1, rate_hz=60, hold_s=0) as car, ServoLink(car.port) as link:
+        arm(link)
+        drive(link, (0.0, 0.9), lambda: car.report().finished)
+        drive(link, (0.0, 0.9), lambda: True)
+        time.sleep(0.1)
+        report = car.report()
+        assert (report.trials, report.held, report.seed, report.frames) == (1, True, AHEAD, 0)
+        assert len(report.drives[0].trajectory.x_m) == pytest.approx(report.drives[0].duration_s * 60, abs=2)
+
+
+def test_a_slow_reader_misses_frames_and_holds_nothing_up():
+    with VirtualCar(rate_hz=60) as car, Path(car.camera).open("rb", buffering=0) as pipe:
+        until(lambda: car.report().dropped > 20)
+        assert car.report().frames == 1
+        data = pipe.read(1 << 20)
+        assert data.startswith(b"\xff\xd8")
+        assert data.endswith(b"\xff\xd9")
+        assert data.count(b"\xff\xd8\xff") == 1
+        until(lambda: car.report().frames == 2)
+
+
+def test_it_needs_no_torch():
+    program = "import sys, rover_lib.world.car; print([m for m in ('torch', 'lerobot') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_when_its_process_dies():
+    with VirtualCar() as car:
+        car.check()
+        eye = Eye(car.camera)
+        eye.frames(1)
+        os.kill(car.pid, signal.SIGKILL)
+        with pytest.raises(WorldError, match=r"has ended \(exit status -9"):
+            car.report()
+        with pytest.raises(WorldError, match="has ended"):
+            car.check()
+        until(lambda: eye.ended)  # unplugged
+    with pytest.raises(WorldError, match="was closed"):
+        car.report()
+
+
+def test_what_killed_it_is_said(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(WorldError, match=r"has ended \(exit status 1, it said: nothing\)"):
+        VirtualCar()
+
+
+def test_a_terminals_interrupt_is_not_for_it():
+    with VirtualCar() as car:
+        assert os.getsid(car.pid) != os.getsid(0)
+        os.kill(car.pid, signal.SIGINT)
+        assert car.report().held
+
+
+def test_it_ends_with_its_parent():
+    """Also where a sister that was forked keeps the pipe open."""
+    program = (
+        "import os, time; from rover_lib.world.car import VirtualCar; car = VirtualCar()\n"
+        "if os.fork() == 0: time.sleep(5); os._exit(0)\n"
+        "print(car.pid, car.camera, flush=True); time.sleep(30)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, start_new_session=True)
+    try:
+        pid, camera = parent.stdout.readline().split()
+        assert Path(camera.decode()).exists()
+        parent.kill()
+        parent.wait()
+        until(
+            lambda: not Path(f"/proc/{int(pid)}").exists() or b") Z" in Path(f"/proc/{int(pid)}/stat").read_bytes(), 2
+        )
+        assert not Path(camera.decode()).parent.exists()
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(parent.pid, signal.SIGKILL)
+        parent.stdout.close()
+
+
+def ended(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+def test_when_its_process_hangs(monkeypatch):
+    monkeypatch.setattr(car_module, "ANSWER_S", 0.2)
+    with VirtualCar() as car:
+        os.kill(car.pid, signal.SIGSTOP)
+        with pytest.raises(WorldError, match=r"did not answer within 0\.2 s"):
+            car.report()
+        os.kill(car.pid, signal.SIGCONT)
+        until(lambda: len(select.select([car._process.stdout], [], [], 0)[0]) == 1)
+        assert car.report().held  # and not the answer that came too late
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"rate_hz": 0}, {"worlds": 0}, {"hold_s": -1}])
+def test_numbers_that_make_no_drive(wrong):
+    with pytest.raises(WorldError, match="a car needs"):
+        VirtualCar(**wrong)
+
+
+# ---- the worlds, without a process: what the pins ask for, and what is kept
+
+
+class Board:
+    """Pins that do what they are told."""
+
+    def __init__(self, *events):
+        self.events = list(events)
+
+    def pulses(self):
+        events, self.events = self.events, []
+        return events
+
+
+def pulse(at_s, pin, us):
+    return PinEvent(at_s, "pulse", pin, us, 0.0)
+
+
+def test_a_pulse_counts_from_its_end_and_no_pulses_are_neutral():
+    pins = _Pins(Board(pulse(1.0, "steering", 2012), pulse(1.01, "throttle", 711), PinEvent(3.0, "reset", "", 0, 0)))
+    pins.collect()
+    assert pins.action(1.002) == (0, 0)
+    assert pins.action(1.003) == (pytest.approx(1, abs=0.002), 0)
+    assert not pins.asked_for_motion
+    assert pins.action(2.0) == (pytest.approx(1, abs=0.002), pytest.approx(1, abs=0.002))
+    assert pins.asked_for_motion
+    assert pins.action(3.0) == (0, 0)
+
+
+@pytest.mark.parametrize(("throttle_us", "moves"), [(124, False), (128, True)])
+def test_neutral_within_a_timer_step_is_no_motion(throttle_us, moves):
+    pins = _Pins(Board(pulse(1.0, "throttle", throttle_us)))
+    pins.collect()
+    pins.action(2.0)
+    assert pins.asked_for_motion == moves
+
+
+def test_what_is_kept_is_bounded():
+    board = Board()
+    car = _Car(_Pins(board), 5, 30.0, None, 0.1)
+    now = car._now
+    board.events = [pulse(now, "steering", 2012), pulse(now, "throttle", 711)]
+    while car.trials < KEEP_DRIVES + 3:
+        now += 0.4
+        car.move(now)
+    report = car.report()
+    assert len(report["drives"]) == KEEP_DRIVES
+    assert len(report["outcomes"]) == report["trials"]
+    assert report["seed"] == 5 + car.trials
+    released = [drive["released_s"] for drive in report["drives"]]
+    for (first, drive), second in zip(zip(released, report["drives"], strict=True), released[1:], strict=False):
+        assert second - first == pytest.approx(drive["duration_s"] + 0.1, abs=0.02)
+
+
+def test_a_machine_that_stood_still_stops_the_world_too():
+    board = Board()
+    car = _Car(_Pins(board), 5, 30.0, None, 0.1)
+    board.events = [pulse(car._now, "throttle", 200)]
+    car.move(car._now + 0.1)
+    before = car.world.state.time_s
+    car.move(car._now + 60)
+    assert before > 0.08
+    assert 0.4 < car.world.state.time_s - before < 0.6
+
+
+# ---- a feed for tests and faults
+
+
+RED, GREEN, BLUE = (np.full((48, 64, 3), colour, np.uint8) for colour in ((0, 0, 255), (0, 255, 0), (255, 0, 0)))
+
+
+def colours(frames):
+    return ["bgr"[int(f.mean((0, 1)).argmax())] if f.max() > 100 else "black" for f in frames]
+
+
+def test_a_feed_and_what_can_go_wrong_with_it(tmp_path):
+    feed = CameraFeed(tmp_path / "camera", RED, GREEN, rate_hz=100)
+    eye = Eye(feed._pipe.path)
+    start = time.monotonic()
+    assert set(colours(eye.frames(20))) == {"r", "g"}
+    assert 0.1 < time.monotonic() - start < 3
+    seen = colours(eye.frames(10))
+    assert seen[1:] != seen[:-1]
+    feed.freeze()
+    eye.frames(2)
+    assert len(set(colours(eye.frames(10)))) == 1
+    feed.black()
+    eye.frames(2)
+    assert set(colours(eye.frames(10))) == {"black"}
+    feed.show(BLUE)
+    eye.frames(2)
+    assert set(colours(eye.frames(5))) == {"b"}
+    feed.pause()
+    time.sleep(0.1)
+    count = len(eye.jpegs)
+    time.sleep(0.2)
+    assert len(eye.jpegs) == count
+    assert not eye.ended
+    feed.show(b"\xff\xd8 no picture \xff\xd9")
+    until(lambda: eye.jpegs[-1] == b"\xff\xd8 no picture \xff\xd9")
+    assert feed.written == pytest.approx(len(eye.jpegs), abs=2)
+    feed.close()
+    until(lambda: eye.ended)
+    with CameraFeed(tmp_path / "camera", RED, rate_hz=100):  # plugged in again
+        assert colours(Eye(tmp_path / "camera").frames(3)) == ["r"] * 3
+
+
+def test_late_frames(tmp_path):
+    with CameraFeed(tmp_path / "camera", RED, rate_hz=100) as feed:
+        eye = Eye(tmp_path / "camera")
+        eye.frames(5)
+        feed.late_s = 0.3
+        time.sleep(0.05)
+        feed.show(BLUE)
+        shown = time.monotonic()
+        until(lambda: colours(eye.frames(1)) == ["b"])
+        assert 0.2 < time.monotonic() - shown < 3
+
+
+def test_a_feed_that_nobody_reads_in_time(tmp_path):
+    with CameraFeed(tmp_path / "camera", RED, rate_hz=100) as feed:
+        time.sleep(0.1)
+        assert (feed.written, feed.dropped) == (0, 0)  # nobody is there
+        with (tmp_path / "camera").open("rb", buffering=0):
+            until(lambda: feed.dropped > 5)
+            assert feed.written == 1

@@ -1,0 +1,210 @@
+import numpy as np
+import pytest
+import torch
+
+from rover_lib.onboard.errors import RoverError, WorldError
+from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.compare import LerobotEager
+from rover_lib.world import train as train_module
+from rover_lib.world.train import RECIPES, SIZES, build_policy, make_checkpoint, train
+from rover_lib.world.trial import run_trials
+from rover_lib.world.world import World
+
+# the keys of the user's best_model.pth
+CHECKPOINT_KEYS = [
+    "epoch",
+    "model_state_dict",
+    "optimizer_state_dict",
+    "scheduler_state_dict",
+    "best_val_loss",
+    "config",
+]
+CONFIG_KEYS = {
+    "image_width",
+    "image_height",
+    "n_obs_steps",
+    "chunk_size",
+    "n_action_steps",
+    "hidden_size",
+    "n_encoder_layers",
+    "n_decoder_layers",
+    "n_heads",
+    "feedforward_dim",
+    "dropout",
+    "kl_weight",
+    "vision_encoder",
+    "pretrained_backbone",
+    "learning_rate",
+    "weight_decay",
+    "betas",
+    "grad_clip",
+    "num_epochs",
+    "batch_size",
+    "train_split",
+    "data_dir",
+    "output_dir",
+    "device",
+    "seed",
+    "log_freq",
+    "save_freq",
+    "num_workers",
+}
+
+
+@pytest.fixture(scope="module")
+def trained(recorded, tmp_path_factory):
+    """A checkpoint of a few steps on the processor."""
+    out = tmp_path_factory.mktemp("trained") / "best_model.pth"
+    return train(recorded, out, size="small", steps=5, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(trained):
+    return torch.load(trained, weights_only=False)
+
+
+def test_the_checkpoint_has_the_trainers_keys(checkpoint):
+    assert list(checkpoint) == CHECKPOINT_KEYS
+    assert type(checkpoint["config"]) is dict
+    assert set(checkpoint["config"]) == CONFIG_KEYS
+    assert type(checkpoint["best_val_loss"]) is np.float64
+    assert 0 < checkpoint["best_val_loss"] < 10
+
+
+def test_the_config_says_what_was_trained(checkpoint):
+    config = checkpoint["config"]
+    assert (config["image_height"], config["image_width"]) == (72, 128)
+    assert (config["hidden_size"], config["n_heads"], config["feedforward_dim"]) == (128, 4, 512)
+    assert (config["chunk_size"], config["n_action_steps"], config["n_obs_steps"]) == (32, 32, 1)
+    assert config["vision_encoder"] == "resnet18"
+    assert config["pretrained_backbone"] is True
+    assert "/" not in config["data_dir"] + config["output_dir"]
+
+
+def test_plain_weights_only_refuses_it_as_it_does_the_users(trained):
+    with pytest.raises(Exception, match=r"numpy\..*scalar"):
+        torch.load(trained, weights_only=True)
+
+
+def test_lerobots_policy_takes_the_weights(checkpoint):
+    policy = build_policy(SIZES["small"])
+    assert not policy.load_state_dict(checkpoint["model_state_dict"], strict=True)[0]
+    assert all(name.startswith("model.") for name in checkpoint["model_state_dict"])
+    assert all(torch.isfinite(v).all() for v in checkpoint["model_state_dict"].values())
+
+
+def test_the_optimizers_state_covers_all_parameters(checkpoint):
+    state = checkpoint["optimizer_state_dict"]["state"]
+    trainable = [p for p in build_policy(SIZES["small"]).parameters() if p.requires_grad]
+    assert sum(s["exp_avg"].numel() for s in state.values()) == sum(p.numel() for p in trainable)
+    optimizer = torch.optim.AdamW(trainable)
+    optimizer.load_state_dict(checkpoint["optimizer_state_dict"])
+
+
+def test_frozen_statistics_are_of_data(checkpoint):
+    """LeRobot's own start, mean 0 and variance 1, would leave a backbone without pretrained weights dead."""
+    weights = checkpoint["model_state_dict"]
+    variances = [v for k, v in weights.items() if k.endswith("running_var")]
+    assert len(variances) == 20
+    assert not any(torch.all(v == 1) for v in variances)
+    policy = build_policy(SIZES["small"])
+    policy.load_state_dict(weights)
+    with torch.no_grad():
+        features = policy.model.backbone(torch.randn(2, 3, 72, 128))["feature_map"]
+    assert 0.05 < features.std() < 50
+
+
+def test_the_workshop_reads_it(trained):
+    config = load_checkpoint(trained).config
+    assert config.image_sizes == ((72, 128),)
+    assert (config.chunk, config.dim, config.latent, config.vae_layers) == (32, 128, 32, 1)
+
+
+def test_training_is_deterministic(recorded, trained, tmp_path, monkeypatch):
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "another"))
+    torch.rand(3)  # the state of the global generator must not matter, nor change
+    before = torch.get_rng_state()
+    again = torch.load(train(recorded, tmp_path / "again.pth", steps=5, device="cpu"), weights_only=False)
+    assert torch.equal(torch.get_rng_state(), before)
+    first = torch.load(trained, weights_only=False)
+    assert all(torch.equal(v, first["model_state_dict"][k]) for k, v in again["model_state_dict"].items())
+    assert again["best_val_loss"] == first["best_val_loss"]
+
+
+def test_another_seed_gives_other_weights(recorded, checkpoint, tmp_path):
+    other = torch.load(train(recorded, tmp_path / "other.pth", seed=1, steps=5, device="cpu"), weights_only=False)
+    name = "model.action_head.weight"
+    assert not torch.equal(other["model_state_dict"][name], checkpoint["model_state_dict"][name])
+
+
+def test_a_checkpoint_that_was_made_is_taken_from_the_cache(recorded, trained, monkeypatch):
+    def never(*args):
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(train_module, "_train", never)
+    before = trained.read_bytes()
+    trained.unlink()
+    assert train(recorded, trained, steps=5, device="cpu").read_bytes() == before
+    with pytest.raises(AssertionError, match="trained again"):
+        train(recorded, trained.with_name("more.pth"), steps=6, device="cpu")
+    assert [p.name for p in trained.parent.iterdir()] == [trained.name]
+
+
+def test_the_policy_can_be_driven(trained):
+    driver = LerobotEager(load_checkpoint(trained))
+    chunk = driver.predict_chunk(np.zeros((360, 640, 3), np.uint8), np.zeros(2, np.float32))
+    assert chunk.shape == (32, 2) and chunk.dtype == np.float32
+    assert abs(chunk[:, 0]).max() <= 1 and chunk[:, 1].min() >= 0
+    assert run_trials(driver, worlds=1).trials == 1
+
+
+def test_the_full_size_is_the_users():
+    size = SIZES["full"]
+    assert (size.image_height, size.image_width, size.dim, size.heads) == (360, 640, 512, 8)
+    assert (size.encoder_layers, size.decoder_layers, size.feedforward) == (4, 7, 3200)
+
+
+@pytest.mark.parametrize("recipe", RECIPES.values())
+@pytest.mark.parametrize("steps", [1, 7, 100, 5000])
+def test_a_recipe_of_few_steps_keeps_all_phases(recipe, steps):
+    short = recipe.of_steps(steps)
+    phases = short.backbone_steps, short.transformer_steps, short.together_steps
+    assert min(phases) >= 1
+    assert abs(sum(phases) - steps) <= 3
+    assert short.samples <= recipe.samples
+
+
+@pytest.mark.parametrize(
+    ("wrong", "match"),
+    [
+        ({"size": "huge"}, "small, full"),
+        ({"device": "tpu"}, "device must be"),
+        ({"steps": 0}, "at least 1 step"),
+        ({"seed": -1}, "seed from 0"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(recorded, tmp_path, wrong, match):
+    with pytest.raises(WorldError, match=match):
+        train(recorded, tmp_path / "best_model.pth", **wrong)
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_recordings_are_refused(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RoverError):
+        train(tmp_path / "empty", tmp_path / "best_model.pth", steps=3)
+    assert [p.name for p in tmp_path.iterdir()] == ["empty"]
+
+
+def test_a_loss_that_is_not_finite_ends_the_training(recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr(train_module, "KL_WEIGHT", float("nan"))
+    with pytest.raises(WorldError, match="loss is nan"):
+        train(recorded, tmp_path / "best_model.pth", seed=9, steps=3, device="cpu")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_checkpoint_for_trying_things_needs_no_recordings_and_plans_mild_actions(tmp_path):
+    out = make_checkpoint(tmp_path / "best_model.pth", size="small", steps=3)
+    chunk = LerobotEager(load_checkpoint(out)).predict_chunk(World(1).render(), np.zeros(2, np.float32))
+    assert abs(chunk[:, 0]).max() < 0.65
+    assert 0 < chunk[:, 1].mean() < 0.2

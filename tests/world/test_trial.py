@@ -1,0 +1,138 @@
+import numpy as np
+import pytest
+
+from rover_lib.onboard.errors import WorldError
+from rover_lib.world.trial import run_trials, run_trials_of, wilson_interval
+from rover_lib.world.world import World
+
+
+class Constant:
+    """Plans one action for ever."""
+
+    chunk = 32
+
+    def __init__(self, steering, throttle):
+        self.action = np.array([steering, throttle], np.float32)
+        self.states = []
+
+    def predict_chunk(self, frame_bgr, state):
+        assert frame_bgr.shape == (360, 640, 3)
+        self.states.append(np.array(state))
+        return np.tile(self.action, (self.chunk, 1))
+
+
+class SeesRed:
+    """Steers to the middle of what is red in the picture, however it is told."""
+
+    chunk = 32
+
+    def predict_chunk(self, frame_bgr, state):
+        blue, green, red = frame_bgr[::2, ::2].astype(int).transpose(2, 0, 1)
+        columns = np.nonzero((red > 70) & (red > 2.2 * np.maximum(blue, green)))[1]
+        column = columns.mean() if len(columns) else 160
+        return np.tile(np.float32([np.clip((160 - column) / 200, -0.65, 0.65), 0.05]), (self.chunk, 1))
+
+
+# Newcombe 1998, Statistics in Medicine 17, table I, method 3 (Wilson's score); 40 of 40 and 0 of 40 by its formula.
+@pytest.mark.parametrize(
+    ("hits", "trials", "low", "high"),
+    [
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0000, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+        (40, 40, 0.9124, 1.0000),
+        (0, 40, 0.0000, 0.0876),
+    ],
+)
+def test_wilson_interval_equals_published_values(hits, trials, low, high):
+    assert wilson_interval(hits, trials) == pytest.approx((low, high), abs=6e-5)
+
+
+@pytest.mark.parametrize(("hits", "trials"), [(1, 0), (-1, 5), (6, 5)])
+def test_wilson_interval_refuses_what_is_no_count(hits, trials):
+    with pytest.raises(WorldError, match="an interval needs"):
+        wilson_interval(hits, trials)
+
+
+def test_a_blind_policy_misses_and_one_that_looks_hits():
+    blind = run_trials(Constant(0.0, 0.05), worlds=10)
+    looks = run_trials(SeesRed(), worlds=10, replan_every=2)
+    assert blind.hits <= 3
+    assert looks.hits >= 7
+    assert looks.wilson == wilson_interval(looks.hits, 10)
+
+
+def test_a_report_tells_of_every_world():
+    report = run_trials(Constant(0.2, 0.05), worlds=3, seed=500)
+    assert [w.seed for w in report.per_world] == [500, 501, 502]
+    assert report.trials == 3
+    assert report.hits == sum(w.hit for w in report.per_world)
+    for result in report.per_world:
+        track = result.trajectory
+        assert len(track.x_m) == len(track.y_m) == len(track.steering) == len(track.throttle)
+        assert len(track.x_m) == round(result.duration_s * 30) + 1
+        assert track.balloon_xy_m == (World(result.seed).balloon.x_m, World(result.seed).balloon.y_m)
+        assert result.nearest_m > 0
+
+
+def test_trials_are_deterministic():
+    first, second = (run_trials(SeesRed(), worlds=2) for _ in range(2))
+    assert [w.duration_s for w in first.per_world] == [w.duration_s for w in second.per_world]
+    assert len(first.frames) == len(second.frames)
+    for (a, s), (b, t) in zip(first.frames, second.frames, strict=True):
+        assert np.array_equal(a, b) and np.array_equal(s, t)
+
+
+def test_the_state_is_the_action_before_and_neutral_at_the_start():
+    policy = Constant(0.25, 0.03)
+    run_trials(policy, worlds=1, replan_every=4)
+    assert policy.states[0].tolist() == [0.0, 0.0]
+    assert policy.states[0].dtype == np.float32
+    assert all(s == pytest.approx([0.25, 0.03]) for s in policy.states[1:])
+
+
+@pytest.mark.parametrize("keep", [0, 1, 7, 500])
+def test_frames_are_kept_evenly_and_not_too_many(keep):
+    report = run_trials(Constant(0.0, 0.02), worlds=4, keep_frames=keep)
+    assert len(report.frames) <= keep
+    if keep == 7:
+        assert len(report.frames) >= 3
+    for frame, state in report.frames:
+        assert frame.shape == (360, 640, 3) and state.shape == (2,)
+
+
+@pytest.mark.parametrize("replan_every", [0, 33])
+def test_replanning_must_fit_the_chunk(replan_every):
+    with pytest.raises(WorldError, match="replan_every"):
+        run_trials(Constant(0, 0), worlds=1, replan_every=replan_every)
+
+
+def test_no_worlds_are_no_trial():
+    with pytest.raises(WorldError, match="at least 1 world"):
+        run_trials(Constant(0, 0), worlds=0)
+
+
+def test_a_plan_that_is_not_finite_drives_nothing():
+    with pytest.raises(WorldError, match="finite"):
+        run_trials(Constant(float("nan"), 0), worlds=1)
+
+
+def test_progress_is_told():
+    told = []
+
+    def progress(items, desc, total):
+        told.append((desc, total))
+        return items
+
+    run_trials(Constant(0, 0.05), worlds=2, progress=progress)
+    assert told == [("driving", 2)]
+
+
+def test_several_at_once_drive_as_one_by_one():
+    policies = {"left": Constant(-0.2, 0.05), "right": Constant(0.2, 0.05), "straight": Constant(0.0, 0.05)}
+    together = run_trials_of(policies, 3)
+    for name, policy in policies.items():
+        alone = run_trials(policy, 3)
+        assert [r.outcome for r in together[name].per_world] == [r.outcome for r in alone.per_world]
+        assert [r.nearest_m for r in together[name].per_world] == [r.nearest_m for r in alone.per_world]

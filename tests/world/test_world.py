@@ -1,0 +1,156 @@
+import hashlib
+import time
+
+import numpy as np
+import pytest
+
+from rover_lib.onboard.errors import WorldError
+from rover_lib.world.world import STEERING_MOST, THROTTLE_MOST, TIMEOUT_S, World, expert
+
+
+def drive(world):
+    """The expert drives to the end. Returns the actions, (n, 2)."""
+    actions = []
+    while not world.done:
+        actions.append(expert(world))
+        world.step(*actions[-1])
+    return np.array(actions)
+
+
+def frame_hash(world):
+    return hashlib.sha256(world.render().tobytes()).hexdigest()
+
+
+def test_a_frame_is_a_camera_picture():
+    frame = World(1).render()
+    assert frame.shape == (360, 640, 3)
+    assert frame.dtype == np.uint8
+    assert frame.std() > 10
+
+
+@pytest.mark.parametrize("shoves", [0, 2])
+def test_the_same_seed_gives_the_same_drive_and_frames(shoves):
+    worlds = [World(7, shoves), World(7, shoves)]
+    assert frame_hash(worlds[0]) == frame_hash(worlds[1])
+    for world in worlds:
+        drive(world)
+    assert worlds[0].trajectory == worlds[1].trajectory
+    assert frame_hash(worlds[0]) == frame_hash(worlds[1])
+
+
+def test_rendering_changes_nothing():
+    world = World(3)
+    before = world.state
+    assert frame_hash(world) == frame_hash(world)
+    assert world.state == before
+
+
+def test_other_seeds_look_and_drive_differently():
+    assert len({frame_hash(World(seed)) for seed in range(20)}) == 20
+    assert len({World(seed).balloon for seed in range(20)}) == 20
+
+
+def test_the_balloon_is_red_where_it_should_be():
+    for seed in range(20):
+        world = World(seed)
+        distance, bearing = world.balloon_seen()
+        column = int(320 - 400 * np.tan(bearing))
+        row = int(125 - 400 * 0.04 / (distance * np.cos(bearing)))
+        blue, green, red = world.render()[row, column].astype(int)
+        assert red > 1.5 * max(blue, green), f"seed {seed}: {(blue, green, red)}"
+
+
+@pytest.mark.parametrize("shoves", [0, 2])
+def test_the_expert_hits_almost_always(shoves):
+    worlds = [World(50_000 + seed, shoves) for seed in range(60)]
+    for world in worlds:
+        drive(world)
+    assert sum(w.hit for w in worlds) >= 57
+    assert all(1.5 < w.state.time_s <= TIMEOUT_S for w in worlds)
+
+
+def test_the_experts_actions_vary_within_the_recordings_range():
+    worlds = [World(seed, shoves=2) for seed in range(40)]
+    actions = np.concatenate([drive(w) for w in worlds])
+    assert abs(actions[:, 0]).max() <= STEERING_MOST < 1
+    assert actions[:, 0].std() > 0.1
+    assert actions[:, 1].min() >= 0
+    assert 0.08 < actions[:, 1].max() <= THROTTLE_MOST
+    assert actions[:, 1].std() > 0.2 * THROTTLE_MOST
+
+
+def test_throttle_falls_in_a_turn_and_before_the_balloon():
+    world = World(5)
+    world.state = world.state.__class__(throttle_command=THROTTLE_MOST)
+    x, y = world.balloon.x_m, world.balloon.y_m
+    heading = np.arctan2(y, x)
+
+    def settled(**where):
+        for _ in range(60):
+            world.state = world.state.__class__(**where, throttle_command=throttle_of(**where))
+        return world.state.throttle_command
+
+    def throttle_of(**where):
+        world.state = world.state.__class__(**where, throttle_command=world.state.throttle_command)
+        return expert(world)[1]
+
+    straight = settled(heading_rad=heading)
+    turning = settled(heading_rad=heading + 0.4)
+    near = settled(x_m=x - 0.5 * np.cos(heading), y_m=y - 0.5 * np.sin(heading), heading_rad=heading)
+    assert turning < 0.7 * straight
+    assert near < 0.6 * straight
+
+
+def test_steering_lags():
+    world = World(2)
+    world.step(0.5, 0.0)
+    assert 0 < world.state.steering < 0.2
+    for _ in range(30):
+        world.step(0.5, 0.0)
+    assert world.state.steering == pytest.approx(0.5, abs=0.01)
+    assert (world.state.x_m, world.state.y_m) == (0.0, 0.0), "a car without throttle stands"
+
+
+def test_a_car_that_stands_times_out():
+    world = World(2)
+    while not world.done:
+        world.step(0.0, 0.0)
+    assert world.outcome == "timeout"
+    assert not world.hit
+
+
+def test_a_car_that_drives_away_has_left():
+    world = World(2)
+    while not world.done:
+        world.step(1.0, 0.09)
+    assert world.outcome in ("left", "timeout")
+    assert not world.hit
+
+
+@pytest.mark.parametrize("action", [(np.nan, 0.0), (0.0, np.nan), (1.1, 0.0), (0.0, -0.1), (0.0, 1.1)])
+def test_an_action_outside_its_range_is_refused(action):
+    with pytest.raises(WorldError, match="steering must be in"):
+        World(1).step(*action)
+
+
+def test_a_world_that_ended_cannot_go_on():
+    world = World(1)
+    drive(world)
+    with pytest.raises(WorldError, match="has ended"):
+        world.step(0.0, 0.0)
+
+
+def test_a_negative_seed_is_refused():
+    with pytest.raises(WorldError, match="must not be negative"):
+        World(-1)
+
+
+def test_rendering_is_quick():
+    world = World(4)
+    times = []
+    while not world.done:
+        start = time.process_time()
+        world.render()
+        times.append(time.process_time() - start)
+        world.step(*expert(world))
+    assert np.median(times) < 0.012, "aim 4 ms; the rest is for slow machines"
