@@ -1,11 +1,26 @@
-"""Errors that a user can act on: one sentence with what was wrong, what was found and what to do.
+"""Errors that a user can act on, as values: what was wrong, what was found, what to do.
 
-The command line prints the sentence and exits with 1; a traceback comes only with --debug.
+    raise CameraError("the camera delivers no frames", found=source, remedy="is it plugged in?")
+
+The command line prints them as one sentence and exits with 1; a traceback comes only with --debug. Whoever wants a part
+of one reads its field, and never takes its text apart.
 """
 
 
 class RoverError(Exception):
-    """Base of every error that is the input's fault, not the program's."""
+    """Base of every error that is the input's fault, not the program's.
+
+    what: was wrong, a clause without a full stop. found: instead of what was expected, None if `what` says all.
+    remedy: what to do about it, "" if there is nothing to say.
+    """
+
+    def __init__(self, what: str, *, found: object = None, remedy: str = ""):
+        super().__init__(what)
+        self.what, self.found, self.remedy = what, found, remedy
+
+    def __str__(self) -> str:
+        text = self.what if self.found is None else f"{self.what}, found {self.found}"
+        return f"{text}; {self.remedy}" if self.remedy else text
 
 
 def sentence_of(error: BaseException) -> str:
@@ -46,7 +61,7 @@ class ParamsError(RoverError):
 
 
 class WorldError(RoverError):
-    """A playground run that cannot be made."""
+    """A run in the balloon world that cannot be made."""
 
 
 class DriveFault(RoverError):

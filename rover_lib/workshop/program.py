@@ -1,0 +1,47 @@
+"""Other programs: run to their end, or ended in an error that says their last words."""
+
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rover_lib.onboard.errors import RoverError
+
+LAST_LINES = 3
+
+
+def run(
+    *command: object,
+    error: type[RoverError] = RoverError,
+    remedy: str = "",
+    cwd: Path | str | None = None,
+    env: Mapping[str, str] | None = None,
+    input: str | None = None,
+    timeout_s: float | None = None,
+    **options: Any,
+) -> str:
+    """Run a command to its end and return its standard output.
+
+    error: what to raise, with `remedy`, if it cannot be started, fails, or takes longer than timeout_s; the sentence
+    has its name and the last lines that it printed. options: of subprocess.run.
+    """
+    words = [str(part) for part in command]
+    name = Path(words[0]).name
+    try:
+        done = subprocess.run(
+            words, capture_output=True, text=True, cwd=cwd, env=env, input=input, timeout=timeout_s, **options
+        )
+    except FileNotFoundError:
+        raise error(f"{name} is not here", remedy=remedy or "install it") from None
+    except subprocess.TimeoutExpired:
+        raise error(f"{name} did not end within {timeout_s:g} s", remedy=remedy) from None
+    if done.returncode:
+        raise error(
+            f"{name} failed (exit status {done.returncode}): {last_words(done.stderr or done.stdout)}", remedy=remedy
+        )
+    return done.stdout
+
+
+def last_words(text: str, lines: int = LAST_LINES) -> str:
+    """The last lines that a program printed, in one."""
+    return " | ".join(text.strip().splitlines()[-lines:]) or "it printed nothing"
