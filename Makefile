@@ -6,21 +6,22 @@ LAB := $(VENV)/bin/python -m lab
 READY := $(VENV)/.ready
 NAME ?= mine
 
-.PHONY: help demo run test lint lab arm faults pi-fast pi firmware flash notebooks clean
+.PHONY: help demo run test test-fast check-release coverage lint lab arm faults pi-fast pi firmware flash notebooks clean
 
 help:
 	@echo "make demo                                   record, train, quantize, compare, benchmark and drive in the balloon world"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
-	@echo "make test                                   lint, unit, parity, notebook tests and one whole run"
-	@echo "make arm NAME=demo [PEERS=1]                count a run's instructions on an emulated Cortex-A76;"
-	@echo "                                            NAME=full makes a policy of the real car's size, PEERS=1 adds other runtimes"
-	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino: about 6 minutes"
-	@echo "make pi-fast                                every playbook on an emulated Pi in a container, and what they promise,"
-	@echo "                                            proven from within: an hour; root, on Debian 12"
-	@echo "make pi                                     a whole emulated Pi: kernel, camera, INT8, USB serial, servo pulses, pulled"
-	@echo "                                            cables: half an hour, the first time three quarters; root, on Debian 12"
-	@echo "make firmware; make flash PORT=/dev/ttyUSB0  build the Arduino's firmware, and put it on the board"
 	@echo "make lab                                    JupyterLab on the notebooks"
+	@echo "make firmware; make flash PORT=/dev/ttyUSB0 build the Arduino's firmware, and put it on the board"
+	@echo
+	@echo "For who changes something; CONTRIBUTING.md says what each proves and how long it takes:"
+	@echo "make test-fast                              what a minute and a half can prove"
+	@echo "make test                                   lint, tests and notebooks, on the demo's run"
+	@echo "make check-release                          what takes an hour and a quiet machine"
+	@echo "make arm NAME=demo [PEERS=1]                count a run's instructions on an emulated Cortex-A76; NAME=full makes"
+	@echo "                                            a policy of the real car's size, PEERS=1 adds other runtimes"
+	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino"
+	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count, into the committed notebooks"
 
 # uv installs the CUDA build of torch, gigabytes that its wheel insists on, in a minute where pip takes several.
@@ -44,10 +45,22 @@ run: $(READY)
 lint: $(READY)
 	$(VENV)/bin/ruff check --quiet
 	$(VENV)/bin/ruff format --quiet --check
+	$(VENV)/bin/mypy
 
 # The demo is the tests' whole run; it is made once, and tests/test_demo.py holds it to the gates of params.yml.
 test: lint demo
 	$(VENV)/bin/pytest
+
+test-fast: $(READY)
+	$(VENV)/bin/pytest -m 'not slow and not emulated and not release' tests
+
+# Real time, whole fleets and whole machines: for a quiet machine, before something is given to others.
+check-release: lint demo
+	$(VENV)/bin/pytest -m release tests
+	$(MAKE) faults pi-fast pi
+
+coverage: demo
+	$(VENV)/bin/pytest --cov=rover_lib --cov=lab --cov-report=term
 
 # NAME=full needs no checkpoint: it makes one. quantize.json is the last that a run of it leaves.
 arm: $(READY)
