@@ -10,8 +10,9 @@ import pytest
 
 from lab.a76 import count as arm
 from lab.arduino import emulator as arduino
+from lab.debian import missing_packages
 
-QEMU_MISSING = arm.missing_packages()
+QEMU_MISSING = missing_packages(arm.NEEDS)
 qemu = pytest.mark.skipif(bool(QEMU_MISSING), reason=f"needs the Debian packages {' '.join(QEMU_MISSING)}")
 
 SIMAVR_MISSING = arduino.missing_packages()

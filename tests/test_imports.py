@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = ("rover_lib.onboard", "rover_lib.workshop", "rover_lib.world", "rover_lib.cli", "lab")  # the lowest first
-ROOMS = ("lab.arduino", "lab.driving", "lab.a76", "lab.pi", "lab.__main__")  # of the laboratory, the same
+ROOMS = ("lab.debian", "lab.arduino", "lab.driving", "lab.a76", "lab.pi", "lab.__main__")  # of the laboratory, the same
 ONBOARD_NEEDS = {"torch", "numpy", "cv2", "serial", "yaml", "systemd_watchdog", "click", "rover_lib"}
 
 

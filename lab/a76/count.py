@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from lab.debian import fetch_packages, install_packages, missing_packages, unpack_packages
 from rover_lib.onboard.artifact import content_hash, read_manifest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
@@ -54,8 +55,12 @@ REQUIREMENTS = REPOSITORY / "requirements_pi.txt"
 
 REFERENCE, STATIC = "policy_fp32", "policy_static"
 LABEL = "counted on an emulated Cortex-A76"
-NEEDS = {"qemu-aarch64": "qemu-user", "gcc": "gcc", "c++filt": "binutils"}  # command: its Debian package
-HEADERS = {"/usr/include/stdio.h": "libc6-dev"}
+NEEDS = {  # the Debian packages of commands and files
+    "qemu-aarch64": "qemu-user",
+    "gcc": "gcc",
+    "c++filt": "binutils",
+    "/usr/include/stdio.h": "libc6-dev",
+}
 RECIPE = 1  # one more when the userland is made in another way: older ones are then not used
 GUEST_PACKAGES = ("python3.11", "libgomp1", "libstdc++6")
 PYTHON, PLATFORM = "3.11", "aarch64-manylinux_2_28"
@@ -134,16 +139,11 @@ class Machine:
     plugin: Path
 
 
-def missing_packages() -> list[str]:
-    """Debian packages that counting needs and this machine lacks."""
-    commands = {package for command, package in NEEDS.items() if not shutil.which(command)}
-    return sorted(commands | {package for file, package in HEADERS.items() if not Path(file).exists()})
-
-
 def prepare(progress: Progress = None) -> Machine:
     """Everything that counting needs, from the cache or made now (about half a minute).
 
-    Debian packages that are missing are installed when this runs as root. Raises ArmError if anything is not to be had.
+    Debian packages that are missing are installed when this runs as root. Raises ArmError or DebianError if anything is
+    not to be had.
     """
     steps = (_install_missing, _plugin, _userland)
     watched = progress(steps, desc="emulated Cortex-A76", total=len(steps)) if progress else steps
@@ -152,19 +152,7 @@ def prepare(progress: Progress = None) -> Machine:
 
 
 def _install_missing() -> None:
-    if missing := missing_packages():
-        install(missing, f"counting needs the Debian packages {' '.join(missing)}, which are not here")
-
-
-def install(packages: Sequence[str], refusal: str) -> None:
-    """Install Debian packages. refusal: what the ArmError says, before the command to type, where that cannot be."""
-    command = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *packages]
-    if os.geteuid() != 0 or not shutil.which("apt-get"):
-        raise ArmError(f"{refusal}: sudo {' '.join(command)}")
-    print(f"installing Debian packages: {' '.join(packages)}", file=sys.stderr)
-    _call(["apt-get", "update", "--quiet"], "apt-get cannot read the package lists")
-    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    _call(command, f"apt-get cannot install {' '.join(packages)}", env=environment)
+    install_packages(missing_packages(NEEDS), "counting")
 
 
 def _call(command: Sequence[Any], what: str, **options: Any) -> str:
@@ -197,12 +185,8 @@ def _userland() -> Path:
 
 
 def _make_userland(root: Path) -> None:
-    for tool in ("apt-get", "dpkg"):
-        if not shutil.which(tool):
-            raise ArmError(f"no {tool} to fetch an arm64 Python with: use Debian 12, in a container if need be")
     with tempfile.TemporaryDirectory(dir=root.parent, prefix=".apt.") as scratch:
-        for package in fetch_packages(Path(scratch), GUEST_PACKAGES):
-            _call(["dpkg", "--extract", package, root], f"dpkg cannot unpack {package.name}")
+        unpack_packages(fetch_packages(Path(scratch), GUEST_PACKAGES), root)
     uv = _uv()
     command = [uv, "pip", "install", "--quiet", "--require-hashes", "--only-binary", ":all:", "--no-deps"]
     command += ["--python-platform", PLATFORM, "--python-version", PYTHON, "--target", _site(root)]
@@ -217,38 +201,6 @@ def _make_userland(root: Path) -> None:
     # Leaves the bytecode of all that they import, which costs a third of a minute in the emulator, and proves them.
     command = [*_qemu(root), root / "usr" / "bin" / f"python{PYTHON}", "-c", "import torch, cv2, serial"]
     _call(command, "the Pi's wheels do not work in the emulator", env=_environment(root, root))
-
-
-def fetch_packages(scratch: Path, packages: Sequence[str], installed: Path | None = None) -> list[Path]:
-    """arm64 packages and what they depend on, as .deb files in a scratch folder; nothing of the host is changed.
-
-    By the host's apt sources and keys, with lists, cache and status of its own. packages: names, or apt's patterns.
-    installed: the root of a system; what it has already is left out. Raises ArmError if they are not to be had.
-    """
-    for folder in ("lists/partial", "archives/partial"):
-        (scratch / folder).mkdir(parents=True)
-    (scratch / "status").touch()  # nothing is installed: the dependencies come along
-    if installed:
-        shutil.copy(installed / "var" / "lib" / "dpkg" / "status", scratch / "status")
-    options = {
-        "APT::Architecture": "arm64",
-        "APT::Architectures": "arm64",
-        "Dir::State": scratch,
-        "Dir::State::lists": scratch / "lists",
-        "Dir::State::status": scratch / "status",
-        "Dir::Cache": scratch,
-        "Dir::Cache::archives": scratch / "archives",
-        "Dir::Cache::pkgcache": "",
-        "Dir::Cache::srcpkgcache": "",
-        "Dir::Log": scratch,
-        "APT::Sandbox::User": "root",
-        "Debug::NoLocking": "true",
-    }
-    apt = ["apt-get", "--quiet", *(f"--option={key}={value}" for key, value in options.items())]
-    _call([*apt, "update"], "apt-get cannot read the arm64 package lists of this machine's sources")
-    install = [*apt, "install", "--yes", "--download-only", "--no-install-recommends", *packages]
-    _call(install, f"apt-get cannot fetch {' '.join(packages)} for arm64 (Debian 12 has them)")
-    return sorted((scratch / "archives").glob("*.deb"))
 
 
 def _uv() -> str:

@@ -22,6 +22,7 @@ from torch import nn
 
 from lab.a76 import count as arm
 from lab.a76.count import ArmError, Counted, Machine
+from lab.debian import install_packages
 from rover_lib.onboard.artifact import read_manifest
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import ACTION_LIMITS
@@ -127,7 +128,7 @@ def _fetch(packages: Sequence[str], folder: Path, *where: str) -> None:
 def _compile(folder: Path) -> None:
     """policy.so from executorch.cpp, as ExecuTorch's own CMake package would compile and link it."""
     if not shutil.which(COMPILER):
-        arm.install([COMPILER_PACKAGE], f"ExecuTorch needs the Debian package {COMPILER_PACKAGE}")
+        install_packages([COMPILER_PACKAGE], "ExecuTorch")
     sdk = folder / "executorch"
     command = [COMPILER, "-std=c++17", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "policy.so", SHIM]
     command += ["-DC10_USING_CUSTOM_GENERATED_MACROS", "-DET_EVENT_TRACER_ENABLED"]

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lab.a76.count import fetch_packages
+from lab.debian import fetch_packages
 from lab.pi import plays
 from lab.pi.container import Container
 from lab.pi.plays import Play

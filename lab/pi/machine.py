@@ -30,7 +30,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lab.a76.count import fetch_packages
+from lab.debian import fetch_packages
 from lab.pi.system import USER, System, emulation, free_port, make_sure, system
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cached_folder, key_of

@@ -21,8 +21,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lab.a76.count import fetch_packages, install
 from lab.arduino import emulator as arduino
+from lab.debian import fetch_packages, install_packages
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.watch import signals
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
@@ -79,21 +79,19 @@ def require() -> None:
 
 
 def require_arduino() -> None:
-    """Installs what the emulated Arduino lacks here. Raises ArmError where that cannot be."""
-    if missing := arduino.missing_packages():
-        install(missing, f"the emulated Arduino needs the Debian packages {' '.join(missing)}, which are not here")
+    """Installs what the emulated Arduino lacks here. Raises DebianError where that cannot be."""
+    install_packages(arduino.missing_packages(), "the emulated Arduino")
 
 
 def make_sure(missing: list[str], what: str, why: str, error: type[RoverError] = EmulationError) -> None:
     """Of root, and of Debian packages that `what` lacks here, which are installed. why: what root is for.
 
-    Raises `error` without root, ArmError for packages that cannot be installed.
+    Raises `error` without root, DebianError for packages that cannot be installed.
     """
     if os.geteuid() != 0:
         packages = f" (and of the Debian packages {' '.join(missing)})" if missing else ""
         raise error(f"{why}, which needs root{packages}: use sudo")
-    if missing:
-        install(missing, f"{what} needs the Debian packages {' '.join(missing)}, which are not here")
+    install_packages(missing, what)
 
 
 @contextlib.contextmanager
@@ -117,7 +115,7 @@ def free_port() -> int:
 def system() -> System:
     """The Pi's file system and the key to it, from the cache or made now (two minutes, most of them emulated).
 
-    Call it within emulation(). Raises EmulationError or ArmError, with what was not to be had.
+    Call it within emulation(). Raises EmulationError or DebianError, with what was not to be had.
     """
     recipe = {"made": [PACKAGES, CONFIGURE, RECIPE], "debian": _codename()}
     folder = cached_folder("pi-system", key_of(recipe), _make)

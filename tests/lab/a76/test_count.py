@@ -110,13 +110,6 @@ def test_kernels_are_summed_and_the_rest_is_other():
     assert found == {"bar": (100, 100, 0), "foo": (55, 20, 10), "other": (1, 0, 0)}
 
 
-def test_packages_are_named_when_they_cannot_be_installed(monkeypatch):
-    monkeypatch.setattr(arm, "missing_packages", lambda: ["qemu-user"])
-    monkeypatch.setattr(arm.os, "geteuid", lambda: 1000)
-    with pytest.raises(ArmError, match=r"Debian packages qemu-user, .*: sudo apt-get install"):
-        arm._install_missing()
-
-
 @pytest.fixture(scope="module")
 def machine() -> Machine:
     return prepare()

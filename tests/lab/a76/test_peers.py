@@ -19,6 +19,7 @@ from lab.a76 import count as arm
 from lab.a76 import peers
 from lab.a76.count import ArmError, Counted
 from lab.a76.peers import ENGINES
+from lab.debian import DebianError
 from rover_lib.onboard.artifact import read_manifest
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.preprocess import prepare_frame
@@ -190,7 +191,9 @@ def test_what_cannot_be_fetched_is_said(tmp_path, monkeypatch):
 def test_the_compiler_is_named_when_it_cannot_be_installed(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(peers.os, "geteuid", lambda: 1000)
-    with pytest.raises(ArmError, match=r"Debian package g\+\+-aarch64-linux-gnu: sudo apt-get install"):
+    with pytest.raises(
+        DebianError, match=r"packages g\+\+-aarch64-linux-gnu, which are not here; sudo apt-get install"
+    ):
         peers._compile(tmp_path)
 
 

@@ -94,11 +94,9 @@ def test_as_root_what_is_missing_is_installed(monkeypatch):
     asked = []
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     monkeypatch.setattr(system.shutil, "which", lambda name: None if name == "ssh" else f"/usr/bin/{name}")
-    monkeypatch.setattr(system, "install", lambda packages, refusal: asked.append((packages, refusal)))
+    monkeypatch.setattr(system, "install_packages", lambda packages, what: asked.append((packages, what)))
     system.require()
-    assert asked == [
-        (["openssh-client"], "an emulated Pi needs the Debian packages openssh-client, which are not here")
-    ]
+    assert asked == [(["openssh-client"], "an emulated Pi")]
 
 
 # What is installed

@@ -1,0 +1,91 @@
+"""Debian packages: what this machine lacks, installed by root; and arm64 ones, fetched without being installed.
+
+missing_packages({"qemu-aarch64": "qemu-user", "/usr/include/stdio.h": "libc6-dev"})     # ["qemu-user"]
+"""
+
+import os
+import shutil
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from rover_lib.onboard.errors import RoverError
+from rover_lib.workshop.program import run
+
+NO_DEBIAN = "use a Debian 12 or 13 with the network, in a container if need be"
+
+
+class DebianError(RoverError):
+    """Debian packages that are needed and are not to be had."""
+
+
+def missing_packages(needs: Mapping[str, str]) -> list[str]:
+    """Debian packages that this machine lacks.
+
+    needs: the package of each command, or of each file by its absolute path; commands of root's folders count too.
+    """
+
+    missing = set()
+    for name, package in needs.items():
+        if not (Path(name).exists() if name.startswith("/") else which(name)):
+            missing.add(package)
+    return sorted(missing)
+
+
+def which(command: str) -> str | None:
+    """As shutil.which, in root's folders too, which a user's PATH may lack."""
+    return shutil.which(command) or shutil.which(command, path="/usr/sbin:/sbin")
+
+
+def install_packages(packages: Sequence[str], what: str) -> None:
+    """Install Debian packages; nothing happens if there are none to install. what: needs them, for the error.
+
+    Raises DebianError with the command to type where this is not root, or with apt-get's last words.
+    """
+    if not packages:
+        return
+    command = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *packages]
+    if os.geteuid() != 0 or not shutil.which("apt-get"):
+        missing = f"{what} needs the Debian packages {' '.join(packages)}, which are not here"
+        raise DebianError(missing, remedy=f"sudo {' '.join(command)}")
+    print(f"installing Debian packages: {' '.join(packages)}", file=sys.stderr)
+    run("apt-get", "update", "--quiet", error=DebianError)
+    run(*command, error=DebianError, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"})
+
+
+def fetch_packages(folder: Path, packages: Sequence[str], installed: Path | None = None) -> list[Path]:
+    """arm64 packages and what they depend on, as .deb files in a scratch folder; nothing of this machine is changed.
+
+    By this machine's apt sources and keys, with lists, cache and status of its own. packages: names, or apt's patterns.
+    installed: the root of a system; what it has already is left out. Raises DebianError if they are not to be had.
+    """
+    for subfolder in ("lists/partial", "archives/partial"):
+        (folder / subfolder).mkdir(parents=True)
+    (folder / "status").touch()  # nothing is installed: the dependencies come along
+    if installed:
+        shutil.copy(installed / "var" / "lib" / "dpkg" / "status", folder / "status")
+    options = {
+        "APT::Architecture": "arm64",
+        "APT::Architectures": "arm64",
+        "Dir::State": folder,
+        "Dir::State::lists": folder / "lists",
+        "Dir::State::status": folder / "status",
+        "Dir::Cache": folder,
+        "Dir::Cache::archives": folder / "archives",
+        "Dir::Cache::pkgcache": "",
+        "Dir::Cache::srcpkgcache": "",
+        "Dir::Log": folder,
+        "APT::Sandbox::User": "root",
+        "Debug::NoLocking": "true",
+    }
+    apt = ["apt-get", "--quiet", *(f"--option={key}={value}" for key, value in options.items())]
+    run(*apt, "update", error=DebianError, remedy=NO_DEBIAN)
+    download = ["install", "--yes", "--download-only", "--no-install-recommends", *packages]
+    run(*apt, *download, error=DebianError, remedy=NO_DEBIAN)
+    return sorted((folder / "archives").glob("*.deb"))
+
+
+def unpack_packages(packages: Iterable[Path], folder: Path) -> None:
+    """The files of .deb packages, without installing them. Raises DebianError."""
+    for package in packages:
+        run("dpkg", "--extract", package, folder, error=DebianError, remedy=NO_DEBIAN)
