@@ -114,9 +114,10 @@ def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
 @pi.command("fast")
 @click.argument("output", type=FILE, default="runs/pi-fast.json")
 @click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifacts are deployed.")
+@click.option("--short", is_flag=True, help="Only provision, deploy, meet one fault of a deployment, and drive.")
 @click.option("--faults/--no-faults", default=True, help="Leave out a deployment's faults and the fleet.")
 @click.pass_context
-def pi_fast(ctx: click.Context, output: Path, demo: Path, faults: bool) -> None:
+def pi_fast(ctx: click.Context, output: Path, demo: Path, short: bool, faults: bool) -> None:
     """Run every playbook on an emulated Pi in a container, and prove from within what they promise.
 
     Real systemd and sshd, aarch64 programs, the real firmware on an emulated Arduino. OUTPUT is JSON, what the
@@ -124,7 +125,7 @@ def pi_fast(ctx: click.Context, output: Path, demo: Path, faults: bool) -> None:
     """
     from lab.pi.fast import run_fast
 
-    outcome = run_fast(output, demo, faults=faults, say=click.echo)
+    outcome = run_fast(output, demo, short=short, faults=faults, say=click.echo)
     for gate in outcome.metrics.get("gates", []):
         click.echo(f"{'ok  ' if gate['holds'] else 'FAIL'}  {gate['gate']}: {gate['wanted']}")
     _end_pi(ctx, outcome.wrong, output)

@@ -8,6 +8,7 @@ import contextlib
 import json
 import os
 import shutil
+import sys
 import tempfile
 import threading
 import time
@@ -136,22 +137,29 @@ def changed_artifact(artifact: Path, target: Path, **changes: Any) -> Path:
 class Bench:
     """A rover that is deployed to, and the network to it. before, target: the mode in use, and the one to be deployed.
 
-    artifacts: two that are fit to be deployed, by their mode. packed: what pack() says of them. found: the disk when
-    its power was cut.
+    artifacts: two that are fit to be deployed, by their mode. allow: as rover_allow, what they may differ in.
+    packed: what pack() says of them. found: the disk when its power was cut.
     """
 
     before = target = ""
     found = Disk()
 
-    def __init__(self, pi: Container, artifacts: Mapping[str, Path], folder: Path, stop: threading.Event):
-        self.pi, self.artifacts, self.stop = pi, dict(artifacts), stop
+    def __init__(
+        self,
+        pi: Container,
+        artifacts: Mapping[str, Path],
+        folder: Path,
+        stop: threading.Event,
+        allow: Sequence[str] = (),
+    ):
+        self.pi, self.artifacts, self.stop, self.allow = pi, dict(artifacts), stop, list(allow)
         self.folder = folder / pi.name
         self.folder.mkdir(parents=True)
         self.wire = Wire(pi)
         self.undo = contextlib.ExitStack()
         self.seconds: dict[str, float] = {}
         self.said: list[str] = []
-        self.packed = {mode: pack(path, self.folder / "packed") for mode, path in self.artifacts.items()}
+        self.packed = {mode: pack(path, self.folder / "packed", allow=allow) for mode, path in self.artifacts.items()}
 
     def __enter__(self) -> "Bench":
         self.wire.__enter__()
@@ -207,12 +215,14 @@ class Bench:
             raise EmulationError("told to stop")
         folder = self.folder / (name or "laptop")
         folder.mkdir(exist_ok=True)
-        given = {"rover_packed": str(folder / "packed"), **variables}
+        command = Path(sys.executable).with_name("rover")
+        given = {"rover_packed": str(folder / "packed"), "rover_command": str(command), **variables}
         return plays.run(book, [self.wire, *others], folder=folder, variables=given, timeout_s=PLAY_S)
 
     def deploy(self, artifact: Path | None = None, **more: Any) -> Play:
         """Runs deploy.yml with an artifact, or with the one to be deployed; what it said is noted."""
-        play = self.play("deploy", rover_artifact=str(artifact or self.artifacts[self.target]), **more)
+        artifact = artifact or self.artifacts[self.target]
+        play = self.play("deploy", rover_artifact=str(artifact), rover_allow=self.allow, **more)
         self.said.append(play.output)
         return play
 

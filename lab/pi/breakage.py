@@ -462,6 +462,11 @@ def wrong_rows(rows: Sequence[Mapping[str, Any]], at_least: int) -> list[str]:
     return found
 
 
+def row_of(name: str, bench: Bench) -> dict[str, Any]:
+    """Of one fault, on a rover that has one of the bench's models."""
+    return _row(next(fault for fault in FAULTS if fault.name == name), bench)
+
+
 def _row(fault: Fault, bench: Bench) -> dict[str, Any]:
     started = time.monotonic()
     row: dict[str, Any] = {"fault": fault.name, "how": fault.how}

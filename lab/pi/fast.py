@@ -35,7 +35,9 @@ import os
 import re
 import shlex
 import signal
+import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import distributions
@@ -46,7 +48,8 @@ from lab.arduino.emulator import NICE as ARDUINO_NICE
 from lab.arduino.emulator import Arduino
 from lab.driving.bench import PLAIN, make_artifact, pictures
 from lab.pi import plays
-from lab.pi.breakage import break_deployments, wrong_rows
+from lab.pi.bench import Bench
+from lab.pi.breakage import break_deployments, row_of, wrong_rows
 from lab.pi.container import CAMERA, PORT, Container
 from lab.pi.fleet import fleet
 from lab.pi.outcome import Outcome
@@ -66,16 +69,23 @@ VENV, STATE = "/opt/rover/venv", "/var/lib/rover-drive"
 ARTIFACTS = ("policy_static.pt", "policy_mixed.pt")
 HZ = 10  # of the service: what the emulator manages on a busy machine; a Pi has 30
 NICE = -5  # of the emulated Pi, which has a processor of its own
+ONE_FAULT = "a byte flipped in what has arrived"  # of those in breakage.py the one that CI meets
 READY_S = 600  # torch under emulation on a busy machine
 MOVING_US = 124  # throttle pulses above it move the car; neutral is 120, a step 4
 
 
 def run_fast(
-    output: Path | str, demo: Path | str, *, faults: bool = True, say: Callable[[str], None] = lambda text: None
+    output: Path | str,
+    demo: Path | str,
+    *,
+    short: bool = False,
+    faults: bool = True,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Outcome:
     """All of it; the report is written to `output` whatever fails.
 
-    demo: a run's folder with ARTIFACTS. faults: of deployments, and the fleet, too. say: told a line for each step.
+    demo: a run's folder with ARTIFACTS. short: provision, deploy, one fault of a deployment and an armed drive, which
+    is what CI has time for. faults: of deployments, and the fleet, too. say: told a line for each step.
     Raises RoverError where it cannot begin: no root, packages that cannot be installed, no artifacts.
     """
     output, demo = Path(output), Path(demo)
@@ -94,7 +104,7 @@ def run_fast(
     ):
         run = _Run(outcome, Path(folder), log)
         try:
-            run.all(*artifacts, faults)
+            run.all(artifacts[0], artifacts[1], short=short, faults=faults)
         except RoverError as error:
             outcome.wrong.append(str(error))
         finally:
@@ -110,6 +120,7 @@ class _Run:
             "rover_wheels": str(folder / "wheels"),
             "rover_packed": str(folder / "packed"),
             "rover_fetched": str(folder / "fetched"),
+            "rover_command": str(Path(sys.executable).with_name("rover")),
             "rover_camera": CAMERA,
             "rover_port": PORT,
             "rover_hz": HZ,
@@ -117,7 +128,7 @@ class _Run:
             "rover_record": True,
         }
 
-    def all(self, static: Path, mixed: Path, faults: bool) -> None:
+    def all(self, static: Path, mixed: Path, *, short: bool, faults: bool) -> None:
         gates = self.outcome.gates
         with self.outcome.step("system") as row:
             before = time.monotonic()
@@ -128,6 +139,9 @@ class _Run:
             with self.outcome.step("boot"):
                 pi.boot()
             with _car(pi) as pins:
+                if short:
+                    self.one_fault(pi, static)
+                    return
                 driving_s = self.playbooks(pi, static, mixed)
                 self.metrics["driving_after_s"] = round(driving_s - begun, 1)
                 self.metrics["plays_s"] = round(time.monotonic() - begun, 1)
@@ -170,13 +184,30 @@ class _Run:
         self.outcome.gate("another model deployed", "another content hash", second[:12], first != second != "")
         self.play("rollback", pi)
         self.outcome.gate("rolled back", first[:12], self.current(pi)[:12], self.current(pi) == first)
-        quick = self.folder / "policy_quick.pt"
-        make_artifact(quick, camera="cam_front", size=(72, 128), engine="qnnpack")
-        self.play("deploy", pi, "deploy a quick one", rover_artifact=str(quick), rover_allow=["mode"])
+        self.play("deploy", pi, "deploy a quick one", rover_artifact=str(self.quick()), rover_allow=["mode"])
         self.play("drive", pi, rover_arm=True, rover_seconds=10)
         self.flight(pi)
         self.play("status", pi, "status again")
         return driving_s
+
+    def one_fault(self, pi: Container, static: Path) -> None:
+        """A deployment that fails, leaves the rover as it was and is healed by another; it then drives what came."""
+        self.play("provision", pi)
+        self.play("deploy", pi, rover_artifact=str(static))
+        artifacts = {"static": static, "fp32": self.quick()}
+        with self.outcome.step(ONE_FAULT), Bench(pi, artifacts, self.folder, threading.Event(), ("mode",)) as bench:
+            row = row_of(ONE_FAULT, bench)
+            self.metrics["faults"] = [row]
+        wrong = wrong_rows([row], 1)
+        self.outcome.gate(ONE_FAULT, "the rover healthy, and healed", wrong or "healed", not wrong)
+        self.play("drive", pi, rover_arm=True, rover_seconds=10)
+        self.flight(pi)
+
+    def quick(self) -> Path:
+        """A policy that an emulated Pi can drive by."""
+        path = self.folder / "policy_quick.pt"
+        make_artifact(path, camera="cam_front", size=(72, 128), engine="qnnpack")
+        return path
 
     def play(self, book: str, pi: Container, name: str = "", *, check: bool = False, **variables: Any) -> plays.Play:
         """Runs one, which has to work. Raises EmulationError with the end of what it said if not."""

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from lab.pi import breakage
+from lab.pi import breakage, fast
 from lab.pi.bench import Bench, Disk, Line, line_of
 from lab.pi.breakage import FAULTS, wrong_rows
 from lab.pi.fleet import results_of, wanted_of
@@ -32,6 +32,7 @@ def test_every_fault_has_its_own_name_and_there_are_enough():
         "at once",
     ):
         assert any(part in name for name in names), part
+    assert fast.ONE_FAULT in names
 
 
 def test_how_far_a_deployment_has_come_is_on_the_disk(tmp_path):
