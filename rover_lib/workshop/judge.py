@@ -1,0 +1,31 @@
+"""One unit for every error of a policy: percent of the range that an action has in the recordings.
+
+A recording whose throttle never changes says nothing of how much an error in throttle matters: that action is not
+judged. Its errors are None, it takes no part in a choice or a budget, and a warning says so.
+"""
+
+from collections.abc import Iterable, Mapping
+
+Range = tuple[float, float]  # (least, most) recorded value of an action
+
+
+def pct_of_range(error: float, recorded: Range) -> float | None:
+    """An error, in units of the action, in percent of its recorded range; None for an action that never changes."""
+    low, high = recorded
+    return 100 * error / (high - low) if high > low else None
+
+
+def worst(errors: Mapping[str, float | None] | Iterable[float | None]) -> float | None:
+    """The largest of the errors that are judged, None if none is."""
+    values = errors.values() if isinstance(errors, Mapping) else errors
+    return max((e for e in values if e is not None), default=None)
+
+
+def constant_actions(action_range: Mapping[str, Range]) -> list[str]:
+    """Names of the actions that never change in the recordings."""
+    return [name for name, (low, high) in action_range.items() if not high > low]
+
+
+def not_judged(action_range: Mapping[str, Range]) -> list[str]:
+    """A warning for each action that never changes in the recordings."""
+    return [f"{name} never changes in these recordings: not judged" for name in constant_actions(action_range)]

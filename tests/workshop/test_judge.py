@@ -1,0 +1,20 @@
+"""Errors as shares of the recorded range, and actions that were never moved."""
+
+from rover_lib.workshop.judge import constant_actions, not_judged, pct_of_range, worst
+
+RANGES = {"steering": (-0.5, 0.5), "throttle": (0.06, 0.06)}
+
+
+def test_an_error_is_a_share_of_what_was_recorded():
+    assert pct_of_range(0.01, RANGES["steering"]) == 1.0
+
+
+def test_an_action_that_never_changes_is_not_judged():
+    assert pct_of_range(0.01, RANGES["throttle"]) is None
+    assert constant_actions(RANGES) == ["throttle"]
+    assert not_judged(RANGES) == ["throttle never changes in these recordings: not judged"]
+
+
+def test_what_is_not_judged_is_never_the_worst():
+    assert worst({"steering": 0.3, "throttle": None}) == worst([0.1, None, 0.3]) == 0.3
+    assert worst({"throttle": None}) is None
