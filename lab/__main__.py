@@ -43,8 +43,8 @@ def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> N
 def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, details: bool, as_json: bool) -> None:
     """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
 
-    A count, never a time. Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of params.yml
-    hold. Needs Debian 12 with qemu-user and gcc, which are installed when you are root.
+    A count, never a time. Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of
+    lab/params.yml hold. Needs Debian 12 with qemu-user and gcc, which are installed when you are root.
     """
     from lab.a76.count import count_run, table
     from rover_lib.onboard.stage import read_stage

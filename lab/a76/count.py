@@ -37,6 +37,7 @@ import numpy as np
 import torch
 
 from lab.debian import fetch_packages, install_packages, missing_packages, unpack_packages
+from lab.params import lab_params
 from rover_lib.onboard.artifact import content_hash, read_manifest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
@@ -624,7 +625,7 @@ def count_run(
     if STATIC in artifacts:
         few = thinned(samples, BIT_FRAMES)
         metrics["backbone_bits"] = backbone_bits(run_dir, machine, again.checkpoint, few)
-    metrics["gates"] = gates(metrics, params()["arm"]["gates"])
+    metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
     how = {"frames": len(samples), "steady": STEADY, "cpu": "cortex-a76", "threads": 1}
     how["qemu"] = _call(["qemu-aarch64", "--version"], "the emulator does not run").splitlines()[0]
     inputs = {p.name: sha256_of(p) for p in artifacts.values()}
@@ -800,7 +801,8 @@ def predicted_ms(simd_g: float, instructions_g: float) -> tuple[float, float]:
 
 
 def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any]]:
-    """What static artifacts must reach, as `compare.gate` rows. metrics: of arm.json; limits: params.yml's arm.gates.
+    """What static artifacts must reach, as `compare.gate` rows. metrics: of arm.json; limits: arm.gates of
+    lab/params.yml.
 
     A gate that this run has no artifact for is left out: the instructions are for the user's policy, known by its
     multiply-accumulates. Errors are held against this machine's: as many times, the worse of the actions.
@@ -873,7 +875,7 @@ def table(content: dict[str, Any]) -> str:
     if note := metrics.get("note"):
         lines += ["", f"note: {note}"]
     if metrics.get("gates"):
-        lines += ["", "gates (params.yml)"]
+        lines += ["", "gates (lab/params.yml)"]
         for row in metrics["gates"]:
             verdict = {True: "pass", False: "FAIL", None: "not measured"}[row["passed"]]
             shown = "-" if row["found"] is None else f"{row['found']:.4g}"

@@ -33,6 +33,7 @@ from lab.arduino.emulator import CC, NICE, Arduino, call
 from lab.driving.pins import Command
 from rover_lib.onboard.artifact import SCHEMA, save_artifact
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.pwm import STOPPED_THROTTLE_US
 from rover_lib.onboard.servo_link import frame
 from rover_lib.onboard.telemetry import LogError, read_log
 from rover_lib.onboard.watch import SWITCH_S, schedule
@@ -533,7 +534,7 @@ class Bench:
             if moving_s is None and self.cable.commands:
                 first_s = self.cable.commands[0].at_s
                 pulses = (e for e in self.events[-2000:] if e.pin == "throttle" and e.monotonic_s > first_s)
-                moving_s = next((e.end_s for e in pulses if e.pulse_us > 124), None)
+                moving_s = next((e.end_s for e in pulses if e.pulse_us > STOPPED_THROTTLE_US), None)
             if not self.drive.running or time.monotonic() - begin > START_S:
                 said = " | ".join(self.drive.stderr()[-3:])
                 raise FaultError(f"rover drive did not start within {START_S:g} s (it said: {said}); drive it by hand")

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from lab.params import lab_params
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pwm import ARDUINO_STEP_US
+from rover_lib.onboard.pwm import ARDUINO_STEP_US, STOPPED_THROTTLE_US
 from rover_lib.world.standin import REST_US, PinEvent
 
 STOPPED, HUMAN, CONTINUES = "stopped", "human", "continues"
@@ -25,19 +26,19 @@ LAST_S = 0.2  # so much of the end must have pulses
 
 @dataclass(frozen=True)
 class Gates:
-    """Of params.yml's section `faults`."""
+    """Of lab/params.yml's section `faults`."""
 
     stopped_ms: float
-    throttle_max_us: float
     takeover_ms: float
     rows: int
     stopped_rows: int
     bytes_us: float
+    throttle_max_us: float = STOPPED_THROTTLE_US
 
     @classmethod
     def of_params(cls) -> "Gates":
-        """Those of params.yml."""
-        return cls(**params()["faults"])
+        """Those of lab/params.yml."""
+        return cls(**lab_params()["faults"])
 
     @property
     def stopped_s(self) -> float:

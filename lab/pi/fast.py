@@ -25,7 +25,7 @@ runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
     drive          {ticks, driven, ended} of the fetched flight log; recorded: {episodes, left, frames, commands}
     faults         [{fault, model_after, healthy, healed_by_rerun, ...}], see breakage.py
     fleet          {cases: [{broken, results, models, healthy, ...}], good}, see fleet.py
-    gates          [{gate, wanted, found, holds}], the limits from params.yml
+    gates          [{gate, wanted, found, holds}], the limits from lab/params.yml
 What is not as it should be is a sentence in `wrong`. Beside it, pi-fast.log has all that the playbooks said.
 """
 
@@ -56,6 +56,7 @@ from lab.pi.outcome import Outcome
 from lab.pi.pulses import Pins
 from lab.pi.system import EmulationError, emulation, interruptible, require, require_arduino, system
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.pwm import STOPPED_THROTTLE_US
 from rover_lib.onboard.recording import read_controls
 from rover_lib.onboard.service import UNIT
 from rover_lib.onboard.stage import sha256_of
@@ -71,7 +72,6 @@ HZ = 10  # of the service: what the emulator manages on a busy machine; a Pi has
 NICE = -5  # of the emulated Pi, which has a processor of its own
 ONE_FAULT = "a byte flipped in what has arrived"  # of those in breakage.py the one that CI meets
 READY_S = 600  # torch under emulation on a busy machine
-MOVING_US = 124  # throttle pulses above it move the car; neutral is 120, a step 4
 
 
 def run_fast(
@@ -334,7 +334,7 @@ def _car(pi: Container) -> Iterator[Pins]:
 
 def moving(pins: Pins, since_s: float) -> list[float]:
     """When (monotonic seconds) pulses that move the car began, or became others."""
-    return [e.monotonic_s for e in pins.since(since_s) if e.pin == "throttle" and e.pulse_us > MOVING_US]
+    return [e.monotonic_s for e in pins.since(since_s) if e.pin == "throttle" and e.pulse_us > STOPPED_THROTTLE_US]
 
 
 # What is proven, each on a Pi that is provisioned and has a model
@@ -557,9 +557,9 @@ def hang(pi: Container, pins: Pins) -> dict[str, Any]:
 def stopped_s(pins: Pins, since_s: float) -> float:
     """When the throttle's pulses became neutral for good, monotonic seconds; infinite if they did not."""
     throttle = [e for e in pins.since(0) if e.pin == "throttle" and e.kind == "pulse"]
-    if not throttle or throttle[-1].pulse_us > MOVING_US:
+    if not throttle or throttle[-1].pulse_us > STOPPED_THROTTLE_US:
         return float("inf")
-    last = max((i for i, e in enumerate(throttle) if e.pulse_us > MOVING_US), default=-1)
+    last = max((i for i, e in enumerate(throttle) if e.pulse_us > STOPPED_THROTTLE_US), default=-1)
     return max(since_s, throttle[last + 1].monotonic_s)
 
 

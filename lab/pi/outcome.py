@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.params import params
+from lab.params import lab_params
 from rover_lib.onboard.stage import write_stage
 
 
 @dataclass
 class Outcome:
-    """stage: pi-fast or pi, whose gates are in params.yml (with _). inputs: hashes of what was deployed.
+    """stage: pi-fast or pi, whose gates are in lab/params.yml (with _). inputs: hashes of what was deployed.
 
     say: told of each step. wrong: a sentence for all that is not as it should be; nothing, if all is. The report is
     written after each step, so that a run which somebody ends leaves what it found.
@@ -25,10 +25,10 @@ class Outcome:
     inputs: dict[str, str] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)
     wrong: list[str] = field(default_factory=list)
-    gates: dict[str, Any] = field(init=False)  # of params.yml as it was at the beginning
+    gates: dict[str, Any] = field(init=False)  # of lab/params.yml as it was at the beginning
 
     def __post_init__(self) -> None:
-        self.gates = params()[self.stage.replace("-", "_")]
+        self.gates = lab_params()[self.stage.replace("-", "_")]
 
     @property
     def steps(self) -> list[dict[str, Any]]:

@@ -29,6 +29,7 @@ from lab.pi.system import interruptible, require_arduino
 from lab.pi.usb_camera import UsbCamera
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.pwm import STOPPED_THROTTLE_US
 from rover_lib.onboard.service import UNIT
 from rover_lib.onboard.telemetry import Flight, read_log
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
@@ -245,7 +246,7 @@ class _Run:
             at_s = time.monotonic()
             pull()
             time.sleep(WATCH_S * self.slow)
-            row = {"fault": name, **stopped(self.pins.since(moving), at_s, self.slow, self.gates["throttle_max_us"])}
+            row = {"fault": name, **stopped(self.pins.since(moving), at_s, self.slow, STOPPED_THROTTLE_US)}
             row |= {"service": self.service(), "says": self.journal()}
             put_back()
             self.sudo(f"systemctl stop {UNIT}")
@@ -264,7 +265,7 @@ class _Run:
 
     def moving(self, since_s: float) -> float | None:
         """When the throttle rose above neutral."""
-        limit = self.gates["throttle_max_us"]
+        limit = STOPPED_THROTTLE_US
         return next(
             (e.monotonic_s for e in self.pins.since(since_s) if e.pin == "throttle" and e.pulse_us > limit), None
         )

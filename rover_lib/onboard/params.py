@@ -1,4 +1,4 @@
-"""params.yml: every gate and default that notebooks, tests, playbooks and the car share."""
+"""Parameters: the rover's own defaults, and over them what a user has set on this machine."""
 
 from pathlib import Path
 from typing import Any
@@ -7,25 +7,48 @@ import yaml
 
 from rover_lib.onboard.errors import ParamsError
 
-PLACES = (
+DEFAULTS = Path(__file__).with_name("params.yml")  # all that a rover reads
+PLACES = (  # of the user's params.yml; the first that exists counts
     Path(__file__).parents[2] / "params.yml",  # a checkout's
     Path("/etc/rover/params.yml"),  # an installed rover's
     Path(__file__).parents[1] / "params.yml",  # an installed workstation's
 )
 
 
-def params(path: Path | str | None = None) -> dict[str, Any]:
-    """The content of params.yml, of the first of PLACES if no path is given.
+def params() -> dict[str, Any]:
+    """The rover's defaults, the user's values in their place where there are some, and the user's other sections.
 
-    Raises ParamsError if it is missing or not YAML.
+    Raises ParamsError for a file that is no YAML mapping.
     """
-    path = path or next((p for p in PLACES if p.is_file()), PLACES[0])
+    found = read_params(DEFAULTS)
+    for place in PLACES:
+        if place.is_file():
+            _set(found, read_params(place), str(place))
+            break
+    return found
+
+
+def read_params(path: Path | str) -> dict[str, Any]:
+    """The content of one file alone. Raises ParamsError if it is missing, or no YAML mapping."""
     try:
         content = yaml.safe_load(Path(path).read_text())
     except FileNotFoundError:
-        raise ParamsError(f"{path}: not found; run from a checkout of the project (pip install -e .)") from None
+        raise ParamsError(f"{path}: not found", remedy="it came with this package: install that again") from None
     except yaml.YAMLError as e:
         raise ParamsError(f"{path}: not readable as YAML ({' '.join(str(e).split())})") from None
+    if content is None:  # nothing but comments
+        return {}
     if not isinstance(content, dict):
-        raise ParamsError(f"{path}: expected a mapping, found {type(content).__name__}")
+        raise ParamsError(f"{path}: expected a mapping", found=type(content).__name__)
     return content
+
+
+def _set(values: dict[str, Any], changes: dict[str, Any], where: str) -> None:
+    """Put `changes` in `values`, key by key, as deep as both are mappings. where: what an error names."""
+    for key, change in changes.items():
+        if not isinstance(values.get(key), dict):
+            values[key] = change
+        elif isinstance(change, dict):
+            _set(values[key], change, f"{where}: {key}")
+        else:
+            raise ParamsError(f"{where}: {key} must be a mapping", found=change)

@@ -31,14 +31,13 @@ import cv2
 import numpy as np
 
 from rover_lib.onboard.errors import WorldError
-from rover_lib.onboard.pwm import NEUTRAL, PwmCalibration
+from rover_lib.onboard.pwm import NEUTRAL, STOPPED_THROTTLE_US, PwmCalibration
 from rover_lib.world.record import JPEG_QUALITY
 from rover_lib.world.standin import PinEvent
 from rover_lib.world.trial import Trajectory, wilson_interval
 from rover_lib.world.world import FRAME_HEIGHT, FRAME_WIDTH, World
 
 HOLD_S = 1.0
-MOVES_ABOVE_US = 124  # a throttle pulse above it asks for motion
 STEPS_PER_S = 100  # of the physics, at least
 KEEP_DRIVES = 8
 KEEP_OUTCOMES = 1000
@@ -403,7 +402,7 @@ class _Pins:
             else:
                 # By the nominal period: the first pulse after a reset has none, and the servo measures the pulse.
                 self._action[event.pin] = self._calibration.channel(event.pin).action(event.pulse_us) or 0.0
-                self.asked_for_motion |= event.pin == "throttle" and event.pulse_us > MOVES_ABOVE_US
+                self.asked_for_motion |= event.pin == "throttle" and event.pulse_us > STOPPED_THROTTLE_US
         return self._action["steering"], self._action["throttle"]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lab.a76 import count as arm
-from rover_lib.onboard.params import params
+from lab.params import lab_params
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import run as runs
 from rover_lib.workshop import session
@@ -124,7 +124,7 @@ def test_counts_are_drawn(tmp_path):
     peer = {key: value for key, value in counted(1.1).items() if key != "sdot_by_kernel"}
     metrics = {"label": arm.LABEL, "artifacts": artifacts, "peers": {"another runtime": peer}, "note": "cannot drive"}
     metrics["backbone_bits"] = {"frames": 4, "values": 123456, "differing": 0}
-    metrics["gates"] = arm.gates(metrics, params()["arm"]["gates"])
+    metrics["gates"] = arm.gates(metrics, lab_params()["arm"]["gates"])
     write_stage(tmp_path / "arm.json", "arm", params={}, metrics=metrics)
     text = shown(runs.execute("06_arm", tmp_path))
     assert arm.LABEL in text and "cannot drive" in text and "0 of 123,456 INT8 values" in text

@@ -15,7 +15,6 @@ from policies import memory_samples
 
 from lab.a76 import count as arm
 from lab.a76.count import ArmError, Machine, count_artifact, count_run, emulate, prepare
-from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT
@@ -23,6 +22,8 @@ from rover_lib.workshop.checkpoint import load_checkpoint
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
 
+# Of the tiny policy, in 1e6 instructions on an emulated Cortex-A76; a count may leave it by 2 %.
+BUDGETS_M = {"policy_fp32": 195.7, "policy_static": 35.2}
 SVC = 0xD4000001
 START, ROUNDS, SECTION = 0x400000, 1000, 7
 
@@ -274,11 +275,9 @@ def test_a_loaded_policy_is_warm(report):
 
 
 def test_counts_stay_within_their_budget(report):
-    budgets = params()["arm"]["budget_m"]
-    assert budgets
-    for stem, budget_m in budgets.items():
+    for stem, budget_m in BUDGETS_M.items():
         found_m = report["metrics"]["artifacts"][stem]["instructions_g"] * 1e3
-        assert found_m == pytest.approx(budget_m, rel=0.02), f"{stem}: set params.yml's arm.budget_m if it is meant"
+        assert found_m == pytest.approx(budget_m, rel=0.02), f"{stem}: set BUDGETS_M if it is meant"
 
 
 def test_what_the_guest_refuses_is_said_in_its_words(machine, tiny_run, tmp_path):

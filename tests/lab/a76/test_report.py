@@ -7,8 +7,8 @@ import pytest
 from click.testing import CliRunner
 
 from lab.a76 import count as arm
+from lab.params import lab_params
 from rover_lib.cli import main
-from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop import run as runs
 
@@ -92,7 +92,7 @@ def artifact(**changed):
 
 def gates(bits=0, **artifacts):
     metrics = {"artifacts": artifacts, "backbone_bits": {"frames": 4, "values": 100, "differing": bits}}
-    return {row["gate"]: row["passed"] for row in arm.gates(metrics, params()["arm"]["gates"])}
+    return {row["gate"]: row["passed"] for row in arm.gates(metrics, lab_params()["arm"]["gates"])}
 
 
 def test_gates_of_the_cars_policy_hold():
@@ -129,7 +129,9 @@ def test_gates_without_an_artifact_are_left_out():
     only_counted = artifact(gmac=9.0, tenth_g=None, reference=None)
     found = gates(policy_static=artifact(gmac=0.4), policy_static_240x432=only_counted)
     assert not [name for name in found if "instructions" in name or "240x432" in name]
-    small = artifact(gmac=params()["arm"]["gates"]["policies"]["policy_static_180x320"]["gmac"], instructions_g=0.45)
+    small = artifact(
+        gmac=lab_params()["arm"]["gates"]["policies"]["policy_static_180x320"]["gmac"], instructions_g=0.45
+    )
     assert gates(policy_static_180x320=small)["policy_static_180x320 instructions_g"] is False
 
 
@@ -148,7 +150,7 @@ def test_the_command_counts_then_draws_then_says_what_it_found(tmp_path, monkeyp
         called.append(("count", options["frames"]))
         found = artifact(x_floor=1.5, first_g=1.4, load_instructions_g=9.0, instructions_g=1.47, tenth_g=1.47)
         metrics = {"artifacts": {"policy_static": found}, "note": "this policy does not drive"}
-        metrics["gates"] = arm.gates(metrics, params()["arm"]["gates"])
+        metrics["gates"] = arm.gates(metrics, lab_params()["arm"]["gates"])
         write_stage(path, "arm", params={}, metrics=metrics)
 
     def count_peers(run_dir, jobs, progress):

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from lab.params import lab_params
 from lab.pi import breakage, fast
 from lab.pi.bench import Bench, Disk, Line, line_of
 from lab.pi.breakage import FAULTS, wrong_rows
 from lab.pi.fleet import results_of, wanted_of
 from lab.pi.system import EmulationError
-from rover_lib.onboard.params import params
 
 ABOUT = {"name": "a" * 64, "sha256": "b" * 64, "bytes": 100, "parts": 2}
 GOOD = {"healthy": True, "status_true": True, "healed_by_rerun": True}
@@ -19,7 +19,7 @@ GOOD = {"healthy": True, "status_true": True, "healed_by_rerun": True}
 
 def test_every_fault_has_its_own_name_and_there_are_enough():
     names = [fault.name for fault in FAULTS]
-    assert len(set(names)) == len(names) >= params()["pi_fast"]["rows"]
+    assert len(set(names)) == len(names) >= lab_params()["pi_fast"]["rows"]
     for part in (
         "power cut",
         "disk",

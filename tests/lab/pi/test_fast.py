@@ -5,11 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from lab.params import lab_params
 from lab.pi import container, fast, plays, system
 from lab.pi.fast import environment, hashed, moving, run_fast, stopped_s, unit_for
 from lab.pi.outcome import Outcome
 from lab.pi.system import EmulationError
-from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.world.standin import PinEvent
 
@@ -173,7 +173,7 @@ def test_a_promise_that_is_broken_is_said_and_written(tmp_path):
     content = read_stage(tmp_path / "pi-fast.json", "pi-fast")
     assert content["metrics"]["wrong"] == ["start limit: wanted 5 tries, found {'tries': 7}"]
     assert [g["holds"] for g in content["metrics"]["gates"]] == [True, False]
-    assert content["params"] == params()["pi_fast"] and content["inputs"] == {"a.pt": "00"}
+    assert content["params"] == lab_params()["pi_fast"] and content["inputs"] == {"a.pt": "00"}
 
 
 def test_a_step_that_fails_is_in_the_report_at_once(tmp_path):

@@ -1,0 +1,34 @@
+"""Parameters: the rover's defaults, and what a user has set in their place."""
+
+import pytest
+
+from lab.params import lab_params
+from rover_lib.onboard import params as p
+from rover_lib.onboard.errors import ParamsError
+
+
+def test_a_users_values_stand_over_the_defaults(tmp_path, monkeypatch):
+    defaults = p.read_params(p.DEFAULTS)
+    (tmp_path / "params.yml").write_text("drive: {fade_s: 0.3}\ngates: {hits_lost: 1}\n")
+    monkeypatch.setattr(p, "PLACES", (tmp_path / "none.yml", tmp_path / "params.yml"))
+    found = p.params()
+    assert found["drive"] == {**defaults["drive"], "fade_s": 0.3}
+    assert found["gates"] == {**defaults["gates"], "hits_lost": 1} and found["flight_log"] == defaults["flight_log"]
+    monkeypatch.setattr(p, "PLACES", ())
+    assert p.params() == defaults
+
+
+@pytest.mark.parametrize(
+    ("text", "says"), [("drive: 5", "drive must be a mapping, found 5"), ("- 1", "mapping, found list"), ("{", "YAML")]
+)
+def test_what_is_no_params_file(tmp_path, monkeypatch, text, says):
+    (tmp_path / "params.yml").write_text(text)
+    monkeypatch.setattr(p, "PLACES", (tmp_path / "params.yml",))
+    with pytest.raises(ParamsError, match=says):
+        p.params()
+
+
+def test_each_parameter_stands_in_one_file():
+    user, rover, lab = (p.read_params(p.PLACES[0]), p.read_params(p.DEFAULTS), lab_params())
+    assert set(user) & set(rover) == {"gates"} and not set(user["gates"]) & set(rover["gates"])
+    assert not set(lab) & (set(user) | set(rover))
