@@ -1,14 +1,12 @@
 """All that a Pi installs, in one folder, so that a rover without internet can be set up from a laptop.
 
-rover_policy-0.1.0+<hash of its sources>-py3-none-any.whl     rover_lib/onboard and the command line, nothing else
+rover_policy-0.1.0+<hash of its files>-py3-none-any.whl       rover_lib/onboard, nothing else
 torch-2.8.0-cp313-...aarch64.whl, ...                          as requirements_pi.txt pins and hashes them
 """
 
-import hashlib
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
@@ -16,22 +14,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.wheel_version import ONBOARD, wheel_version
+from rover_lib.workshop.program import run
 
-REPOSITORY = Path(__file__).parents[2]
-REQUIREMENTS = "requirements_pi.txt"
+REQUIREMENTS = Path(__file__).parents[2] / "requirements_pi.txt"
 PYTHONS = ("3.11", "3.13")  # of Debian 12 and 13, and of Raspberry Pi OS, which follows them
 # The newest glibc that a wheel may ask for is Debian 12's 2.36; pip takes a list, not "at most".
 PLATFORMS = [f"manylinux_2_{minor}_aarch64" for minor in range(17, 37)] + ["manylinux2014_aarch64"]
-PARTS = ("__init__.py", "cli.py", "onboard/*.py")
 
 
 class WheelhouseError(RoverError):
-    """Wheels that are not to be had."""
+    """Wheels that cannot be made or fetched."""
 
 
 @dataclass(frozen=True)
 class Wheelhouse:
-    """wheel: rover_lib's own. version: its, with the hash of its sources. changed: something new is in the folder."""
+    """wheel: the rover's own. version: its, with the hash of its files. changed: something new is in the folder."""
 
     wheel: Path
     version: str
@@ -39,73 +37,47 @@ class Wheelhouse:
 
 
 def make(folder: Path | str, *, pythons: Iterable[str] = PYTHONS, only_rover: bool = False) -> Wheelhouse:
-    """Fill a folder with the Pi's wheels, and rover_lib's own; what is there already is not fetched again.
+    """Fill a folder with the rover's own wheel and those that it needs; what is there already is not fetched again.
 
     pythons: the Pis'. only_rover: no others, for Pis with internet. Raises WheelhouseError.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     before = {p.name for p in folder.glob("*.whl")}
-    wheel, version = _own(folder)
+    wheel, version = _build(folder)
     if not only_rover:
-        _others(folder, tuple(pythons))
+        for python in pythons:
+            _fetch(folder, python)
     return Wheelhouse(wheel, version, {p.name for p in folder.glob("*.whl")} != before)
 
 
-def sources() -> list[Path]:
-    """The files of rover_lib that a Pi gets."""
-    return sorted(p for part in PARTS for p in (REPOSITORY / "rover_lib").glob(part))
-
-
-def own_version() -> str:
-    """rover_lib's version with the hash of what a Pi gets of it: another content is another version to pip."""
-    digest = hashlib.sha256()
-    for path in [REPOSITORY / "pyproject.toml", *sources()]:
-        digest.update(f"{path.relative_to(REPOSITORY)}\0".encode() + path.read_bytes() + b"\0")
-    found = re.search(r'^version = "(.+)"$', (REPOSITORY / "pyproject.toml").read_text(), re.MULTILINE)
-    return f"{found[1]}+{digest.hexdigest()[:12]}"
-
-
-def _own(folder: Path) -> tuple[Path, str]:
-    version = own_version()
+def _build(folder: Path) -> tuple[Path, str]:
+    """The rover's own wheel in `folder`, and its version; older ones are removed."""
+    version = wheel_version()
     wheel = folder / f"rover_policy-{version}-py3-none-any.whl"
     if wheel.exists():
         return wheel, version
-    with tempfile.TemporaryDirectory() as name:
-        tree = Path(name, "tree")
-        for path in [*sources(), REPOSITORY / "README.md", REPOSITORY / "LICENSE"]:
-            target = tree / path.relative_to(REPOSITORY)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(path, target)
-        project = (REPOSITORY / "pyproject.toml").read_text()
-        (tree / "pyproject.toml").write_text(
-            re.sub(r'^version = ".+"$', f'version = "{version}"', project, count=1, flags=re.MULTILINE)
-        )
-        built = Path(name, "built")
-        # The same sources make the same bytes: no dates in the zip.
-        _pip(["wheel", "--no-deps", "--wheel-dir", built, tree], "rover_lib's wheel", SOURCE_DATE_EPOCH="315532800")
+    with tempfile.TemporaryDirectory() as built:
+        # The same files make the same bytes: the zip has this date, whatever the user's environment says.
+        environment = {**os.environ, "SOURCE_DATE_EPOCH": "315532800"}
+        command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", built]
+        run(*command, cwd=ONBOARD, env=environment, error=WheelhouseError, remedy="is this a checkout of the project?")
         for old in folder.glob("rover_policy-*.whl"):
             old.unlink()
-        shutil.move(next(built.glob("*.whl")), wheel)
+        shutil.move(Path(built, wheel.name), wheel)
     return wheel, version
 
 
-def _others(folder: Path, pythons: tuple[str, ...]) -> None:
-    lines = (REPOSITORY / REQUIREMENTS).read_text().splitlines()
+def _fetch(folder: Path, python: str) -> None:
+    """The other wheels, for one Python."""
+    lines = REQUIREMENTS.read_text().splitlines()
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as f:
         # Without conditions: pip would judge them by this machine's Python, not by the Pi's.
         f.write("\n".join(re.sub(r"\s;[^\\]*", " ", line) for line in lines) + "\n")
         f.flush()
-        for python in pythons:
-            platforms = [o for p in PLATFORMS for o in ("--platform", p)]
-            where = ["--dest", folder, "--python-version", python, "--implementation", "cp", *platforms]
-            what = ["--require-hashes", "--no-deps", "--only-binary", ":all:", "--requirement", f.name]
-            _pip(["download", *where, *what], f"the wheels of {REQUIREMENTS} for Python {python}")
-
-
-def _pip(arguments: list[object], what: str, **environment: str) -> None:
-    command = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", *map(str, arguments)]
-    found = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment})
-    if found.returncode:
-        last = (found.stderr.strip() or found.stdout.strip() or "it says nothing").splitlines()[-1]
-        raise WheelhouseError(f"pip cannot make or fetch {what}: {last}; is there internet here?")
+        pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "download", "--dest", folder]
+        platforms = [o for p in PLATFORMS for o in ("--platform", p)]
+        target = ["--python-version", python, "--implementation", "cp", *platforms]
+        what = ["--require-hashes", "--no-deps", "--only-binary", ":all:", "--requirement", f.name]
+        remedy = f"is there internet here? pip fetches the wheels of {REQUIREMENTS.name} for Python {python}"
+        run(*pip, *target, *what, error=WheelhouseError, remedy=remedy)

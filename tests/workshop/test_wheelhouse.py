@@ -1,12 +1,17 @@
-"""The Pi's wheels: rover_lib's own with what drives and nothing else, the others as they are pinned."""
+"""The Pi's wheels: the rover's own with what drives and nothing else, the others as they are pinned."""
 
 import re
+import shutil
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 
+from rover_lib.onboard import wheel_version as v
 from rover_lib.workshop import wheelhouse as w
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -16,35 +21,58 @@ def own(tmp_path_factory) -> w.Wheelhouse:
 
 def test_the_own_wheel_has_what_drives_and_nothing_else(own):
     names = zipfile.ZipFile(own.wheel).namelist()
-    code = {n for n in names if not n.startswith("rover_policy-")}
-    assert {"rover_lib/cli.py", "rover_lib/__init__.py", "rover_lib/onboard/drive.py"} <= code
-    assert all(re.fullmatch(r"rover_lib/(__init__|cli|onboard/\w+)\.py", n) for n in code), code
+    files = {n for n in names if not n.startswith("rover_policy-")}
+    assert {"rover_lib/__init__.py", "rover_lib/onboard/cli.py", "rover_lib/onboard/params.yml"} <= files
+    assert all(re.fullmatch(r"rover_lib/(__init__\.py|LICENSE|onboard/\w+\.(py|yml|toml))", n) for n in files), files
     scripts = next(n for n in names if n.endswith("entry_points.txt"))
-    assert "rover = rover_lib.cli:main" in zipfile.ZipFile(own.wheel).read(scripts).decode()
+    assert "rover = rover_lib.onboard.cli:main" in zipfile.ZipFile(own.wheel).read(scripts).decode()
 
 
-def test_a_second_time_changes_nothing_and_other_sources_are_another_version(own, monkeypatch, tmp_path):
+def test_a_second_time_changes_nothing_and_the_same_files_make_the_same_bytes(own, tmp_path):
     assert own.changed
-    again = w.make(own.wheel.parent, only_rover=True)
-    assert again == w.Wheelhouse(own.wheel, own.version, False)
-    changed = tmp_path / "rover_lib" / "cli.py"
-    changed.parent.mkdir()
-    changed.write_text("x = 1\n")
-    monkeypatch.setattr(w, "sources", lambda: [changed])
-    (tmp_path / "pyproject.toml").write_text((w.REPOSITORY / "pyproject.toml").read_text())
-    monkeypatch.setattr(w, "REPOSITORY", tmp_path)
-    assert w.own_version() != own.version and re.fullmatch(r"\d+\.\d+\.\d+\+[0-9a-f]{12}", w.own_version())
+    assert w.make(own.wheel.parent, only_rover=True) == w.Wheelhouse(own.wheel, own.version, False)
+    (tmp_path / "rover_policy-0.0.1-py3-none-any.whl").touch()
+    again = w.make(tmp_path, only_rover=True)
+    assert again.changed and [p.name for p in tmp_path.iterdir()] == [own.wheel.name]
+    assert again.wheel.read_bytes() == own.wheel.read_bytes()
 
 
+def test_another_content_is_another_version(own, monkeypatch, tmp_path):
+    shutil.copytree(v.ONBOARD, tmp_path / "onboard", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(v.PACKAGE, tmp_path)
+    monkeypatch.setattr(v, "ONBOARD", tmp_path / "onboard")
+    monkeypatch.setattr(v, "PACKAGE", tmp_path / "__init__.py")
+    assert v.wheel_version() == own.version and re.fullmatch(r"\d+\.\d+\.\d+\+[0-9a-f]{12}", own.version)
+    for name in ("__init__.py", "onboard/drive.py", "onboard/params.yml", "onboard/pyproject.toml"):
+        before = v.wheel_version()
+        with (tmp_path / name).open("a") as f:
+            f.write("# another\n")
+        assert v.wheel_version() != before, name
+
+
+def test_the_rover_needs_the_same_on_both_sides():
+    def dependencies(path: Path) -> list[str]:
+        return tomllib.loads(path.read_text())["project"]["dependencies"]
+
+    rovers = dependencies(v.ONBOARD / "pyproject.toml")
+    assert dependencies(ROOT / "pyproject.toml") == rovers
+    pinned = set(re.findall(r"^([\w-]+)==", w.REQUIREMENTS.read_text(), re.MULTILINE))
+    assert {re.split(r"[=<>]", line)[0] for line in rovers} <= pinned
+
+
+@pytest.fixture
+def no_build(monkeypatch):
+    monkeypatch.setattr(w, "_build", lambda folder: (folder / "own.whl", "1"))
+
+
+@pytest.mark.usefixtures("no_build")
 def test_the_others_come_by_hash_for_each_python_and_aarch64(tmp_path, monkeypatch):
     asked = []
 
-    def pip(arguments, what, **environment):
-        listed = Path(str(arguments[-1])).read_text() if "download" in arguments else ""
-        asked.append((list(map(str, arguments)), listed))
+    def run(*command, **options):
+        asked.append((list(map(str, command)), Path(str(command[-1])).read_text()))
 
-    monkeypatch.setattr(w, "_own", lambda folder: (folder / "own.whl", "1"))
-    monkeypatch.setattr(w, "_pip", pip)
+    monkeypatch.setattr(w, "run", run)
     w.make(tmp_path, pythons=("3.11", "3.13"))
     assert [a[a.index("--python-version") + 1] for a, _ in asked] == ["3.11", "3.13"]
     for arguments, listed in asked:
@@ -52,17 +80,15 @@ def test_the_others_come_by_hash_for_each_python_and_aarch64(tmp_path, monkeypat
             arguments
         )
         assert "python_full_version" not in listed and "setuptools==" in listed and "torch==2.8.0" in listed
-        pinned = (w.REPOSITORY / w.REQUIREMENTS).read_text()
-        assert listed.count("--hash=sha256:") == pinned.count("--hash=sha256:")
+        assert listed.count("--hash=sha256:") == w.REQUIREMENTS.read_text().count("--hash=sha256:")
 
 
+@pytest.mark.usefixtures("no_build")
 def test_no_internet_ends_in_a_sentence(tmp_path, monkeypatch):
     monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/")
     monkeypatch.setenv("PIP_RETRIES", "0")
-    monkeypatch.setattr(w, "_own", lambda folder: (folder / "own.whl", "1"))
-    monkeypatch.setattr(w, "REQUIREMENTS", "requirements_pi.txt")
     for name in ("PIP_EXTRA_INDEX_URL", "PIP_FIND_LINKS"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("PIP_CONFIG_FILE", "/dev/null")
-    with pytest.raises(w.WheelhouseError, match=r"pip cannot make or fetch the wheels of .* is there internet here\?"):
+    with pytest.raises(w.WheelhouseError, match=r"is there internet here\? pip fetches the wheels of requirements_pi"):
         w.make(tmp_path, pythons=("3.13",))
