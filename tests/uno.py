@@ -34,7 +34,7 @@ def compiled(name: str, *arguments: object) -> Path:
     """What gcc makes of `arguments`, with warnings as errors."""
     path = _folder() / name
     if not path.exists():
-        arduino.call(*arduino.CC, "-I", REPOSITORY / "firmware/rover", "-o", path, *arguments)
+        arduino.compile_c(*arduino.CC, "-I", REPOSITORY / "firmware/rover", "-o", path, *arguments)
     return path
 
 

@@ -1,44 +1,45 @@
 """The rover's Arduino without a board: the real firmware in simavr.
 
-It is a serial port that a ServoLink opens, and says what its servo pins do, as PinEvents.
+It is a serial port that a ServoLink opens, and tells what its servo pins do, as PinEvents.
 """
 
 import contextlib
-import fcntl
 import functools
 import os
 import re
 import secrets
-import shutil
-import subprocess
 import tempfile
 import threading
 import time
 from pathlib import Path
 from typing import NamedTuple
 
+from lab import debian
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.program import run
+from rover_lib.world.child import Child
 from rover_lib.world.standin import BOOT_S, REST_US, PinEvent
 
 REPOSITORY = Path(__file__).parents[2]
 FIRMWARE = REPOSITORY / "firmware"
 EMULATOR = Path(__file__).with_name("arduino.c")
-PACKAGES = {  # Debian's, and what shows that each is there
-    "gcc": lambda: shutil.which("gcc"),
-    "make": lambda: shutil.which("make"),
-    "gcc-avr": lambda: shutil.which("avr-gcc"),
-    "binutils-avr": lambda: shutil.which("avr-ar"),
-    "avr-libc": lambda: Path("/usr/lib/avr/include/avr/io.h").exists(),
-    "arduino-core-avr": lambda: Path("/usr/share/arduino/hardware/arduino/avr/cores/arduino").exists(),
-    "libsimavr-dev": lambda: Path("/usr/include/simavr/sim_avr.h").exists(),
-    "libelf-dev": lambda: Path("/usr/include/libelf.h").exists(),
+NEEDS = {  # commands and files, and the Debian packages that have them
+    "gcc": "gcc",
+    "make": "make",
+    "avr-gcc": "gcc-avr",
+    "avr-ar": "binutils-avr",
+    "/usr/lib/avr/include/avr/io.h": "avr-libc",
+    "/usr/share/arduino/hardware/arduino/avr/cores/arduino": "arduino-core-avr",
+    "/usr/include/simavr/sim_avr.h": "libsimavr-dev",
+    "/usr/include/libelf.h": "libelf-dev",
 }
 CC = ("gcc", "-O2", "-g", "-Wall", "-Wextra", "-Werror")
 WITH_SIMAVR = ("-I/usr/include/simavr", str(EMULATOR), "-lsimavr", "-lelf", "-lutil", "-lm")
+OUR_SOURCE = "is this the repository's own source?"
 LOG_BYTES = 1 << 20  # of the pins that wait to be read: 20 s of every pulse
 START_S = 10.0
-STOP_S = 3.0
+NICE = -10  # a real Arduino has a processor of its own
 
 
 class ArduinoError(RoverError):
@@ -54,7 +55,7 @@ class Built(NamedTuple):
 
 def missing_packages() -> list[str]:
     """Debian packages that the emulated Arduino needs and this machine lacks."""
-    return [name for name, there in PACKAGES.items() if not there()]
+    return debian.missing_packages(NEEDS)
 
 
 @functools.cache
@@ -63,42 +64,41 @@ def build() -> Built:
 
     Raises ArduinoError where Debian packages or the repository's sources are missing, or the compiler complains.
     """
-    if missing := missing_packages():
+    if missing := " ".join(missing_packages()):
         raise ArduinoError(
-            f"the emulated Arduino needs the Debian packages {' '.join(missing)}, which are not here: "
-            f"sudo apt-get install --no-install-recommends {' '.join(missing)}"
+            f"the emulated Arduino needs the Debian packages {missing}, which are not here",
+            remedy=f"sudo apt-get install --no-install-recommends {missing}",
         )
     sources = [EMULATOR, FIRMWARE / "Makefile", *sorted(p for p in (FIRMWARE / "rover").glob("*") if p.is_file())]
     if not all(source.is_file() for source in sources):
-        raise ArduinoError(f"no firmware in {FIRMWARE}: the emulated Arduino needs a checkout of the repository")
+        raise ArduinoError(
+            f"no firmware in {FIRMWARE}", remedy="the emulated Arduino needs a checkout of the repository"
+        )
 
     def make(folder: Path) -> None:
-        call("make", "-C", FIRMWARE, f"BUILD={folder}/firmware")
-        call(*CC, "-DPROGRAM", "-o", folder / "arduino", *WITH_SIMAVR)
+        compile_c("make", "-C", FIRMWARE, f"BUILD={folder}/firmware")
+        compile_c(*CC, "-DPROGRAM", "-o", folder / "arduino", *WITH_SIMAVR)
 
     folder = cached_folder("arduino", key_of({"names": [source.name for source in sources]}, *sources), make)
     return Built(folder / "firmware" / "rover.elf", folder / "arduino")
 
 
+def compile_c(*command: object) -> None:
+    """Runs a compiler, or make. Raises ArduinoError with its last words."""
+    run(*command, error=ArduinoError, remedy=OUR_SOURCE)
+
+
 @functools.cache
 def symbol(name: str) -> int:
     """Flash address of a function of the firmware."""
-    found = re.search(rf"^([0-9a-f]+) \w {name}$", call("avr-nm", build().firmware), re.M)
-    if not found:
+    table = run("avr-nm", build().firmware, error=ArduinoError)
+    line = re.search(rf"^([0-9a-f]+) \w {name}$", table, re.M)
+    if not line:
         raise ArduinoError(f"{build().firmware}: the firmware has no function {name}")
-    return int(found[1], 16)
+    return int(line[1], 16)
 
 
-def call(*command: object) -> str:
-    """Run a command, return what it said. Raises ArduinoError with the end of its complaint if it fails."""
-    done = subprocess.run([str(c) for c in command], capture_output=True, text=True)
-    if done.returncode:
-        said = " | ".join((done.stderr or done.stdout).strip().splitlines()[-3:])
-        raise ArduinoError(f"{command[0]} failed ({said}): is this the repository's own source?")
-    return done.stdout
-
-
-class Arduino:
+class EmulatedArduino:
     """The real firmware in simavr, in real time, as a process of its own that ends with this one.
 
     port: for a ServoLink. Opening it resets the Arduino, as a real one's. pid: of the process.
@@ -115,39 +115,32 @@ class Arduino:
     ):
         """every_pulse: pulses() has each pulse, a thousand a second; otherwise those that differ from the one before.
 
-        transmitter: its pulses from the start on, see transmitter(). nice: scheduling priority; a real Arduino has a
-        processor of its own, -10 comes near that (below 0 only for root, silently left out for others). slow: its
-        clock runs so many times slower than this machine's: pulses are by its own, monotonic_s by this machine's.
+        transmitter: its pulses from the start on, see transmitter(). nice: scheduling priority, NICE comes near a
+        processor of its own (below 0 only for root, silently left out for others). slow: its clock runs that many times
+        slower than this machine's; pulses are by its own, monotonic_s by this machine's.
         Raises ArduinoError as build() does, and if the program does not start.
         """
         built = build()
         # A link that the program makes, and removes even where this process was killed.
         self.port = str(Path(tempfile.gettempdir()) / f"rover-arduino-{secrets.token_hex(8)}")
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115, open as long as the process
         self._reading = threading.Lock()
         self._rest = b""
-        log = "all" if every_pulse else "changes"
-        command = [built.program, built.firmware, "--link", self.port, "--log", log, "--reset-on-open"]
-        self._process = subprocess.Popen(
-            [*command, "--boot-ms", f"{boot_s * 1000:.0f}", "--slow", f"{slow:g}"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            bufsize=0,
-            start_new_session=True,  # a terminal's ^C is not for it
+        options = ["--link", self.port, "--log", "all" if every_pulse else "changes", "--reset-on-open"]
+        options += ["--boot-ms", f"{boot_s * 1000:.0f}", "--slow", f"{slow:g}"]
+        self._process = Child(
+            "the emulated Arduino", built.program, built.firmware, *options, error=ArduinoError, talks=True
         )
         self.pid = self._process.pid
-        os.set_blocking(self._process.stdout.fileno(), False)
-        fcntl.fcntl(self._process.stdout.fileno(), fcntl.F_SETPIPE_SZ, LOG_BYTES)
+        self._process.keep_unread(LOG_BYTES)
         try:
             with contextlib.suppress(PermissionError):
                 os.setpriority(os.PRIO_PROCESS, self.pid, nice)
-            end = time.monotonic() + START_S
+            deadline = time.monotonic() + START_S
             while not os.path.lexists(self.port):  # Path.exists would follow the link
-                self._check()
-                if time.monotonic() > end:
+                self._process.check()
+                if time.monotonic() > deadline:
                     raise ArduinoError(
-                        f"the emulated Arduino did not start within {START_S:g} s: is this machine busy?"
+                        f"the emulated Arduino did not start within {START_S:g} s", remedy="is this machine busy?"
                     )
                 time.sleep(0.005)
             self.transmitter(*transmitter)
@@ -155,7 +148,7 @@ class Arduino:
             self.close()
             raise
 
-    def __enter__(self) -> "Arduino":
+    def __enter__(self) -> "EmulatedArduino":
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -163,31 +156,30 @@ class Arduino:
 
     def transmitter(self, steering_us: float, throttle_us: float) -> None:
         """The pulses that the receiver gets, from the next on; 0 is no signal."""
-        self._tell(f"transmitter {steering_us} {throttle_us}")
+        self._process.send_line(f"transmitter {steering_us} {throttle_us}")
 
     def reset(self) -> None:
         """The reset button."""
-        self._tell("reset")
+        self._process.send_line("reset")
 
     def hang(self) -> None:
         """The firmware's loop() becomes an endless one, until the next reset."""
-        self._tell(f"hang {symbol('loop'):x}")
+        self._process.send_line(f"hang {symbol('loop'):x}")
 
     def pulses(self) -> list[PinEvent]:
         """What happened since the last call, in the order of its end.
 
-        With every_pulse call it every 10 s at least: what does not fit the pipe is lost, and 'lost' then says how much.
+        With every_pulse call it every 10 s at least: what does not fit the pipe is lost, and 'lost' has how much.
         Raises ArduinoError if the process has ended.
         """
         with self._reading:
-            data, ended = self._rest, False
-            with contextlib.suppress(BlockingIOError):
-                while more := self._read():
-                    data += more
-                ended = True
-            *lines, self._rest = data.split(b"\n")
-        if ended and not lines:
-            raise self._ended()
+            try:
+                while data := self._process.read():
+                    self._rest += data
+            except ArduinoError:
+                if b"\n" not in self._rest:
+                    raise
+            *lines, self._rest = self._rest.split(b"\n")
         return [
             PinEvent(float(at), kind, pin, float(pulse), float(period))
             for at, kind, pin, pulse, period in (line.decode().split(",") for line in lines)
@@ -195,48 +187,14 @@ class Arduino:
 
     def close(self) -> None:
         """Ends the process. Raises nothing."""
-        with contextlib.suppress(OSError):
-            self._process.stdin.close()
-        try:
-            self._process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
         with self._reading:
-            self._process.stdout.close()
-        self._errors.close()
+            self._process.close()
         Path(self.port).unlink(missing_ok=True)
 
-    def _read(self) -> bytes:
-        """b"" when it has ended; BlockingIOError while it has nothing to say."""
-        return b"" if self._process.stdout.closed else os.read(self._process.stdout.fileno(), 1 << 16)
 
-    def _tell(self, text: str) -> None:
-        try:
-            self._process.stdin.write(f"{text}\n".encode())
-        except (OSError, ValueError):
-            raise self._ended() from None
-
-    def _check(self) -> None:
-        if self._process.poll() is not None:
-            raise self._ended()
-
-    def _ended(self) -> ArduinoError:
-        if self._errors.closed:
-            return ArduinoError("the emulated Arduino was closed: make a new one")
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(STOP_S)
-        self._errors.seek(0)
-        said = self._errors.read()[-500:].decode(errors="replace").strip().replace("\n", " | ")
-        return ArduinoError(
-            f"the emulated Arduino has ended (exit status {self._process.returncode}, it said: {said}): start a new one"
-        )
-
-
-NICE = -10  # a real Arduino has a processor of its own
 BOARD = f"{__name__}:board"  # for a VirtualCar, which makes it in its own process
 
 
-def board() -> Arduino:
+def board() -> EmulatedArduino:
     """The real firmware as a virtual car's board: a transmitter at rest, and only pulses that changed are read."""
-    return Arduino(every_pulse=False, transmitter=REST_US, nice=NICE)
+    return EmulatedArduino(every_pulse=False, transmitter=REST_US, nice=NICE)

@@ -16,7 +16,6 @@ import select
 import shutil
 import signal
 import struct
-import subprocess
 import sys
 import tempfile
 import termios
@@ -32,6 +31,7 @@ import numpy as np
 
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.pwm import NEUTRAL, STOPPED_THROTTLE_US, PwmCalibration
+from rover_lib.world.child import Child
 from rover_lib.world.record import JPEG_QUALITY
 from rover_lib.world.standin import PinEvent
 from rover_lib.world.trial import Trajectory, wilson_interval
@@ -46,9 +46,8 @@ NOISE = 3  # grey levels of the camera's noise: two frames of a car that stands 
 PIPE_BYTES = 1 << 20  # a frame fits in whole
 NICE = 5  # what drives goes first; a camera may be late
 PRIORITY = 1  # of real time, below the loop that drives it
-START_S = 20.0
+START_S = 60.0  # a busy machine takes its time to import all that
 ANSWER_S = 5.0
-STOP_S = 5.0
 STAND_IN = "rover_lib.world.standin:StandIn"
 
 
@@ -77,7 +76,7 @@ class FramePipe:
             fcntl.fcntl(self._fd, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         poller = select.poll()
         poller.register(self._fd, select.POLLOUT)
-        if any(said & select.POLLERR for _, said in poller.poll(0)):
+        if any(events & select.POLLERR for _, events in poller.poll(0)):
             self.close()  # the reader has left; the next one starts with a new frame
             return False
         return True
@@ -117,7 +116,7 @@ class CameraFeed:
 
     path: the FIFO, made if it is not there. pictures: JPEGs, or frames (h, w, 3) uint8 BGR, shown in turn and over
     again; a single one is the same frame again and again. written, dropped: frames, so far; dropped are those for which
-    the reader was too slow. late_s: may be set; each frame is written so much after it was due.
+    the reader was too slow. late_s: may be set; the delay of each frame after it was due.
     """
 
     def __init__(self, path: Path | str, *pictures: bytes | np.ndarray, rate_hz: float = 30.0):
@@ -203,7 +202,7 @@ class CarReport:
     outcomes: (seed, outcome) of the last 1000 worlds. drives: the last 8. frames: written to the camera; dropped: those
     that its reader was too slow for; late: those that this machine was too slow for.
     Of the world that it is in now, its seed, whether the car is held, distance and bearing (positive to the left) of
-    the balloon, and the speed. finished: as many worlds as were asked for have ended.
+    the balloon, and the speed. finished: all the worlds that were asked for have ended.
     """
 
     hits: int
@@ -229,7 +228,7 @@ class VirtualCar:
 
     The first world begins when the pins first ask for motion. A world ends by a hit, past the balloon ('left'), or
     after 8 s. Then the car stands in the next one, and is held for hold_s, so that a plan for what it sees now is in
-    force when it is let go. worlds: after so many it stays where it is; None: it goes on.
+    force when it is let go. worlds: after that many it stays where it is; None: it goes on.
     It ends with this process, at the latest a frame later.
     """
 
@@ -250,15 +249,14 @@ class VirtualCar:
         """
         if seed < 0 or not 1 <= rate_hz <= 120 or hold_s < 0 or (worlds is not None and worlds < 1):
             raise WorldError(
-                f"a car needs a seed from 0, 1 to 120 frames per second, at least 1 world and a hold from 0 s, found "
-                f"{seed}, {rate_hz}, {worlds} and {hold_s}"
+                "a car needs a seed from 0, 1 to 120 frames per second, at least 1 world and a hold from 0 s",
+                found=f"{seed}, {rate_hz}, {worlds} and {hold_s}",
             )
         self._folder = Path(tempfile.mkdtemp(prefix="rover-car-"))
         self.camera = str(self._folder / "camera")
         self._talking = threading.Lock()
-        self._said = b""
+        self._answers = b""
         self._asked = 0
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115, open as long as the car
         options = {
             "seed": seed,
             "board": board,
@@ -270,14 +268,12 @@ class VirtualCar:
             "camera": self.camera,
             "parent": os.getpid(),
         }
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "rover_lib.world.car", json.dumps(options)],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},  # where the board's module is
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            bufsize=0,
-            start_new_session=True,  # a terminal's ^C is for this process, which then stops in order
+        self._process = Child(
+            "the virtual car",
+            *(sys.executable, "-m", "rover_lib.world.car", json.dumps(options)),
+            error=WorldError,
+            talks=True,
+            env={"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},  # where the board's module is
         )
         self.pid = self._process.pid
         try:
@@ -294,76 +290,48 @@ class VirtualCar:
 
     def check(self) -> None:
         """Raises WorldError if its process has ended. Costs nothing."""
-        if self._process.poll() is not None:
-            raise self._ended()
+        self._process.check()
 
     def report(self) -> CarReport:
         """What became of it so far; waits for a frame's time. Raises WorldError if its process is gone or hangs."""
         with self._talking:
             self._asked += 1
-            try:
-                self._process.stdin.write(f"report {self._asked}\n".encode())
-            except (OSError, ValueError):
-                raise self._ended() from None
+            self._process.send_line(f"report {self._asked}")
             while (answer := self._answer(ANSWER_S))["asked"] != self._asked:
                 pass  # an answer that came too late
-        found = answer["report"]
+        report = answer["report"]
         drives = [
             Drive(
                 **{k: v for k, v in drive.items() if k not in ("track", "balloon_xy_m")},
                 trajectory=Trajectory(*np.array(drive["track"]).T, balloon_xy_m=tuple(drive["balloon_xy_m"])),
             )
-            for drive in found.pop("drives")
+            for drive in report.pop("drives")
         ]
-        outcomes = [(seed, outcome) for seed, outcome in found.pop("outcomes")]
-        wilson = wilson_interval(found["hits"], found["trials"]) if found["trials"] else None
-        return CarReport(wilson=wilson, outcomes=outcomes, drives=drives, **found)
+        outcomes = [(seed, outcome) for seed, outcome in report.pop("outcomes")]
+        wilson = wilson_interval(report["hits"], report["trials"]) if report["trials"] else None
+        return CarReport(wilson=wilson, outcomes=outcomes, drives=drives, **report)
 
     def summary(self) -> dict[str, Any]:
-        """What a drive's report says of it. Raises as report()."""
+        """What a drive's report has of it: hits, trials, camera_late. Raises as report()."""
         report = self.report()
         return {"hits": report.hits, "trials": report.trials, "camera_late": report.late}
 
     def close(self) -> None:
         """Ends it. Raises nothing."""
-        with contextlib.suppress(OSError):
-            self._process.stdin.close()
-        try:
-            self._process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._process.stdout.close()
-        self._errors.close()
+        self._process.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _answer(self, within_s: float) -> dict[str, Any]:
-        end = time.monotonic() + within_s
-        while b"\n" not in self._said:
-            left = max(0.0, end - time.monotonic())
-            try:
-                ready = select.select([self._process.stdout], [], [], left)[0]
-                data = os.read(self._process.stdout.fileno(), 1 << 16) if ready else None
-            except (OSError, ValueError):  # closed meanwhile
-                data = b""
-            if data == b"":
-                raise self._ended()
-            if data is None:
-                raise WorldError(f"the virtual car did not answer within {within_s:g} s: is this machine too busy?")
-            self._said += data
-        line, _, self._said = self._said.partition(b"\n")
+        deadline = time.monotonic() + within_s
+        while b"\n" not in self._answers:
+            data = self._process.read(max(0.0, deadline - time.monotonic()))
+            if not data:
+                raise WorldError(
+                    f"the virtual car did not answer within {within_s:g} s", remedy="is this machine too busy?"
+                )
+            self._answers += data
+        line, _, self._answers = self._answers.partition(b"\n")
         return json.loads(line)
-
-    def _ended(self) -> WorldError:
-        if self._errors.closed:
-            return WorldError("the virtual car was closed: make a new one")
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(STOP_S)
-        self._errors.seek(0)
-        said = self._errors.read().decode(errors="replace").strip().splitlines() or ["nothing"]
-        return WorldError(
-            f"the virtual car has ended (exit status {self._process.returncode}, it said: {said[-1]}): start a new one"
-        )
 
 
 # ---- in the process

@@ -22,9 +22,10 @@ class PinEvent(NamedTuple):
     """Something on the servo pins, or that explains what they do.
 
     kind: 'pulse'; 'cut', a pulse that a reset ended; 'line', one of the host came in whole; 'reset', the pins float;
-    'open', of the port; 'stall', this machine had no time for the Arduino, pulse_us is for how long; 'lost', so many
-    events (pulse_us) that were not read in time. monotonic_s: time.monotonic() at which the pin rose, or it happened.
-    pin: 'steering', 'throttle' or ''. period_us: since the pin rose before that, 0 for the first after a reset.
+    'open', of the port; 'stall', this machine had no time for the Arduino, pulse_us is for how long; 'lost', events
+    that were not read in time, pulse_us is their count. pin: 'steering', 'throttle' or ''. monotonic_s:
+    time.monotonic() at which the pin rose, or it happened. period_us: since the pin rose before that, 0 for the first
+    after a reset.
     """
 
     monotonic_s: float
@@ -111,10 +112,10 @@ class StandIn:
         while not self._closing.is_set():
             due = min(self._status_due, self._commanded + _TIMEOUT_S) if self._state == "A" else self._status_due
             wait_s = min(max(due - time.monotonic(), 0.0), _STATUS_S)
-            said = dict(poller.poll(wait_s * 1000)).get(self._master, 0)
-            was_open, is_open = is_open, not said & select.POLLHUP
+            events = dict(poller.poll(wait_s * 1000)).get(self._master, 0)
+            was_open, is_open = is_open, not events & select.POLLHUP
             if not is_open:
-                self._judge_time()
+                self._check_timeout()
                 time.sleep(0.005)
                 continue
             if not was_open:
@@ -123,9 +124,9 @@ class StandIn:
                 self._closing.wait(self._boot_s)
                 self._read()  # the boot loader has it
                 self._started = time.monotonic()
-                self._say("")  # ends a line that the reset cut
+                self._send("")  # ends a line that the reset cut
                 self._hello("e")
-            self._judge_time()
+            self._check_timeout()
             for byte in self._read():
                 self._take(byte)
             if time.monotonic() >= self._status_due:
@@ -137,13 +138,13 @@ class StandIn:
         except OSError:  # nothing there, or just closed
             return b""
 
-    def _say(self, body: str) -> None:
+    def _send(self, body: str) -> None:
         line = f"{body}*{zlib.crc32(body.encode()):08X}\n" if body else "\n"
         with contextlib.suppress(OSError):  # what nobody reads is lost, as on a wire
             os.write(self._master, line.encode())
 
     def _hello(self, reset: str = "-") -> None:
-        self._say(f"<H 1 stand-in {self._boot} {self._sequence} {reset}")
+        self._send(f"<H 1 stand-in {self._boot} {self._sequence} {reset}")
 
     def _status(self) -> None:
         now = time.monotonic()
@@ -152,7 +153,7 @@ class StandIn:
         receiver = " ".join(
             f"{us} {channel.period_us}" for us, channel in zip(self._neutral, self._channels, strict=True)
         )
-        self._say(
+        self._send(
             f"<S {self._boot} {uptime_ms} {self._sequence} {self._result} {self._state} {self._reason} "
             f"{self._pins[0]} {self._pins[1]} {receiver} {self._bad} {self._old} {self._out_of_range} 0"
         )
@@ -173,15 +174,15 @@ class StandIn:
 
     def _command(self, line: bytes) -> None:
         body, _, crc = line.rpartition(b"*")
-        found = _COMMAND.fullmatch(body.decode("ascii", "replace"))
-        if not found or crc != b"%08X" % zlib.crc32(body):
+        command = _COMMAND.fullmatch(body.decode("ascii", "replace"))
+        if not command or crc != b"%08X" % zlib.crc32(body):
             self._bad += 1
             return
         if body == b">Q":
             self._hello()
             return
-        kind = found[1] or found[4]
-        boot, sequence, *pulses = (int(number) for number in found.groups() if number and number.isdigit())
+        kind = command[1] or command[4]
+        boot, sequence, *pulses = (int(number) for number in command.groups() if number and number.isdigit())
         if boot != self._boot or not 1 <= (sequence - self._sequence) % (1 << 32) <= _SEQUENCE_WINDOW:
             self._old += 1
             self._result = "o"
@@ -209,7 +210,7 @@ class StandIn:
             self._set_pins(*pulses)
         return "k"
 
-    def _judge_time(self) -> None:
+    def _check_timeout(self) -> None:
         if self._state == "A" and time.monotonic() - self._commanded >= _TIMEOUT_S:
             self._enter("S", "t")
 
