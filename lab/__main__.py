@@ -90,7 +90,7 @@ def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...]) -> No
     """
     from lab.driving.faults import run_faults
 
-    outcome = run_faults(only, say=click.echo)
+    outcome = run_faults(only, echo=click.echo)
     if output:
         outcome.write(output)
     show(outcome.summary, False)

@@ -1,4 +1,4 @@
-"""Faults while the car drives at speed, judged by the pulses on its servo pins: `rover faults runs/faults.json`.
+"""Faults while the car drives at speed, judged by the pulses on its servo pins: `python -m lab faults OUTPUT`.
 
 Everything is what drives the real car: `rover drive` as a process, pyserial, and the real firmware, in simavr and in
 real time. Three things stand in for hardware. The camera is a FIFO of JPEGs, read by the same Camera class as a V4L2
@@ -31,107 +31,106 @@ from typing import Any
 
 import numpy as np
 
-from lab.arduino.emulator import CC, REPOSITORY, build, call
-from lab.driving.bench import (
-    BEYOND,
-    END_S,
-    HANG,
-    NAN,
-    OTHER,
-    PLAIN,
-    RAISE,
-    SLOW,
-    START_S,
-    Bench,
-    Change,
-    Drive,
-    FaultError,
-    Process,
-    by_line,
-    dropping,
-    flipping,
-    pictures,
+from lab.arduino.emulator import CC, REPOSITORY, build, compile_c
+from lab.driving.bench import END_S, Drive, DrivingBench, FaultError, RoverCommand
+from lab.driving.cable import Change, dropping, flipping, whole_lines
+from lab.driving.pins import (
+    CONTINUES,
+    HUMAN,
+    LATE_COMMAND_S,
+    PERIOD_US,
+    STEP_US,
+    STOPPED,
+    TICK_US,
+    Gates,
+    Observation,
+    Verdict,
+    judge,
 )
-from lab.driving.pins import CONTINUES, HUMAN, PERIOD_US, STEP_US, STOPPED, TICK_US, Gates, Seen, judge
+from lab.driving.policy import HANG, NAN, OTHER, OUT_OF_RANGE, PLAIN, RAISE, SLOW, pictures
 from rover_lib.onboard.servo_link import frame
 from rover_lib.onboard.stage import write_stage
 from rover_lib.world.standin import REST_US, PinEvent
 
-TRIES = 3  # of a row during which this machine had no time for the Arduino
+ATTEMPTS = 5  # at a row that this machine spoilt
 FUZZ_LINES = 1_000_000
 
 
 @dataclass(frozen=True)
-class Fault:
-    """One row. inject: makes it happen, waits if it takes time, and returns when it happened (None: when called).
+class FaultRow:
+    """One fault, and what is expected of it.
 
-    says: a regular expression of the line that tells of it, in the flight log or on stderr; of the drive after it if
-    later. how: it is injected. watch_s: so long it is watched after inject. exit_code: of the drive, None: it goes on.
-    start: of the drive, see Drive. limits: what makes a `continues` stop after all. human_us: of `human`.
+    inject: makes it happen, waits if it takes time, and returns when it happened (None: when called).
+    message: a regular expression of the line that tells of it, in the flight log or on stderr; of the drive after it if
+    told_later. method: how it is injected. watch_s: how long it is watched after inject.
+    start: of the drive, see Drive. exit_code: of the drive, None: it goes on.
+    limits: what makes a `continues` stop after all. until_limit: that happens here.
+    starves: it takes the time of this machine away. human_us: of `human`.
     """
 
     name: str
     expected: str
-    inject: Callable[[Bench], float | None]
-    says: str
-    how: str
+    inject: Callable[[DrivingBench], float | None]
+    message: str
+    method: str
     exit_code: int | None
     watch_s: float = 1.0
     start: str = ""
-    later: bool = False
+    told_later: bool = False
     limits: str = ""
     until_limit: bool = False
+    starves: bool = False
     human_us: tuple[float, float] = REST_US
 
 
-FAULTS: list[Fault] = []
+FAULTS: list[FaultRow] = []
 
 
-def _fault(name: str, expected: str, says: str, how: str, **more: Any) -> Callable[[Callable], Callable]:
+def _fault(name: str, expected: str, message: str, method: str, **more: Any) -> Callable[[Callable], Callable]:
     more.setdefault("exit_code", {STOPPED: 3, HUMAN: 4, CONTINUES: None}[expected])
 
-    def add(inject: Callable[[Bench], float | None]) -> Callable[[Bench], float | None]:
-        FAULTS.append(Fault(name, expected, inject, says, how, **more))
+    def add(inject: Callable[[DrivingBench], float | None]) -> Callable[[DrivingBench], float | None]:
+        FAULTS.append(FaultRow(name, expected, inject, message, method, **more))
         return inject
 
     return add
 
 
-def _sees(name: str, told: int, says: str) -> None:
-    _fault(name, STOPPED, says, "the picture tells the policy to")(lambda bench: bench.show(told))
+def _by_picture(name: str, instruction: int, message: str) -> None:
+    _fault(name, STOPPED, message, "the picture tells the policy to")(lambda bench: bench.show(instruction))
 
 
-def _signals(name: str, number: int, says: str, **more: Any) -> None:
-    _fault(name, STOPPED, says, "a signal from outside", **more)(lambda bench: bench.signal(number))
+def _by_signal(name: str, number: int, message: str, **more: Any) -> None:
+    _fault(name, STOPPED, message, "a signal from outside", **more)(lambda bench: bench.signal(number))
 
 
 @_fault("camera unplugged", STOPPED, "is the camera unplugged", "the FIFO's writer closes it")
-def _unplug_camera(bench: Bench) -> None:
+def _unplug_camera(bench: DrivingBench) -> None:
     bench.feed.close()
 
 
 @_fault("camera frozen", STOPPED, "the camera is frozen", "the same JPEG again and again")
-def _freeze(bench: Bench) -> None:
+def _freeze(bench: DrivingBench) -> None:
     bench.feed.freeze()
 
 
 @_fault("camera black", STOPPED, "picture is black", "black pictures, with a sensor's noise")
-def _blacken(bench: Bench) -> None:
+def _blacken(bench: DrivingBench) -> None:
     bench.feed.show(*pictures(PLAIN, level=0))
 
 
 @_fault("camera changes its picture's size", STOPPED, "the picture changed from", "pictures of 160x80")
-def _resize(bench: Bench) -> None:
+def _resize(bench: DrivingBench) -> None:
     bench.feed.show(*pictures(PLAIN, size=(80, 160)))
 
 
-_sees("inference raises", RAISE, "told to fail by the picture")
-_sees("inference returns NaN", NAN, "NaN or Inf|not finite")
-_sees("inference returns out of range", BEYOND, "outside the range")
+_by_picture("inference raises", RAISE, "told to fail by the picture")
+_by_picture("inference returns NaN", NAN, "NaN or Inf|not finite")
+_by_picture("inference returns out of range", OUT_OF_RANGE, "outside the range")
 
 
 @_fault("inference process killed", STOPPED, r"process ended \(SIGKILL\)", "SIGKILL to the child of rover drive")
-def _kill_inference(bench: Bench) -> None:
+def _kill_inference(bench: DrivingBench) -> None:
     for pid in bench.drive.children():
         os.kill(pid, signal.SIGKILL)
 
@@ -143,7 +142,7 @@ def _kill_inference(bench: Bench) -> None:
     "the loop's thread leaves by exit(2), in the process",
     start="end the loop's thread",
 )
-def _kill_loop(bench: Bench) -> None:
+def _kill_loop(bench: DrivingBench) -> None:
     bench.signal(signal.SIGUSR2)
 
 
@@ -154,12 +153,12 @@ def _kill_loop(bench: Bench) -> None:
     "raised by a signal's handler, wherever the loop is",
     start="raise in the loop",
 )
-def _raise_in_loop(bench: Bench) -> None:
+def _raise_in_loop(bench: DrivingBench) -> None:
     bench.signal(signal.SIGUSR2)
 
 
 @_fault("host process stopped", STOPPED, "no valid command for 150 ms|said nothing for", "SIGSTOP, after 1 s SIGCONT")
-def _pause_process(bench: Bench) -> float:
+def _pause_process(bench: DrivingBench) -> float:
     at_s = time.monotonic()
     bench.signal(signal.SIGSTOP)
     bench.wait(1.0)
@@ -167,58 +166,58 @@ def _pause_process(bench: Bench) -> float:
     return at_s
 
 
-_signals("SIGTERM", signal.SIGTERM, "SIGTERM: stopping", exit_code=0)
-_signals("SIGINT", signal.SIGINT, "SIGINT: stopping", exit_code=0)
-_signals("SIGHUP", signal.SIGHUP, "SIGHUP: stopping", exit_code=0)
-_signals("SIGKILL", signal.SIGKILL, "the drive before this one", exit_code=-signal.SIGKILL, later=True)
+_by_signal("SIGTERM", signal.SIGTERM, "SIGTERM: stopping", exit_code=0)
+_by_signal("SIGINT", signal.SIGINT, "SIGINT: stopping", exit_code=0)
+_by_signal("SIGHUP", signal.SIGHUP, "SIGHUP: stopping", exit_code=0)
+_by_signal("SIGKILL", signal.SIGKILL, "the drive before this one", exit_code=-signal.SIGKILL, told_later=True)
 
 
 @_fault("serial unplugged", STOPPED, "is it still plugged in", "both ends of the pty behind the port are closed")
-def _unplug_serial(bench: Bench) -> None:
+def _unplug_serial(bench: DrivingBench) -> None:
     bench.cable.unplug()
 
 
 @_fault("serial stuck", STOPPED, "took no data", "the port's output is suspended: writes block")
-def _stick(bench: Bench) -> None:
+def _stick(bench: DrivingBench) -> None:
     bench.cable.stick()
 
 
 @_fault(
     "serial silent from the host", STOPPED, "no valid command for 150 ms", "the line to the Arduino carries nothing"
 )
-def _silence(bench: Bench) -> None:
+def _silence(bench: DrivingBench) -> None:
     bench.cable.to_arduino = lambda data: b""
 
 
 @_fault("Arduino reset", STOPPED, r"was reset \(reset pin\)", "the reset button")
-def _reset(bench: Bench) -> None:
+def _reset(bench: DrivingBench) -> None:
     bench.arduino.reset()
 
 
 @_fault("Arduino loop hung", STOPPED, r"was reset \(watchdog\)", "an endless loop in place of the firmware's")
-def _hang(bench: Bench) -> None:
+def _hang(bench: DrivingBench) -> None:
     bench.arduino.hang()
 
 
 @_fault("receiver lost", STOPPED, "transmitter's signal was lost", "no pulses on the receiver's pins")
-def _lose_receiver(bench: Bench) -> None:
+def _lose_receiver(bench: DrivingBench) -> None:
     bench.arduino.transmitter(0, 0)
 
 
 @_fault("receiver's throttle channel lost", STOPPED, "transmitter's signal was lost", "no pulses on that pin")
-def _lose_throttle(bench: Bench) -> None:
+def _lose_throttle(bench: DrivingBench) -> None:
     bench.arduino.transmitter(REST_US[0], 0)
 
 
-def _takes_over(name: str, steering_us: float, throttle_us: float) -> None:
+def _by_human(name: str, steering_us: float, throttle_us: float) -> None:
     human_us = (steering_us, throttle_us)
     _fault(name, HUMAN, "the human took over", f"the transmitter sends {human_us}", human_us=human_us)(
         lambda bench: bench.arduino.transmitter(*human_us)
     )
 
 
-_takes_over("human takes over by steering", 1600, 140)
-_takes_over("human takes over by throttle", 1470, 200)
+_by_human("human takes over by steering", 1600, 140)
+_by_human("human takes over by throttle", 1470, 200)
 
 
 @_fault(
@@ -229,7 +228,7 @@ _takes_over("human takes over by throttle", 1470, 200)
     watch_s=0.1,
     limits="as 'camera gives no more frames', when none comes for longer than that",
 )
-def _frames_late(bench: Bench) -> float:
+def _frames_late(bench: DrivingBench) -> float:
     at_s = time.monotonic()
     bench.feed.pause()
     bench.wait(0.3)
@@ -247,7 +246,7 @@ def _frames_late(bench: Bench) -> float:
     "the picture tells the policy to",
     limits="as 'inference hangs', when it is longer",
 )
-def _slow_inference(bench: Bench) -> float:
+def _slow_inference(bench: DrivingBench) -> float:
     at_s = time.monotonic()
     bench.show(SLOW)
     bench.wait(0.05)
@@ -264,7 +263,7 @@ def _slow_inference(bench: Bench) -> float:
     watch_s=1.6,
     limits="none: the loaded policy drives on; the next start checks the new file",
 )
-def _swap(bench: Bench) -> None:
+def _swap(bench: DrivingBench) -> None:
     kept, other = bench.folder / "kept.pt", bench.folder / "other.pt"
     os.link(bench.artifact, kept)
     bench.undo.callback(kept.replace, bench.artifact)
@@ -283,7 +282,7 @@ COMMANDS_LOST = "the Arduino stops the car 150 ms after the last command that ca
     watch_s=2.0,
     limits=COMMANDS_LOST,
 )
-def _flip(bench: Bench) -> None:
+def _flip(bench: DrivingBench) -> None:
     bench.cable.to_arduino = flipping(bench.rng, 0.01)
     bench.cable.to_host = flipping(random.Random(bench.rng.random()), 0.01)
 
@@ -296,7 +295,7 @@ def _flip(bench: Bench) -> None:
     watch_s=2.0,
     limits=COMMANDS_LOST,
 )
-def _drop(bench: Bench) -> None:
+def _drop(bench: DrivingBench) -> None:
     bench.cable.to_arduino = dropping(bench.rng, 0.3)
     bench.cable.to_host = dropping(random.Random(bench.rng.random()), 0.3)
 
@@ -308,7 +307,7 @@ def _drop(bench: Bench) -> None:
     "after other plans: the lines that asked for them, one every 20 ms",
     limits="none: an old sequence moves no pin and renews nothing",
 )
-def _replay(bench: Bench) -> float:
+def _replay(bench: DrivingBench) -> float:
     first = len(bench.cable.lines)
     bench.show(OTHER)
     bench.wait(0.8)
@@ -330,7 +329,7 @@ def _replay(bench: Bench) -> float:
     watch_s=2.0,
     limits=COMMANDS_LOST,
 )
-def _cut(bench: Bench) -> None:
+def _cut(bench: DrivingBench) -> None:
     def cutting() -> Change:
         number = 0
 
@@ -339,7 +338,7 @@ def _cut(bench: Bench) -> None:
             number += 1
             return line if number % 3 else line[: len(line) // 2]
 
-        return by_line(cut)
+        return whole_lines(cut)
 
     bench.cable.to_arduino, bench.cable.to_host = cutting(), cutting()
 
@@ -351,7 +350,7 @@ def _cut(bench: Bench) -> None:
     "rubbish, a modem manager's questions, and whole lines for another start of the Arduino, one every 15 ms",
     limits="none by what it writes; what it reads is lost to rover drive: 0.5 s without a status stop the car",
 )
-def _intrude(bench: Bench) -> float:
+def _intrude(bench: DrivingBench) -> float:
     whole = [frame(f">D 0 {n} 2000 700") for n in range(1, 20)] + [frame(">A 0 1"), frame(">N 0 2")]
     bench.cable.not_ours |= {line[:-1] for line in whole}
     at_s = time.monotonic()
@@ -369,12 +368,14 @@ def _intrude(bench: Bench) -> float:
     "this machine is busy",
     "4 busy processes of ordinary priority",
     watch_s=3.0,
+    starves=True,
     limits="as 'inference hangs', when the policy gets so little that plans become too old",
 )
-def _starve(bench: Bench) -> None:
+def _starve(bench: DrivingBench) -> None:
     for _ in range(4):
         busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-        bench.undo.callback(lambda busy=busy: (busy.kill(), busy.wait()))
+        bench.undo.callback(busy.wait)
+        bench.undo.callback(busy.kill)  # this one first
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, busy.pid, 0)
 
@@ -388,7 +389,7 @@ def _starve(bench: Bench) -> None:
     watch_s=2.0,
     limits="none: it drives without a log, and says so once",
 )
-def _fill_disk(bench: Bench) -> None:
+def _fill_disk(bench: DrivingBench) -> None:
     bench.fill_disk()
 
 
@@ -413,7 +414,7 @@ for hours in (1, -1):
     watch_s=2.0,
     limits="none: it drives without a log, and says so once",
 )
-def _fail_logger(bench: Bench) -> None:
+def _fail_logger(bench: DrivingBench) -> None:
     bench.signal(signal.SIGUSR2)
 
 
@@ -426,7 +427,7 @@ def _fail_logger(bench: Bench) -> None:
     until_limit=True,
     exit_code=3,
 )
-def _hang_inference(bench: Bench) -> None:
+def _hang_inference(bench: DrivingBench) -> None:
     bench.show(HANG)
 
 
@@ -439,68 +440,84 @@ def _hang_inference(bench: Bench) -> None:
     until_limit=True,
     exit_code=3,
 )
-def _no_frames(bench: Bench) -> None:
+def _no_frames(bench: DrivingBench) -> None:
     bench.feed.pause()
 
 
 # ---- a run
 
 
-def run_fault(bench: Bench, fault: Fault, gates: Gates) -> dict[str, Any]:
+def run_fault(bench: DrivingBench, fault: FaultRow, gates: Gates) -> dict[str, Any]:
     """Injects a fault into the drive that is at speed and judges it; a row of metrics.faults.
 
-    Its `recovered`, and its `log_line` if that comes later, are None where the next start of a drive tells them.
+    Where this machine spoilt it, it is repeated, at most ATTEMPTS times in all. Its `recovered`, and its `log_line` if
+    that is told later, are None where the next start of a drive tells them.
     """
-    attempts = 0
-    while True:
-        attempts += 1
-        drive = bench.drive
-        bench.rng.seed(fault.name)
-        bench.events = bench.events[-2000:]
-        drive.mark()
-        called_s = time.monotonic()
-        at_s = fault.inject(bench) or called_s
-        bench.wait(fault.watch_s)
-        end_s = time.monotonic()
-        bench.wait(0.05)  # a pulse is known when it ends
-        commands = [c for c in bench.cable.commands if at_s - 1 < c.at_s <= end_s]
-        seen = Seen(bench.events, commands, at_s, end_s)
-        code = drive.process.poll() if fault.exit_code is None else drive.wait(END_S)
-        said = None if fault.later else _find(fault.says, drive, at_s)
-        bench.calm()
-        if not (stalled_ms := seen.stalled_ms()) or attempts == TRIES:
+    for attempts in range(1, ATTEMPTS + 1):
+        seen, code, line = _inject(bench, fault)
+        if attempts == ATTEMPTS or not _spoilt(fault, seen, gates):
             break
         bench.at_speed(fault.start)
     verdict = judge(fault.expected, seen, gates, human_us=fault.human_us, until_limit=fault.until_limit)
     if code != fault.exit_code:
         verdict.wrong.append(f"rover drive ended with {code}, expected {fault.exit_code}")
-    limits = fault.limits
-    if fault.until_limit:
-        fades, stops = verdict.figures["fades_after_ms"], verdict.figures["stopped_after_ms"]
-        limits = f"the plan's age: the throttle fades from {fades} ms on, is off at {stops} ms, and drive ends"
     return {
         "fault": fault.name,
         "expected": fault.expected,
         **verdict.figures,
         "recovered": not verdict.wrong if fault.exit_code is None else None,
-        "log_line": said,
+        "log_line": line,
         "exit_code": code,
-        "injected": fault.how if fault.start != "disk" else bench.disk_is,
-        "limits": limits,
+        "injected": fault.method if fault.start != "disk" else bench.disk_is,
+        "limits": _limits(fault, verdict),
         "attempts": attempts,
-        "stalled_ms": round(stalled_ms, 1),
+        "stalled_ms": round(seen.stalled_ms(), 1),
         "wrong": verdict.wrong,
     }
 
 
-def _find(says: str, drive: Drive, since_s: float | None = None, within_s: float = 1.5) -> str | None:
-    """The first line that says so."""
-    end = time.monotonic() + within_s
+def _inject(bench: DrivingBench, fault: FaultRow) -> tuple[Observation, int | None, str | None]:
+    """Makes it happen once: what was seen, the drive's exit code, and the line that tells of it."""
+    drive = bench.drive
+    bench.rng.seed(fault.name)
+    bench.events = bench.events[-2000:]
+    drive.mark()
+    called_s = time.monotonic()
+    at_s = fault.inject(bench) or called_s
+    bench.wait(fault.watch_s)
+    end_s = time.monotonic()
+    bench.wait(0.05)  # a pulse is known when it ends
+    commands = [c for c in bench.cable.commands if at_s - 1 < c.at_s <= end_s]
+    seen = Observation(bench.events, commands, at_s, end_s)
+    code = drive.process.poll() if fault.exit_code is None else drive.wait(END_S)
+    line = None if fault.told_later else _line_of(fault.message, drive, at_s)
+    bench.clear_faults()
+    return seen, code, line
+
+
+def _spoilt(fault: FaultRow, seen: Observation, gates: Gates) -> bool:
+    """Whether this machine had no time for the Arduino or for the drive, so that there is nothing to judge."""
+    if seen.stalled_ms() or not seen.was_driving(gates.throttle_max_us):
+        return True
+    must_command = fault.expected == CONTINUES and not fault.until_limit and not fault.starves
+    return must_command and seen.longest_pause_s() > LATE_COMMAND_S
+
+
+def _limits(fault: FaultRow, verdict: Verdict) -> str:
+    if not fault.until_limit:
+        return fault.limits
+    fades, stops = verdict.figures["fades_after_ms"], verdict.figures["stopped_after_ms"]
+    return f"the plan's age: the throttle fades from {fades} ms on, is off at {stops} ms, and drive ends"
+
+
+def _line_of(message: str, drive: Drive, since_s: float | None = None, within_s: float = 1.5) -> str | None:
+    """The first line of the drive that matches."""
+    deadline = time.monotonic() + within_s
     while True:
-        for line in drive.said(since_s):
-            if re.search(says, line):
+        for line in drive.messages(since_s):
+            if re.search(message, line):
                 return line
-        if time.monotonic() > end:
+        if time.monotonic() > deadline:
             return None
         time.sleep(0.1)
 
@@ -514,13 +531,15 @@ def fuzz(lines: int = FUZZ_LINES, seed: int = 1) -> dict[str, Any]:
     sources = REPOSITORY / "tests" / "firmware" / "fuzz.c", firmware / "protocol.c", firmware / "vehicle.c"
     with tempfile.TemporaryDirectory(prefix="rover-fuzz-") as folder:
         program = Path(folder) / "fuzz"
-        call(*CC, "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-I", firmware, "-o", program, *sources)
+        compile_c(
+            *CC, "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-I", firmware, "-o", program, *sources
+        )
         done = subprocess.run([program, str(lines), str(seed)], capture_output=True, text=True)
-    said = (done.stdout + done.stderr).strip()
-    return {"lines": lines, "seed": seed, "unsafe_pulses": int(done.returncode != 0), "said": said}
+    printed = (done.stdout + done.stderr).strip()
+    return {"lines": lines, "seed": seed, "unsafe_pulses": int(done.returncode != 0), "said": printed}
 
 
-def transmitted_and_replayed(bench: Bench, steps: int = 24, step_s: float = 0.2) -> dict[str, Any]:
+def transmitted_and_replayed(bench: DrivingBench, steps: int = 24, step_s: float = 0.2) -> dict[str, Any]:
     """A transmitter's pulses, recorded by `rover record` and replayed by `rover drive --replay`, on the pins.
 
     worst_us: of all pulses of the replay, against what was transmitted in their place; None if that is another
@@ -536,21 +555,22 @@ def transmitted_and_replayed(bench: Bench, steps: int = 24, step_s: float = 0.2)
     bench.end_drive()
     bench.repair()
     folder, times_s = bench.folder / "episodes", []
-    with contextlib.closing(Process(bench, ["record", folder, *bench.devices()])) as record:
-        record.until("recording")
+    with contextlib.closing(RoverCommand("record", folder, *bench.devices())) as record:
+        record.wait_for_message("recording")
         for pulses in sent:
             times_s.append(time.monotonic())
             bench.arduino.transmitter(*pulses)
             bench.wait(step_s)
         record.process.send_signal(signal.SIGINT)
-        record.must_end(START_S)
+        record.wait_for_success()
     bench.wait(0.1)
     bench.events = []
     episode = next(folder.glob("episode_*"))
-    with contextlib.closing(Process(bench, ["drive", "--replay", episode, "--port", bench.cable.port])) as replay:
-        replay.until("armed")
+    options = ["--replay", episode, "--port", bench.cable.port]
+    with contextlib.closing(RoverCommand("drive", *options)) as replay:
+        replay.wait_for_message("armed")
         bench.wait(steps * step_s)
-        replay.must_end(START_S)
+        replay.wait_for_success()
     bench.wait(0.2)
     since_s = bench.cable.commands[0].at_s + 2 * PERIOD_US["steering"] * 1e-6  # before, they are the transmitter's
     return compare_steps([e for e in bench.events if e.monotonic_s > since_s], sent, times_s)
@@ -562,9 +582,10 @@ def compare_steps(
     """Steps of pulses (steering, throttle; us) that were sent at times, against those on the pins; see above."""
     result: dict[str, Any] = {"steps": len(sent), "worst_us": 0.0, "worst_ms": 0.0, "pulses": 0}
     for i, pin in enumerate(PERIOD_US):
-        found = [e for e in events if e.pin == pin and e.kind == "pulse"]
         runs: list[list[PinEvent]] = []
-        for e in found:
+        for e in events:
+            if e.pin != pin or e.kind != "pulse":
+                continue
             if not runs or abs(e.pulse_us - runs[-1][0].pulse_us) > 2 * STEP_US:
                 runs.append([])
             runs[-1].append(e)
@@ -582,7 +603,7 @@ def compare_steps(
 
 
 @dataclass
-class Outcome:
+class FaultsOutcome:
     """What a run found: the rows, the fuzz and the bytes (None: left out), and all that is not as expected."""
 
     gates: Gates
@@ -618,33 +639,34 @@ def run_faults(
     *,
     gates: Gates | None = None,
     fuzz_lines: int = FUZZ_LINES,
-    say: Callable[[str], None] = lambda text: None,
-) -> Outcome:
+    echo: Callable[[str], None] = lambda text: None,
+) -> FaultsOutcome:
     """Injects all faults, or those of `only`, where 'fuzz' and 'bytes' are names too; about 5 minutes for all.
 
-    say: is told a line as each is done. Raises FaultError for names that are none and for a bench that does not drive,
+    echo: prints a line as each is done. Raises FaultError for names that are none and for a bench that does not drive,
     ArduinoError if there is no emulated Arduino here.
     """
     gates, only, begin = gates or Gates.of_params(), list(only), time.monotonic()
     if unknown := sorted(set(only) - {f.name for f in FAULTS} - {"fuzz", "bytes"}):
-        raise FaultError(f"no fault {unknown}: choose from {[f.name for f in FAULTS]}, 'fuzz' and 'bytes'")
+        names = [f.name for f in FAULTS]
+        raise FaultError(f"no fault {unknown}", remedy=f"choose from {names}, 'fuzz' and 'bytes'")
     build()  # here, where its errors are seen
-    outcome = Outcome(gates)
+    outcome = FaultsOutcome(gates)
     chosen = [f for f in FAULTS if not only or f.name in only]
     if not only or "fuzz" in only:
         outcome.fuzz = fuzz(fuzz_lines)
-        say(f"fuzz: {outcome.fuzz['said']}")
+        echo(f"fuzz: {outcome.fuzz['said']}")
         if outcome.fuzz["unsafe_pulses"]:
             outcome.wrong.append(f"fuzz: {outcome.fuzz['said']}")
-    with Bench() as bench:
+    with DrivingBench() as bench:
         if not only or "bytes" in only:
             outcome.bytes = transmitted_and_replayed(bench)
-            say(f"bytes: {outcome.bytes}")
+            echo(f"bytes: {outcome.bytes}")
             if outcome.bytes["worst_us"] is None or outcome.bytes["worst_us"] > gates.bytes_us:
                 outcome.wrong.append(f"bytes: {outcome.bytes}, {gates.bytes_us:g} us are allowed")
         for fault, row in _rows(bench, chosen, gates):
             _complete(fault, row)
-            say(row_text(row))
+            echo(row_text(row))
             outcome.rows.append(row)
             outcome.wrong += [f"{row['fault']}: {sentence}" for sentence in row["wrong"]]
     outcome.seconds = time.monotonic() - begin
@@ -654,14 +676,14 @@ def run_faults(
     return outcome
 
 
-def _rows(bench: Bench, chosen: Sequence[Fault], gates: Gates) -> Iterator[tuple[Fault, dict[str, Any]]]:
+def _rows(bench: DrivingBench, chosen: Sequence[FaultRow], gates: Gates) -> Iterator[tuple[FaultRow, dict[str, Any]]]:
     """Each fault's row, once all that belongs to it is known: that it drives again only the next start tells."""
-    before: tuple[Fault, dict[str, Any]] | None = None
+    before: tuple[FaultRow, dict[str, Any]] | None = None
     for fault in chosen:
         if before:
             _drive_again(bench, *before, fault.start)
             yield before
-        elif bench.drive is None:
+        else:
             bench.at_speed(fault.start)
         before = fault, run_fault(bench, fault, gates)
     if before:
@@ -669,7 +691,7 @@ def _rows(bench: Bench, chosen: Sequence[Fault], gates: Gates) -> Iterator[tuple
         yield before
 
 
-def _drive_again(bench: Bench, fault: Fault, row: dict[str, Any], start: str) -> None:
+def _drive_again(bench: DrivingBench, fault: FaultRow, row: dict[str, Any], start: str) -> None:
     """The next drive; what it tells of a fault before it."""
     try:
         bench.at_speed(start)
@@ -680,13 +702,13 @@ def _drive_again(bench: Bench, fault: Fault, row: dict[str, Any], start: str) ->
         bench.at_speed(start)
     if fault.exit_code is not None:
         row["recovered"] = again
-    if fault.later:
-        row["log_line"] = _find(fault.says, bench.drive)
+    if fault.told_later:
+        row["log_line"] = _line_of(fault.message, bench.drive)
 
 
-def _complete(fault: Fault, row: dict[str, Any]) -> None:
+def _complete(fault: FaultRow, row: dict[str, Any]) -> None:
     if row["log_line"] is None:
-        row["wrong"].append(f"no line tells of it (wanted: {fault.says})")
+        row["wrong"].append(f"no line tells of it (wanted: {fault.message})")
     row["found"] = fault.expected if not row["wrong"] else "not as expected"
 
 

@@ -5,6 +5,7 @@ All times are of the monotonic clock that simavr's pins, the cable and the bench
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 from lab.params import lab_params
@@ -20,8 +21,9 @@ EDGE_US = 0.5  # an edge in simavr is known to 0.25 us
 STEP_US = ARDUINO_STEP_US + EDGE_US  # of a pulse that the Arduino measured and made again
 COMMAND_US = {"steering": 1.0, "throttle": 2.5}  # half a step of its timer, and an edge
 STILL_VALID_S = 0.2  # the Arduino holds a command for 150 ms, and a steering pulse begins 21 ms later
-BEFORE_S = 0.2  # so long it must have been driving before a fault
-LAST_S = 0.2  # so much of the end must have pulses
+BEFORE_S = 0.2  # it must have been driving for that long before a fault
+LAST_S = 0.2  # of the end, which must have pulses
+LATE_COMMAND_S = 0.1  # three of a drive's ticks
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Command(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Seen:
+class Observation:
     """What a fault is judged by. events: of the pins, in order; commands: of the drive; from before at_s to end_s."""
 
     events: Sequence[PinEvent]
@@ -68,10 +70,20 @@ class Seen:
         to_s = self.end_s if to_s is None else to_s
         return [e for e in self.events if e.pin == pin and e.kind in ("pulse", "cut") and from_s < e.end_s <= to_s]
 
+    def was_driving(self, throttle_max_us: float) -> bool:
+        """Whether each throttle pulse right before the fault moved the car."""
+        before = self.pulses("throttle", self.at_s - BEFORE_S, self.at_s)
+        return bool(before) and min(e.pulse_us for e in before) > throttle_max_us
+
     def stalled_ms(self) -> float:
-        """So long this machine had no time for the Arduino, or for who read its pins."""
+        """How long this machine had no time for the Arduino, or for who read its pins."""
         spoilt = [e for e in self.events if e.kind in ("stall", "lost") and self.at_s - BEFORE_S < e.monotonic_s]
         return sum(e.pulse_us / 1e3 if e.kind == "stall" else 1e9 for e in spoilt)
+
+    def longest_pause_s(self) -> float:
+        """The longest between two commands of the drive, from the fault on."""
+        times = [self.at_s, *(c.at_s for c in self.commands if c.at_s > self.at_s), self.end_s]
+        return max(b - a for a, b in pairwise(times))
 
 
 @dataclass
@@ -83,7 +95,12 @@ class Verdict:
 
 
 def judge(
-    expected: str, seen: Seen, gates: Gates, *, human_us: tuple[float, float] = REST_US, until_limit: bool = False
+    expected: str,
+    seen: Observation,
+    gates: Gates,
+    *,
+    human_us: tuple[float, float] = REST_US,
+    until_limit: bool = False,
 ) -> Verdict:
     """What the pins did from the fault on, against what was expected.
 
@@ -98,13 +115,12 @@ def judge(
         "steering_us_after": round(steering[-1].pulse_us, 1) if steering else None,
     }
     wrong = []
-    before = seen.pulses("throttle", seen.at_s - BEFORE_S, seen.at_s)
-    if not before or min(e.pulse_us for e in before) <= gates.throttle_max_us:
+    if not seen.was_driving(gates.throttle_max_us):
         wrong.append(f"the car was not driving in the {BEFORE_S * 1e3:g} ms before the fault")
     for pin, period_us in PERIOD_US.items():
-        found, wanted = len(seen.pulses(pin, seen.end_s - LAST_S)), LAST_S * 1e6 / period_us
-        if found < wanted - 2:
-            wrong.append(f"{found} {pin} pulses in the last {LAST_S * 1e3:g} ms, {wanted:.0f} are its rate")
+        count, wanted = len(seen.pulses(pin, seen.end_s - LAST_S)), LAST_S * 1e6 / period_us
+        if count < wanted - 2:
+            wrong.append(f"{count} {pin} pulses in the last {LAST_S * 1e3:g} ms, {wanted:.0f} are its rate")
     if expected == STOPPED:
         wrong += _not_stopped(seen, gates, figures, human_us)
     elif expected == HUMAN:
@@ -114,7 +130,9 @@ def judge(
     return Verdict(figures, wrong)
 
 
-def _not_stopped(seen: Seen, gates: Gates, figures: dict[str, Any], rest_us: tuple[float, float]) -> Iterator[str]:
+def _not_stopped(
+    seen: Observation, gates: Gates, figures: dict[str, Any], rest_us: tuple[float, float]
+) -> Iterator[str]:
     if figures["stopped_after_ms"] > gates.stopped_ms:
         yield f"throttle off {figures['stopped_after_ms']:g} ms after the fault, {gates.stopped_ms:g} are allowed"
     if (figures["max_throttle_us_after"] or 0) > gates.throttle_max_us:
@@ -126,23 +144,25 @@ def _not_stopped(seen: Seen, gates: Gates, figures: dict[str, Any], rest_us: tup
         yield f"steering at {off[-1]:g} us, neutral is {NEUTRAL_US['steering']}"
 
 
-def _not_human(seen: Seen, gates: Gates, figures: dict[str, Any], human_us: tuple[float, float]) -> Iterator[str]:
+def _not_human(
+    seen: Observation, gates: Gates, figures: dict[str, Any], human_us: tuple[float, float]
+) -> Iterator[str]:
     took_ms = 0.0
     for pin, wanted_us in zip(PERIOD_US, human_us, strict=True):
-        found = seen.pulses(pin)
-        ours = [i for i, e in enumerate(found) if abs(e.pulse_us - wanted_us) > STEP_US]
+        pulses = seen.pulses(pin)
+        ours = [i for i, e in enumerate(pulses) if abs(e.pulse_us - wanted_us) > STEP_US]
         first = ours[-1] + 1 if ours else 0
-        if first >= len(found):
+        if first >= len(pulses):
             figures["takeover_ms"] = None
             yield f"{pin} was never the human's"
             return
-        took_ms = max(took_ms, (found[first].end_s - seen.at_s) * 1e3)
+        took_ms = max(took_ms, (pulses[first].end_s - seen.at_s) * 1e3)
     figures |= {"stopped_after_ms": None, "takeover_ms": round(took_ms, 1)}
     if took_ms > gates.takeover_ms:
         yield f"the human's pulses after {took_ms:.1f} ms, {gates.takeover_ms:g} are allowed"
 
 
-def _not_continued(seen: Seen, gates: Gates, figures: dict[str, Any], until_limit: bool) -> Iterator[str]:
+def _not_continued(seen: Observation, gates: Gates, figures: dict[str, Any], until_limit: bool) -> Iterator[str]:
     if until_limit:
         yield from _not_limited(seen, gates, figures)
     stopped_s = seen.at_s + figures["stopped_after_ms"] / 1e3 + 1e-4 if until_limit else seen.end_s
@@ -164,7 +184,7 @@ def _not_continued(seen: Seen, gates: Gates, figures: dict[str, Any], until_limi
         yield "the throttle went off"
 
 
-def _not_limited(seen: Seen, gates: Gates, figures: dict[str, Any]) -> Iterator[str]:
+def _not_limited(seen: Observation, gates: Gates, figures: dict[str, Any]) -> Iterator[str]:
     """Fading from params' fade_s on, off at its stop_s: ages of a plan, which is younger when the fault comes."""
     limits, throttle = params()["drive"], seen.pulses("throttle")
     fading = [e.end_s for e in throttle if e.pulse_us < throttle[0].pulse_us - 2 * ARDUINO_STEP_US]

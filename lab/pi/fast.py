@@ -45,8 +45,8 @@ from pathlib import Path
 from typing import Any
 
 from lab.arduino.emulator import NICE as ARDUINO_NICE
-from lab.arduino.emulator import Arduino
-from lab.driving.bench import PLAIN, make_artifact, pictures
+from lab.arduino.emulator import EmulatedArduino
+from lab.driving.policy import PLAIN, make_artifact, pictures
 from lab.pi import plays
 from lab.pi.bench import Bench
 from lab.pi.breakage import break_deployments, row_of, wrong_rows
@@ -324,7 +324,7 @@ def _car(pi: Container) -> Iterator[Pins]:
     """Camera and Arduino, plugged in; what the pins do."""
     with (
         CameraFeed(pi.bench / "camera", *pictures(PLAIN, (180, 320)), rate_hz=HZ),
-        Arduino(every_pulse=False, transmitter=REST_US, nice=ARDUINO_NICE) as board,
+        EmulatedArduino(every_pulse=False, transmitter=REST_US, nice=ARDUINO_NICE) as board,
         Pins(board) as pins,
     ):
         (pi.bench / "camera").chmod(0o666)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.arduino.emulator import Arduino
+from lab.arduino.emulator import EmulatedArduino
 from lab.driving.pins import NEUTRAL_US, PERIOD_US, STEP_US
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.telemetry import Flight
@@ -22,7 +22,7 @@ READ_S = 0.2  # between readings of the pins
 class Pins:
     """Everything that an Arduino's pins do, from now on; a context manager."""
 
-    def __init__(self, board: Arduino):
+    def __init__(self, board: EmulatedArduino):
         self._board = board
         self._events: list[PinEvent] = []
         self._done = threading.Event()

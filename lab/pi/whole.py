@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from lab.arduino.emulator import Arduino
+from lab.arduino.emulator import EmulatedArduino
 from lab.pi import machine, plays
 from lab.pi.machine import DEBS, Card, Machine, card
 from lab.pi.outcome import Outcome
@@ -128,7 +128,7 @@ class _Run:
             frames = _frames(recordings, self.folder / "frames.yuyv")
         with contextlib.ExitStack() as on:
             self.pi = on.enter_context(Machine(flashed, self.folder, layer=layer, slow=self.slow, drives=[frames]))
-            board = on.enter_context(Arduino(transmitter=REST_US, slow=self.slow, nice=-5))
+            board = on.enter_context(EmulatedArduino(transmitter=REST_US, slow=self.slow, nice=-5))
             self.pins = on.enter_context(Pins(board))
             self.pi.plug(board.port)
             with self.outcome.step("boot, until ssh answers"):

@@ -1,0 +1,137 @@
+"""A serial cable with this program in it, so that it can be cut, stuck and garbled."""
+
+import contextlib
+import os
+import pty
+import random
+import re
+import select
+import termios
+import threading
+import time
+import tty
+from collections import deque
+from collections.abc import Callable
+
+from lab.driving.pins import Command
+from lab.driving.priority import boost
+from rover_lib.onboard.servo_link import frame
+
+Change = Callable[[bytes], bytes]
+
+
+def whole_lines(change: Change) -> Change:
+    """A change of whole lines, made one of a stream of bytes."""
+    pending = b""
+
+    def pass_on(data: bytes) -> bytes:
+        nonlocal pending
+        *lines, pending = (pending + data).split(b"\n")
+        return b"".join(change(line + b"\n") for line in lines)
+
+    return pass_on
+
+
+def flipping(rng: random.Random, share: float) -> Change:
+    """Flips a bit of that share of the bytes."""
+    return lambda data: bytes(b ^ (1 << rng.randrange(8)) if rng.random() < share else b for b in data)
+
+
+def dropping(rng: random.Random, share: float) -> Change:
+    """Drops that share of the lines."""
+    return whole_lines(lambda line: b"" if rng.random() < share else line)
+
+
+_DRIVE = re.compile(rb">D \d+ \d+ (\d+) (\d+)\*[0-9A-F]{8}")
+
+
+class Cable:
+    """The cable between a host and an Arduino. port: the host's end; opening it resets the Arduino, as DTR does.
+
+    to_arduino, to_host: may be set; change what passes. commands: the drives that the host wrote, before any change.
+    lines: all that it wrote. not_ours: lines that others write to the port, and which are no commands of the drive.
+    """
+
+    def __init__(self, arduino_port: str):
+        self._arduino_port = arduino_port
+        self._master, slave = pty.openpty()
+        tty.setraw(slave)
+        self.port = os.ttyname(slave)
+        os.close(slave)  # so that POLLHUP tells whether somebody has the port open
+        os.set_blocking(self._master, False)
+        self.to_arduino: Change | None = None
+        self.to_host: Change | None = None
+        self.commands: list[Command] = []
+        self.lines: list[bytes] = []
+        self.not_ours: set[bytes] = set()
+        self._injected: deque[bytes] = deque()
+        self._pending = b""
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="cable", daemon=True)
+        self._thread.start()
+
+    def unplug(self) -> None:
+        """Both ends come to nothing."""
+        self._closing.set()
+        self._thread.join()
+
+    def stick(self) -> None:
+        """The port takes no more bytes: who writes waits."""
+        port = os.open(self.port, os.O_RDWR | os.O_NOCTTY)
+        termios.tcflow(port, termios.TCOOFF)
+        os.close(port)
+
+    def inject(self, data: bytes) -> None:
+        """Bytes for the Arduino, as if the host had sent them."""
+        self._injected.append(data)
+
+    def _run(self) -> None:
+        boost(threading.get_native_id())
+        poller, arduino = select.poll(), -1
+        poller.register(self._master, select.POLLIN)
+        while not self._closing.is_set():
+            events = dict(poller.poll(20))
+            if events.get(self._master, 0) & select.POLLHUP:  # nobody has it open
+                if arduino >= 0:
+                    poller.unregister(arduino)
+                    os.close(arduino)
+                    arduino = -1
+                self._closing.wait(0.005)
+                continue
+            if arduino < 0:
+                arduino = os.open(self._arduino_port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+                poller.register(arduino, select.POLLIN)
+                self._pending = b""
+            if data := _read(self._master):
+                self._note(data)
+                _write(arduino, self.to_arduino(data) if self.to_arduino else data)
+            while self._injected:
+                _write(arduino, self._injected.popleft())
+            if data := _read(arduino):
+                _write(self._master, self.to_host(data) if self.to_host else data)
+        for fd in (self._master, arduino):
+            if fd >= 0:
+                os.close(fd)
+
+    def _note(self, data: bytes) -> None:
+        now = time.monotonic()
+        *lines, self._pending = (self._pending + data).split(b"\n")
+        for line in lines:
+            line = line[max(0, line.rfind(b">")) :]
+            if line in self.not_ours:
+                continue
+            self.lines.append(line + b"\n")
+            drive = _DRIVE.fullmatch(line)
+            if drive and frame(line.split(b"*")[0].decode()) == line + b"\n":
+                self.commands.append(Command(now, int(drive[1]), int(drive[2])))
+
+
+def _read(fd: int) -> bytes:
+    with contextlib.suppress(OSError):  # nothing there, or the other end is gone
+        return os.read(fd, 4096)
+    return b""
+
+
+def _write(fd: int, data: bytes) -> None:
+    with contextlib.suppress(OSError):  # what nobody takes is lost, as on a wire
+        os.write(fd, data)
