@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lab.driving.bench import make_artifact, pictures
+from lab.driving.policy import make_artifact, pictures
 from rover_lib.cli import main
 from rover_lib.onboard.pilot import SLACK_S
 from rover_lib.onboard.recording import read_controls

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from uno import body_of, line
 
-from lab.arduino.emulator import Arduino
+from lab.arduino.emulator import EmulatedArduino
 from rover_lib.onboard.errors import PwmError, RoverError
 from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
 
@@ -344,7 +344,7 @@ def test_threads_share_a_link():
 # ---- the real firmware, in real time
 
 
-class Emulated(Arduino):
+class Emulated(EmulatedArduino):
     """The emulated Arduino, and what was on its pins since it started."""
 
     def __init__(self):
@@ -372,6 +372,7 @@ def drive(link, seconds, steering_us=1800, throttle_us=600):
 
 @pytest.mark.emulated
 @needs.simavr
+@needs.real_time
 def test_the_real_firmware_arms_drives_and_stops(emulated):
     emulated.transmitter(1460, 124)
     with ServoLink(emulated.port) as link:
@@ -412,6 +413,7 @@ def test_the_real_firmware_without_a_transmitter_refuses(emulated):
 
 @pytest.mark.emulated
 @needs.simavr
+@needs.real_time
 def test_the_human_and_the_watchdog_are_seen_by_the_host(emulated):
     emulated.transmitter(1460, 124)
     with ServoLink(emulated.port) as link:

@@ -16,10 +16,11 @@ import pytest
 import serial
 from click.testing import CliRunner
 
-from lab.driving import bench, faults
-from lab.driving.bench import Cable, FaultError
-from lab.driving.pins import CONTINUES, HUMAN, PERIOD_US, STOPPED, Command, Gates, Seen, judge
-from rover_lib.cli import main
+from lab.__main__ import main
+from lab.driving import faults, policy
+from lab.driving.bench import FaultError
+from lab.driving.cable import Cable, dropping, flipping
+from lab.driving.pins import CONTINUES, HUMAN, PERIOD_US, STOPPED, Command, Gates, Observation, judge
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.servo_link import frame
@@ -49,7 +50,7 @@ def commanded(what, start=START - 0.5, end=END):
 
 
 def verdict(expected, what, *, commands=None, end=END, **more):
-    seen = Seen(pulses(what, end=end), commanded(what) if commands is None else commands, AT, end)
+    seen = Observation(pulses(what, end=end), commanded(what) if commands is None else commands, AT, end)
     return judge(expected, seen, GATES, **more)
 
 
@@ -100,7 +101,7 @@ def test_not_stopped(what, sentence):
 def test_a_pulse_that_a_reset_cut_is_a_pulse():
     events = pulses(then((0.1, 1456, 120)))
     events.append(PinEvent(AT + 0.5, "cut", "throttle", 300.0, 0.0))
-    found = judge(STOPPED, Seen(events, [], AT, END), GATES)
+    found = judge(STOPPED, Observation(events, [], AT, END), GATES)
     assert found.figures["max_throttle_us_after"] == 300
     assert found.wrong
 
@@ -195,10 +196,10 @@ def test_not_limited(what, sentence):
 
 def test_a_machine_that_stalled_is_known():
     events = pulses(then((0.1, 1456, 120)))
-    assert Seen(events, [], AT, END).stalled_ms() == 0
-    assert Seen([*events, PinEvent(AT + 1, "stall", "", 30_000.0, 0.0)], [], AT, END).stalled_ms() == 30
-    assert Seen([*events, PinEvent(AT - 1, "stall", "", 30_000.0, 0.0)], [], AT, END).stalled_ms() == 0
-    assert Seen([*events, PinEvent(AT + 1, "lost", "", 5.0, 0.0)], [], AT, END).stalled_ms() > 1e6
+    assert Observation(events, [], AT, END).stalled_ms() == 0
+    assert Observation([*events, PinEvent(AT + 1, "stall", "", 30_000.0, 0.0)], [], AT, END).stalled_ms() == 30
+    assert Observation([*events, PinEvent(AT - 1, "stall", "", 30_000.0, 0.0)], [], AT, END).stalled_ms() == 0
+    assert Observation([*events, PinEvent(AT + 1, "lost", "", 5.0, 0.0)], [], AT, END).stalled_ms() > 1e6
 
 
 def test_the_gates_are_those_of_params():
@@ -209,7 +210,7 @@ def test_every_row_is_one_of_a_kind_and_there_are_enough():
     names = [f.name for f in faults.FAULTS]
     assert len(set(names)) == len(names) >= GATES.rows
     assert sum(f.expected == STOPPED for f in faults.FAULTS) >= GATES.stopped_rows
-    assert all(f.says and (f.how or f.start == "disk") for f in faults.FAULTS)
+    assert all(f.message and (f.method or f.start == "disk") for f in faults.FAULTS)
     assert all(f.limits or f.until_limit for f in faults.FAULTS if f.expected == CONTINUES)
 
 
@@ -238,34 +239,34 @@ def test_steps_that_come_out_as_they_went_in():
 
 
 @pytest.fixture(scope="module")
-def policy(tmp_path_factory):
+def obedient(tmp_path_factory):
     path = tmp_path_factory.mktemp("faults") / "policy.pt"
-    bench.make_artifact(path)
+    policy.make_artifact(path)
     return load_policy(path)
 
 
-def told(policy, what):
-    jpegs = bench.pictures(what)
+def planned(obedient, instruction):
+    jpegs = policy.pictures(instruction)
     assert len(set(jpegs)) == len(jpegs)
-    found = [
-        policy.predict_unclipped(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), np.zeros(2))
+    plans = [
+        obedient.predict_unclipped(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR), np.zeros(2))
         for jpeg in jpegs[:3]
     ]
-    assert all(np.array_equal(found[0], other) for other in found)
-    return found[0]
+    assert all(np.array_equal(plans[0], other) for other in plans)
+    return plans[0]
 
 
-def test_the_policy_does_what_the_picture_tells_it_to(policy):
-    assert np.allclose(told(policy, bench.PLAIN), bench.PLAN)
-    assert np.allclose(told(policy, bench.OTHER), bench.OTHER_PLAN)
-    assert np.allclose(told(policy, bench.BEYOND), 5.0)
+def test_the_policy_does_what_the_picture_tells_it_to(obedient):
+    assert np.allclose(planned(obedient, policy.PLAIN), policy.PLAN)
+    assert np.allclose(planned(obedient, policy.OTHER), policy.OTHER_PLAN)
+    assert np.allclose(planned(obedient, policy.OUT_OF_RANGE), 5.0)
     start = time.monotonic()
-    assert np.allclose(told(policy, bench.SLOW), bench.PLAN)
+    assert np.allclose(planned(obedient, policy.SLOW), policy.PLAN)
     assert 0.85 < time.monotonic() - start < 3
     with pytest.raises(PolicyError, match="NaN"):
-        told(policy, bench.NAN)
+        planned(obedient, policy.NAN)
     with pytest.raises(Exception, match="told to fail by the picture"):
-        told(policy, bench.RAISE)
+        planned(obedient, policy.RAISE)
 
 
 # ---- the cable
@@ -348,12 +349,12 @@ def test_a_stuck_cable_blocks_and_an_unplugged_one_fails(ends):
 def test_spoiling():
     rng = random.Random(1)
     data = bytes(range(256)) * 100
-    changed = bench.flipping(rng, 0.01)(data)
+    changed = flipping(rng, 0.01)(data)
     bits = [bin(a ^ b).count("1") for a, b in zip(data, changed, strict=True)]
     assert max(bits) == 1
     assert 0.008 < sum(bits) / len(data) < 0.012
     lines = [b"%d\n" % i for i in range(1000)]
-    drop = bench.dropping(rng, 0.3)
+    drop = dropping(rng, 0.3)
     kept = b"".join(drop(line[:2]) + drop(line[2:]) for line in lines).splitlines(keepends=True)
     assert set(kept) < set(lines)
     assert 650 < len(kept) < 750

@@ -1,0 +1,99 @@
+"""The stand-in's rules: no line but the right one moves a pin. What goes for the firmware too is in test_emulator."""
+
+import contextlib
+import time
+from pathlib import Path
+
+import needs
+import serial
+from uno import body_of, line, status_of
+
+from rover_lib.world.standin import StandIn
+
+
+class Raw:
+    """The stand-in's port, without a link."""
+
+    def __init__(self, board):
+        self.port = serial.Serial(board.port, timeout=1)
+        hello = next(body for body in iter(self.read, None) if body.startswith("<H"))
+        self.boot, self.sequence = int(hello.split()[3]), int(hello.split()[4])
+
+    def read(self):
+        while True:
+            if body := body_of(self.port.readline()[:-1]):
+                return body
+
+    def say(self, text):
+        """What the status says after it."""
+        self.port.reset_input_buffer()
+        self.port.write(text)
+        time.sleep(0.03)
+        self.port.reset_input_buffer()
+        self.port.readline()
+        return status_of(next(body for body in iter(self.read, None) if body.startswith("<S")))
+
+    def command(self, kind, *values):
+        self.sequence += 1
+        return line(f">{kind} {' '.join(map(str, (self.boot, self.sequence, *values)))}")
+
+
+@contextlib.contextmanager
+def opened():
+    with StandIn() as board:
+        raw = Raw(board)
+        yield raw
+        raw.port.close()
+
+
+@needs.real_time
+def test_the_stand_in_ignores_what_the_firmware_ignores():
+    with opened() as raw:
+        assert raw.say(raw.command("D", 1500, 200)).result == "i"
+        arming = raw.command("A")
+        assert raw.say(arming).state == "A"
+        old = raw.command("D", 1500, 200)
+        status = raw.say(old)
+        assert (status.result, status.steering_us, status.throttle_us) == ("k", 1500, 200)
+        status = raw.say(old)
+        assert (status.result, status.old) == ("o", 1)
+        raw.boot += 1
+        assert raw.say(raw.command("D", 1900, 600)).old == 2
+        raw.boot -= 1
+        for bad in (
+            b">D 1 2 3\n",
+            old.replace(b"1500", b"1900"),
+            old[:9] + old,
+            line(">D 1 99"),
+            b">" + b"x" * 80 + b"\n",
+        ):
+            raw.say(raw.command("D", 1500, 200))
+            assert raw.say(bad).throttle_us in (200, 120)
+        status = raw.say(b"")
+        assert status.bad == 5
+        for pulses in ((899, 200), (2013, 200), (1500, 119), (1500, 712)):
+            raw.say(raw.command("A"))
+            assert raw.say(raw.command("D", *pulses)).result == "r"
+        raw.say(raw.command("A"))
+        status = raw.say(raw.command("N"))
+        assert (status.state, status.reason, status.throttle_us) == ("S", "n", 120)
+        time.sleep(0.2)
+        assert raw.say(arming).state == "S"  # replayed
+
+
+@needs.real_time
+def test_an_out_of_range_command_is_no_sign_of_life():
+    with opened() as raw:
+        raw.say(raw.command("A"))
+        end = time.monotonic() + 0.25
+        while time.monotonic() < end:
+            raw.port.write(raw.command("D", 1500, 900))
+            time.sleep(0.02)
+        assert raw.say(b"").reason == "t"
+
+
+def test_unplugging_the_stand_in():
+    board = StandIn()
+    board.close()
+    board.close()
+    assert not Path(board.port).exists()
