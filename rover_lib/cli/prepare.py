@@ -1,5 +1,6 @@
 """Commands that make artifacts of a checkpoint, and look at them."""
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -34,16 +35,11 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def inspect(file: Path, as_json: bool) -> None:
     """Say what FILE is: an artifact, a checkpoint, or a folder of recordings."""
-    import zipfile
-
     from rover_lib.onboard.artifact import check_integrity, content_hash, read_manifest
 
-    if file.is_file() and zipfile.is_zipfile(file):
-        with zipfile.ZipFile(file) as z:
-            scripted = any("/code/" in name for name in z.namelist())
-        if scripted:
-            check_integrity(file)
-            return show({"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}, as_json)
+    if file.is_file() and _is_scripted(file):
+        check_integrity(file)
+        return show({"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}, as_json)
     if file.is_dir() and not (file / "config.json").exists():
         from rover_lib.workshop.episodes import load_recordings
 
@@ -52,6 +48,15 @@ def inspect(file: Path, as_json: bool) -> None:
 
     checkpoint = load_checkpoint(file)
     return show({"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}, as_json)
+
+
+def _is_scripted(file: Path) -> bool:
+    """Whether it is a TorchScript archive. A damaged one is not: the checkpoint's loader says what is wrong with it."""
+    try:
+        with zipfile.ZipFile(file) as z:
+            return any("/code/" in name for name in z.namelist())
+    except Exception:  # zipfile says in many types that a file is damaged
+        return False
 
 
 @click.command()

@@ -1,11 +1,17 @@
 """Checkpoints in: the trainer's best_model.pth or LeRobot's pretrained_model/ folder, checked before they are used.
 
 Nothing in a file is ever executed: pickles are read with weights_only=True, and what that refuses is refused by name.
+Nothing is built from a number that a file only claims: every size is bounded first, by what the file's own bytes can
+hold or by what no policy reaches.
 """
 
 import json
+import math
 import re
+import stat
+import warnings
 import zipfile
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,13 +19,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, Affine, imagenet
+from rover_lib.workshop.untrusted import LARGEST, listed, shown
 
 TRAINER_KEYS = {  # of the trainer's config: what the shape of the policy needs
     "image_width", "image_height", "chunk_size", "hidden_size", "n_encoder_layers", "n_decoder_layers", "n_heads",
@@ -27,6 +33,19 @@ TRAINER_KEYS = {  # of the trainer's config: what the shape of the policy needs
 }  # fmt: skip
 TRAINER_CAMERA = "cam_front"
 TWO_ACTIONS = ("steering", "throttle")
+FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)  # what weights and statistics can be
+BEFORE_ZIP = bytes.fromhex("80028a0a6cfc9c46f9206aa85019")  # first bytes of what torch.save wrote before 1.6
+
+# Bounds, each far above what a policy of full size has, and low enough to be read in a second.
+PICKLE_BYTES = 2_000_000  # of a trainer's file without its tensors: 0.2 MB, and perhaps a history of losses
+JSON_BYTES = 1_000_000  # LeRobot's config.json: 3 kB
+HEADER_BYTES = 1_000_000  # of model.safetensors: 100 bytes for each of some 300 tensors
+STATISTICS_BYTES = 16_000_000  # LeRobot's: a few kB
+LARGEST_SIZE = 1_000_000  # a whole number in a config
+LARGEST_SIDE_PX = 8192  # the largest picture of a Pi's cameras has 4608 pixels a side
+MOST_ACTIONS = 1000  # and numbers in a state
+REPORTED = 1000  # entries of the trainer's config, in the report
+
 FEATURE_PX = 32  # a ResNet sees one feature per so many pixels a side
 SQUEEZED = 0.05  # of the aspect ratio: 432x240 for 640x360 is 0.013
 
@@ -51,19 +70,25 @@ class Checkpoint:
         """
         if len(self.config.cameras) != 1:
             raise CheckpointError(
-                f"{self.path}: has {len(self.config.cameras)} cameras; another size is only known for one"
+                f"{self.path}: has {len(self.config.cameras)} cameras", remedy="another size is only known for one"
             )
         if not all(isinstance(n, int) and not isinstance(n, bool) for n in (height, width)):
-            raise CheckpointError(f"an image size must be two whole numbers, found {height!r} and {width!r}")
+            raise CheckpointError(
+                "an image size must be two whole numbers",
+                found=f"{shown(height)} and {shown(width)}",
+                remedy="give height and width in pixels",
+            )
         if min(height, width) < FEATURE_PX:
             raise CheckpointError(
-                f"an image of {width}x{height} is smaller than one feature of the backbone; use at least {FEATURE_PX}"
+                f"an image of {width}x{height} is smaller than one feature of the backbone",
+                remedy=f"use at least {FEATURE_PX}",
             )
         ((trained_height, trained_width),) = self.config.image_sizes
         if abs(width * trained_height / (height * trained_width) - 1) > SQUEEZED:
             raise CheckpointError(
                 f"an image of {width}x{height} has another aspect ratio than {trained_width}x{trained_height}, which "
-                "the policy was trained with; choose one that squeezes the picture by less than 5 %"
+                "the policy was trained with",
+                remedy="choose one that squeezes the picture by less than 5 %",
             )
         return replace(self, config=replace(self.config, image_sizes=((height, width),)))
 
@@ -75,9 +100,14 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
     weights do not agree, and for policies that this project cannot run.
     """
     path = Path(path)
-    if not path.exists():
-        raise CheckpointError(f"{path}: not found; give the trainer's .pth file or LeRobot's pretrained_model folder")
-    return _load_lerobot(path) if path.is_dir() else _load_trainer(path)
+    if path.is_dir():
+        return _load_lerobot(path)
+    if not path.is_file():
+        what = "neither a file nor a folder" if path.exists() else "not found"
+        raise CheckpointError(
+            f"{path}: {what}", remedy="give the trainer's .pth file or LeRobot's pretrained_model folder"
+        )
+    return _load_trainer(path)
 
 
 # --- the trainer's file ---------------------------------------------------------------------------------------------
@@ -86,21 +116,24 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
 def _load_trainer(path: Path) -> Checkpoint:
     content = _read_pickle(path)
     if not isinstance(content, dict):
-        raise CheckpointError(f"{path}: expected a dict, found {type(content).__name__}; is it a trainer checkpoint?")
+        raise CheckpointError(
+            f"{path}: expected a dict", found=type(content).__name__, remedy="is it a trainer checkpoint?"
+        )
+    file_bytes = path.stat().st_size
     for key in ("config", "model_state_dict"):
         if not isinstance(content.get(key), dict):
             raise CheckpointError(
-                f"{path}: no '{key}' in it (found {sorted(map(str, content))[:8]}); "
-                "is this a trainer checkpoint, or only its weights?"
+                f"{path}: no '{key}' in it",
+                found=listed(content),
+                remedy="is this a trainer checkpoint, or only its weights?",
             )
-    raw, weights = content["config"], _named_weights(path, content["model_state_dict"])
+    raw, weights = content["config"], _named_weights(path, content["model_state_dict"], file_bytes)
     if missing := sorted(TRAINER_KEYS - set(raw)):
-        raise CheckpointError(f"{path}: the config lacks {missing}; it cannot be read off the weights, add them")
-    if raw.get("n_obs_steps", 1) != 1:
         raise CheckpointError(
-            f"{path}: n_obs_steps is {raw['n_obs_steps']!r}; ACT acts on one observation, train with 1"
+            f"{path}: the config lacks {missing}", remedy="it cannot be read off the weights, add them"
         )
-    height, width = (_positive(path, raw, k) for k in ("image_height", "image_width"))
+    _one_observation(path, raw)
+    height, width = (_positive(path, raw, k, LARGEST_SIDE_PX) for k in ("image_height", "image_width"))
     config = _config_from(
         path,
         weights,
@@ -115,14 +148,38 @@ def _load_trainer(path: Path) -> Checkpoint:
         backbone=raw["vision_encoder"],
         image_norm=(imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
     )
-    optimizer = content.get("optimizer_state_dict")
     extra = {
-        "epoch": content.get("epoch"),
-        "best_val_loss": None if content.get("best_val_loss") is None else float(content["best_val_loss"]),
-        "optimizer_mb": _tensor_bytes(optimizer) / 1e6,
-        "trainer_config": raw,
+        "epoch": _reported(content.get("epoch")),
+        "best_val_loss": _loss(path, content.get("best_val_loss")),
+        "optimizer_mb": _tensor_bytes(content.get("optimizer_state_dict")) / 1e6,
+        "trainer_config": _reported(raw),
     }
-    return _checked(path, "trainer", config, weights, sha256_of(path), path.stat().st_size, extra)
+    return _checked(path, "trainer", config, weights, sha256_of(path), file_bytes, extra)
+
+
+def _loss(path: Path, value: Any) -> float | None:
+    """A loss as a number: None if there is none, NaN if the training had diverged."""
+    if value is None or (isinstance(value, (int, float, np.number)) and not isinstance(value, bool)):
+        with suppress(OverflowError):
+            return None if value is None else float(value)
+    if _is_plain(value) and value.numel() == 1:
+        return float(value)
+    raise CheckpointError(
+        f"{path}: best_val_loss is not a number", found=shown(value), remedy="save it as one, or leave it out"
+    )
+
+
+def _reported(value: Any, depth: int = 3) -> Any:
+    """A value for the report, in JSON's types: what is endless or no number, text or list of them is only named."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, (str, bool, float, type(None))) or (isinstance(value, int) and abs(value) < LARGEST):
+        return value
+    if depth and isinstance(value, (dict, list, tuple)) and len(value) <= REPORTED:
+        if isinstance(value, dict):
+            return {k if isinstance(k, str) else shown(k): _reported(v, depth - 1) for k, v in value.items()}
+        return [_reported(v, depth - 1) for v in value]
+    return shown(value)
 
 
 def _numpy_scalars() -> list[Any]:
@@ -135,37 +192,105 @@ def _numpy_scalars() -> list[Any]:
 def _read_pickle(path: Path) -> Any:
     try:
         with zipfile.ZipFile(path) as z:
+            _check_archive(path, z)
             damaged = z.testzip()  # torch.load accepts overwritten weight bytes; the zip's CRC does not
-    except (zipfile.BadZipFile, OSError, RuntimeError) as e:
-        if not zipfile.is_zipfile(path):
-            raise CheckpointError(
-                f"{path}: not a torch checkpoint of this decade, or cut short ({e}); copy the file again"
-            ) from None
-        raise CheckpointError(f"{path}: damaged ({e}); copy the file again") from None
+    except CheckpointError:
+        raise
+    except Exception as e:  # zipfile says in many types that a file is damaged
+        raise _no_archive(path, e) from None
     if damaged:
-        raise CheckpointError(f"{path}: damaged, the checksum of '{damaged}' does not match; copy the file again")
+        raise CheckpointError(
+            f"{path}: damaged, the checksum of '{damaged}' does not match", remedy="copy the file again"
+        )
     try:
-        with torch.serialization.safe_globals(_numpy_scalars()):
+        with torch.serialization.safe_globals(_numpy_scalars()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of torch, about sparse tensors and the like: they are refused below
             # mmap: the optimizer's two thirds of the file are counted, never read
             return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as e:  # torch wraps what it meets in many types; each means the same to the user
-        wanted = re.search(r"GLOBAL ([\w.]+)", str(e))
-        if wanted:
+        if wanted := re.search(r"GLOBAL ([\w.]+)", str(e)):
+            raise _runs_code(path, wanted[1]) from None
+        raise CheckpointError(f"{path}: not readable ({_reason(e)})", remedy="copy the file again") from None
+
+
+def _no_archive(path: Path, error: Exception) -> CheckpointError:
+    """What to say of a file that is no archive, or a damaged one."""
+    with suppress(OSError), path.open("rb") as f:
+        if f.read(len(BEFORE_ZIP)) == BEFORE_ZIP:
+            return CheckpointError(
+                f"{path}: in torch's format of before 1.6, which has neither checksums nor bounds",
+                remedy="load it with torch.load(path, weights_only=True) and save that again with torch.save",
+            )
+    if zipfile.is_zipfile(path):
+        return CheckpointError(f"{path}: damaged ({_reason(error)})", remedy="copy the file again")
+    return CheckpointError(
+        f"{path}: not a torch checkpoint of this decade, or cut short ({_reason(error)})", remedy="copy the file again"
+    )
+
+
+def _reason(error: Exception) -> str:
+    """The first line of an error's text, or its name if it has none."""
+    text = str(error).rpartition("WeightsUnpickler error: ")[2]  # torch puts advice before it, to read it unsafely
+    return (text.splitlines() or [type(error).__name__])[0][:200]
+
+
+def _check_archive(path: Path, z: zipfile.ZipFile) -> None:
+    """Raise CheckpointError for an archive that claims more than the file holds, before anything in it is read."""
+    entries, file_bytes = z.infolist(), path.stat().st_size
+    # Compressed or overlapping entries can be a thousand times the file; torch writes neither, and could not map them.
+    if any(e.compress_type != zipfile.ZIP_STORED for e in entries) or sum(e.file_size for e in entries) > file_bytes:
+        raise CheckpointError(
+            f"{path}: its entries are compressed, or claim more than the file holds",
+            remedy="use the file as torch.save wrote it",
+        )
+    for entry in entries:
+        if not entry.filename.endswith("data.pkl"):
+            continue
+        if entry.file_size > PICKLE_BYTES:
             raise CheckpointError(
-                f"{path}: refused, reading it would run code (it asks for '{wanted[1]}'); "
-                "save only tensors, numbers and strings in a checkpoint"
-            ) from None
-        raise CheckpointError(f"{path}: not readable ({str(e).splitlines()[0][:200]}); copy the file again") from None
+                f"{path}: has {entry.file_size / 1e6:.1f} MB beside its tensors, more than {PICKLE_BYTES / 1e6:g} MB",
+                remedy="save fewer numbers and names in a checkpoint, or save them as tensors",
+            )
+        if b"bytearray\n" in z.read(entry):  # torch lets it through, and bytearray(10**11) would fill the memory
+            raise _runs_code(path, "bytearray")
+
+
+def _runs_code(path: Path, wanted: str) -> CheckpointError:
+    return CheckpointError(
+        f"{path}: refused, reading it would run code (it asks for '{wanted}')",
+        remedy="save only tensors, numbers and strings in a checkpoint",
+    )
 
 
 def _tensor_bytes(value: Any) -> int:
-    if isinstance(value, Tensor):
-        return value.numel() * value.element_size()
-    if isinstance(value, dict):
-        return sum(_tensor_bytes(v) for v in value.values())
-    if isinstance(value, (list, tuple)):
-        return sum(_tensor_bytes(v) for v in value)
-    return 0
+    """Bytes of all tensors in dicts, lists and tuples, each object counted once: lists can hold themselves."""
+    total, seen, waiting = 0, set(), [value]
+    while waiting:
+        value = waiting.pop()
+        if id(value) in seen:
+            continue
+        seen.add(id(value))
+        if isinstance(value, Tensor):
+            total += _bytes(value) if _is_plain(value) else 0
+        elif isinstance(value, dict):
+            waiting.extend(value.values())
+        elif isinstance(value, (list, tuple)):
+            waiting.extend(value)
+    return total
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether it is a tensor of numbers in memory: neither sparse, nor quantized, nor on torch's meta device."""
+    return (
+        isinstance(value, Tensor)
+        and value.layout == torch.strided
+        and value.device.type == "cpu"
+        and not value.is_quantized
+    )
+
+
+def _bytes(tensor: Tensor) -> int:
+    return tensor.numel() * tensor.element_size()
 
 
 # --- LeRobot's folder -----------------------------------------------------------------------------------------------
@@ -174,39 +299,52 @@ def _tensor_bytes(value: Any) -> int:
 def _load_lerobot(folder: Path) -> Checkpoint:
     raw = _read_json(folder / "config.json")
     if raw.get("type") != "act":
-        raise CheckpointError(f"{folder}/config.json: policy type is {raw.get('type')!r}; only 'act' is known here")
+        raise CheckpointError(
+            f"{folder}/config.json: policy type is {shown(raw.get('type'))}", remedy="only 'act' is known here"
+        )
     file = folder / "model.safetensors"
-    weights = _named_weights(file, _read_safetensors(file))
-    inputs, outputs = raw.get("input_features") or {}, raw.get("output_features") or {}
-    cameras, sizes = [], []
-    for name, feature in inputs.items():
-        kind, shape = _feature(folder, name, feature)
+    weights = _named_weights(file, _read_safetensors(file), file.stat().st_size)
+    inputs, outputs = (_features(folder, raw, key) for key in ("input_features", "output_features"))
+    sizes: dict[str, tuple[int, int]] = {}
+    for name, (kind, shape) in inputs.items():
         if kind == "VISUAL":
-            if len(shape) != 3 or shape[0] != 3:
+            if len(shape) != 3 or shape[0] != 3 or max(shape) > LARGEST_SIDE_PX:
                 raise CheckpointError(
-                    f"{folder}: camera '{name}' has shape {shape}; only (3, height, width) works here"
+                    f"{folder}: camera {shown(name)} has shape {shape[:4]}",
+                    remedy=f"only (3, height, width) works here, up to {LARGEST_SIDE_PX} pixels a side",
                 )
-            cameras.append(name)
-            sizes.append((shape[1], shape[2]))
+            sizes[name] = (shape[1], shape[2])
         elif kind == "ENV":
-            raise CheckpointError(f"{folder}: input '{name}' is an environment state, which no camera car has")
-    if not cameras:
-        raise CheckpointError(f"{folder}: the policy has no camera input (found {sorted(inputs)}); nothing to drive by")
+            raise CheckpointError(
+                f"{folder}: input {shown(name)} is an environment state, which no camera car has",
+                remedy="train a policy without it",
+            )
+    if not sizes:
+        raise CheckpointError(
+            f"{folder}: the policy has no camera input (it has {listed(inputs) or 'none'})",
+            remedy="nothing to drive by",
+        )
     if "observation.state" not in inputs:
-        raise CheckpointError(f"{folder}: the policy has no 'observation.state' input; LeRobot's forward needs one too")
+        raise CheckpointError(
+            f"{folder}: the policy has no 'observation.state' input", remedy="LeRobot's forward needs one too"
+        )
     if "action" not in outputs:
-        raise CheckpointError(f"{folder}: the policy has no 'action' output (found {sorted(outputs)})")
-    if raw.get("n_obs_steps", 1) != 1:
-        raise CheckpointError(f"{folder}: n_obs_steps is {raw['n_obs_steps']!r}; ACT acts on one observation")
+        raise CheckpointError(
+            f"{folder}: the policy has no 'action' output",
+            found=listed(outputs) or "none",
+            remedy="train one that acts",
+        )
+    _one_observation(folder, raw)
     keys = ("chunk_size", "dim_model", "n_heads", "dim_feedforward", "n_encoder_layers", "n_decoder_layers")
     chunk, dim, heads, feedforward, n_encoder, n_decoder = (_positive(folder, raw, k) for k in keys)
     inner = Normaliser(folder, "policy_preprocessor.json", "normalizer_processor")
     outer = Normaliser(folder, "policy_postprocessor.json", "unnormalizer_processor")
+    states, actions = inputs["observation.state"][1], outputs["action"][1]
     config = _config_from(
         folder,
         weights,
-        cameras=tuple(c.removeprefix("observation.images.").removeprefix("observation.") for c in cameras),
-        image_sizes=tuple(sizes),
+        cameras=tuple(c.removeprefix("observation.images.").removeprefix("observation.") for c in sizes),
+        image_sizes=tuple(sizes.values()),
         chunk=chunk,
         dim=dim,
         heads=heads,
@@ -214,21 +352,44 @@ def _load_lerobot(folder: Path) -> Checkpoint:
         encoder_layers=n_encoder,
         decoder_layers=n_decoder,
         backbone=raw.get("vision_backbone"),
-        dilation=bool(raw.get("replace_final_stride_with_dilation", False)),
-        pre_norm=bool(raw.get("pre_norm", False)),
+        dilation=_flag(folder, raw, "replace_final_stride_with_dilation"),
+        pre_norm=_flag(folder, raw, "pre_norm"),
         activation=raw.get("feedforward_activation", "relu"),
-        image_norm=tuple(inner.affine(c, "VISUAL", 3) or Affine((1.0,) * 3, (0.0,) * 3) for c in cameras),
-        state_norm=inner.affine("observation.state", "STATE", _feature(folder, "", inputs["observation.state"])[1][0]),
-        action_unnorm=outer.affine("action", "ACTION", _feature(folder, "", outputs["action"])[1][0], inverse=True),
+        image_norm=tuple(inner.affine(c, "VISUAL", 3) or Affine((1.0,) * 3, (0.0,) * 3) for c in sizes),
+        state_norm=inner.affine("observation.state", "STATE", states[0]),
+        action_unnorm=outer.affine("action", "ACTION", actions[0], inverse=True),
     )
+    for name, shape, size in (
+        ("observation.state", states, len(config.state_names)),
+        ("action", actions, len(config.action_names)),
+    ):
+        if shape != [size]:
+            raise CheckpointError(
+                f"{folder}: config and weights do not agree ('{name}' has shape {shape}, the weights are for {size})",
+                remedy="copy the whole folder again",
+            )
     extra = {"optimizer_mb": 0.0, "normalisation": {"in": inner.modes, "out": outer.modes}}
     return _checked(folder, "lerobot", config, weights, sha256_of(file), file.stat().st_size, extra)
 
 
-def _feature(folder: Path, name: str, feature: Any) -> tuple[str, list[int]]:
-    with suppress(KeyError, TypeError, ValueError):
-        return str(feature["type"]), [int(n) for n in feature["shape"]]
-    raise CheckpointError(f"{folder}/config.json: feature '{name}' has no type and shape (found {feature!r})")
+def _features(folder: Path, raw: Mapping[str, Any], key: str) -> dict[str, tuple[str, list[int]]]:
+    """Type and shape of each of the config's features, by name."""
+    features = raw.get(key) or {}
+    if not isinstance(features, dict):
+        raise CheckpointError(
+            f"{folder}/config.json: '{key}' is no object", found=shown(features), remedy="copy the folder again"
+        )
+    checked = {}
+    for name, feature in features.items():
+        kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
+        if not isinstance(kind, str) or not isinstance(shape, list) or not shape or not all(map(_is_size, shape)):
+            raise CheckpointError(
+                f"{folder}/config.json: feature {shown(name)} has no type and shape",
+                found=f"{shown(kind)} and {shown(shape)}",
+                remedy="copy the folder again",
+            )
+        checked[name] = kind, shape
+    return checked
 
 
 class Normaliser:
@@ -244,30 +405,56 @@ class Normaliser:
         self.eps = 1e-8
         if not self.where.exists():
             return
-        steps = _read_json(self.where).get("steps", [])
-        renames = [s for s in steps if (s.get("config") or {}).get("rename_map")]
-        if renames:
-            raise CheckpointError(
-                f"{self.where}: renames observations ({renames[0]['config']}); rename the inputs instead"
-            )
         known = {"rename_observations_processor", "to_batch_processor", "device_processor", step_name}
-        if unknown := [str(s.get("registry_name")) for s in steps if s.get("registry_name") not in known]:
-            raise CheckpointError(f"{self.where}: has processor steps that are not known here: {unknown}")
-        for step in steps:
-            if step.get("registry_name") == step_name:
-                self.modes = dict(step["config"].get("norm_map", {}))
-                self.eps = float(step["config"].get("eps", 1e-8))
+        for step in self._steps():
+            config = step["config"]
+            if renames := config.get("rename_map"):
+                raise CheckpointError(
+                    f"{self.where}: renames observations ({shown(renames)})", remedy="rename the inputs instead"
+                )
+            if step["registry_name"] not in known:
+                raise CheckpointError(
+                    f"{self.where}: has a processor step that is not known here: {shown(step['registry_name'])}",
+                    remedy="train without it, or do in the recordings what it does",
+                )
+            if step["registry_name"] == step_name:
+                self.modes, self.eps = config.get("norm_map", {}), config.get("eps", 1e-8)
                 if state := step.get("state_file"):
-                    if Path(state).name != state:
-                        raise CheckpointError(f"{self.where}: its state file '{state}' lies outside the folder")
-                    self.stats = _read_safetensors(folder / state)
+                    self.stats = self._read_statistics(folder, state)
+        texts = isinstance(self.modes, dict) and all(isinstance(v, str) for v in self.modes.values())
+        if not texts or not isinstance(self.eps, (int, float)) or not math.isfinite(self.eps):
+            raise CheckpointError(
+                f"{self.where}: a norm_map of texts and a number eps are expected",
+                found=f"{shown(self.modes)} and {shown(self.eps)}",
+                remedy="copy the folder again",
+            )
+
+    def _steps(self) -> list[dict[str, Any]]:
+        """The processor's steps, each with a name and a config."""
+        steps = _read_json(self.where).get("steps", [])
+        named = isinstance(steps, list) and all(
+            isinstance(s, dict) and isinstance(s.get("registry_name"), str) and isinstance(s.get("config") or {}, dict)
+            for s in steps
+        )
+        if not named:
+            raise CheckpointError(
+                f"{self.where}: its steps are no list of objects with a registry_name and a config",
+                remedy="copy the folder again",
+            )
+        return [{**s, "config": s.get("config") or {}} for s in steps]
+
+    def _read_statistics(self, folder: Path, name: Any) -> dict[str, Tensor]:
+        if not isinstance(name, str) or Path(name).name != name:
+            raise CheckpointError(
+                f"{self.where}: its state file {shown(name)} lies outside the folder",
+                remedy="copy the whole folder again",
+            )
+        return _read_safetensors(folder / name, STATISTICS_BYTES)
 
     def affine(self, key: str, kind: str, size: int, inverse: bool = False) -> Affine | None:
         """LeRobot's _apply_transform as scale and shift; None where it leaves the feature alone."""
         mode = self.modes.get(kind, "IDENTITY")
-        stats = {
-            k.removeprefix(f"{key}."): v.double().flatten() for k, v in self.stats.items() if k.startswith(f"{key}.")
-        }
+        stats = {k.removeprefix(f"{key}."): v for k, v in self.stats.items() if k.startswith(f"{key}.")}
         if mode == "IDENTITY" or not stats:
             return None
         pairs = {
@@ -277,62 +464,162 @@ class Normaliser:
             "QUANTILE10": ("q10", "q90"),
         }
         if mode not in pairs:
-            raise CheckpointError(f"{self.where}: normalisation mode '{mode}' of '{key}' is not known here")
+            raise CheckpointError(
+                f"{self.where}: normalisation mode {shown(mode)} of '{key}' is not known here",
+                remedy=f"known are IDENTITY, {', '.join(pairs)}",
+            )
         if missing := [p for p in pairs[mode] if p not in stats]:
             raise CheckpointError(
-                f"{self.where}: mode '{mode}' of '{key}' needs {missing}, the file has {sorted(stats)}"
+                f"{self.where}: mode '{mode}' of '{key}' needs {missing}",
+                found=listed(sorted(stats)),
+                remedy="copy the whole folder again, or compute the statistics again",
             )
-        a, b = (stats[p] for p in pairs[mode])
+        if odd := [p for p in pairs[mode] if stats[p].dtype not in FLOATS]:
+            raise CheckpointError(
+                f"{self.where}: statistics of '{key}' are no floats ({odd})", remedy="compute them again"
+            )
+        a, b = (stats[p].double().flatten() for p in pairs[mode])
         if len(a) != size or len(b) != size:
-            raise CheckpointError(f"{self.where}: statistics of '{key}' have {len(a)} values, the feature has {size}")
+            raise CheckpointError(
+                f"{self.where}: statistics of '{key}' have {len(a)} values, the feature has {size}",
+                remedy="copy the whole folder again",
+            )
         if mode == "MEAN_STD":
             scale, shift = (b, a) if inverse else (1 / (b + self.eps), -a / (b + self.eps))
         else:
             span = torch.where(a == b, torch.full_like(a, self.eps), b - a)
             scale, shift = (span / 2, a + span / 2) if inverse else (2 / span, -2 * a / span - 1)
         if not (torch.isfinite(scale).all() and torch.isfinite(shift).all()):
-            raise CheckpointError(f"{self.where}: statistics of '{key}' are not finite; compute them again")
+            raise CheckpointError(f"{self.where}: statistics of '{key}' are not finite", remedy="compute them again")
         return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
+
+
+def _of_folder(path: Path, most_bytes: int | None = None) -> Path:
+    """The path of a file of a LeRobot folder, once it is known to be one, and not larger than it can sensibly be."""
+    try:
+        status = path.stat()
+    except OSError as e:
+        reason = "not found" if isinstance(e, FileNotFoundError) else f"cannot be read ({e.strerror})"
+        raise CheckpointError(
+            f"{path}: {reason}", remedy="a LeRobot folder has config.json and model.safetensors"
+        ) from None
+    if not stat.S_ISREG(status.st_mode):
+        raise CheckpointError(f"{path}: not a file", remedy="a LeRobot folder has config.json and model.safetensors")
+    if most_bytes is not None and status.st_size > most_bytes:
+        raise CheckpointError(
+            f"{path}: has {status.st_size / 1e6:.1f} MB, at most {most_bytes / 1e6:g} are read",
+            remedy="copy the folder again",
+        )
+    return path
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: not found; a LeRobot folder has config.json and model.safetensors") from None
-    except (ValueError, OSError) as e:
-        raise CheckpointError(f"{path}: not readable as JSON ({e}); copy the folder again") from None
+        content = json.loads(_of_folder(path, JSON_BYTES).read_bytes())
+    except (ValueError, OSError, RecursionError) as e:  # RecursionError: brackets nested without end
+        raise CheckpointError(f"{path}: not readable as JSON ({e})", remedy="copy the folder again") from None
     if not isinstance(content, dict):
-        raise CheckpointError(f"{path}: expected a JSON object, found {type(content).__name__}")
+        raise CheckpointError(
+            f"{path}: expected a JSON object", found=type(content).__name__, remedy="copy the folder again"
+        )
     return content
 
 
-def _read_safetensors(path: Path) -> dict[str, Tensor]:
+def _read_safetensors(path: Path, most_bytes: int | None = None) -> dict[str, Tensor]:
     try:
+        with _of_folder(path, most_bytes).open("rb") as f:
+            header_bytes = int.from_bytes(f.read(8), "little")
+        if header_bytes > HEADER_BYTES:
+            raise CheckpointError(
+                f"{path}: not readable as safetensors (its header claims {header_bytes / 1e6:.1f} MB, "
+                f"at most {HEADER_BYTES / 1e6:g} are read)",
+                remedy="copy the file again",
+            )
         return load_file(path)
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: not found; a LeRobot folder has config.json and model.safetensors") from None
-    except (SafetensorError, OSError) as e:
-        raise CheckpointError(f"{path}: not readable as safetensors ({e}); copy the file again") from None
+    except CheckpointError:
+        raise
+    except Exception as e:  # whatever its Rust or torch says of a header that lies
+        raise CheckpointError(
+            f"{path}: not readable as safetensors ({shown(str(e))})", remedy="copy the file again"
+        ) from None
 
 
 # --- what both have in common ---------------------------------------------------------------------------------------
 
 
-def _named_weights(path: Path, state: dict[Any, Any]) -> dict[str, Tensor]:
+def _named_weights(path: Path, state: dict[Any, Any], file_bytes: int) -> dict[str, Tensor]:
+    """The weights by LeRobot's names without `model.`: dense floats that together fit into the file."""
     odd = [k for k, v in state.items() if not isinstance(k, str) or not isinstance(v, Tensor)]
     if odd:
-        raise CheckpointError(f"{path}: weights that are no tensors: {odd[:5]}")
+        raise CheckpointError(
+            f"{path}: weights that are no tensors: {listed(odd)}", remedy="save policy.state_dict() as it is"
+        )
     if outside := [k for k in state if not k.startswith("model.")]:
-        raise CheckpointError(f"{path}: names outside 'model.': {outside[:5]}; is it an ACTPolicy of LeRobot?")
-    return {k.removeprefix("model."): v for k, v in state.items()}
+        raise CheckpointError(
+            f"{path}: names outside 'model.': {listed(outside)}", remedy="is it an ACTPolicy of LeRobot?"
+        )
+    weights = {k.removeprefix("model."): v for k, v in state.items()}
+    for name, weight in weights.items():
+        if problem := _unusable(weight):
+            raise CheckpointError(
+                f"{path}: weight {shown(name)} is {problem}", remedy="save the weights as trained, dense and in floats"
+            )
+    claimed = sum(map(_bytes, weights.values()))
+    if claimed > file_bytes:  # weights that share their values, or repeat one
+        raise CheckpointError(
+            f"{path}: its weights claim {claimed / 1e6:.1f} MB in a file of {file_bytes / 1e6:.1f} MB",
+            remedy="save each weight with values of its own (.clone())",
+        )
+    return weights
 
 
-def _positive(path: Path, raw: dict[str, Any], key: str) -> int:
+def _unusable(weight: Tensor) -> str | None:
+    """Why a tensor is no weight."""
+    if weight.device.type == "meta":
+        return "without values, on torch's meta device"
+    if weight.is_quantized:
+        return "quantized"
+    if not _is_plain(weight):
+        return f"not dense ({str(weight.layout).removeprefix('torch.')})"
+    if weight.dtype not in FLOATS:
+        return f"of {weight.dtype}, not of floats"
+    if not weight.numel():
+        return "empty"
+    return None
+
+
+def _is_size(value: Any, most: int = LARGEST_SIZE) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most
+
+
+def _positive(path: Path, raw: dict[str, Any], key: str, most: int = LARGEST_SIZE) -> int:
     value = raw.get(key)
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise CheckpointError(f"{path}: config '{key}' must be a whole number of at least 1, found {value!r}")
+    if not _is_size(value, most):
+        raise CheckpointError(
+            f"{path}: config '{key}' must be a whole number of at least 1 and at most {most}",
+            found=shown(value),
+            remedy="correct it to what the policy was trained with",
+        )
     return value
+
+
+def _flag(path: Path, raw: dict[str, Any], key: str) -> bool:
+    value = raw.get(key)
+    if value is None or (isinstance(value, int) and value in (0, 1)):
+        return bool(value)
+    raise CheckpointError(
+        f"{path}: config '{key}' must be true or false",
+        found=shown(value),
+        remedy="correct it to what the policy was trained with",
+    )
+
+
+def _one_observation(path: Path, raw: dict[str, Any]) -> None:
+    steps = raw.get("n_obs_steps", 1)
+    if not isinstance(steps, (int, float)) or steps != 1:
+        raise CheckpointError(
+            f"{path}: n_obs_steps is {shown(steps)}", remedy="ACT acts on one observation, train with 1"
+        )
 
 
 def _names(count: int, stem: str) -> tuple[str, ...]:
@@ -341,33 +628,52 @@ def _names(count: int, stem: str) -> tuple[str, ...]:
 
 def _config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActConfig:
     """Add to what the config says what only the weights' shapes say, and refuse what cannot be run."""
-    if known["backbone"] not in BACKBONES:
-        raise CheckpointError(
-            f"{path}: backbone {known['backbone']!r} is not known here; known are {sorted(BACKBONES)}"
-        )
-    if known.get("activation", "relu") not in ACTIVATIONS:
-        raise CheckpointError(
-            f"{path}: activation {known['activation']!r} is not known here; known are {sorted(ACTIVATIONS)}"
-        )
+    for key, choices in (("backbone", BACKBONES), ("activation", ACTIVATIONS)):
+        value = known.get(key, "relu")
+        if not isinstance(value, str) or value not in choices:
+            raise CheckpointError(
+                f"{path}: {key} {shown(value)} is not known here", remedy=f"known are {', '.join(sorted(choices))}"
+            )
     if known.get("dilation") and BACKBONES[known["backbone"]][0] == "basic":
         raise CheckpointError(
-            f"{path}: {known['backbone']} cannot be dilated (torchvision refuses it too); use resnet50"
+            f"{path}: {known['backbone']} cannot be dilated (torchvision refuses it too)", remedy="use resnet50"
         )
     if known["dim"] % known["heads"]:
-        raise CheckpointError(f"{path}: {known['heads']} heads do not divide a width of {known['dim']}")
+        raise CheckpointError(
+            f"{path}: {known['heads']} heads do not divide a width of {known['dim']}",
+            remedy="correct them to what the policy was trained with",
+        )
     if known["dim"] % 4:
-        raise CheckpointError(f"{path}: a width of {known['dim']} has no 2-d positions; it must be a multiple of 4")
+        raise CheckpointError(
+            f"{path}: a width of {known['dim']} has no 2-d positions", remedy="it must be a multiple of 4"
+        )
 
     def shape(name: str) -> tuple[int, ...]:
         if name not in weights:
-            raise CheckpointError(f"{path}: no weight '{name}'; is it an ACTPolicy of LeRobot, and whole?")
+            raise CheckpointError(f"{path}: no weight '{name}'", remedy="is it an ACTPolicy of LeRobot, and whole?")
         return tuple(weights[name].shape)
 
+    def last(name: str) -> int:
+        size = shape(name)[-1] if shape(name) else 0
+        if not 1 <= size <= MOST_ACTIONS:
+            raise CheckpointError(
+                f"{path}: weight '{name}' has shape {shape(name)}, with no size from 1 to {MOST_ACTIONS} at its end",
+                remedy="is it an ACTPolicy of LeRobot, and whole?",
+            )
+        return size
+
+    for part in ("encoder", "decoder"):
+        # each layer has many weights: what builds the expected shapes cannot be made to build for a minute
+        if (count := known[f"{part}_layers"]) > len(weights):
+            raise CheckpointError(
+                f"{path}: config and weights do not agree ({count} {part} layers, {len(weights)} weights in all)",
+                remedy="correct the config to what the policy was trained with",
+            )
     vae = {m[1] for k in weights if (m := re.match(r"vae_encoder\.layers\.(\d+)\.", k))}
     return ActConfig(
-        state_names=_names(shape("encoder_robot_state_input_proj.weight")[-1], "state"),
-        action_names=_names(shape("action_head.bias")[0], "action"),
-        latent=shape("encoder_latent_input_proj.weight")[-1],
+        state_names=_names(last("encoder_robot_state_input_proj.weight"), "state"),
+        action_names=_names(last("action_head.bias"), "action"),
+        latent=last("encoder_latent_input_proj.weight"),
         vae_layers=len(vae),
         **known,
     )
@@ -448,10 +754,6 @@ def _resnet_shapes(name: str) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-
-
 def _checked(
     path: Path,
     kind: str,
@@ -465,15 +767,20 @@ def _checked(
     found = {k: tuple(v.shape) for k, v in weights.items()}
     problems = []
     if missing := sorted(expected.keys() - found.keys()):
-        problems.append(f"missing: {_listed(missing)}")
+        problems.append(f"missing: {listed(missing)}")
     if unknown := sorted(found.keys() - expected.keys()):
-        problems.append(f"unknown: {_listed(unknown)}")
+        problems.append(f"unknown: {listed(unknown)}")
     if wrong := [f"{k} is {found[k]}, not {expected[k]}" for k in expected if k in found and found[k] != expected[k]]:
-        problems.append(f"of another shape: {_listed(wrong)}")
+        problems.append(f"of another shape: {listed(wrong)}")
     if problems:
-        raise CheckpointError(f"{path}: config and weights do not agree ({'; '.join(problems)})")
-    if bad := [k for k, v in weights.items() if not torch.isfinite(v).all()]:
-        raise CheckpointError(f"{path}: NaN or Inf in {_listed(bad)}; training diverged, take an earlier checkpoint")
+        raise CheckpointError(
+            f"{path}: config and weights do not agree ({'; '.join(problems)})",
+            remedy="correct the config to what the policy was trained with",
+        )
+    if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
+        raise CheckpointError(
+            f"{path}: NaN or Inf in {listed(bad)}", remedy="training diverged, take an earlier checkpoint"
+        )
     parts: dict[str, int] = {}
     for k, v in weights.items():
         part = "vae (training only)" if k.startswith("vae_") else k.split(".")[0].removesuffix("_embed")

@@ -1,19 +1,27 @@
 """Checkpoints in, and every way in which one can be wrong."""
 
 import json
+import math
 import os
 import pickle
+import shutil
+import time
 import zipfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from policies import TINY, lerobot_policy, memory_samples, trainer_content
+from safetensors.torch import save_file
 
+from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.act import ACT
-from rover_lib.workshop.checkpoint import expected_shapes, load_checkpoint
+from rover_lib.workshop.checkpoint import PICKLE_BYTES, expected_shapes, load_checkpoint
 from rover_lib.workshop.compare import LerobotEager
 from rover_lib.workshop.quantize import inputs_of
 
@@ -71,6 +79,9 @@ def test_expected_shapes_are_lerobots(tiny, backbone):
     assert expected_shapes(replace(tiny.config, backbone=backbone)) == theirs
 
 
+BIAS = "model.decoder.norm.bias"
+
+
 class Evil:
     def __reduce__(self):
         return os.system, ("touch owned",)
@@ -102,12 +113,14 @@ def test_refuses_to_run_code(tiny_policy, tmp_path, monkeypatch):
         (lambda c: c["model_state_dict"].update({"model.extra": torch.zeros(1)}), "unknown: extra"),
         (lambda c: c["model_state_dict"].update({"other.extra": torch.zeros(1)}), "other.extra"),
         (lambda c: c["model_state_dict"].update({"model.action_head.bias": 3}), "action_head.bias"),
-        (lambda c: c["model_state_dict"]["model.decoder.norm.bias"].fill_(np.nan), "NaN or Inf in decoder.norm.bias"),
-        (lambda c: c["model_state_dict"]["model.decoder.norm.bias"].fill_(np.inf), "NaN or Inf"),
+        (lambda c: c["model_state_dict"].update({BIAS: torch.full((64,), np.nan)}), "NaN or Inf in decoder.norm.bias"),
+        (lambda c: c["model_state_dict"].update({BIAS: torch.full((64,), np.inf)}), "NaN or Inf"),
+        # finite, but not as the float32 that drives
+        (lambda c: c["model_state_dict"].update({BIAS: torch.full((64,), 1e300, dtype=torch.float64)}), "NaN or Inf"),
     ],
 )
-def test_refuses_what_does_not_agree(change, says, tmp_path):
-    content = trainer_content(lerobot_policy(**TINY))
+def test_refuses_what_does_not_agree(change, says, tiny_policy, tmp_path):
+    content = trainer_content(tiny_policy)
     change(content)
     assert says in refused(write(content, tmp_path / "bad.pth"))
 
@@ -131,11 +144,10 @@ def test_refuses_damaged_files(tiny_file, tmp_path):
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tiny_policy, tmp_path):
     from test_act import image_stats, saved
 
-    policy = lerobot_policy(**TINY)
-    saved(policy, tmp_path, image_stats(policy))
+    saved(tiny_policy, tmp_path, image_stats(tiny_policy))
     return tmp_path
 
 
@@ -216,3 +228,305 @@ def test_another_size_is_for_one_camera(tiny):
     two = replace(tiny, config=replace(tiny.config, cameras=("left", "right"), image_sizes=((72, 128),) * 2))
     with pytest.raises(CheckpointError, match="2 cameras"):
         two.at_size(54, 96)
+
+
+# ---- files that lie: refused in a sentence with a remedy, in less than a second or two -------------------------------
+
+QUICKLY_S = 2.0  # of this process: no more than an honest file of the same size takes
+WILD = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+
+
+def refused_quickly(path) -> CheckpointError:
+    start_s = time.process_time()
+    with pytest.raises(CheckpointError) as e:
+        load_checkpoint(path)
+    assert time.process_time() - start_s < QUICKLY_S
+    message = str(e.value)
+    assert str(path) in message and "\n" not in message and len(message) < 1000
+    assert e.value.remedy
+    return e.value
+
+
+def small(**changes):
+    """A trainer's content with one small weight: wrong as a whole, and quick to write."""
+    config = {"image_width": 128, "image_height": 72, "chunk_size": 32, "hidden_size": 64, "n_encoder_layers": 1,
+              "n_decoder_layers": 2, "n_heads": 4, "feedforward_dim": 128, "vision_encoder": "resnet18"}  # fmt: skip
+    weights = {
+        "model.encoder_robot_state_input_proj.weight": torch.zeros(64, 2),
+        "model.encoder_latent_input_proj.weight": torch.zeros(64, 32),
+        "model.action_head.bias": torch.ones(2),
+    }
+    config |= changes.pop("config", {})
+    return {"config": config, "model_state_dict": weights | changes.pop("weights", {}), **changes}
+
+
+@pytest.mark.parametrize(
+    ("weight", "says"),
+    [
+        (torch.eye(3).to_sparse(), "not dense (sparse_coo)"),
+        (torch.empty(10**9, device="meta"), "meta device"),
+        (torch.quantize_per_tensor(torch.ones(3), 0.1, 0, torch.qint8), "quantized"),
+        (torch.ones(3, dtype=torch.complex64), "of torch.complex64"),
+        (torch.ones(3, dtype=torch.bool), "of torch.bool"),
+        (torch.ones(3, dtype=torch.int64), "of torch.int64"),
+        (torch.ones(3).to(torch.float8_e4m3fn), "of torch.float8_e4m3fn"),
+        (torch.zeros(0, 10**12), "empty"),
+        (torch.zeros(1).expand(10**6, 10**5), "claim 400000.0 MB"),
+    ],
+)
+def test_a_weight_that_is_no_dense_float_is_refused(weight, says, tmp_path):
+    path = write(small(weights={"model.action_head.bias": weight}), tmp_path / "bad.pth")
+    assert says in str(refused_quickly(path))
+
+
+def test_weights_that_share_a_storage_claim_more_than_the_file_holds(tmp_path):
+    shared = torch.zeros(1000, 1000)
+    path = write(small(weights={f"model.w{i}": shared.view(-1)[: 10**6] for i in range(100)}), tmp_path / "bad.pth")
+    assert "its weights claim 400.0 MB" in str(refused_quickly(path))
+
+
+@pytest.mark.parametrize("key", ["encoder", "decoder"])
+def test_a_million_layers_are_not_built(key, tmp_path):
+    path = write(small(config={f"n_{key}_layers": 10**6}), tmp_path / "bad.pth")
+    assert f"1000000 {key} layers, 3 weights" in str(refused_quickly(path))
+
+
+HOLDS_ITSELF: list = []
+HOLDS_ITSELF.append(HOLDS_ITSELF)
+DOUBLED: list = [1]
+for _ in range(60):  # 2**60 numbers, in sixty lists
+    DOUBLED = [DOUBLED, DOUBLED]
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["low", "0.1", True, 10**500, [0.1], torch.ones(2), HOLDS_ITSELF, DOUBLED],
+    ids=lambda v: type(v).__name__,
+)
+def test_a_loss_that_is_no_number_is_refused(value, tmp_path):
+    path = write(small(best_val_loss=value), tmp_path / "bad.pth")
+    assert "best_val_loss is not a number" in str(refused_quickly(path))
+
+
+@pytest.mark.parametrize(
+    "value",
+    [10**500, -1, True, 2.5, "a\nb" * 999, HOLDS_ITSELF, DOUBLED, torch.ones(2), torch.eye(2).to_sparse()],
+    ids=lambda v: type(v).__name__,
+)
+@pytest.mark.parametrize("key", ["n_obs_steps", "image_height", "hidden_size", "n_decoder_layers", "vision_encoder"])
+def test_a_config_of_odd_values_is_refused(key, value, tmp_path):
+    if key != "n_obs_steps" or value is not True:  # which is one
+        refused_quickly(write(small(config={key: value}), tmp_path / "bad.pth"))
+
+
+def test_the_report_is_finite_and_plain(tiny_policy, tmp_path):
+    """What else is in a trainer's file is reported as far as JSON can hold it, and never walked without end."""
+    content = trainer_content(tiny_policy)
+    content["config"] |= {
+        "history": HOLDS_ITSELF,
+        "all": DOUBLED,
+        "huge": 10**500,
+        "mean": torch.ones(3),
+        "size": (1, 2),
+    }
+    content |= {"epoch": np.int64(7), "optimizer_state_dict": [DOUBLED, HOLDS_ITSELF, torch.eye(2).to_sparse()]}
+    report = load_checkpoint(write(content, tmp_path / "odd.pth")).report
+    text = json.dumps(report)
+    assert len(text) < 20_000 and report["optimizer_mb"] == 0 and report["epoch"] == 7
+    assert report["trainer_config"]["betas"] == [0.9, 0.999] and report["trainer_config"]["size"] == [1, 2]
+    assert report["trainer_config"]["huge"] == "an integer of 1661 bits"
+
+
+def test_the_format_before_zip_files_is_refused_by_its_name(tmp_path):
+    path = tmp_path / "old.pth"
+    torch.save(small(), path, _use_new_zipfile_serialization=False)
+    error = refused_quickly(path)
+    assert "torch's format of before 1.6" in error.what and "torch.save" in error.remedy
+
+
+def rewritten(path, change, compression=zipfile.ZIP_STORED):
+    """The same archive with another pickle in it, and right checksums."""
+    other = path.with_suffix(".changed.pth")
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(other, "w", compression) as target:
+        for name in source.namelist():
+            data = source.read(name)
+            target.writestr(name, change(data) if name.endswith("data.pkl") else data)
+    return other
+
+
+def test_archives_that_unfold_to_more_than_the_file_are_refused(tmp_path):
+    path = write(small(), tmp_path / "a.pth")
+    assert "compressed" in str(refused_quickly(rewritten(path, bytes, zipfile.ZIP_DEFLATED)))
+    assert "it asks for 'bytearray'" in str(
+        refused_quickly(rewritten(path, lambda _: b"\x80\x02cbuiltins\nbytearray\nJ\x00\x00\x00\x40\x85R."))
+    )
+    assert "MB beside its tensors" in str(refused_quickly(rewritten(path, lambda d: d + bytes(PICKLE_BYTES))))
+    assert "not readable" in str(refused_quickly(rewritten(path, lambda _: b"\x80\x02" + b"]" * 10**5)))
+
+
+def test_a_pipe_is_no_checkpoint(tmp_path):
+    os.mkfifo(tmp_path / "pipe.pth")
+    assert "neither a file nor a folder" in str(refused_quickly(tmp_path / "pipe.pth"))
+
+
+@pytest.fixture(scope="module")
+def small_file(tmp_path_factory):
+    return write(small(), tmp_path_factory.mktemp("small") / "small.pth")
+
+
+CHANGES = st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), min_size=1, max_size=5)
+
+
+def changed(data: bytes, changes) -> bytes:
+    data = bytearray(data)
+    for at, value in changes:
+        data[at % len(data)] = value
+    return bytes(data)
+
+
+@WILD
+@given(changes=CHANGES)
+def test_wild_bytes_in_an_archive(small_file, changes):
+    path = small_file.with_name("wild.pth")
+    path.write_bytes(changed(small_file.read_bytes(), changes))
+    refused_quickly(path)
+
+
+@WILD
+@given(changes=CHANGES)
+def test_wild_bytes_in_a_pickle(small_file, changes):
+    refused_quickly(rewritten(small_file, lambda data: changed(data, changes)))
+
+
+def test_inspecting_a_damaged_archive_is_a_sentence(small_file, tmp_path):
+    path = tmp_path / "damaged.pth"
+    data = small_file.read_bytes()
+    at = data.index(b"PK\x01\x02")  # the directory at the archive's end
+    path.write_bytes(data[:at] + b"PK\xff\xff" + data[at + 4 :])
+    result = CliRunner().invoke(main, ["inspect", str(path)])
+    assert result.exit_code == 1 and "damaged (Bad magic number for central directory)" in result.output
+
+
+# ---- the same of LeRobot's folder --------------------------------------------------------------------------------
+
+
+def safetensors(header: bytes, data: bytes = b"", length: int | None = None) -> bytes:
+    return (len(header) if length is None else length).to_bytes(8, "little") + header + data
+
+
+@pytest.fixture(scope="module")
+def small_folder(tmp_path_factory):
+    """LeRobot's files with three weights: wrong as a whole, and quick to read."""
+    path = tmp_path_factory.mktemp("lerobot")
+    features = {"observation.images.front": {"type": "VISUAL", "shape": [3, 72, 128]},
+                "observation.state": {"type": "STATE", "shape": [2]}}  # fmt: skip
+    config = {"type": "act", "n_obs_steps": 1, "chunk_size": 32, "dim_model": 64, "n_heads": 4, "dim_feedforward": 128,
+              "n_encoder_layers": 1, "n_decoder_layers": 2, "vision_backbone": "resnet18", "pre_norm": False,
+              "replace_final_stride_with_dilation": False, "feedforward_activation": "relu",
+              "input_features": features, "output_features": {"action": {"type": "ACTION", "shape": [2]}}}  # fmt: skip
+    (path / "config.json").write_text(json.dumps(config))
+    save_file({k: v.clone() for k, v in small()["model_state_dict"].items()}, path / "model.safetensors")
+    norm = {"norm_map": {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MIN_MAX"}, "eps": 1e-8}
+    for file, name in (
+        ("policy_preprocessor", "normalizer_processor"),
+        ("policy_postprocessor", "unnormalizer_processor"),
+    ):
+        steps = [{"registry_name": name, "config": norm, "state_file": "stats.safetensors"}]
+        (path / f"{file}.json").write_text(json.dumps({"steps": steps}))
+    two = torch.tensor([1.0, 2.0])
+    keys = [f"{key}.{stat}" for key in ("observation.state", "action") for stat in ("mean", "std", "min", "max")]
+    save_file({key: two + len(key) for key in keys}, path / "stats.safetensors")
+    return path
+
+
+def test_the_small_folder_lacks_only_weights(small_folder):
+    assert "config and weights do not agree (missing: " in str(refused_quickly(small_folder))
+
+
+@pytest.fixture
+def copied(small_folder, tmp_path):
+    return shutil.copytree(small_folder, tmp_path / "copied")
+
+
+@pytest.mark.parametrize("file", ["config.json", "policy_preprocessor.json"])
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('{"a":' * 1000 + "1" + "}" * 1000, "not readable as JSON"),
+        ("[" * 100_000, "not readable as JSON"),
+        (json.dumps({str(i): i for i in range(10**5)}), "MB, at most 1 are read"),
+        ("[]", "expected a JSON object"),
+        ('{"a": 1' + "0" * 5000 + "}", "not readable as JSON"),
+        ("\ud800", "not readable as JSON"),
+    ],
+    ids=["deep", "unended", "many entries", "list", "huge number", "no text"],
+)
+def test_json_that_is_too_deep_or_too_large_is_refused(copied, file, text, says):
+    (copied / file).write_bytes(text.encode(errors="surrogatepass"))
+    assert says in str(refused_quickly(copied))
+
+
+@pytest.mark.parametrize("file", ["config.json", "model.safetensors", "policy_preprocessor.json"])
+def test_a_pipe_in_a_folder_is_refused(copied, file):
+    (copied / file).unlink()
+    os.mkfifo(copied / file)
+    assert "not a file" in str(refused_quickly(copied))
+
+
+ODD = st.one_of(
+    st.sampled_from([None, True, -1, 0, 1, 10**6, 10**400, 2**63, 0.5, math.nan, math.inf, "", "relu", "..", "a\nb"]),
+    st.sampled_from([[], {}, [[]], [1], [3, -72, 128], [3, 10**9, 10**9], {"a": {}}, {"type": "VISUAL", "shape": []}]),
+)
+
+
+def places(content, path=()):
+    """The path of every value in nested JSON."""
+    yield path
+    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    for key, value in items:
+        yield from places(value, (*path, key))
+
+
+@WILD
+@given(data=st.data(), file=st.sampled_from(["config.json", "policy_preprocessor.json", "policy_postprocessor.json"]))
+def test_wild_values_in_a_folder(small_folder, data, file):
+    """One value of its JSON replaced by an odd one: refused, if not for this then for the weights that it lacks."""
+    path = small_folder / file
+    before = path.read_text()
+    content = json.loads(before)
+    *parents, last = data.draw(st.sampled_from([p for p in places(content) if p]))
+    inner = content
+    for key in parents:
+        inner = inner[key]
+    inner[last] = data.draw(ODD)
+    path.write_text(json.dumps(content))
+    try:
+        refused_quickly(small_folder)
+    finally:
+        path.write_text(before)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (safetensors(b"{}", length=2**40), "its header claims 1099511.6 MB"),
+        (safetensors(b"{" * 100_000), "not readable as safetensors"),
+        (safetensors(b'{"model.a":{"dtype":"F32","shape":[-1],"data_offsets":[0,4]}}', bytes(4)), "not readable"),
+        (safetensors(b'{"model.a":{"dtype":"F32","shape":[4294967296,4294967296],"data_offsets":[0,4]}}', bytes(4)),
+         "not readable"),
+        (safetensors(b'{"model.a":{"dtype":"F32","shape":[10],"data_offsets":[0,40]}}', bytes(4)), "not readable"),
+        (safetensors(b'{"model.a":{"dtype":"F32","shape":[0,99999999999],"data_offsets":[0,0]}}'), "is empty"),
+        (safetensors(b'{"model.a":{"dtype":"I64","shape":[1],"data_offsets":[0,8]}}', bytes(8)), "of torch.int64"),
+        (safetensors(b'{"model.a":{"dtype":"X9","shape":[1],"data_offsets":[0,8]}}', bytes(8)), "not readable"),
+    ],
+)  # fmt: skip
+def test_a_header_that_lies_is_refused(copied, content, says):
+    (copied / "model.safetensors").write_bytes(content)
+    assert says in str(refused_quickly(copied))
+
+
+def test_features_that_the_weights_do_not_have_are_refused(folder):
+    edit(folder / "config.json", lambda c: c["input_features"]["observation.state"].update(shape=[3]))
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        (folder / name).unlink()
+    assert "'observation.state' has shape [3], the weights are for 2" in refused(folder)
