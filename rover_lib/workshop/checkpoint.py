@@ -186,7 +186,8 @@ def _numpy_scalars() -> list[Any]:
     """best_val_loss is np.mean's float64; older numpys pickled it as numpy.core, newer ones as numpy._core."""
     names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
     dtypes = [type(np.dtype(t)) for t in (np.float64, np.float32, np.int64, np.int32)]
-    return [*((np._core.multiarray.scalar, n) for n in names), np.dtype, *dtypes]
+    scalar = np.float64(0).__reduce__()[0]
+    return [*((scalar, n) for n in names), np.dtype, *dtypes]
 
 
 def _read_pickle(path: Path) -> Any:
@@ -594,7 +595,7 @@ def _is_size(value: Any, most: int = LARGEST_SIZE) -> bool:
 
 def _positive(path: Path, raw: dict[str, Any], key: str, most: int = LARGEST_SIZE) -> int:
     value = raw.get(key)
-    if not _is_size(value, most):
+    if not isinstance(value, int) or not _is_size(value, most):
         raise CheckpointError(
             f"{path}: config '{key}' must be a whole number of at least 1 and at most {most}",
             found=shown(value),
