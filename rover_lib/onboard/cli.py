@@ -7,9 +7,8 @@ import json
 import sys
 import traceback
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import click
 
@@ -83,16 +82,6 @@ def main(debug: bool) -> None:
     """Drive a car by a learned policy: what works on the rover. A workstation's `rover` knows more commands."""
 
 
-class Car(Protocol):
-    """A car to drive that is not the one at --camera and --port."""
-
-    camera: str
-    port: str
-
-    def summary(self) -> dict[str, Any]:
-        """What became of it, for the report."""
-
-
 def drive_options(command: Callable) -> Callable:
     """The options of driving, on the rover and in the world."""
     for option in reversed(DRIVE_OPTIONS):
@@ -139,29 +128,23 @@ def drive(ctx: click.Context, **options: Any) -> None:
     ctx.exit(run_drive(**options))
 
 
-def run_drive(
-    artifact: Path | None,
-    replay: Path | None,
-    json_file: Any,
-    *,
-    car: Callable[[], AbstractContextManager[Car]] | None = None,
-    latency_ms: float = 0.0,
-    **options: Any,
-) -> int:
-    """Drive, print or write what it was, and return the exit code. car: opens another than that of --camera, --port."""
-    from rover_lib.onboard.drive import Report
+def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
+    """Drive by DriveOptions, print or write what it was, and return the exit code. car: as of drive_car()."""
+    from rover_lib.onboard.drive import DriveOptions, drive_car
     from rover_lib.onboard.errors import DriveFault, TakenOver
+    from rover_lib.onboard.loop import Report
     from rover_lib.onboard.service import NotArmed
 
-    if bool(artifact) == bool(replay):
+    o = DriveOptions(**options)
+    if bool(o.artifact) == bool(o.replay):
         raise click.UsageError("give an ARTIFACT, or --replay EPISODE")
-    if options["service"] and (replay or options["dry_run"]):
+    if o.service and (o.replay or o.dry_run):
         raise click.UsageError("--service drives a car by an artifact: no --replay, no --dry-run")
-    if options["record_mb"] and not options["record"]:
+    if o.record_mb and not o.record:
         raise click.UsageError("--record-mb belongs to --record")
-    report, more, code = Report(), {}, 0
+    report, code = Report(), 0
     try:
-        _drive(artifact, replay, report, more, car=car, latency_ms=latency_ms, **options)
+        drive_car(o, report, car)
     except NotArmed as e:
         click.echo(f"rover: {e}", err=True)
     except (DriveFault, TakenOver) as e:
@@ -172,85 +155,11 @@ def run_drive(
             raise
         traceback.print_exc()  # a defect of this program, which has stopped the car too
         code = 3
-    result = {**report.summary(), **more}
     if json_file:
-        json_file.write(json.dumps(result, indent=2) + "\n")
+        json_file.write(json.dumps(report.summary(), indent=2) + "\n")
     else:
-        show(result, False)
+        show(report.summary(), False)
     return code
-
-
-def _drive(
-    artifact: Path | None,
-    replay: Path | None,
-    report: Any,
-    more: dict[str, Any],
-    *,
-    camera: str,
-    port: str,
-    hz: float,
-    dry_run: bool,
-    record: Path | None,
-    record_mb: float | None,
-    throttle_limit: float | None,
-    blend_ticks: int | None,
-    ensemble: float | None,
-    threads: int | None,
-    log_file: Path | None,
-    car: Callable[[], AbstractContextManager[Car]] | None,
-    latency_ms: float,
-    service: bool,
-    **ends: Any,
-) -> None:
-    """The drive command's devices, opened in order and closed in reverse; more: what a world adds to the report."""
-    import logging
-    import threading
-    from contextlib import ExitStack
-
-    from rover_lib.onboard import drive as d
-    from rover_lib.onboard import watch as w
-    from rover_lib.onboard.camera import Camera
-    from rover_lib.onboard.host import default_log
-    from rover_lib.onboard.params import params
-    from rover_lib.onboard.pilot import ReplayPilot
-    from rover_lib.onboard.plan import Settings
-    from rover_lib.onboard.recording import read_controls
-    from rover_lib.onboard.service import Service
-    from rover_lib.onboard.servo_link import ServoLink
-    from rover_lib.onboard.telemetry import FlightLog, StatusLine
-
-    p = params()
-    settings = Settings.of(p["drive"], throttle_limit=throttle_limit, blend_ticks=blend_ticks, ensemble=ensemble)
-    controls = read_controls(replay) if replay else None
-    stop = threading.Event()
-    with ExitStack() as stack:
-        header = {"artifact": str(artifact or replay), "hz": hz, **vars(settings)}
-        status = stack.enter_context(StatusLine(lambda: report.status, sys.stderr))
-        logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status.handler], force=True)
-        limits = {"max_bytes": int(p["flight_log"]["max_mb"] * 1e6), "keep": p["flight_log"]["keep"]}
-        path = log_file or default_log()
-        unended = w.unended(path)
-        log = stack.enter_context(FlightLog(path, header=header, **limits))
-        if unended:
-            log.event(unended, level=logging.WARNING)
-        stack.enter_context(w.ended_by_signals(stop, log))
-        stack.enter_context(w.ended_if_hung(report, log))
-        if car:
-            other = stack.enter_context(car())
-            camera, port = other.camera, other.port
-            stack.callback(lambda: more.update(other.summary()))
-        wait = stack.enter_context(Service(report, stop, log.event)).wait if service else d.at_once
-        link = None if dry_run else stack.enter_context(ServoLink(port))
-        common = {"rate_hz": hz, "log": log, "stop": stop, "report": report, **ends}
-        if controls:
-            limit = 1.0 if throttle_limit is None else throttle_limit
-            with w.going_first(log):
-                d.drive(ReplayPilot(controls, throttle_limit=limit), link, watch=w.Troubles(report, link), **common)
-            return
-        frames = stack.enter_context(Camera(camera))
-        recording = {"record": record, "record_mb": record_mb}
-        how = {"threads": threads, "latency_s": latency_ms / 1e3}
-        d.drive_artifact(artifact, frames, link, settings=settings, wait=wait, **recording, **how, **common)
 
 
 @main.command("record")

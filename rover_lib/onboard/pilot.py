@@ -69,7 +69,7 @@ class PolicyPilot:
         self._follower = Follower(settings, rate_hz)
         self._moving_s: float | None = None  # since when the car has been driving
         self._black_s: float | None = None  # since when the picture has been black
-        self._frame_age_s = self._asking_s = 0.0  # the most, since troubles()
+        self._frame_age_s = self._asking_s = 0.0  # the most, since warnings()
 
     def ready(self, stop: threading.Event) -> None:
         end = time.monotonic() + FIRST_PLAN_S
@@ -111,8 +111,8 @@ class PolicyPilot:
         elif self._moving_s is None:
             self._moving_s = at_s
 
-    def troubles(self) -> Iterator[str]:
-        """For drive's `watch`: of camera and policy, since it was asked last."""
+    def warnings(self) -> Iterator[str]:
+        """A source of warnings: of camera and policy, since it was asked last."""
         age_s, asking_s, plan = self._frame_age_s, self._asking_s, self._follower.plan
         self._frame_age_s = self._asking_s = 0.0
         if age_s > LATE_FRAME_S:

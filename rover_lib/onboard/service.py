@@ -13,7 +13,7 @@ What the service says of itself (systemctl show --property=StatusText) begins wi
 only while that is "disarmed".
 
 systemd's watchdog hears of ticks that happened and of nothing else: while the car drives, those of the control loop;
-while it is disarmed, the looks at camera, policy and Arduino. A loop that hangs, or a process that does, is killed
+while it is disarmed, the checks of camera, policy and Arduino. A loop that hangs, or a process that does, is killed
 after WatchdogSec; the Arduino has stopped the car 150 ms after the last command.
 """
 
@@ -31,12 +31,12 @@ from systemd_watchdog import WatchDog
 from rover_lib.onboard.errors import RoverError
 
 if TYPE_CHECKING:  # who asks for the service's state, as every playbook does, waits for neither numpy nor OpenCV
-    from rover_lib.onboard.drive import Arm, Report
+    from rover_lib.onboard.loop import Arm, Report
     from rover_lib.onboard.servo_link import Telemetry
 
 UNIT = "rover-drive.service"
 ARM = signal.SIGUSR1
-LOOK_S = 0.1  # between looks while disarmed
+CHECK_S = 0.1  # between checks while disarmed
 FEED_S = 0.25  # WatchdogSec is 2 s
 STATUS_S = 1.0
 ARMED_S = 5.0  # the Arduino answers within 0.5
@@ -63,7 +63,7 @@ class Service:
         # One that never waits: systemd may be busy, and the loop must not be.
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self._systemd = WatchDog(sock=self._socket)
-        self._looks = 0
+        self._rounds = 0  # of checks that passed
         self._state = ""
         self._asked = threading.Event()
         self._done = threading.Event()
@@ -82,27 +82,27 @@ class Service:
         signal.signal(ARM, self._before)
         self._socket.close()
 
-    def wait(self, arm: "Arm", looks: Iterable[Callable[[], object]] = ()) -> "Telemetry | None":
+    def wait_for_human(self, arm: "Arm", checks: Iterable[Callable[[], object]] = ()) -> "Telemetry | None":
         """Ready: waits until a human arms the car and the Arduino agrees; what arm() returned.
 
-        What drive_artifact() takes as `wait`. looks: what must go on working meanwhile; each raises if it does not.
-        Raises NotArmed when told to stop, and what a look raises.
+        checks: what must go on working meanwhile; each raises if it does not. Raises NotArmed when told to stop, and
+        what a check raises.
         """
-        looks = tuple(looks)
+        checks = tuple(checks)
         self._asked.clear()  # whoever asked before could not know what the car would do
         self._tell(f"{DISARMED}: waiting for a human to arm it")
         with contextlib.suppress(OSError):
             self._systemd.ready()
         while not self._stop.is_set():
-            for look in looks:
-                look()
-            self._looks += 1
-            if not self._asked.wait(LOOK_S):
+            for check in checks:
+                check()
+            self._rounds += 1
+            if not self._asked.wait(CHECK_S):
                 continue
             self._asked.clear()
             try:
                 telemetry = arm()
-            except RoverError as error:  # what is broken, and not only in the way, the next look finds
+            except RoverError as error:  # what is broken, and not only in the way, the next check finds
                 self._say(f"not armed: {error}")
                 self._tell(f"{DISARMED}: {error}")
                 continue
@@ -116,8 +116,8 @@ class Service:
         while not self._done.wait(FEED_S):
             if self._report.ended:
                 return self._stopping(self._report.ended)
-            happened = self._looks + self._report.ticks
-            if happened == seen or not self._looks:
+            happened = self._rounds + self._report.ticks
+            if happened == seen or not self._rounds:
                 continue
             seen = happened
             with contextlib.suppress(OSError):
@@ -179,7 +179,7 @@ def arm_car(unit: str = UNIT, *, timeout_s: float = ARMED_S) -> str:
         raise ServiceError(f"{unit} cannot be told to arm ({sent.stderr.strip()}); use sudo")
     end = time.monotonic() + timeout_s
     while time.monotonic() < end:
-        time.sleep(LOOK_S)
+        time.sleep(CHECK_S)
         now = state_of(unit)
         if now["active"] != "active" or now["state"] == DRIVING or now["text"] != found["text"]:
             break

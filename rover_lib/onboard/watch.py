@@ -1,6 +1,6 @@
-"""What stands around the control loop: its priority, its signals, its end when it hangs, what is out of the ordinary.
+"""What stands around the control loop: its priority, its signals, its end when it hangs, and warnings.
 
-The loop knows none of these.
+The loop knows none of these. A source of warnings is called once a second, and gives sentences for the log.
 """
 
 import contextlib
@@ -14,13 +14,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rover_lib.onboard.loop import Report
 from rover_lib.onboard.servo_link import LinkError, ServoLink, Telemetry
 from rover_lib.onboard.telemetry import FlightLog
-
-if TYPE_CHECKING:
-    from rover_lib.onboard.drive import Report
 
 SWITCH_S = 0.0005  # other threads give the interpreter back to the loop after at most so long, not Python's 5 ms
 PRIORITY = 2  # of real time: above what stands in for a car in the balloon world
@@ -31,12 +29,13 @@ IDLE = 0.05  # of the processors' time; with less, somebody waits
 STOLEN = 0.03  # of the same
 SAY_AGAIN = 3  # looks after which what goes on is said again
 CLOCK_SET_S = 1.0
+SETTLED_S = 60.0  # memory is watched for growth from here on
 TAIL_BYTES = 1 << 16
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 @contextlib.contextmanager
-def going_first(log: FlightLog) -> Iterator[None]:
+def boosted_priority(log: FlightLog) -> Iterator[None]:
     """Inside, this process goes before all that is not as urgent, if its user may ask for that.
 
     All its threads, which sleep most of the time: one that was made to wait while it holds the interpreter would keep
@@ -69,7 +68,7 @@ def schedule(policy: int, priority: int) -> None:
 
 
 @contextlib.contextmanager
-def ended_by_signals(stop: threading.Event, log: FlightLog) -> Iterator[None]:
+def stopped_by_signals(stop: threading.Event, log: FlightLog) -> Iterator[None]:
     """SIGTERM, SIGINT and SIGHUP set `stop` inside; a second one does what it did before. For the main thread."""
 
     def on_signal(number: int, frame: FrameType | None) -> None:
@@ -84,7 +83,7 @@ def ended_by_signals(stop: threading.Event, log: FlightLog) -> Iterator[None]:
 @contextlib.contextmanager
 def signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[dict[int, Any]]:
     """SIGTERM, SIGINT and SIGHUP go to `handler` inside, and where they went before afterwards; gives the latter."""
-    before = {number: signal.signal(number, handler) for number in SIGNALS}
+    before: dict[int, Any] = {number: signal.signal(number, handler) for number in SIGNALS}
     try:
         yield before
     finally:
@@ -93,7 +92,7 @@ def signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[dict[i
 
 
 @contextlib.contextmanager
-def ended_if_hung(report: "Report", log: FlightLog) -> Iterator[None]:
+def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
     """Inside, this process ends (exit code 3) when its loop has begun, has not ended, and ticks no more.
 
     Nobody else would end it, and camera, port and memory would stay taken. Counted in turns of its own, so that a
@@ -119,7 +118,7 @@ def ended_if_hung(report: "Report", log: FlightLog) -> Iterator[None]:
         done.set()
 
 
-def unended(log: Path | str) -> str | None:
+def unfinished_drive(log: Path | str) -> str | None:
     """A sentence if the last drive in a flight log was armed, and never came to its end; to be asked before a new one.
 
     A process that is killed, or has no power any more, cannot say so itself.
@@ -143,13 +142,13 @@ def unended(log: Path | str) -> str | None:
     return f"{log}: the drive before this one has no end: killed, or without power or disk" if ticks else None
 
 
-class Troubles:
+class HealthWatch:
     """For drive's `watch`: what was out of the ordinary since it was asked last, a sentence for each.
 
     link: None drives no motor.
     """
 
-    def __init__(self, report: "Report", link: ServoLink | None):
+    def __init__(self, report: Report, link: ServoLink | None):
         self._report, self._link = report, link
         self._ticks = 0
         self._counted: tuple[int, ...] | None = None
@@ -163,7 +162,7 @@ class Troubles:
             yield f"commands were up to {late_ms:.1f} ms late"
         with contextlib.suppress(LinkError):  # the next tick looks at it
             if self._link and (telemetry := self._link.latest()):
-                yield from self._of_the_link(telemetry)
+                yield from self._of_the_link(self._link.garbled, telemetry)
         spent, before = _processors(), self._spent
         self._spent = spent
         if spent and before and spent[1] > before[1]:
@@ -178,8 +177,8 @@ class Troubles:
         if abs(clock_s - before_s) > CLOCK_SET_S:
             yield f"the system's clock was set by {clock_s - before_s:+.0f} s; nothing that drives goes by it"
 
-    def _of_the_link(self, t: Telemetry) -> Iterator[str]:
-        counted = (self._report.resent, self._link.garbled, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
+    def _of_the_link(self, garbled_lines: int, t: Telemetry) -> Iterator[str]:
+        counted = (self._report.resent, garbled_lines, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
         before, self._counted = self._counted or counted, counted
         again, garbled, bad, old, beyond, lost = (now - then for now, then in zip(counted, before, strict=True))
         if again > OFTEN or garbled or bad or old or beyond or lost:
@@ -199,7 +198,7 @@ def _processors() -> tuple[int, int, int] | None:
         return None
 
 
-def artifact_watch(path: Path | str) -> Callable[[], Iterable[str]]:
+def artifact_changes(path: Path | str) -> Callable[[], Iterable[str]]:
     """For drive's `watch`: says once when the file that was loaded is another one, or gone."""
 
     def look() -> tuple[int, ...] | None:
@@ -218,6 +217,25 @@ def artifact_watch(path: Path | str) -> Callable[[], Iterable[str]]:
             yield f"{path}: {'changed' if found else 'gone'} on disk; the policy that was loaded goes on driving"
 
     return watch
+
+
+class MemoryWatch:
+    """A source of no warnings, which keeps the report's memory up to date. pids: of the processes that count."""
+
+    def __init__(self, report: Report, pids: Iterable[int], clock: Callable[[], float] = time.monotonic):
+        self._report, self._pids, self._clock = report, tuple(pids), clock
+        self._start_s: float | None = None
+        self._first_mb: float | None = None  # after the first minute
+
+    def __call__(self) -> Iterable[str]:
+        report, now = self._report, self._clock()
+        self._start_s = now if self._start_s is None else self._start_s
+        report.memory_mb = memory_mb(self._pids)
+        if self._first_mb is None and now - self._start_s >= SETTLED_S:
+            self._first_mb = report.memory_mb
+        if self._first_mb and report.memory_mb:
+            report.memory_growth_mb = round(report.memory_mb - self._first_mb, 2)
+        return ()
 
 
 def memory_mb(pids: Iterable[int]) -> float | None:

@@ -2,7 +2,7 @@
 
     reports = run_latencies([policy], [Condition(0.0, settings), Condition(0.15, settings)], worlds=40)
 
-The very loop of the car drives: `onboard.drive.drive` with its PolicyPilot, on a virtual clock. What stands in are the
+The very loop of the car drives: `onboard.loop.drive` with its PolicyPilot, on a virtual clock. What stands in are the
 camera and the planner's thread. Nothing waits, and nothing depends on how fast this machine is.
 """
 
@@ -21,8 +21,8 @@ import numpy as np
 
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.camera import Frame
-from rover_lib.onboard.drive import drive
 from rover_lib.onboard.errors import DriveFault, RoverError, WorldError
+from rover_lib.onboard.loop import Until, drive
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Order, PolicyPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
@@ -211,7 +211,7 @@ def drive_late(policy: Plans, seed: int, condition: Condition) -> LateDrive:
     car = _Car(World(seed, condition.pushes), policy, condition.latency_s, commanded)
     pilot = _Pilot(car, commanded, condition.settings, policy.rate_hz)
     try:
-        drive(pilot, None, rate_hz=RATE_HZ, log=_NoLog(), stop=car.stop, clock=car.clock, sleep=car.sleep)
+        drive(pilot, None, _NoLog(), rate_hz=RATE_HZ, until=Until(stop=car.stop), clock=car.clock, sleep=car.sleep)
         outcome = car.world.outcome
     except DriveFault as fault:
         if fault.__cause__:  # the policy failed: it is not that a plan is too old

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from rover_lib.onboard.camera import CameraError, Frame
-from rover_lib.onboard.drive import Report, drive
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
+from rover_lib.onboard.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.pilot import Order, PolicyPilot, ReplayPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
 from rover_lib.onboard.pwm import PwmCalibration
@@ -22,7 +22,16 @@ from rover_lib.onboard.recording import Controls
 from rover_lib.onboard.service import NotArmed
 from rover_lib.onboard.servo_link import Hello, LinkError, State, Telemetry
 from rover_lib.onboard.telemetry import FlightLog
-from rover_lib.onboard.watch import OFTEN, Troubles, _processors, artifact_watch, ended_by_signals, memory_mb, unended
+from rover_lib.onboard.watch import (
+    OFTEN,
+    HealthWatch,
+    MemoryWatch,
+    _processors,
+    artifact_changes,
+    memory_mb,
+    stopped_by_signals,
+    unfinished_drive,
+)
 
 PERIOD = 1 / 30
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.AUTONOMOUS, "a", 1456, 120, None, None, None, None, 0, 0, 0, 0)
@@ -126,14 +135,14 @@ def link(clock):
     return Link(clock)
 
 
-def go(pilot, link, clock, log=None, **options):
-    options = {"rate_hz": 30, "clock": clock, "sleep": clock.sleep, **options}
-    return drive(pilot, link, log=log or Log(), **options)
+def go(pilot, link, clock, log=None, *, rate_hz=30, until=None, report=None, **hooks):
+    times = {"rate_hz": rate_hz, "clock": clock, "sleep": clock.sleep}
+    return drive(pilot, link, log or Log(), until=until, hooks=Hooks(**hooks), report=report, **times)
 
 
 def test_a_command_at_each_absolute_deadline(link, clock):
     log = Log()
-    report = go(Always(), link, clock, log, ticks=90)
+    report = go(Always(), link, clock, log, until=Until(ticks=90))
     assert link.said[0] == "arm"
     assert link.said[-1] == "neutral"
     assert np.diff(link.sent_at) == pytest.approx(PERIOD)
@@ -150,7 +159,7 @@ def test_a_command_at_each_absolute_deadline(link, clock):
 
 def test_work_does_not_shift_the_deadlines(link, clock):
     busy = {n: lambda: clock.sleep(0.02) for n in range(1, 30)}
-    report = go(Always(busy), link, clock, ticks=30)
+    report = go(Always(busy), link, clock, until=Until(ticks=30))
     assert np.diff(link.sent_at)[:-1] == pytest.approx(PERIOD)
     assert report.missed == 0
     assert report.summary()["jitter_p50_ms"] == pytest.approx(20, abs=0.1)  # as late as its work took
@@ -158,7 +167,7 @@ def test_work_does_not_shift_the_deadlines(link, clock):
 
 def test_ticks_that_were_missed_are_counted_and_left_out(link, clock):
     log = Log()
-    report = go(Always({10: lambda: clock.sleep(3.4 * PERIOD)}), link, clock, log, ticks=20)
+    report = go(Always({10: lambda: clock.sleep(3.4 * PERIOD)}), link, clock, log, until=Until(ticks=20))
     assert report.missed == 2  # the third deadline in that time is only late
     assert (link.sent_at[-1] - link.sent_at[0]) / PERIOD == pytest.approx(21, abs=0.01)
     assert any("missed 2 ticks" in e for e in log.events)
@@ -173,24 +182,24 @@ def test_rates_of_no_car(link, clock, rate_hz):
 
 @pytest.mark.parametrize("rate_hz", [10, 50, 100])
 def test_rates_of_a_car(link, clock, rate_hz):
-    go(Always(), link, clock, rate_hz=rate_hz, ticks=10)
+    go(Always(), link, clock, rate_hz=rate_hz, until=Until(ticks=10))
     assert np.diff(link.sent_at) == pytest.approx(1 / rate_hz)
 
 
 def test_ends_as_asked(link, clock):
     assert go(Always({5: "done"}), link, clock).ended == "done"
     assert link.said[-1] == "neutral"
-    report = go(Always(), Link(clock), clock, max_seconds=1.0)
+    report = go(Always(), Link(clock), clock, until=Until(max_seconds=1.0))
     assert report.ticks == 31
     stop = threading.Event()
-    report = go(Always({7: stop.set}), link := Link(clock), clock, stop=stop)
+    report = go(Always({7: stop.set}), link := Link(clock), clock, until=Until(stop=stop))
     assert (report.ticks, report.ended, link.said[-1]) == (7, "told to stop", "neutral")
 
 
 def test_told_to_stop_before_it_began(link, clock):
     stop = threading.Event()
     stop.set()
-    assert go(Always(), link, clock, stop=stop).ticks == 0
+    assert go(Always(), link, clock, until=Until(stop=stop)).ticks == 0
     assert "arm" not in link.said
 
 
@@ -218,26 +227,25 @@ def test_whatever_ends_it_neutral_is_the_first_that_follows(link, clock, what, r
 def test_a_human_says_when(link, clock):
     """All is ready by then; nothing was sent before."""
 
-    def wait(arm):
-        said = list(pilot.was_ready), list(link.said)
-        assert said == ([True], [])
+    def arm():
+        assert (pilot.was_ready, link.said) == ([True], [])
         clock.sleep(5)
-        return arm()
+        return link.arm()
 
     pilot = Always()
     pilot.was_ready = []
     pilot.ready = lambda stop: pilot.was_ready.append(True)
-    report = go(pilot, link, clock, ticks=3, wait=wait)
+    report = go(pilot, link, clock, until=Until(ticks=3), arm=arm)
     assert link.said == ["arm", *[(1456, 150)] * 3, "neutral"]
     assert report.missed == 0 and link.sent_at[0] == 1005.0  # the deadlines begin when it is armed
 
 
 def test_a_human_who_never_says_so(link, clock):
-    def wait(arm):
+    def arm():
         raise NotArmed("told to stop")
 
     with pytest.raises(NotArmed):
-        go(Always(), link, clock, wait=wait)
+        go(Always(), link, clock, arm=arm)
     assert link.said == ["neutral"]
 
 
@@ -268,7 +276,7 @@ def test_the_arduino_has_the_last_word(link, clock, change, raised, match):
 
 def test_what_was_not_acknowledged_is_sent_again(clock):
     link = Link(clock, acknowledge=lambda n: n % 3 == 0)  # two of three get lost
-    report = go(Always(), link, clock, ticks=30)
+    report = go(Always(), link, clock, until=Until(ticks=30))
     assert report.resent >= 15
     assert report.missed == 0
     assert len(link.drives) == 30 + report.resent
@@ -283,14 +291,14 @@ def test_a_port_that_is_stuck_for_a_moment(link, clock):
         link.fails = None
 
     log = Log()
-    report = go(Always({5: stuck, 8: free}), link, clock, log, ticks=10)
+    report = go(Always({5: stuck, 8: free}), link, clock, log, until=Until(ticks=10))
     assert report.ticks == 10
     assert sum("not sent" in e for e in log.events) == 1
 
 
 def test_a_dry_run_drives_no_motor(clock):
     log = Log()
-    report = go(Always(), None, clock, log, ticks=5)
+    report = go(Always(), None, clock, log, until=Until(ticks=5))
     assert report.ticks == len(log.ticks) == 5
     assert log.ticks[0].state == ""
 
@@ -298,16 +306,16 @@ def test_a_dry_run_drives_no_motor(clock):
 def test_each_second_is_watched(link, clock):
     log = Log()
     said = iter([["first"], [], ["third"]])
-    go(Always(), link, clock, log, max_seconds=2.5, watch=lambda: next(said))
+    go(Always(), link, clock, log, until=Until(max_seconds=2.5), warnings=lambda: next(said))
     assert [e for e in log.events if e in ("first", "third")] == ["first", "third"]
 
 
 def test_a_recorder_gets_what_was_commanded(link, clock):
     rows = []
-    go(Always(), link, clock, ticks=3, record=lambda *row, **extra: rows.append((row, extra)), mode="static")
+    go(Always(), link, clock, until=Until(ticks=3), record=lambda *row, **extra: rows.append((row, extra)))
     (_, arduino_ms, *pulses), extra = rows[0]
     assert (arduino_ms, pulses) == (0, [1456, 150, 21316, 1016])
-    assert extra == {"mode": "static", "plan_age_ms": 100.0}
+    assert extra == {"plan_age_ms": 100.0}
 
 
 # ---- the pilot of a policy
@@ -456,7 +464,7 @@ def test_a_replay_stops_in_a_hole_of_the_recording(link, clock):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_signals_ask_it_to_stop(number):
     stop, log, before = threading.Event(), Log(), signal.getsignal(number)
-    with ended_by_signals(stop, log):
+    with stopped_by_signals(stop, log):
         os.kill(os.getpid(), number)
         time.sleep(0.01)
         assert stop.is_set()
@@ -467,7 +475,7 @@ def test_signals_ask_it_to_stop(number):
 def test_an_artifact_that_changes_is_noticed_once(tmp_path):
     path = tmp_path / "policy.pt"
     path.write_bytes(b"one")
-    watch = artifact_watch(path)
+    watch = artifact_changes(path)
     assert list(watch()) == []
     path.write_bytes(b"another")
     assert "changed on disk" in next(iter(watch()))
@@ -482,7 +490,7 @@ def test_what_is_ridden_through_is_said(link, clock, monkeypatch):
     link.status = replace(STATUS, bad_lines=4)
     monkeypatch.setattr("rover_lib.onboard.watch._processors", lambda: tuple(spent))
     monkeypatch.setattr("rover_lib.onboard.watch.time", Time(system_s))
-    look = Troubles(report, link)
+    look = HealthWatch(report, link)
     assert list(look()) == []  # what was before it is not its own
 
     report.late_ms.extend([0.1, 6.5, 0.2])
@@ -531,18 +539,18 @@ def test_this_machines_processors():
 
 def test_frames_and_plans_that_are_late_are_said(pilot):
     drives(pilot, 0.5)
-    assert list(pilot.troubles()) == []
+    assert list(pilot.warnings()) == []
     last_s = 0.5 - PERIOD
     pilot.order(last_s + 0.19)
-    assert list(pilot.troubles()) == []
+    assert list(pilot.warnings()) == []
     pilot.plans.asking_s = 0.35
     pilot.order(last_s + 0.35)
     pilot.plans.asking_s = 0.0
     drives(pilot, 0.2, start_s=1.0)
-    frames, policy = pilot.troubles()
+    frames, policy = pilot.warnings()
     assert frames == "no new frame for 0.35 s"
     assert policy.startswith("the policy took 0.35 s or more")
-    assert list(pilot.troubles()) == []
+    assert list(pilot.warnings()) == []
 
 
 HEADER = '{"kind":"header","schema":1}'
@@ -569,33 +577,33 @@ TICK, MACHINE = "0.0333,0.1,A,a", '{"kind":"machine"}'
 def test_a_drive_before_that_has_no_end_is_noticed(tmp_path, lines, ended):
     path = tmp_path / "flight.log"
     path.write_text("".join(f"{line}\n" for line in lines))
-    said = unended(path)
+    said = unfinished_drive(path)
     assert (said is None) == ended
     assert ended or "the drive before this one has no end" in said
-    assert unended(tmp_path / "none.log") is None
+    assert unfinished_drive(tmp_path / "none.log") is None
 
 
 def test_a_real_log_ends(tmp_path, link, clock):
     path = tmp_path / "flight.log"
     with FlightLog(path, header={}, max_bytes=100_000, keep=1) as log:
-        go(Always(), link, clock, log, ticks=5)
+        go(Always(), link, clock, log, until=Until(ticks=5))
         log_cut = path.with_name("cut.log")
-    assert unended(path) is None
+    assert unfinished_drive(path) is None
     log_cut.write_bytes(path.read_bytes().partition(b'"event":"ended')[0].rpartition(b"\n")[0])
-    assert unended(log_cut)
+    assert unfinished_drive(log_cut)
 
 
 def test_a_loop_that_is_dead_ends_the_process():
     """In a process, since it ends that; a loop that ticks, or has ended, does not."""
     code = """
 import sys, threading, time
-from rover_lib.onboard import drive, watch
+from rover_lib.onboard import loop, watch
 watch.HUNG_S = 0.3
 class Log:
     def event(self, text, **_): print(text, flush=True)
     def close(self): print("closed", flush=True)
-report = drive.Report(ticks=0)
-with watch.ended_if_hung(report, Log()):
+report = loop.Report(ticks=0)
+with watch.exit_if_hung(report, Log()):
     time.sleep(0.6)  # not begun
     for _ in range(30):
         report.ticks += 1
@@ -616,3 +624,16 @@ print("alive")
 def test_memory():
     assert memory_mb([os.getpid()]) > 10
     assert memory_mb([2**22 + 1]) is None
+
+
+def test_memory_is_watched_for_growth_after_the_first_minute(clock, monkeypatch):
+    megabytes = iter([500.0, 520.0, 521.5])
+    monkeypatch.setattr("rover_lib.onboard.watch.memory_mb", lambda pids: next(megabytes))
+    report = Report()
+    watch = MemoryWatch(report, [1], clock)
+    seen = []
+    for _ in range(3):
+        assert not list(watch())
+        seen.append((report.memory_mb, report.memory_growth_mb))
+        clock.sleep(60)
+    assert seen == [(500.0, None), (520.0, 0.0), (521.5, 1.5)]

@@ -12,7 +12,7 @@ import pytest
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.camera import CameraError, Frame
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.onboard.inference import Planner, PolicyProcess, PolicyThread, late
+from rover_lib.onboard.inference import Planner, PolicyProcess, late
 from rover_lib.onboard.plan import Commanded
 
 FRAME = np.random.default_rng(0).integers(0, 256, (36, 64, 3), np.uint8)
@@ -98,7 +98,7 @@ def test_it_rests_unless_somebody_is_in_a_hurry():
     with Planner(Frames(), lambda frame, state: CHUNK, Commanded(), 30.0, rest_s=0.2) as planner:
         planner.wait(2.0)
         assert 1 <= counted_plans(planner, 0.7) <= 4
-        with planner.hurrying():
+        with planner.without_rest():
             assert counted_plans(planner, 0.5) > 20
         assert counted_plans(planner, 0.7) <= 5
         start = time.monotonic()
@@ -111,7 +111,7 @@ def test_a_plan_to_begin_by_is_fresh():
         planner.renew(5.0)
         assert planner.newest() is old
         time.sleep(0.1)
-        with planner.hurrying():
+        with planner.without_rest():
             planner.renew(0.05)
         assert planner.newest().number > old.number
 
@@ -128,7 +128,7 @@ def test_a_policy_that_has_no_fresh_plan(monkeypatch):
 
     with Planner(Frames(), predict, Commanded(), 30.0, rest_s=10.0) as planner:
         planner.wait(2.0)
-        with planner.hurrying():
+        with planner.without_rest():
             with pytest.raises(PolicyError, match=r"no fresh plan within 0\.1 s; is this machine too busy"):
                 planner.renew(0.0)
             time.sleep(0.5)
@@ -164,8 +164,6 @@ def test_the_process_computes_what_the_policy_does(process, artifacts):
     state = np.array([0.1, 0.02], np.float32)
     assert process.predict(FRAME, state).tolist() == policy.predict_unclipped(FRAME, state).tolist()
     assert (process.rate_hz, process.chunk, process.manifest["mode"]) == (policy.rate_hz, policy.chunk, "static")
-    with PolicyThread(artifacts["static"], threads=1) as here:
-        assert here.predict(FRAME, state).tolist() == process.predict(FRAME, state).tolist()
 
 
 def test_a_bad_state_is_a_sentence_and_the_process_goes_on(process):

@@ -15,8 +15,8 @@ from click.testing import CliRunner
 
 from rover_lib.cli import main
 from rover_lib.onboard import service as s
-from rover_lib.onboard.drive import Report
 from rover_lib.onboard.errors import PolicyError
+from rover_lib.onboard.loop import Report
 from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.recording import read_controls
 from rover_lib.onboard.servo_link import LinkError
@@ -81,7 +81,7 @@ def test_ready_and_disarmed_until_a_human_arms(systemd):
     armed = []
     with s.Service(Report(), threading.Event()) as service:
         thread = waiting(systemd, human)
-        assert service.wait(lambda: armed.append("now") or "telemetry") == "telemetry"
+        assert service.wait_for_human(lambda: armed.append("now") or "telemetry") == "telemetry"
         thread.join()
     systemd.hear()
     assert armed == ["now"]
@@ -98,7 +98,7 @@ def test_nothing_arms_by_itself(systemd):
         human()
         thread = waiting(systemd, lambda: (time.sleep(0.3), stop.set()))
         with pytest.raises(s.NotArmed, match="told to stop before a human armed"):
-            service.wait(lambda: armed.append(1))
+            service.wait_for_human(lambda: armed.append(1))
         thread.join()
     assert not armed
 
@@ -121,7 +121,7 @@ def test_an_arduino_that_refuses_leaves_it_waiting(systemd):
 
     with s.Service(Report(), threading.Event(), said.append) as service:
         thread = waiting(systemd, ask_twice)
-        assert service.wait(arm) == "telemetry"
+        assert service.wait_for_human(arm) == "telemetry"
         thread.join()
     assert "STATUS=disarmed: no transmitter; switch it on" in systemd.lines
     assert said == ["not armed: no transmitter; switch it on"]
@@ -138,7 +138,7 @@ def test_a_plan_that_is_late_is_no_reason_to_give_up(systemd):
 
     with s.Service(Report(), threading.Event()) as service:
         thread = waiting(systemd, human)
-        assert service.wait(arm) == "telemetry"
+        assert service.wait_for_human(arm) == "telemetry"
         thread.join()
         time.sleep(0.2)  # the last signal
     systemd.hear()
@@ -146,11 +146,11 @@ def test_a_plan_that_is_late_is_no_reason_to_give_up(systemd):
 
 
 def test_what_breaks_while_it_waits_ends_it(systemd):
-    def look() -> None:
+    def check() -> None:
         raise LinkError("the Arduino said nothing for 0.6 s; is it still plugged in?")
 
     with s.Service(Report(), threading.Event()) as service, pytest.raises(LinkError, match="plugged in"):
-        service.wait(lambda: pytest.fail("armed"), [look])
+        service.wait_for_human(lambda: pytest.fail("armed"), [check])
 
 
 def feeds(lines: list[str]) -> int:
@@ -162,10 +162,10 @@ def test_the_watchdog_hears_of_ticks_that_happened_only(systemd):
     with s.Service(report, threading.Event()) as service:
         assert feeds(systemd.hear(0.6)) == 0  # nothing before it is ready: loading takes what it takes
         thread = waiting(systemd, lambda: (time.sleep(0.8), human()))
-        service.wait(lambda: None)
+        service.wait_for_human(lambda: None)
         thread.join()
         systemd.hear()
-        assert feeds(systemd.lines) >= 2  # the looks while it waits
+        assert feeds(systemd.lines) >= 2  # the checks while it waits
         systemd.hear(2 * s.FEED_S)
         assert feeds(systemd.hear(0.8)) == 0  # armed, and the loop hangs
         report.status = "steering +0.10\nREADY=0"
@@ -192,14 +192,14 @@ def test_without_systemd_it_works_the_same(monkeypatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     threading.Timer(0.3, human).start()
     with s.Service(Report(), threading.Event()) as service:
-        assert service.wait(lambda: 7) == 7
+        assert service.wait_for_human(lambda: 7) == 7
 
 
 def test_a_systemd_that_takes_nothing_holds_nobody_up(systemd, monkeypatch):
     with s.Service(Report(), threading.Event()) as service:
         systemd.socket.close()
         threading.Timer(0.2, human).start()
-        assert service.wait(lambda: 7) == 7
+        assert service.wait_for_human(lambda: 7) == 7
 
 
 def test_the_signal_means_what_it_meant_before(systemd):

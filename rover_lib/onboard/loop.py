@@ -1,0 +1,326 @@
+"""The control loop: a command at each absolute deadline, and a stopped car at the end of every fault.
+
+    with ServoLink(port) as link:
+        report = drive(pilot, link, log, rate_hz=30, until=Until(max_seconds=60))
+
+Nothing is driven by on an exception: whatever ends the loop, neutral is the first that is sent after it, and the
+Arduino stops by itself 150 ms after the last command should that not get through. What is opened around it, and by
+what options, is in drive.py.
+"""
+
+import logging
+import threading
+import time
+from array import array
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, TakenOver, sentence_of
+from rover_lib.onboard.pilot import Order, Pilot
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.servo_link import SEQUENCES, LinkError, ServoLink, State, Telemetry
+from rover_lib.onboard.telemetry import Tick
+
+RATES_HZ = (10.0, 100.0)
+RESEND_S = 0.018  # a command takes 3 ms on the wire, a status that is under way 7, its own 7
+SPARE_S = 0.004  # before a deadline nothing is sent again
+
+Arm = Callable[[], Telemetry | None]  # arms the car; None: no motor is driven
+Warnings = Callable[[], Iterable[str]]  # sentences about what was out of the ordinary since the last call
+
+
+class Log(Protocol):
+    """What the loop needs of a flight log."""
+
+    start_s: float
+
+    def tick(self, row: Tick) -> None:
+        """One control tick. Waits for nothing."""
+
+    def event(self, text: str, *, level: int = logging.INFO, **fields: Any) -> None:
+        """Something that happened. Waits for nothing."""
+
+
+@dataclass(frozen=True)
+class Until:
+    """What ends a drive as asked: a count of ticks, a duration, or `stop`, whichever comes first."""
+
+    ticks: int | None = None
+    max_seconds: float | None = None
+    stop: threading.Event = field(default_factory=threading.Event)
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """What an assembly adds to the loop.
+
+    arm: called once all is ready, arms the car, and may wait for a human before; None: the link's own arm(), at once.
+    warnings: called once a second; the sentences that it gives go to the log. record: takes each command, as
+    Recorder.control does.
+    """
+
+    arm: Arm | None = None
+    warnings: Warnings = lambda: ()
+    record: Callable[..., None] | None = None
+
+
+@dataclass
+class Report:
+    """What a drive was. Times of ticks in milliseconds; jitter: how late a command went out after its deadline."""
+
+    ticks: int = 0
+    missed: int = 0
+    resent: int = 0
+    seconds: float = 0.0
+    ended: str = ""
+    status: str = "getting ready"  # a line for people
+    memory_mb: float | None = None  # resident, of the loop's process and its children, at the end
+    memory_growth_mb: float | None = None  # since the first minute
+    world: dict[str, Any] = field(default_factory=dict)  # what became of a car that is not a real one
+    late_ms: array = field(default_factory=lambda: array("f"), repr=False)
+    plan_age_ms: array = field(default_factory=lambda: array("f"), repr=False)
+    latency_ms: array = field(default_factory=lambda: array("f"), repr=False)
+
+    def summary(self) -> dict[str, Any]:
+        """For JSON: ticks, missed, jitter_p50_ms, jitter_p99_ms, jitter_max_ms, plan_age_p95_ms, ..."""
+
+        def at(values: array, pct: float) -> float | None:
+            return round(float(np.percentile(values, pct)), 3) if len(values) else None
+
+        return {
+            "ticks": self.ticks,
+            "missed": self.missed,
+            "jitter_p50_ms": at(self.late_ms, 50),
+            "jitter_p99_ms": at(self.late_ms, 99),
+            "jitter_max_ms": at(self.late_ms, 100),
+            "plan_age_p95_ms": at(self.plan_age_ms, 95),
+            "latency_p50_ms": at(self.latency_ms, 50),
+            "latency_p95_ms": at(self.latency_ms, 95),
+            "resent": self.resent,
+            "seconds": round(self.seconds, 3),
+            "memory_mb": self.memory_mb,
+            "memory_growth_mb": self.memory_growth_mb,
+            "ended": self.ended,
+            **self.world,
+        }
+
+
+def drive(
+    pilot: Pilot,
+    link: ServoLink | None,
+    log: Log,
+    *,
+    rate_hz: float,
+    until: Until | None = None,
+    hooks: Hooks | None = None,
+    report: Report | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Report:
+    """Arms the car, then sends the pilot's order at each deadline until one of the ends is reached.
+
+    link: None drives no motor. rate_hz: of the commands, within RATES_HZ. until: None: the pilot's own end. report: is
+    filled as it goes, so that it is there after a fault too.
+    Raises RoverError if it cannot be begun, DriveFault with what stopped the car, TakenOver when the human did;
+    whatever it is, the car was told neutral before.
+    """
+    if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
+        raise ParamsError(f"a car is driven at {RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz", found=f"{rate_hz:g}")
+    report = report if report is not None else Report()
+    until = until or Until()
+    loop = _Loop(pilot, link, log, 1 / rate_hz, until, hooks or Hooks(), report, clock, sleep)
+    pilot.ready(until.stop)
+    if until.stop.is_set():
+        report.ended = "stopped before it began"
+        return report
+    try:
+        loop.arm()
+        report.ended = loop.run()
+    except BaseException as error:
+        stopped = loop.neutral()  # first of all, and before anything that may take long
+        report.ended = sentence_of(error)
+        log.event(report.ended, level=logging.ERROR)
+        if isinstance(error, RoverError) and not isinstance(error, (DriveFault, TakenOver)) and loop.armed:
+            raise DriveFault(report.ended) from error
+        raise
+    else:
+        stopped = loop.neutral()
+        log.event(f"ended: {report.ended}")
+    finally:
+        log.event(stopped)
+        report.seconds = clock() - loop.start_s if loop.start_s else 0.0
+    return report
+
+
+@dataclass
+class _Loop:
+    pilot: Pilot
+    link: ServoLink | None
+    log: Log
+    period_s: float
+    until: Until
+    hooks: Hooks
+    report: Report
+    clock: Callable[[], float]
+    sleep: Callable[[float], None]
+
+    def __post_init__(self) -> None:
+        self.armed = False
+        self.start_s = 0.0
+        self.boot = 0  # of the Arduino that was armed
+        self.sequence = 0  # of the newest command
+        self.sent_s = 0.0
+        self.last: Order | None = None
+        self.port_stuck = False  # the port did not take the last command
+
+    def arm(self) -> None:
+        arm = self.hooks.arm or (self.link.arm if self.link else lambda: None)
+        telemetry = arm()
+        self.boot = telemetry.boot if telemetry else 0
+        self.armed = True
+        self.log.event("armed" if self.link else "dry run: no motor is driven")
+
+    def neutral(self) -> str:
+        """Stops the car; a sentence about how that went."""
+        if not self.link:
+            return "neutral: no motor was driven"
+        try:
+            return f"neutral: {self.link.neutral().why}"
+        except LinkError as error:
+            return f"neutral was not answered, the Arduino stops by itself: {error}"
+
+    def run(self) -> str:
+        """Ticks until something ends it; what did."""
+        report, until = self.report, self.until
+        self.start_s = start = self.clock()
+        n = seconds = 0
+        while True:
+            deadline = start + n * self.period_s
+            self._wait(deadline)
+            if until.stop.is_set():
+                return "told to stop"
+            now = self.clock()
+            if (behind := int((now - deadline) / self.period_s)) > 0:
+                report.missed += behind
+                n += behind
+                self.log.event(f"missed {behind} ticks: the machine had no time for the loop")
+                deadline += behind * self.period_s
+            telemetry = self._telemetry()
+            order = self.pilot.order(now)
+            if order is None:
+                return "done"
+            self._send(order)
+            self.pilot.sent(self.sent_s, order)
+            self._note(order, telemetry, deadline, now)
+            n += 1
+            report.ticks += 1
+            if until.ticks is not None and report.ticks >= until.ticks:
+                return f"{until.ticks} ticks"
+            if until.max_seconds is not None and now - start >= until.max_seconds:
+                return f"{until.max_seconds:g} s"
+            if now - start >= seconds:
+                seconds += 1
+                for warning in self.hooks.warnings():
+                    self.log.event(warning)
+                report.status = self._status(order, telemetry)
+
+    def _status(self, order: Order, telemetry: Telemetry | None) -> str:
+        who = telemetry.why if telemetry else "dry run"
+        plan = ""
+        if order.age_s is not None and order.latency_s is not None:
+            plan = f", plan {order.age_s * 1e3:.0f} ms old, took {order.latency_s * 1e3:.0f}"
+        late = f"late {max(self.report.late_ms[-100:]):.1f} ms at most, {self.report.missed} missed"
+        return f"{who}: steering {order.steering:+.2f}, throttle {order.throttle:.3f}{plan}; {late}"
+
+    def _wait(self, deadline: float) -> None:
+        """Until the deadline; a command that the Arduino has not acknowledged meanwhile is sent again."""
+        link, last = self.link, self.last
+        while link and last and (again := max(self.sent_s + RESEND_S, self.clock())) < deadline - SPARE_S:
+            self.sleep(max(0.0, again - self.clock()))
+            try:
+                telemetry = link.latest()
+                if telemetry and (telemetry.sequence - self.sequence) % SEQUENCES < SEQUENCES // 2:
+                    break
+                self._put(link, last)
+            except LinkError:  # the next tick looks at it
+                break
+            self.report.resent += 1
+        if (left := deadline - self.clock()) > 0:
+            self.sleep(left)
+
+    def _telemetry(self) -> Telemetry | None:
+        """The newest, if the Arduino still lets us drive."""
+        if not self.link:
+            return None
+        telemetry = self.link.latest()
+        if telemetry is None:
+            raise DriveFault("the Arduino sends no status")
+        if telemetry.boot != self.boot:
+            hello = self.link.hello
+            why = hello.reset if hello and hello.boot == telemetry.boot else "unknown reason"
+            raise DriveFault(f"the Arduino was reset ({why}); it is in manual now")
+        if telemetry.state is State.MANUAL:
+            raise TakenOver("the human took over with the transmitter")
+        if telemetry.state is not State.AUTONOMOUS:
+            raise DriveFault(f"the Arduino stopped the car: {telemetry.why}")
+        return telemetry
+
+    def _send(self, order: Order) -> None:
+        self.last = order
+        if not self.link:
+            self.sent_s = self.clock()
+            return
+        try:
+            self._put(self.link, order)
+            self.port_stuck = False
+        except LinkError as error:
+            self.link.latest()  # raises if the port is gone
+            if not self.port_stuck:  # perhaps for a moment only; the Arduino knows when to stop
+                self.log.event(f"a command was not sent: {error}")
+            self.port_stuck = True
+
+    def _put(self, link: ServoLink, order: Order) -> None:
+        self.sequence = link.send(order.steering_us, order.throttle_us)
+        self.sent_s = self.clock()
+
+    def _note(self, order: Order, telemetry: Telemetry | None, deadline: float, now: float) -> None:
+        late_ms = (max(self.sent_s, now) - deadline) * 1e3
+        plan_age_ms = None if order.age_s is None else order.age_s * 1e3
+        latency_ms = None if order.latency_s is None else order.latency_s * 1e3
+        self.report.late_ms.append(late_ms)
+        if plan_age_ms is not None and latency_ms is not None:
+            self.report.plan_age_ms.append(plan_age_ms)
+            self.report.latency_ms.append(latency_ms)
+        self.log.tick(
+            Tick(
+                t_s=now - self.log.start_s,
+                late_ms=late_ms,
+                state=telemetry.state.value if telemetry else "",
+                reason=telemetry.reason if telemetry else "",
+                steering=order.steering,
+                throttle=order.throttle,
+                steering_us=order.steering_us,
+                throttle_us=order.throttle_us,
+                pins_steering_us=telemetry.steering_us if telemetry else None,
+                pins_throttle_us=telemetry.throttle_us if telemetry else None,
+                plan=order.plan,
+                plan_age_ms=plan_age_ms,
+                latency_ms=latency_ms,
+                fade=order.fade,
+                frame=order.frame,
+            )
+        )
+        if self.hooks.record:
+            calibration = self.link.calibration if self.link else PwmCalibration()
+            self.hooks.record(
+                self.sent_s,
+                telemetry.uptime_ms if telemetry else round((now - self.start_s) * 1e3),
+                order.steering_us,
+                order.throttle_us,
+                round(calibration.steering.period_us),
+                round(calibration.throttle.period_us),
+                plan_age_ms=None if plan_age_ms is None else round(plan_age_ms, 1),
+            )
