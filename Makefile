@@ -65,7 +65,7 @@ coverage: demo
 # NAME=full needs no checkpoint: it makes one. quantize.json is the last that a run of it leaves.
 arm: $(READY)
 	@test '$(NAME)' != full -o -f runs/full/quantize.json || { echo $(LAB) full runs/full; $(LAB) full runs/full; }
-	$(LAB) arm 'runs/$(NAME)' $(if $(PEERS),--peers) $(if $(filter full,$(NAME)),--details)
+	$(LAB) arm 'runs/$(NAME)' $(if $(PEERS),--peers)
 
 faults: $(READY)
 	$(LAB) faults runs/faults.json

@@ -38,15 +38,15 @@ def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> N
 )
 @click.option("--jobs", type=click.IntRange(min=1), help="Artifacts at a time [default: all cores].")
 @click.option("--peers", is_flag=True, help="Count ONNX Runtime, ExecuTorch and others beside them.")
-@click.option("--details", is_flag=True, help="Count the static policy part by part too, and what else was tried.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, details: bool, as_json: bool) -> None:
+def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, as_json: bool) -> None:
     """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
 
     A count, never a time. Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of
     lab/params.yml hold. Needs Debian 12 with qemu-user and gcc, which are installed when you are root.
     """
-    from lab.a76.count import count_run, table
+    from lab.a76.count_run import count_run
+    from lab.a76.report import table
     from rover_lib.onboard.stage import read_stage
     from rover_lib.workshop.run import execute
 
@@ -55,10 +55,6 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, details: bool
         from lab.a76.peers import count_peers
 
         count_peers(run_dir, jobs=jobs, progress=progress())
-    if details:
-        from lab.a76.parts import count_parts
-
-        count_parts(run_dir, progress=progress())
     execute("06_arm", run_dir)
     content = read_stage(run_dir / "arm.json", "arm")
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
@@ -69,7 +65,7 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, details: bool
 @click.option("--samples", type=click.IntRange(min=1), default=64, show_default=True, help="Calibration samples.")
 @click.option("--steps", type=click.IntRange(min=1), default=24, show_default=True, help="Training steps.")
 def full(run_dir: Path, **options: Any) -> None:
-    """Make a policy of the real car's size in RUN_DIR, and artifacts of it at several image sizes, for `rover arm`.
+    """Make a policy of the real car's size in RUN_DIR, and artifacts of it at several image sizes, for `arm`.
 
     Real in format, size and ranges, but trained for a few steps only: it does not drive.
     """

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from lab.a76 import count
+from lab.a76 import core
 from lab.arduino import emulator
 from lab.debian import missing_packages
 
-QEMU_MISSING = missing_packages(count.NEEDS)
+QEMU_MISSING = missing_packages(core.NEEDS)
 qemu = pytest.mark.skipif(bool(QEMU_MISSING), reason=f"needs the Debian packages {' '.join(QEMU_MISSING)}")
 
 SIMAVR_MISSING = emulator.missing_packages()

@@ -1,6 +1,6 @@
-"""A full-size policy for the ruler, with no checkpoint at hand: real in format, size and ranges, but it cannot drive.
+"""A full-size policy to count, with no checkpoint at hand: real in format, size and ranges, but it cannot drive.
 
-full_run("runs/full")      # some ten minutes; `rover arm runs/full` then counts it
+full_run("runs/full")      # some ten minutes; `python -m lab arm runs/full` then counts it
 """
 
 from collections.abc import Callable, Iterable
@@ -22,7 +22,7 @@ from rover_lib.world.train import make_checkpoint
 
 NOTE = "trained for a few steps only, so that activations have real ranges: this policy does not drive"
 STEPS = 24
-DRIVES = 16  # two of them choose, two judge: far more than the 50 frames that the ruler wants
+DRIVES = 16  # two of them choose, two judge: far more than the 50 frames that judge a count
 SAMPLES = 64  # calibrate
 CURVE_SAMPLES = 8  # calibrate what is only counted: the count does not depend on the ranges
 VECTORS = 8  # frames on which an export is checked against its policy
@@ -49,7 +49,7 @@ def full_run(
     sizes, curve: further image sizes (height, width) in pixels, of the same weights. progress: called like
     tqdm.tqdm(iterable, desc=, total=), or None.
 
-    Leaves what the notebooks leave, as far as `rover arm` needs it: episodes, best_model.pth, load.json,
+    Leaves what the notebooks leave, as far as counting needs it: episodes, best_model.pth, load.json,
     calibrate.json, calibration.pt, policy_fp32.pt, policy_static.pt and, when all is there, quantize.json; for each of
     `sizes` calibration_<height>x<width>.pt, policy_fp32_<height>x<width>.pt and policy_static_<height>x<width>.pt; for
     each of `curve` only the last. load.json says that this policy does not drive. Recordings and checkpoint come from
@@ -68,7 +68,8 @@ def full_run(
     chosen, _ = choose_calibration(loaded.parts.calibration, samples, seed)
     few, _ = choose_calibration(loaded.parts.calibration, min(samples, CURVE_SAMPLES), seed)
     vectors = thinned(loaded.parts.choosing, VECTORS)
-    ck, modes = loaded.checkpoint, {}
+    ck = loaded.checkpoint
+    modes: dict[str, Any] = {}
     for at in curve:
         modes |= _quantized(run_dir, ck.at_size(*at), few, vectors, suffix_of(at), fp32=False, progress=progress)
     for at in sizes:

@@ -1,6 +1,6 @@
-"""The ruler's peers: what other engines execute for the same policy on the same emulated Cortex-A76.
+"""What other engines execute for the same policy on the same emulated Cortex-A76.
 
-    count_peers("runs/full")      # adds metrics.peers to runs/full/arm.json, which arm.count_run has written
+    count_peers("runs/full")      # adds metrics.peers to runs/full/arm.json, which judge.count_run has written
 
 Each engine quantizes the float policy with its own tools, on the frames that calibrated ours, and is judged on the same
 held-out frames. It brings packages of its own, pinned here, that are laid before ours on Python's path, on this machine
@@ -9,20 +9,22 @@ and in the emulated Pi, and never installed: nothing of it is in our environment
 
 import json
 import os
-import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch import nn
 
-from lab.a76 import count as arm
-from lab.a76.count import ArmError, Counted, Machine
-from lab.debian import install_packages
+from lab.a76.core import FOR_GUEST, GUEST, CountError, fetch_wheels, prepare
+from lab.a76.count import COUNTED, OURS, Counted, Guest, count_artifact, side_by_side
+from lab.a76.count_run import REFERENCE, chunks_here, errors_pct
+from lab.a76.report import artifact_metrics
+from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.artifact import read_manifest
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import ACTION_LIMITS
@@ -34,17 +36,17 @@ from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.episodes import Sample, choose_calibration
-from rover_lib.workshop.session import opened
+from rover_lib.workshop.program import run
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.session import Opened, opened
 
-FOLDER = Path(__file__).parent / "guest" / "peers"
-GUEST = FOLDER / "guest.py"
+FOLDER = GUEST / "peers"
 COMMON = (FOLDER / "float_policy.py", FOLDER / "planes.py")
 SHIM = FOLDER / "executorch.cpp"
-COMPILER, COMPILER_PACKAGE = "aarch64-linux-gnu-g++", "g++-aarch64-linux-gnu"
+COMPILER = "aarch64-linux-gnu-g++"
+NEEDS = {COMPILER: "g++-aarch64-linux-gnu"}  # the Debian package of a command
 AFFINE = "policy_static_affine"
 FRAMES = 20  # judge a peer: its error is only to show that it computes the same policy
-
-Progress = Callable[..., Iterable] | None
 
 
 @dataclass(frozen=True)
@@ -101,34 +103,27 @@ def packages_here(engine: Engine) -> Path:
     made = {"packages": engine.packages, "python": sys.version_info[:2], "machine": os.uname().machine}
 
     def make(folder: Path) -> None:
-        _fetch(engine.packages, folder, "--python", sys.executable)
+        fetch_wheels(folder, "--python", sys.executable, *engine.packages)
 
     return cached_folder(f"peer-{engine.name}", key_of(made), make)
 
 
 def packages_there(engine: Engine) -> Path:
     """The same for the emulated Pi; for ExecuTorch with our call of its C++ runtime, compiled."""
-    made = {"packages": engine.guest_packages, "python": arm.PYTHON, "platform": arm.PLATFORM}
+    made = {"packages": engine.guest_packages, "for": FOR_GUEST}
     compiled = engine.name == "executorch"
 
     def make(folder: Path) -> None:
-        platform = ("--python-platform", arm.PLATFORM, "--python-version", arm.PYTHON)
-        _fetch(engine.guest_packages, folder, *platform)
+        fetch_wheels(folder, *FOR_GUEST, *engine.guest_packages)
         if compiled:
             _compile(folder)
 
     return cached_folder(f"arm-peer-{engine.name}", key_of(made, *([SHIM] if compiled else [])), make)
 
 
-def _fetch(packages: Sequence[str], folder: Path, *where: str) -> None:
-    command = [arm._uv(), "pip", "install", "--quiet", "--only-binary", ":all:", "--no-deps", "--target", folder]
-    arm._call([*command, *where, *packages], f"uv cannot fetch {packages[0]} and what it needs")
-
-
 def _compile(folder: Path) -> None:
     """policy.so from executorch.cpp, as ExecuTorch's own CMake package would compile and link it."""
-    if not shutil.which(COMPILER):
-        install_packages([COMPILER_PACKAGE], "ExecuTorch")
+    install_packages(missing_packages(NEEDS), "ExecuTorch")
     sdk = folder / "executorch"
     command = [COMPILER, "-std=c++17", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "policy.so", SHIM]
     command += ["-DC10_USING_CUSTOM_GENERATED_MACROS", "-DET_EVENT_TRACER_ENABLED"]
@@ -138,27 +133,37 @@ def _compile(folder: Path) -> None:
     # Kernels and backends register themselves when they are loaded; nothing refers to them by name.
     libraries = ("", "_backend_xnnpack", "_kernels_optimized", "_kernels_quantized", "_threadpool")
     command += ["-Wl,--no-as-needed", *(f"-lexecutorch{name}" for name in libraries)]
-    arm._call(command, f"{SHIM.name} does not compile")
+    run(*command, error=CountError)
 
 
 # --- their form of the policy -----------------------------------------------------------------------------------------
 
 
-def made_by(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> tuple[Path, dict]:
+@dataclass(frozen=True)
+class Made:
+    """An engine's form of the policy, and what its maker says of it.
+
+    report: `int8_layers` (their count), `float_layers` (their names), `versions`; empty for our own.
+    """
+
+    path: Path
+    report: dict[str, Any]
+
+
+def made_by(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> Made:
     """The policy as an engine's own tools quantize it, in `folder`, made again only if anything that goes in changed.
 
-    samples: calibrate. Returns the file, and what its maker said: `int8_layers` (how many), `float_layers` (names),
-    `versions`. Raises ArmError if the tools fail, or if they left a layer in float that ours has in INT8.
+    samples: calibrate. Raises CountError if the tools fail, or if they left a layer in float that ours has in INT8.
     """
-    artifact, said = folder / f"{engine.name}{engine.suffix}", folder / f"{engine.name}.json"
+    artifact, report = folder / f"{engine.name}{engine.suffix}", folder / f"{engine.name}.json"
     frames = [sha256_of(s.frame_path) for s in samples]
     states = [s.state.tolist() for s in samples]
     goes_in = {"checkpoint": checkpoint.sha256, "frames": frames, "states": states, "packages": engine.packages}
     key = key_of(goes_in, engine.maker, *COMMON, act)
-    if artifact.exists() and said.exists():
-        before = read_stage(said, "peer")
+    if artifact.exists() and report.exists():
+        before = read_stage(report, "peer")
         if before["params"] == {"key": key} and before["inputs"] == {artifact.name: sha256_of(artifact)}:
-            return artifact, before["metrics"]
+            return Made(artifact, before["metrics"])
     height, width = checkpoint.config.image_sizes[0]
     with tempfile.TemporaryDirectory(prefix="rover-peer-") as scratch, atomic_path(artifact) as temporary:
         calibration = Path(scratch) / "calibration.npz"
@@ -166,11 +171,12 @@ def made_by(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], f
         np.savez(calibration, state=np.stack([s.state for s in samples]).astype(np.float32), frames=prepared)
         environment = {**os.environ, "PYTHONPATH": str(packages_here(engine))}
         command = [sys.executable, engine.maker, checkpoint.path.resolve(), calibration, temporary]
-        printed = arm._call(command, f"{engine.name} cannot quantize {checkpoint.path}", env=environment)
+        remedy = f"{engine.name}'s tools were to quantize {checkpoint.path}"
+        printed = run(*command, error=CountError, remedy=remedy, env=environment)
         made = json.loads(printed.splitlines()[-1])
         check_int8(engine.name, made, int8_layers(checkpoint))
-    write_stage(said, "peer", params={"key": key}, metrics=made, inputs={artifact.name: sha256_of(artifact)})
-    return artifact, made
+    write_stage(report, "peer", params={"key": key}, metrics=made, inputs={artifact.name: sha256_of(artifact)})
+    return Made(artifact, made)
 
 
 def int8_layers(checkpoint: Checkpoint) -> int:
@@ -181,43 +187,33 @@ def int8_layers(checkpoint: Checkpoint) -> int:
 
 
 def check_int8(name: str, made: dict[str, Any], expected: int) -> None:
-    """Raise ArmError unless a peer has as many layers in INT8 as ours: tools have left them in float without a word."""
+    """Raise CountError unless a peer has as many layers in INT8 as ours: tools have left some in float silently."""
     if made["int8_layers"] != expected:
-        raise ArmError(
-            f"{name}: {made['int8_layers']} convolutions and linears became INT8, ours has {expected}; "
-            f"float are {made['float_layers'][:5]}"
-        )
+        what = f"{name}: {made['int8_layers']} convolutions and linears became INT8, and {expected} in ours"
+        raise CountError(f"{what}; float are {made['float_layers'][:5]}")
 
 
-def affine(run_dir: Path, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> Path:
+def affine(run_dir: Path, again: Opened) -> Made:
     """Our static artifact by the recipe of the tutorials (quint8 activations), from the run's own calibration."""
     calibration = q.Calibration.load(run_dir / "calibration.pt")
-    path = folder / f"{AFFINE}.pt"
-    policy = q.quantize(checkpoint, q.Scheme("static", kind="affine", smooth=calibration.smooth), calibration)
-    v = params()["parity"]
+    path, v = run_dir / "peers" / f"{AFFINE}.pt", params()["parity"]
+    policy = q.quantize(again.checkpoint, q.Scheme("static", kind="affine", smooth=calibration.smooth), calibration)
     options = {"tolerance": v["fp32"], "int8_errors": v["int8_errors"], "vectors": v["vectors"]}
-    q.export(policy, checkpoint, path, samples=samples, calibration=calibration, **options)
-    return path
+    samples = thinned(again.parts.choosing, 8)
+    q.export(policy, again.checkpoint, path, samples=samples, calibration=calibration, **options)
+    return Made(path, {})
 
 
 # --- counting ---------------------------------------------------------------------------------------------------------
 
 
-def count_peer(
-    machine: Machine,
-    engine: Engine,
-    artifact: Path,
-    samples: Sequence[Any],
-    size: tuple[int, int],
-    **how: Any,
-) -> Counted:
-    """`arm.count_artifact` of an engine's artifact. size: (height, width) of the image that it takes. how: of that."""
-    there = packages_there(engine)
-    return arm.count_guest(machine, GUEST, artifact, samples, engine.name, *size, packages=there, **how)
+def guest_of(engine: Engine, size: tuple[int, int]) -> Guest:
+    """What runs an engine's artifact in the emulated Pi. size: (height, width) of the image that it takes."""
+    return Guest(FOLDER / "guest.py", (engine.name, *size), packages_there(engine))
 
 
 def count_peers(
-    run_dir: Path | str, *, frames: int = FRAMES, jobs: int | None = None, progress: Progress = None
+    run_dir: Path | str, *, frames: int = FRAMES, jobs: int | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
     """Count the peers of a run's static artifact, add them to its arm.json and return what is in it.
 
@@ -226,63 +222,67 @@ def count_peers(
     `made_with`, the versions of their tools). What the engines make is kept in run_dir/peers. A peer's chunks come from
     the emulated Pi, the reference from this machine, whose FP32 count_run has held against the Pi's.
     frames: held-out frames to judge with (`torch_affine`, several times slower, with half of them). jobs: emulated
-    machines at a time. Raises ArmError if arm.json is not there or is of other artifacts, or if a peer cannot be had,
+    machines at a time. Raises CountError if arm.json is not there or is of other artifacts, or if a peer cannot be had,
     made or run.
     """
     run_dir = Path(run_dir)
     content, reference = counted_run(run_dir)
     artifacts = content["metrics"]["artifacts"]
-    manifest = read_manifest(reference)
     again = opened(run_dir)
-    checkpoint, ranges = again.checkpoint, again.recordings.action_range()
+    samples = thinned(again.parts.held_out, frames)
+    core = prepare(progress)
+    # The packages of all of them first: what cannot be had should fail before hours are spent on the others.
+    guests = {}
+    for engine in progress(ENGINES, desc="peers' packages", total=len(ENGINES)):
+        packages_here(engine)
+        guests[engine.name] = guest_of(engine, again.checkpoint.config.image_sizes[0])
     given = read_stage(run_dir / "calibrate.json", "calibrate")["params"]
     calibrating, _ = choose_calibration(again.parts.calibration, given["samples"], given["seed"])
-    samples = thinned(again.parts.held_out, frames)
-    machine = arm.prepare(progress)
-    folder, size = run_dir / "peers", checkpoint.config.image_sizes[0]
-    # The packages of all of them first: what cannot be had should fail before hours are spent on the others.
-    steps = [lambda e=e, get=get: get(e) for e in ENGINES for get in (packages_here, packages_there)]
-    for step in progress(steps, desc="peers' packages", total=len(steps)) if progress else steps:
-        step()
-    made = {}
-    for engine in progress(ENGINES, desc="peers' quantization", total=len(ENGINES)) if progress else ENGINES:
-        made[engine.name] = made_by(engine, checkpoint, calibrating, folder)
-
-    todo: dict[str, Callable[..., Counted]] = {}
-    for engine in ENGINES:
-        todo[engine.name] = lambda engine=engine, **how: count_peer(
-            machine, engine, made[engine.name][0], samples, size, **how
-        )
+    made: dict[str, Made] = {}
+    for engine in progress(ENGINES, desc="peers' quantization", total=len(ENGINES)):
+        made[engine.name] = made_by(engine, again.checkpoint, calibrating, run_dir / "peers")
+    judged = dict.fromkeys(made, samples)
     if AFFINE not in artifacts:
-        path = affine(run_dir, checkpoint, thinned(again.parts.choosing, 8), folder)
-        todo["torch_affine"] = lambda **how: arm.count_artifact(machine, path, samples[::2], **how)
-        made["torch_affine"] = path, {}
-    steps = max(len(samples), arm.COUNTED) * len(todo)
-    counts = arm.side_by_side(todo, steps, "peers, emulated", jobs or os.cpu_count() or 1, progress)
+        made["torch_affine"], judged["torch_affine"] = affine(run_dir, again), samples[::2]
 
-    here = arm._chunks_here(reference, samples, progress)
+    counts: dict[str, Callable[..., Counted]] = {}
+    for name, peer in made.items():
+        counts[name] = partial(count_artifact, core, peer.path, judged[name], guest=guests.get(name, OURS))
+    inferences = sum(max(len(judged[name]), COUNTED) for name in made)
+    counted = side_by_side(counts, inferences, "peers, emulated", jobs or os.cpu_count() or 1, progress)
+
+    here, manifest = chunks_here(reference, samples, progress), read_manifest(reference)
     peers = {}
-    for name, stem in (("torch_fp32", arm.REFERENCE), ("torch_affine", AFFINE)):
+    for name, stem in (("torch_fp32", REFERENCE), ("torch_affine", AFFINE)):
         if stem in artifacts:
-            file_mb = (run_dir / f"{stem}.pt").stat().st_size / 1e6
-            peers[name] = {"artifact": stem, "file_mb": file_mb} | artifacts[stem]
-    for name, counted in counts.items():
-        path, said = made[name]
-        judged = here[::2] if name == "torch_affine" else here
-        peers[name] = peer_metrics(counted, manifest, judged, ranges) | {"file_mb": path.stat().st_size / 1e6}
-        if said:
-            peers[name] |= {"int8_layers": said["int8_layers"], "made_with": said["versions"]}
-    return with_peers(run_dir, content, peers, [path for path, _ in made.values()])
+            peers[name] = {"artifact": stem, "file_mb": file_mb(run_dir / f"{stem}.pt")} | artifacts[stem]
+    ranges = again.recordings.action_range()
+    for name, peer in made.items():
+        expected = here[::2] if name == "torch_affine" else here
+        peers[name] = peer_metrics(counted[name], manifest, expected, ranges) | {"file_mb": file_mb(peer.path)}
+        if peer.report:
+            peers[name] |= {"int8_layers": peer.report["int8_layers"], "made_with": peer.report["versions"]}
+    inputs = content["inputs"] | {
+        f"{peer.path.parent.name}/{peer.path.name}": sha256_of(peer.path) for peer in made.values()
+    }
+    metrics = content["metrics"] | {"peers": peers}
+    return write_stage(run_dir / "arm.json", "arm", params=content["params"], metrics=metrics, inputs=inputs)
+
+
+def file_mb(path: Path) -> float:
+    """Size of a file in 10**6 bytes."""
+    return path.stat().st_size / 1e6
 
 
 def counted_run(run_dir: Path) -> tuple[dict[str, Any], Path]:
-    """A run's arm.json, and its FP32 artifact. Raises ArmError unless the one was counted from the other."""
-    path, reference = run_dir / "arm.json", run_dir / f"{arm.REFERENCE}.pt"
+    """A run's arm.json, and its FP32 artifact. Raises CountError unless the one was counted from the other."""
+    path, reference = run_dir / "arm.json", run_dir / f"{REFERENCE}.pt"
+    remedy = f"count the run's own artifacts first ('python -m lab arm {run_dir}')"
     if not path.exists():
-        raise ArmError(f"{path}: not found; count the run's own artifacts first ('rover arm {run_dir}')")
+        raise CountError(f"{path}: not found", remedy=remedy)
     content = read_stage(path, "arm")
     if not reference.exists() or content["inputs"].get(reference.name) != sha256_of(reference):
-        raise ArmError(f"{path}: counted from another {reference.name}; count the run again ('rover arm {run_dir}')")
+        raise CountError(f"{path}: counted from another {reference.name}", remedy=remedy)
     return content, reference
 
 
@@ -290,19 +290,12 @@ def peer_metrics(
     counted: Counted, manifest: dict[str, Any], reference: np.ndarray, ranges: dict[str, tuple[float, float]]
 ) -> dict[str, Any]:
     """What arm.json says of one peer. manifest: of our FP32 artifact. reference: its chunks, (n, C, A)."""
-    if counted.chunks.shape != reference.shape or not np.isfinite(counted.chunks).all():
-        raise ArmError(f"a peer gave {counted.chunks.shape} of actions, finite or not, where {reference.shape} belong")
+    if counted.chunks.shape != reference.shape:
+        raise CountError(f"a peer gave no actions of {reference.shape}", found=counted.chunks.shape)
+    if not np.isfinite(counted.chunks).all():
+        raise CountError("a peer gave actions that are not finite")
     names = manifest["action_names"]
     low, high = np.array([ACTION_LIMITS.get(name, (-np.inf, np.inf)) for name in names], np.float32).T
-    errors = arm.errors_pct(reference, np.clip(counted.chunks, low, high), names, ranges)  # as predict_chunk clips
-    found = arm.artifact_metrics(counted, manifest) | errors
-    return found | {"reference": arm.REFERENCE, "frames": len(reference), "frames_on_the_core": len(counted.chunks)}
-
-
-def with_peers(
-    run_dir: Path, content: dict[str, Any], peers: dict[str, dict[str, Any]], artifacts: Sequence[Path]
-) -> dict[str, Any]:
-    """Write arm.json again, all else as it was."""
-    inputs = content["inputs"] | {f"{p.parent.name}/{p.name}": sha256_of(p) for p in artifacts}
-    metrics = content["metrics"] | {"peers": peers}
-    return write_stage(run_dir / "arm.json", "arm", params=content["params"], metrics=metrics, inputs=inputs)
+    errors = errors_pct(reference, np.clip(counted.chunks, low, high), names, ranges)  # as predict_chunk clips
+    frames = {"frames": len(reference), "frames_on_the_core": len(counted.chunks)}
+    return artifact_metrics(counted, manifest) | errors | {"reference": REFERENCE} | frames

@@ -10,7 +10,7 @@ import nbformat
 import numpy as np
 import pytest
 
-from lab.a76 import count as arm
+from lab.a76 import report
 from lab.params import lab_params
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import run as runs
@@ -86,7 +86,7 @@ def test_all_know_the_run_folder():
     assert {"checkpoint", "episodes"} <= parameters_of(PATHS[0])
 
 
-# --- the ruler's notebook ---
+# --- the notebook of counted instructions ---
 
 
 def counted(fewer: float, **changed):
@@ -106,7 +106,7 @@ def counted(fewer: float, **changed):
         "peak_memory_loading_mb": 300,
         "frames_on_the_core": 50,
         "reference": "policy_fp32",
-        "computed_pi5_ms": dict(zip(("low", "high"), arm.predicted_ms(fewer, 1.2 * fewer + 0.2), strict=True)),
+        "computed_pi5_ms": dict(zip(("low", "high"), report.predicted_ms(fewer, 1.2 * fewer + 0.2), strict=True)),
     }
     errors = {f"{where}{action}_mae_pct": 0.1 for where in ("", "workstation_") for action in ("steering", "throttle")}
     return found | errors | changed
@@ -122,12 +122,17 @@ def test_counts_are_drawn(tmp_path):
     small |= {"reference": None, "tenth_g": None}
     artifacts = {"policy_fp32": counted(4), "policy_static": counted(1), "policy_static_180x320": small}
     peer = {key: value for key, value in counted(1.1).items() if key != "sdot_by_kernel"}
-    metrics = {"label": arm.LABEL, "artifacts": artifacts, "peers": {"another runtime": peer}, "note": "cannot drive"}
+    metrics = {
+        "label": report.LABEL,
+        "artifacts": artifacts,
+        "peers": {"another runtime": peer},
+        "note": "cannot drive",
+    }
     metrics["backbone_bits"] = {"frames": 4, "values": 123456, "differing": 0}
-    metrics["gates"] = arm.gates(metrics, lab_params()["arm"]["gates"])
+    metrics["gates"] = report.gates(metrics, lab_params()["arm"]["gates"])
     write_stage(tmp_path / "arm.json", "arm", params={}, metrics=metrics)
     text = shown(runs.execute("06_arm", tmp_path))
-    assert arm.LABEL in text and "cannot drive" in text and "0 of 123,456 INT8 values" in text
+    assert report.LABEL in text and "cannot drive" in text and "0 of 123,456 INT8 values" in text
     assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {
         f"06_{figure}" for figure in ("counted", "by_kernel", "by_size", "computed_times", "gates")
     }

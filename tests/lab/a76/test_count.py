@@ -1,4 +1,4 @@
-"""The ruler against what is known: a program whose instructions can be counted by hand, and itself."""
+"""Counting against what is known: a program whose instructions can be counted by hand, and itself."""
 
 import os
 import struct
@@ -13,8 +13,13 @@ import pytest
 import torch
 from policies import memory_samples
 
-from lab.a76 import count as arm
-from lab.a76.count import ArmError, Machine, count_artifact, count_run, emulate, prepare
+from lab.a76 import core as a76
+from lab.a76 import count_run as counting
+from lab.a76 import report as reports
+from lab.a76.core import BLOCK, Core, CountError, emulate, prepare
+from lab.a76.count import STEADY, Counted, count_artifact
+from lab.a76.count_run import count_run
+from lab.a76.symbols import Functions, GuestFunctions, by_kernel
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT
@@ -59,9 +64,9 @@ def program(path: Path, code: list[int]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def plugin_only(tmp_path_factory) -> Machine:
+def plugin_only(tmp_path_factory) -> Core:
     """Enough for a static program: no userland."""
-    return Machine(tmp_path_factory.mktemp("root"), arm._plugin())
+    return Core(tmp_path_factory.mktemp("root"), a76.build_plugin())
 
 
 def test_a_known_program_is_counted_exactly(plugin_only, tmp_path):
@@ -74,14 +79,14 @@ def test_a_known_program_is_counted_exactly(plugin_only, tmp_path):
 
 
 def test_a_program_that_fails_ends_in_a_sentence(plugin_only, tmp_path):
-    with pytest.raises(ArmError, match=r"ended with 3 after its start: it said nothing"):
+    with pytest.raises(CountError, match=r"ended with 3 after its start: it printed nothing"):
         emulate(plugin_only, [program(tmp_path / "fails", [*mov(8, 93), *mov(0, 3), SVC])], tmp_path)
 
 
 def test_what_hangs_is_ended(plugin_only, tmp_path, monkeypatch):
-    monkeypatch.setattr(arm, "SILENCE_S", 0.5)
+    monkeypatch.setattr(a76, "SILENCE_S", 0.5)
     hangs = program(tmp_path / "hangs", [0x14000000])  # a branch to itself
-    with pytest.raises(ArmError, match=r"said nothing for 0\.5 s"):
+    with pytest.raises(CountError, match=r"printed nothing for 0\.5 s"):
         emulate(plugin_only, [hangs], tmp_path)
     running = [p / "cmdline" for p in Path("/proc").iterdir() if p.name.isdigit()]
     assert not any(str(hangs).encode() in p.read_bytes() for p in running if os.access(p, os.R_OK))
@@ -94,25 +99,25 @@ def test_functions_are_named_by_address(tmp_path):
     listing = subprocess.run(["nm", tmp_path / "two.so"], capture_output=True, text=True, check=True).stdout
     at = {name: int(address, 16) for address, kind, name in (x.split() for x in listing.splitlines() if x[0] == "0")}
     library = tmp_path / "two.so"
-    names = arm.Names(
+    names = GuestFunctions(
         f"5000000000-5000010000 r-xp 00000000 08:01 1234    {library}\n5000010000-5000011000 rw-p 0 0:0 0\n"
     )
     assert names[0x5000000000 + at["first"]] == names[0x5000000000 + at["second"] - 1] == "first"
     assert names[0x5000000000 + at["second"] + 4] == "second"
     assert names[0x5000010010] == names[0x10] == "[unknown]"
-    with pytest.raises(ArmError, match="not a 64-bit ELF"):
-        arm.Binary(source)
+    with pytest.raises(CountError, match="not a 64-bit ELF"):
+        Functions(source)
 
 
 def test_kernels_are_summed_and_the_rest_is_other():
     rows = [(1, 10, 5, 2, 1), (2, 1, 5, 0, 0), (3, 100, 1, 1, 0), (4, 1, 1, 0, 0)]
     names = {1: "_Z3fooi", 2: "_Z3fooi", 3: "bar", 4: "baz"}
-    found = arm.by_kernel(np.array(rows, arm.BLOCK), names, at_most=2)
+    found = by_kernel(np.array(rows, BLOCK), names, at_most=2)
     assert found == {"bar": (100, 100, 0), "foo": (55, 20, 10), "other": (1, 0, 0)}
 
 
 @pytest.fixture(scope="module")
-def machine() -> Machine:
+def core() -> Core:
     return prepare()
 
 
@@ -147,23 +152,23 @@ def again(tiny_file) -> SimpleNamespace:
 
 
 @pytest.fixture(scope="module")
-def counts() -> dict[str, arm.Counted]:
+def counts() -> dict[str, Counted]:
     """What the emulated Pi said of each artifact of `report`."""
     return {}
 
 
 @pytest.fixture(scope="module")
-def report(machine, tiny_run, again, counts) -> dict:
+def report(core, tiny_run, again, counts) -> dict:
     """count_run on held-out frames from memory."""
-    count_all = arm._count_all
+    count_all = counting._count_all
 
     def keep(*args):
         counts.update(count_all(*args))
         return counts
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(arm, "opened", lambda run_dir: again)
-        patch.setattr(arm, "_count_all", keep)
+        patch.setattr(counting, "opened", lambda run_dir: again)
+        patch.setattr(counting, "_count_all", keep)
         return count_run(tiny_run, frames=12)
 
 
@@ -181,9 +186,9 @@ def test_a_run_is_counted(report, tiny_run):
     assert 0 < static["steering_mae_pct"] < 2 * static["workstation_steering_mae_pct"]
     assert 100 < static["peak_memory_mb"] < 500
     assert static["threads"] == 1 and static["frames_on_the_core"] == 12
-    low_ms, high_ms = arm.predicted_ms(static["simd_g"], static["instructions_g"])
-    assert static["computed_pi5_ms"] == {"low": low_ms, "high": high_ms, "formula": arm.PREDICTED}
-    assert "policy_static" in arm.table(report)
+    low_ms, high_ms = reports.predicted_ms(static["simd_g"], static["instructions_g"])
+    assert static["computed_pi5_ms"] == {"low": low_ms, "high": high_ms, "formula": reports.PREDICTED}
+    assert "policy_static" in reports.table(report)
 
 
 def test_an_image_size_without_fp32_is_only_counted(report):
@@ -206,8 +211,8 @@ def test_the_int8_backbone_is_the_same_bit_for_bit(report):
     assert bits == {"frames": 4, "values": 4 * 64 * 3 * 4, "differing": 0}
 
 
-def test_bits_that_differ_are_found(machine, tiny_run, again, monkeypatch):
-    def flipped(_: Machine, script: Path, arguments: list[str], folder: Path) -> None:
+def test_bits_that_differ_are_found(core, tiny_run, again, monkeypatch):
+    def flipped(_: Core, script: Path, arguments: list[str], folder: Path) -> None:
         torch.backends.quantized.engine = q.ENGINE
         with np.load(folder / "inputs.npz") as seen, torch.inference_mode():
             frame = torch.from_numpy(seen["frame_0000"])
@@ -215,17 +220,17 @@ def test_bits_that_differ_are_found(machine, tiny_run, again, monkeypatch):
         found[0, 0, 0, 0] += 1
         np.save(folder / "backbone.npy", found)
 
-    monkeypatch.setattr(arm, "emulate_script", flipped)
-    bits = arm.backbone_bits(tiny_run, machine, again.checkpoint, memory_samples(1))
+    monkeypatch.setattr(counting, "emulate_script", flipped)
+    bits = counting.backbone_bits(tiny_run, core, again.checkpoint, memory_samples(1))
     assert bits == {"frames": 1, "values": 64 * 3 * 4, "differing": 1}
 
 
-def test_another_calibration_has_no_bits_to_compare(machine, tiny_run, again, tmp_path):
+def test_another_calibration_has_no_bits_to_compare(core, tiny_run, again, tmp_path):
     for name in ("policy_static.pt", "quantize.json"):
         (tmp_path / name).write_bytes((tiny_run / name).read_bytes())
     q.calibrate(again.checkpoint, memory_samples(4, seed=5)).save(tmp_path / "calibration.pt")
-    with pytest.raises(ArmError, match=r"calibration\.pt are not those of quantize\.json"):
-        arm.backbone_bits(tmp_path, machine, again.checkpoint, memory_samples(1))
+    with pytest.raises(CountError, match=r"calibration\.pt are not those of quantize\.json"):
+        counting.backbone_bits(tmp_path, core, again.checkpoint, memory_samples(1))
 
 
 def test_a_slow_fp32_is_held_against_this_machines(report, tiny_run, again, counts, tmp_path, monkeypatch):
@@ -235,34 +240,35 @@ def test_a_slow_fp32_is_held_against_this_machines(report, tiny_run, again, coun
     def fewer(_, artifacts, plans, *args):
         """The same emulated inferences, as many as are asked for."""
         return {
-            stem: replace(c, chunks=c.chunks[: len(plans[stem][0])], inferences=c.inferences[: plans[stem][1]])
+            stem: replace(c, chunks=c.chunks[: len(plan.frames)], inferences=c.inferences[: plan.counted])
             for stem, c in counts.items()
+            for plan in [plans[stem]]
         }
 
-    monkeypatch.setattr(arm, "opened", lambda run_dir: again)
-    monkeypatch.setattr(arm, "_count_all", fewer)
-    monkeypatch.setattr(arm, "backbone_bits", lambda *args: report["metrics"]["backbone_bits"])
-    monkeypatch.setattr(arm, "SLOW_GMAC", 0.0)
+    monkeypatch.setattr(counting, "opened", lambda run_dir: again)
+    monkeypatch.setattr(counting, "_count_all", fewer)
+    monkeypatch.setattr(counting, "backbone_bits", lambda *args: report["metrics"]["backbone_bits"])
+    monkeypatch.setattr(counting, "SLOW_GMAC", 0.0)
     found = count_run(tmp_path, frames=12)["metrics"]["artifacts"]
     fp32, static, before = found["policy_fp32"], found["policy_static"], report["metrics"]["artifacts"]["policy_static"]
-    assert (fp32["frames_on_the_core"], fp32["tenth_g"]) == (arm.STEADY, None)
+    assert (fp32["frames_on_the_core"], fp32["tenth_g"]) == (STEADY, None)
     assert 0 < static["reference_max_difference"] < 1e-4
     same = ("instructions_g", "tenth_g", "frames_on_the_core", "steering_mae_pct", "throttle_mae_pct")
     assert {key: static[key] for key in same} == {key: before[key] for key in same}
 
 
-def test_an_fp32_that_differs_on_the_core_is_no_reference(machine, tiny_run, again, monkeypatch):
-    monkeypatch.setattr(arm, "opened", lambda run_dir: again)
-    monkeypatch.setattr(arm, "SLOW_GMAC", 0.0)
-    fake = SimpleNamespace(chunks=np.full((arm.STEADY, 32, 2), 0.5, np.float32))
-    monkeypatch.setattr(arm, "_count_all", lambda _, artifacts, *args: dict.fromkeys(artifacts, fake))
-    monkeypatch.setattr(arm, "artifact_metrics", lambda counted, manifest: {})
-    with pytest.raises(ArmError, match=r"policy_fp32\.pt: differs by .* on the core"):
+def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again, monkeypatch):
+    monkeypatch.setattr(counting, "opened", lambda run_dir: again)
+    monkeypatch.setattr(counting, "SLOW_GMAC", 0.0)
+    fake = SimpleNamespace(chunks=np.full((STEADY, 32, 2), 0.5, np.float32))
+    monkeypatch.setattr(counting, "_count_all", lambda _, artifacts, *args: dict.fromkeys(artifacts, fake))
+    monkeypatch.setattr(counting, "artifact_metrics", lambda counted, manifest: {})
+    with pytest.raises(CountError, match=r"policy_fp32\.pt: differs by .* on the core"):
         count_run(tiny_run, frames=4)
 
 
-def test_a_count_is_repeatable(report, machine, tiny_run):
-    again = count_artifact(machine, tiny_run / "policy_static.pt", memory_samples(12, seed=1)[:3], counted=3)
+def test_a_count_is_repeatable(report, core, tiny_run):
+    again = count_artifact(core, tiny_run / "policy_static.pt", memory_samples(12, seed=1)[:3], counted=3)
     assert again.steady / 1e9 == pytest.approx(
         report["metrics"]["artifacts"]["policy_static"]["instructions_g"], rel=0.002
     )
@@ -280,8 +286,10 @@ def test_counts_stay_within_their_budget(report):
         assert found_m == pytest.approx(budget_m, rel=0.02), f"{stem}: set BUDGETS_M if it is meant"
 
 
-def test_what_the_guest_refuses_is_said_in_its_words(machine, tiny_run, tmp_path):
+def test_what_the_guest_refuses_is_said_in_its_words(core, tiny_run, tmp_path):
     broken = tmp_path / "broken.pt"
     broken.write_bytes((tiny_run / "policy_static.pt").read_bytes()[:-1000])
-    with pytest.raises(ArmError, match=r"ended with 1 after load: error: .*broken\.pt: not an artifact, or cut short"):
-        count_artifact(machine, broken, memory_samples(1), counted=3)
+    with pytest.raises(
+        CountError, match=r"ended with 1 after load: error: .*broken\.pt: not an artifact, or cut short"
+    ):
+        count_artifact(core, broken, memory_samples(1), counted=3)

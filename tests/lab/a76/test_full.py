@@ -1,4 +1,4 @@
-"""The ruler's own policy, at the small size: what `rover arm` needs of it is there, and is one policy."""
+"""The full-size policy, at the small size: what counting needs of it is there, and is one policy."""
 
 import json
 
@@ -20,7 +20,7 @@ def run_dir(cache, tmp_path_factory):
     return full_run(tmp_path_factory.mktemp("runs") / "full", steps=5, **SIZE)
 
 
-def test_leaves_what_the_ruler_needs(run_dir):
+def test_leaves_what_counting_needs(run_dir):
     artifacts = {p.stem: load_policy(p) for p in run_dir.glob("policy_*.pt")}
     assert {name: p.image_size for name, p in artifacts.items()} == {
         "policy_fp32": (72, 128),

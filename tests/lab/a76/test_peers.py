@@ -15,10 +15,13 @@ import pytest
 import torch
 from policies import memory_samples
 
-from lab.a76 import count as arm
 from lab.a76 import peers
-from lab.a76.count import ArmError, Counted
-from lab.a76.peers import ENGINES
+from lab.a76.core import BLOCK, CountError, prepare
+from lab.a76.count import Counted, count_artifact
+from lab.a76.count_run import errors_pct
+from lab.a76.peers import ENGINES, Made
+from lab.a76.report import LABEL, artifact_metrics
+from lab.a76.symbols import GuestFunctions, by_kernel
 from lab.debian import DebianError
 from rover_lib.onboard.artifact import read_manifest
 from rover_lib.onboard.policy import load_policy
@@ -81,7 +84,7 @@ def counted(chunks: np.ndarray, steady: int = 3_000_000) -> Counted:
 
 
 def arm_json(folder: Path, **artifacts: dict) -> dict:
-    metrics = {"label": arm.LABEL, "artifacts": {"policy_fp32": {"instructions_g": 0.2}, **artifacts}, "gates": [1]}
+    metrics = {"label": LABEL, "artifacts": {"policy_fp32": {"instructions_g": 0.2}, **artifacts}, "gates": [1]}
     inputs = {"policy_fp32.pt": sha256_of(folder / "policy_fp32.pt")}
     return write_stage(folder / "arm.json", "arm", params={"frames": 6}, metrics=metrics, inputs=inputs)
 
@@ -102,7 +105,7 @@ def test_a_peer_is_judged_by_its_distance_from_fp32(tiny_run):
     beyond = peers.peer_metrics(counted(np.full_like(off, [1.5, -0.2])), manifest, np.full_like(off, [1, 0]), RANGES)
     assert beyond["steering_mae_pct"] == beyond["throttle_mae_pct"] == 0, "no pulse can say more"
     for wrong in (off[:, :16], np.where(off > 0.08, np.nan, off)):
-        with pytest.raises(ArmError, match="a peer gave"):
+        with pytest.raises(CountError, match="a peer gave"):
             peers.peer_metrics(counted(wrong), manifest, reference, RANGES)
 
 
@@ -111,7 +114,7 @@ def test_as_many_layers_are_int8_as_in_ours(tiny, tiny_run):
     expected = peers.int8_layers(tiny)
     assert expected == ours.report["int8_modules"] > 20
     peers.check_int8("engine", {"int8_layers": expected, "float_layers": ["head"]}, expected)
-    with pytest.raises(ArmError, match=rf"engine: 3 .* became INT8, ours has {expected}; float are \['a', 'b'\]"):
+    with pytest.raises(CountError, match=rf"engine: 3 .* became INT8, and {expected} in ours; float are \['a', 'b'\]"):
         peers.check_int8("engine", {"int8_layers": 3, "float_layers": ["a", "b"]}, expected)
 
 
@@ -137,28 +140,28 @@ def tools(tiny, monkeypatch):
     """Instead of an engine's tools: what they were asked for, and files as they would leave them."""
     seen = SimpleNamespace(calls=[], int8_layers=peers.int8_layers(tiny))
 
-    def call(command, what, **options):
-        _, calibration, artifact = command[2:]
+    def run(python, script, checkpoint, calibration, artifact, **options):
         with np.load(calibration) as given:
-            seen.calls.append((Path(command[1]).name, {k: given[k] for k in given}, options["env"]["PYTHONPATH"]))
+            seen.calls.append((Path(script).name, {k: given[k] for k in given}, options["env"]["PYTHONPATH"]))
         artifact.write_bytes(b"made")
         return json.dumps({"int8_layers": seen.int8_layers, "float_layers": ["head"], "versions": {"tool": "1"}})
 
     monkeypatch.setattr(peers, "packages_here", lambda engine: Path("/packages") / engine.name)
-    monkeypatch.setattr(arm, "_call", call)
+    monkeypatch.setattr(peers, "run", run)
     return seen
 
 
 def test_an_engine_gets_the_calibration_frames_and_is_asked_once(tiny, tools, tmp_path):
     engine, samples = ENGINES[0], file_samples(tmp_path, 4, seed=2)
     out = tmp_path / "peers"
-    path, made = peers.made_by(engine, tiny, samples, out)
-    assert (path.name, path.read_bytes(), made["versions"]) == ("onnxruntime.onnx", b"made", {"tool": "1"})
+    made = peers.made_by(engine, tiny, samples, out)
+    path = made.path
+    assert (path.name, path.read_bytes(), made.report["versions"]) == ("onnxruntime.onnx", b"made", {"tool": "1"})
     ((script, given, python_path),) = tools.calls
     assert (script, python_path) == ("make_onnxruntime.py", "/packages/onnxruntime")
     np.testing.assert_array_equal(given["state"], [s.state for s in samples])
     np.testing.assert_array_equal(given["frames"][2], prepare_frame(samples[2].frame_bgr(), 72, 128))
-    assert peers.made_by(engine, tiny, samples, out) == (path, made)
+    assert peers.made_by(engine, tiny, samples, out) == made
     assert len(tools.calls) == 1
     peers.made_by(engine, tiny, samples[:3], out)
     assert len(tools.calls) == 2, "other frames"
@@ -169,7 +172,7 @@ def test_an_engine_gets_the_calibration_frames_and_is_asked_once(tiny, tools, tm
 
 def test_a_layer_left_in_float_is_no_peer(tiny, tools, tmp_path):
     tools.int8_layers -= 1
-    with pytest.raises(ArmError, match=r"executorch: .* became INT8, ours has"):
+    with pytest.raises(CountError, match=r"executorch: .* became INT8, and \d+ in ours"):
         peers.made_by(ENGINES[1], tiny, file_samples(tmp_path, 2, seed=2), tmp_path / "peers")
     assert not list((tmp_path / "peers").iterdir())
 
@@ -179,12 +182,12 @@ def test_what_cannot_be_fetched_is_said(tmp_path, monkeypatch):
     monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))
     monkeypatch.setenv("UV_OFFLINE", "1")
     for get in (peers.packages_here, peers.packages_there):
-        with pytest.raises(ArmError, match=r"uv cannot fetch onnxruntime==\S+ and what it needs: .*onnxruntime"):
+        with pytest.raises(CountError, match=r"uv failed .*; is the index within reach that has .*onnxruntime==\S+"):
             get(ENGINES[0])
     assert not list((tmp_path / "cache").iterdir())
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ArmError, match="no uv to fetch"):
+    with pytest.raises(CountError, match="no uv to fetch"):
         peers.packages_here(ENGINES[0])
 
 
@@ -198,12 +201,12 @@ def test_the_compiler_is_named_when_it_cannot_be_installed(tmp_path, monkeypatch
 
 
 def test_counts_of_another_policy_are_refused(tiny_run, tmp_path):
-    with pytest.raises(ArmError, match=r"arm\.json: not found; count the run's own artifacts first"):
+    with pytest.raises(CountError, match=r"arm\.json: not found; count the run's own artifacts first"):
         peers.count_peers(tmp_path)
     (tmp_path / "policy_fp32.pt").write_bytes(b"one")
     arm_json(tmp_path)
     (tmp_path / "policy_fp32.pt").write_bytes(b"another")
-    with pytest.raises(ArmError, match=r"counted from another policy_fp32\.pt; count the run again"):
+    with pytest.raises(CountError, match=r"counted from another policy_fp32\.pt; count the run's own artifacts"):
         peers.count_peers(tmp_path)
 
 
@@ -214,9 +217,9 @@ def test_blocks_of_a_stripped_library_are_told_apart(tmp_path):
     subprocess.run(
         ["gcc", "-shared", "-fPIC", "-fvisibility=hidden", "-s", "-o", tmp_path / "one.so", source], check=True
     )
-    blocks = np.array([(0x5000001100, 2, 8, 4, 4), (0x5000001140, 1, 5, 0, 0)], arm.BLOCK)
-    names = arm.Names(f"5000000000-5000010000 r-xp 0 08:01 1    {tmp_path / 'one.so'}\n")
-    assert arm.by_kernel(blocks, names) == {"[one.so] loops with SDOT": (16, 8, 8), "[one.so]": (5, 0, 0)}
+    blocks = np.array([(0x5000001100, 2, 8, 4, 4), (0x5000001140, 1, 5, 0, 0)], BLOCK)
+    names = GuestFunctions(f"5000000000-5000010000 r-xp 0 08:01 1    {tmp_path / 'one.so'}\n")
+    assert by_kernel(blocks, names) == {"[one.so] loops with SDOT": (16, 8, 8), "[one.so]": (5, 0, 0)}
 
 
 @pytest.fixture
@@ -225,7 +228,7 @@ def without_engines(tiny_run, monkeypatch):
     samples = tiny_run.opened.parts.held_out
     monkeypatch.setattr(peers, "opened", lambda run_dir: tiny_run.opened)
     monkeypatch.setattr(peers, "thinned", lambda given, n: tuple(given[:n]))
-    monkeypatch.setattr(arm, "prepare", lambda progress: None)
+    monkeypatch.setattr(peers, "prepare", lambda progress: None)
     monkeypatch.setattr(peers, "packages_here", lambda engine: None)
     monkeypatch.setattr(peers, "packages_there", lambda engine: None)
 
@@ -234,18 +237,16 @@ def without_engines(tiny_run, monkeypatch):
         path = folder / f"{engine.name}{engine.suffix}"
         path.write_bytes(b"x" * 1_500_000)
         assert calibrating == tiny_run.opened.parts.calibration
-        return path, {"int8_layers": 7, "float_layers": [], "versions": {"tool": "1"}}
+        return Made(path, {"int8_layers": 7, "float_layers": [], "versions": {"tool": "1"}})
 
-    def count(machine, *rest, **how):
-        given = rest[-1] if isinstance(rest[-1], tuple) and isinstance(rest[-1][0], FileSample) else rest[-2]
-        assert given in (samples[:6], samples[:6:2])
+    def count(core, artifact, given, guest, on_step, stop):
+        assert given == (samples[:6] if artifact.suffix in (".onnx", ".pte") else samples[:6:2])
         policy = load_policy(tiny_run.folder / "policy_fp32.pt", threads=1)
-        how["on_step"]()
+        on_step()
         return counted(np.stack([policy.predict_chunk(s.frame_bgr(), s.state) for s in given]) + np.float32([0.01, 0]))
 
     monkeypatch.setattr(peers, "made_by", made_by)
-    monkeypatch.setattr(peers, "count_peer", count)
-    monkeypatch.setattr(arm, "count_artifact", count)
+    monkeypatch.setattr(peers, "count_artifact", count)
 
 
 def test_peers_join_what_was_counted(without_engines, tiny_run):
@@ -269,10 +270,10 @@ def test_peers_join_what_was_counted(without_engines, tiny_run):
 
 
 def test_an_affine_artifact_of_the_run_is_not_counted_twice(without_engines, tiny_run, monkeypatch):
-    def count_artifact(*rest, **how):
-        raise AssertionError("counted twice")
+    def affine(*rest):
+        raise AssertionError("made and counted twice")
 
-    monkeypatch.setattr(arm, "count_artifact", count_artifact)
+    monkeypatch.setattr(peers, "affine", affine)
     (tiny_run.folder / "policy_static_affine.pt").write_bytes(b"x" * 2_000_000)
     arm_json(tiny_run.folder, policy_static_affine={"instructions_g": 0.15})
     rows = peers.count_peers(tiny_run.folder, frames=6)["metrics"]["peers"]
@@ -282,12 +283,12 @@ def test_an_affine_artifact_of_the_run_is_not_counted_twice(without_engines, tin
 
 def test_a_peer_that_fails_leaves_arm_json_as_it_was(without_engines, tiny_run, monkeypatch):
     def fails(*rest, **how):
-        raise ArmError("the emulated program ended with 1")
+        raise CountError("the emulated program ended with 1")
 
     arm_json(tiny_run.folder)
     before = (tiny_run.folder / "arm.json").read_bytes()
-    monkeypatch.setattr(peers, "count_peer", fails)
-    with pytest.raises(ArmError, match="ended with 1"):
+    monkeypatch.setattr(peers, "count_artifact", fails)
+    with pytest.raises(CountError, match="ended with 1"):
         peers.count_peers(tiny_run.folder, frames=6)
     assert (tiny_run.folder / "arm.json").read_bytes() == before
 
@@ -297,17 +298,16 @@ def test_a_peer_that_fails_leaves_arm_json_as_it_was(without_engines, tiny_run, 
 
 @needs_engines
 def test_the_engines_run_the_policy_in_int8(tiny, tiny_run, monkeypatch):
-    for module in (arm, peers):
-        monkeypatch.setattr(module, "opened", lambda run_dir: tiny_run.opened)
-    machine, samples = arm.prepare(), tiny_run.opened.parts.held_out[:6]
-    ours = arm.count_artifact(machine, tiny_run.folder / "policy_static.pt", samples, counted=3)
-    fp32 = arm.count_artifact(machine, tiny_run.folder / "policy_fp32.pt", samples, counted=3)
+    monkeypatch.setattr(peers, "opened", lambda run_dir: tiny_run.opened)
+    machine, samples = prepare(), tiny_run.opened.parts.held_out[:6]
+    ours = count_artifact(machine, tiny_run.folder / "policy_static.pt", samples, counted=3)
+    fp32 = count_artifact(machine, tiny_run.folder / "policy_fp32.pt", samples, counted=3)
     manifest = read_manifest(tiny_run.folder / "policy_fp32.pt")
-    metrics = {"artifacts": {"policy_fp32": arm.artifact_metrics(fp32, manifest)}}
+    metrics = {"artifacts": {"policy_fp32": artifact_metrics(fp32, manifest)}}
     inputs = {"policy_fp32.pt": sha256_of(tiny_run.folder / "policy_fp32.pt")}
     write_stage(tiny_run.folder / "arm.json", "arm", params={"frames": 6}, metrics=metrics, inputs=inputs)
     rows = peers.count_peers(tiny_run.folder, frames=6)["metrics"]["peers"]
-    our_error = arm.errors_pct(fp32.chunks, ours.chunks, manifest["action_names"], RANGES)  # throttle: all clipped to 0
+    our_error = errors_pct(fp32.chunks, ours.chunks, manifest["action_names"], RANGES)  # throttle: all clipped to 0
     for engine in ENGINES:
         row = rows[engine.name]
         assert 0 < row["sdot_g"] < row["simd_g"] < row["instructions_g"] < fp32.steady / 1e9, engine.name

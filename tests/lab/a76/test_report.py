@@ -6,18 +6,19 @@ from types import SimpleNamespace
 import pytest
 from click.testing import CliRunner
 
-from lab.a76 import count as arm
+from lab.__main__ import main
+from lab.a76 import count_run as counting
+from lab.a76 import report
 from lab.params import lab_params
-from rover_lib.cli import main
 from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop import run as runs
 
 # As counted: {kernel: (instructions, SDOT among them, group)}, 10**9
 KERNELS = {
-    "xnn_qs8_qc8w_igemm_minmax_fp32_ukernel_4x16c4__asm_aarch64_neondot_ld128": (0.0332, 0.0234, arm.INT8_OTHER),
-    "xnn_qs8_qc8w_gemm_minmax_fp32_ukernel_4x16c4__asm_aarch64_neondot_ld128": (0.0008, 0.0006, arm.INT8_OTHER),
-    "pytorch_q8conv_ukernel_8x8__aarch64_neon": (0.134, 0.0, arm.INT8_OTHER),
-    "pytorch_q8gemm_dq_ukernel_8x8__aarch64_neon": (0.0028, 0.0, arm.INT8_OTHER),
+    "xnn_qs8_qc8w_igemm_minmax_fp32_ukernel_4x16c4__asm_aarch64_neondot_ld128": (0.0332, 0.0234, report.INT8_OTHER),
+    "xnn_qs8_qc8w_gemm_minmax_fp32_ukernel_4x16c4__asm_aarch64_neondot_ld128": (0.0008, 0.0006, report.INT8_OTHER),
+    "pytorch_q8conv_ukernel_8x8__aarch64_neon": (0.134, 0.0, report.INT8_OTHER),
+    "pytorch_q8gemm_dq_ukernel_8x8__aarch64_neon": (0.0028, 0.0, report.INT8_OTHER),
     "sgemm_kernel_ARMV8": (0.0969, 0.0, "float products"),
     "arm_gemm::a64_ffhybrid_fp32_mla_6x16": (0.0442, 0.0, "float products"),
     "xnn_f32_gemm_minmax_ukernel_6x8__asm_aarch64_neonfma_ld128": (0.01, 0.0, "float products"),
@@ -39,36 +40,38 @@ KERNELS = {
     "at::native::(anonymous namespace)::_qmaxpool_2d_nhwc_kernel<c10::qint8>": (0.0001, 0, "element-wise"),
     "at::native::(anonymous namespace)::cpu_max_pool<float, false>": (0.0066, 0.0, "element-wise"),
     "at::native::DEFAULT::VectorizedLoop2d<at::native::add_kernel": (5e-4, 0, "element-wise"),
-    "_PyEval_EvalFrameDefault": (0.00003, 0.0, arm.REST),
-    "pthreadpool_parallelize_2d_tile_2d": (0.00003, 0.0, arm.REST),
-    "[unknown]": (0.002, 0.0, arm.REST),
-    "other": (0.0012, 0.0, arm.REST),
+    "_PyEval_EvalFrameDefault": (0.00003, 0.0, report.REST),
+    "pthreadpool_parallelize_2d_tile_2d": (0.00003, 0.0, report.REST),
+    "[unknown]": (0.002, 0.0, report.REST),
+    "other": (0.0012, 0.0, report.REST),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_a_kernel_has_one_group(kernel):
     instructions_g, sdot_g, group = KERNELS[kernel]
-    found = arm.group_kernels({"instructions_by_kernel": {kernel: instructions_g}, "sdot_by_kernel": {kernel: sdot_g}})
+    found = report.group_kernels(
+        {"instructions_by_kernel": {kernel: instructions_g}, "sdot_by_kernel": {kernel: sdot_g}}
+    )
     assert {name: g for name, g in found.items() if g} == pytest.approx(
-        {group: instructions_g - sdot_g} | ({arm.INT8_SDOT: sdot_g} if sdot_g else {})
+        {group: instructions_g - sdot_g} | ({report.INT8_SDOT: sdot_g} if sdot_g else {})
     )
 
 
 def test_groups_sum_to_the_whole_in_one_order():
     kernels = {name: row[0] for name, row in KERNELS.items()}
-    found = arm.group_kernels({"instructions_by_kernel": kernels})  # a peer without SDOT by kernel
+    found = report.group_kernels({"instructions_by_kernel": kernels})  # a peer without SDOT by kernel
     assert sum(found.values()) == pytest.approx(sum(kernels.values()))
     first, *_, last = found
-    assert (first, last) == (arm.INT8_SDOT, arm.REST) and found[first] == 0
-    assert list(found) == list(arm.group_kernels({"instructions_by_kernel": {}}))
+    assert (first, last) == (report.INT8_SDOT, report.REST) and found[first] == 0
+    assert list(found) == list(report.group_kernels({"instructions_by_kernel": {}}))
 
 
 def test_the_computed_time_is_a_range():
-    low_ms, high_ms = arm.predicted_ms(simd_g=1.08, instructions_g=1.43)
+    low_ms, high_ms = report.predicted_ms(simd_g=1.08, instructions_g=1.43)
     assert low_ms == pytest.approx(56.25)  # 1.08e9 / (2 x 4 x 2.4e9)
     # the published run itself: 207 GMAC/s in loops of 80 instructions per 64 SDOT
-    assert arm.predicted_ms(0, 15.02 / 16 * 80 / 64)[1] == pytest.approx(1e3 * 15.02 / 207)
+    assert report.predicted_ms(0, 15.02 / 16 * 80 / 64)[1] == pytest.approx(1e3 * 15.02 / 207)
     assert low_ms < high_ms < 2 * low_ms
 
 
@@ -92,7 +95,7 @@ def artifact(**changed):
 
 def gates(bits=0, **artifacts):
     metrics = {"artifacts": artifacts, "backbone_bits": {"frames": 4, "values": 100, "differing": bits}}
-    return {row["gate"]: row["passed"] for row in arm.gates(metrics, lab_params()["arm"]["gates"])}
+    return {row["gate"]: row["passed"] for row in report.gates(metrics, lab_params()["arm"]["gates"])}
 
 
 def test_gates_of_the_cars_policy_hold():
@@ -137,9 +140,9 @@ def test_gates_without_an_artifact_are_left_out():
 
 def test_an_image_size_is_judged_by_fp32_of_its_own():
     there = ("policy_fp32", "policy_fp32_180x320", "policy_static")
-    assert arm.reference_of("policy_static", there) == "policy_fp32"
-    assert arm.reference_of("policy_static_180x320", there) == "policy_fp32_180x320"
-    assert arm.reference_of("policy_static_240x432", there) is None
+    assert counting.reference_of("policy_static", there) == "policy_fp32"
+    assert counting.reference_of("policy_static_180x320", there) == "policy_fp32_180x320"
+    assert counting.reference_of("policy_static_240x432", there) is None
 
 
 def test_the_command_counts_then_draws_then_says_what_it_found(tmp_path, monkeypatch):
@@ -150,7 +153,7 @@ def test_the_command_counts_then_draws_then_says_what_it_found(tmp_path, monkeyp
         called.append(("count", options["frames"]))
         found = artifact(x_floor=1.5, first_g=1.4, load_instructions_g=9.0, instructions_g=1.47, tenth_g=1.47)
         metrics = {"artifacts": {"policy_static": found}, "note": "this policy does not drive"}
-        metrics["gates"] = arm.gates(metrics, lab_params()["arm"]["gates"])
+        metrics["gates"] = report.gates(metrics, lab_params()["arm"]["gates"])
         write_stage(path, "arm", params={}, metrics=metrics)
 
     def count_peers(run_dir, jobs, progress):
@@ -159,14 +162,14 @@ def test_the_command_counts_then_draws_then_says_what_it_found(tmp_path, monkeyp
         metrics["peers"] = {"another runtime": {"instructions_g": 1.7, "simd_g": 1.1, "x_floor": 1.8}}
         write_stage(path, "arm", params={}, metrics=metrics)
 
-    monkeypatch.setattr(arm, "count_run", count_run)
+    monkeypatch.setattr(counting, "count_run", count_run)
     monkeypatch.setitem(sys.modules, "lab.a76.peers", SimpleNamespace(count_peers=count_peers))
     monkeypatch.setattr(runs, "execute", lambda name, run_dir: called.append(name))
     result = CliRunner().invoke(main, ["arm", str(tmp_path), "--peers", "--frames", "7"])
     assert result.exit_code == 0, result.output
     assert called == [("count", 7), "peers", "06_arm"]
     lines = result.output.splitlines()
-    assert lines[0].startswith(arm.LABEL) and lines[2].startswith("policy_static") and "1.47" in lines[2]
+    assert lines[0].startswith(report.LABEL) and lines[2].startswith("policy_static") and "1.47" in lines[2]
     assert lines[3].split() == ["another", "runtime", "1.7", "1.1", "1.80", *"--------"]
     assert "note: this policy does not drive" in lines
     (failed,) = [line for line in lines if line.endswith("FAIL")]

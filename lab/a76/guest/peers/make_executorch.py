@@ -2,7 +2,7 @@
 
     make_executorch.py CHECKPOINT CALIBRATION ARTIFACT
 
-Runs on the workstation with ExecuTorch's packages before ours (see rover_lib/workshop/peers.py); arguments and the
+Runs on the workstation with ExecuTorch's packages before ours (see lab/a76/peers.py); arguments and the
 printed JSON line are those of make_onnxruntime.py, ARTIFACT is a .pte.
 
 The quantizer's own recipe: symmetric INT8 weights per channel, INT8 activations, ranges by histogram. It is set for the

@@ -2,7 +2,7 @@
 
     make_onnxruntime.py CHECKPOINT CALIBRATION ARTIFACT
 
-Runs on the workstation with ONNX Runtime's packages before ours (see rover_lib/workshop/peers.py). CALIBRATION: see
+Runs on the workstation with ONNX Runtime's packages before ours (see lab/a76/peers.py). CALIBRATION: see
 float_policy.observations. Writes ARTIFACT, an .onnx of inputs `state` and `frame`, and prints one JSON line:
 {"int8_layers": how many convolutions and linears became INT8, "float_layers": [the others], "versions"}.
 

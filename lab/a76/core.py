@@ -1,0 +1,336 @@
+"""An emulated Cortex-A76, the core of a Raspberry Pi 5, that counts what a program executes on it.
+
+    core = prepare()
+    emulation = emulate_script(core, Path("predict.py"), [], folder)
+    emulation.total(section=0)
+
+Emulation says nothing about time, but it counts exactly, on any workstation, and the same again tomorrow. What is
+emulated is an arm64 Debian's Python with the wheels that a Pi gets (requirements_pi.txt), under QEMU's user emulation
+with a small plugin of ours (guest/count.c). Nothing of the host is changed: packages are fetched by a private apt,
+unpacked without being installed, and cached.
+
+Memory is the most that the emulator's process held resident, as the kernel keeps it, less the emulator's own share: its
+translated code and the plugin's counters lie outside the address range that it reserves for the guest at a fixed place,
+grow slowly, and are read five times a second. They are reported beside it. MB are 10**6 bytes.
+"""
+
+import os
+import re
+import selectors
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event
+from typing import IO, Any
+
+import numpy as np
+
+from lab.debian import fetch_packages, install_packages, missing_packages, unpack_packages
+from rover_lib.onboard.errors import RoverError
+from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.program import last_words, run
+from rover_lib.workshop.progress import Progress, silent
+
+REPOSITORY = Path(__file__).parents[2]
+GUEST = Path(__file__).parent / "guest"
+PLUGIN = GUEST / "count.c"
+REQUIREMENTS = REPOSITORY / "requirements_pi.txt"
+
+NEEDS = {  # the Debian packages of commands and files
+    "qemu-aarch64": "qemu-user",
+    "gcc": "gcc",
+    "c++filt": "binutils",
+    "/usr/include/stdio.h": "libc6-dev",
+}
+RECIPE = 1  # one more when the userland is made in another way: older ones are then not used
+GUEST_PACKAGES = ("python3.11", "libgomp1", "libstdc++6")
+PYTHON, PLATFORM = "3.11", "aarch64-manylinux_2_28"
+FOR_GUEST = ("--python-platform", PLATFORM, "--python-version", PYTHON)  # of `fetch_wheels`
+CORES = 4  # of the Pi; with fewer or others in /proc/cpuinfo, XNNPACK would choose other kernels
+CPUINFO = """processor\t: {core}
+BogoMIPS\t: 108.00
+Features\t: fp asimd evtstrm aes pmull sha1 sha2 crc32 atomics fphp asimdhp cpuid asimdrdm lrcpc dcpop asimddp
+CPU implementer\t: 0x41
+CPU architecture: 8
+CPU variant\t: 0x4
+CPU part\t: 0xd0b
+CPU revision\t: 1
+
+"""
+GUEST_BASE, GUEST_SIZE = 0x100000000000, 0x4000000000  # the guest's addresses, as the host sees them
+SAMPLE_S = 0.2  # the emulator's own memory grows slowly
+SILENCE_S = 1200  # of its processor's time: loading the full policy in FP32 takes five minutes without a word
+WAITING = 6  # times as long by the clock, on a machine that has more to do
+
+BLOCK = np.dtype([(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot")])  # as in count.c
+
+
+class CountError(RoverError):
+    """Instructions that cannot be counted: no emulated core here, a program that failed on it, or an unfit run."""
+
+
+# --- preparing --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Core:
+    """An emulated core: its file system, the Pi's wheels included, and the plugin that counts."""
+
+    root: Path
+    plugin: Path
+
+
+def prepare(progress: Progress = silent) -> Core:
+    """Everything that counting needs, from the cache or made now (about half a minute).
+
+    Debian packages that are missing are installed when this runs as root. Raises CountError or DebianError if anything
+    is not to be had.
+    """
+    steps = (_install_missing, build_plugin, _userland)
+    _, plugin, root = [step() for step in progress(steps, desc="emulated Cortex-A76", total=len(steps))]
+    return Core(root, plugin)
+
+
+def _install_missing() -> None:
+    install_packages(missing_packages(NEEDS), "counting")
+
+
+def build_plugin() -> Path:
+    """The plugin that counts, from the cache or compiled now."""
+
+    def make(folder: Path) -> None:
+        # What the emulator provides is resolved when it loads the plugin.
+        run("gcc", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "count.so", PLUGIN, error=CountError)
+
+    return cached_folder("arm-plugin", key_of({}, PLUGIN), make) / "count.so"
+
+
+def _userland() -> Path:
+    recipe = {"made": [GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, CORES, RECIPE]}
+    return cached_folder("arm-userland", key_of(recipe, REQUIREMENTS), _make_userland)
+
+
+def _make_userland(root: Path) -> None:
+    with tempfile.TemporaryDirectory(dir=root.parent, prefix=".apt.") as scratch:
+        unpack_packages(fetch_packages(Path(scratch), GUEST_PACKAGES), root)
+    fetch_wheels(_site(root), "--require-hashes", *FOR_GUEST, "--requirement", REQUIREMENTS)
+    # QEMU looks for every absolute path below this root first, so these stand before the host's own files.
+    (root / "proc").mkdir()
+    (root / "proc" / "cpuinfo").write_text("".join(CPUINFO.format(core=i) for i in range(CORES)))
+    cpus = root / "sys" / "devices" / "system" / "cpu"
+    cpus.mkdir(parents=True)
+    for name in ("possible", "present", "online"):
+        (cpus / name).write_text(f"0-{CORES - 1}\n")
+    # Leaves the bytecode of all that they import, which costs a third of a minute in the emulator, and proves them.
+    imports = [_python(root), "-c", "import torch, cv2, serial"]
+    run(*_qemu(root), *imports, error=CountError, env=_environment(root, root))
+
+
+def fetch_wheels(folder: Path, *what: object) -> None:
+    """Python packages in a folder, by uv and without being installed. what: packages, and further options of uv.
+
+    Without their dependencies: all are named. Raises CountError if they are not to be had.
+    """
+    beside = Path(sys.executable).parent / "uv"
+    uv = str(beside) if beside.is_file() else shutil.which("uv")
+    if not uv:
+        raise CountError("no uv to fetch Python packages with", remedy="pip install uv ('make arm' has it)")
+    options = ["--quiet", "--only-binary", ":all:", "--no-deps", "--target", folder]
+    remedy = f"is the index within reach that has {' '.join(map(str, what))}?"
+    run(uv, "pip", "install", *options, *what, error=CountError, remedy=remedy)
+
+
+def _qemu(root: Path) -> list[str]:
+    place = ["-B", hex(GUEST_BASE), "-R", hex(GUEST_SIZE)]
+    # setpriv: whoever started it may be killed before it can end its emulator
+    return ["setpriv", "--pdeathsig", "KILL", "qemu-aarch64", "-L", str(root), "-cpu", "cortex-a76", *place]
+
+
+def _python(root: Path) -> Path:
+    return root / "usr" / "bin" / f"python{PYTHON}"
+
+
+def _site(root: Path) -> Path:
+    return root / "opt" / "site"
+
+
+def _environment(root: Path, home: Path) -> dict[str, str]:
+    """Of an emulated Python: nothing of the host's, one thread."""
+    return {
+        "PATH": "/usr/bin",
+        "LANG": "C.UTF-8",
+        "HOME": str(home),
+        "TMPDIR": str(home),
+        "PYTHONHOME": str(root / "usr"),
+        "PYTHONPATH": str(_site(root)),
+        "PYTHONHASHSEED": "0",  # the same order in every dict, the same count
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+
+
+# --- running ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Emulation:
+    """What one program did: its counts by section, and the most memory that it held in each of its steps."""
+
+    sections: dict[int, np.ndarray]  # of BLOCK
+    peak_mb: dict[str, float]  # by the line that the program had printed last; "" before the first
+    emulator_mb: float  # the emulator's own, at the end
+
+    def total(self, section: int, what: str = "instructions") -> int:
+        """Instructions (or "simd", "sdot") that were executed in a section."""
+        blocks = self.sections[section]
+        return int((blocks["entered"] * blocks[what]).sum())
+
+
+def emulate_script(
+    core: Core,
+    script: Path,
+    arguments: Sequence[object],
+    folder: Path,
+    *,
+    packages: Path | None = None,
+    **options: Any,
+) -> Emulation:
+    """`emulate` a Python script of ours with the Pi's wheels, rover_lib and what lies beside guest/predict.py.
+
+    packages: laid before the Pi's own. options: of `emulate`.
+    """
+    environment = _environment(core.root, folder)
+    places = [*([packages] if packages else []), environment["PYTHONPATH"], REPOSITORY, GUEST]
+    environment["PYTHONPATH"] = ":".join(map(str, places))
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # nothing of the emulated Python goes into the checkout
+    return emulate(core, [_python(core.root), script, *arguments], folder, environment=environment, **options)
+
+
+def emulate(
+    core: Core,
+    command: Sequence[object],
+    folder: Path,
+    *,
+    environment: dict[str, str] | None = None,
+    on_line: Callable[[str], None] = lambda line: None,
+    stop: Event | None = None,
+) -> Emulation:
+    """Run an aarch64 program to its end, one core, and read the counts that it marked (see guest/count.c).
+
+    folder: for the counts, and what the program leaves. on_line: told each line on its stdout. stop: ends it when set.
+    Raises CountError with the end of its stderr if it fails, or prints nothing for SILENCE_S of its processor's time;
+    whatever ends this, the emulator ends with it.
+    """
+    qemu = [*_qemu(core.root), "-plugin", f"{core.plugin},folder={folder}", *command]
+    with (folder / "stderr").open("wb") as stderr:
+        try:
+            process = subprocess.Popen(
+                [str(c) for c in qemu],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=stderr,
+                env=environment or {},
+                cwd=folder,
+            )
+        except OSError as e:
+            raise CountError(f"the emulator does not start: {e}") from None
+    watched = _Watched(process.pid)
+    assert process.stdout  # a pipe
+    try:
+        _read_to_the_end(process.stdout, watched, on_line, stop or Event())
+        code = process.wait()
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+    if code:
+        end = last_words((folder / "stderr").read_text(errors="replace"))
+        raise CountError(f"the emulated program ended with {code} after {watched.step or 'its start'}: {end}")
+    sections = {int(f.stem): np.fromfile(f, BLOCK) for f in folder.glob("*.blocks")}
+    return Emulation(sections, dict(watched.peak_mb), watched.emulator_mb)
+
+
+@dataclass
+class _Watched:
+    """What is known of a running emulator; its peaks are told apart by the line that the program printed last."""
+
+    pid: int
+    step: str = ""
+    peak_mb: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    emulator_mb: float = 0.0
+
+    def sample(self) -> None:
+        peak_mb, outside_mb = _memory_mb(self.pid)
+        self.peak_mb[self.step] = max(self.peak_mb[self.step], peak_mb - outside_mb)
+        self.emulator_mb = outside_mb or self.emulator_mb
+
+    def begin(self, step: str) -> None:
+        if step != self.step:
+            _forget_peak(self.pid)
+        self.step = step
+
+
+def _read_to_the_end(stdout: IO[bytes], watched: _Watched, on_line: Callable[[str], None], stop: Event) -> None:
+    """Read what the program prints, and sample its memory, until it closes its stdout."""
+    unread, last_s, last_cpu_s = b"", time.monotonic(), 0.0
+    with selectors.DefaultSelector() as readable:
+        readable.register(stdout, selectors.EVENT_READ)
+        while True:
+            ready = readable.select(SAMPLE_S)
+            if stop.is_set():
+                raise CountError("stopped, because another count failed")
+            watched.sample()
+            if not ready:
+                silent_s = max(_cpu_s(watched.pid) - last_cpu_s, (time.monotonic() - last_s) / WAITING)
+                if silent_s > SILENCE_S:
+                    after = watched.step or "its start"
+                    raise CountError(f"the emulated program printed nothing for {SILENCE_S} s after {after}")
+                continue
+            last_s, last_cpu_s = time.monotonic(), _cpu_s(watched.pid)
+            content = os.read(stdout.fileno(), 65536)
+            if not content:
+                return
+            *lines, unread = (unread + content).split(b"\n")
+            for line in lines:
+                watched.begin(line.decode(errors="replace"))
+                on_line(watched.step)
+
+
+# By hand: psutil knows neither the kernel's own peak (VmHWM) nor how to reset it.
+
+
+def _memory_mb(pid: int) -> tuple[float, float]:
+    """The most that a process held resident, and what it holds now outside the guest's addresses; zeros if it ended."""
+    outside_kb, in_guest = 0, False
+    try:
+        mappings = Path(f"/proc/{pid}/smaps").read_text()
+        peak = re.search(r"^VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text(), re.M)
+    except OSError:
+        return 0.0, 0.0
+    for line in mappings.splitlines():
+        if line.startswith("Rss:"):
+            outside_kb += 0 if in_guest else int(line.split()[1])
+        elif not line[0].isupper():  # a mapping's addresses; the lines about it start in capitals
+            in_guest = GUEST_BASE <= int(line.partition("-")[0], 16) < GUEST_BASE + GUEST_SIZE
+    return (int(peak[1]) * 1024 / 1e6, outside_kb * 1024 / 1e6) if peak else (0.0, 0.0)
+
+
+def _cpu_s(pid: int) -> float:
+    """Processor time that a process has used; 0 if it ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _forget_peak(pid: int) -> None:
+    with suppress(OSError):  # ended, or a kernel without it: then a peak of before counts too, and none is missed
+        Path(f"/proc/{pid}/clear_refs").write_text("5")

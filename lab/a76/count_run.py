@@ -1,0 +1,229 @@
+"""Every artifact of a run counted in the emulated Pi, and what it predicts there judged.
+
+count_run("runs/demo")      # writes runs/demo/arm.json
+"""
+
+import os
+import re
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lab.a76.core import Core, CountError, emulate_script, prepare
+from lab.a76.count import COUNTED, OURS, STEADY, Counted, count_artifact, side_by_side
+from lab.a76.report import LABEL, STATIC, artifact_metrics, gates
+from lab.params import lab_params
+from rover_lib.onboard.artifact import content_hash, read_manifest
+from rover_lib.onboard.params import params
+from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from rover_lib.workshop import quantize as q
+from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.compare import thinned
+from rover_lib.workshop.judge import pct_of_range
+from rover_lib.workshop.program import run
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.session import Opened, opened
+
+REFERENCE = "policy_fp32"
+FRAMES = 50
+SLOW_GMAC = 1.0  # FP32 of more takes a minute and a half per emulated inference, so that few frames must do
+BIT_FRAMES = 4
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How an artifact is counted: its FP32 artifact, the frames that it predicts in the emulated Pi, and more.
+
+    reference: None where there is no FP32 artifact of its image size, so that it is only counted. frames: indices.
+    counted: inferences that are counted one by one.
+    """
+
+    reference: str | None
+    frames: tuple[int, ...]
+    counted: int = COUNTED
+
+
+def count_run(
+    run_dir: Path | str, *, frames: int = FRAMES, jobs: int | None = None, progress: Progress = silent
+) -> dict[str, Any]:
+    """Count every artifact of a run, write its arm.json and return what is in it.
+
+    Judged on `frames` of the run's held-out frames: what each artifact predicts in the emulated Pi against what the
+    FP32 artifact of its image size predicts on this machine, and the same of this machine's predictions beside it.
+    FP32 takes up to minutes per frame there: it predicts a few frames there too, and must give what it gives here, to
+    the parity vectors' tolerance. An artifact of an image size without an FP32 is counted only. Of policy_static also
+    the bits that its INT8 backbone gives are compared (see `backbone_bits`).
+    jobs: artifacts at a time, each in one thread and below 1 GB; the machine's cores if None. Raises CountError, or
+    what reading the run raises.
+    """
+    run_dir = Path(run_dir)
+    artifacts = {p.stem: p for p in sorted(run_dir.glob("policy_*.pt"))}
+    if REFERENCE not in artifacts:
+        raise CountError(
+            f"{run_dir}: no {REFERENCE}.pt in it", found=sorted(artifacts), remedy="'rover run' makes a run"
+        )
+    manifests = {stem: read_manifest(path) for stem, path in artifacts.items()}
+    again = opened(run_dir)
+    samples = thinned(again.parts.held_out, frames)
+    if not samples:
+        raise CountError(
+            f"{run_dir}: its recordings have no held-out frames to judge with", remedy="record more episodes"
+        )
+    core = prepare(progress)
+    plans = plans_of(manifests, len(samples))
+    counts = _count_all(core, artifacts, plans, samples, jobs or os.cpu_count() or 1, progress)
+    rows = {stem: artifact_metrics(counts[stem], manifests[stem]) for stem in artifacts}
+    for stem, judged in _judged(artifacts, plans, counts, samples, again, progress).items():
+        rows[stem] |= judged
+    metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows}
+    if (run_dir / "load.json").exists() and (note := read_stage(run_dir / "load.json", "load")["metrics"].get("note")):
+        metrics["note"] = note
+    if STATIC in artifacts:
+        metrics["backbone_bits"] = backbone_bits(run_dir, core, again.checkpoint, thinned(samples, BIT_FRAMES))
+    metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
+    given = {"frames": len(samples), "steady": STEADY, "cpu": "cortex-a76", "threads": 1}
+    given["qemu"] = run("qemu-aarch64", "--version", error=CountError).splitlines()[0]
+    inputs = {p.name: sha256_of(p) for p in artifacts.values()}
+    return write_stage(run_dir / "arm.json", "arm", params=given, metrics=metrics, inputs=inputs)
+
+
+def reference_of(stem: str, artifacts: Iterable[str]) -> str | None:
+    """The FP32 artifact to judge by: policy_static_180x320 by policy_fp32_180x320, or by none if that is not there."""
+    size = re.search(r"_\d+x\d+$", stem)
+    own = REFERENCE + (size.group() if size else "")
+    return own if own in artifacts else None
+
+
+def plans_of(manifests: Mapping[str, Mapping[str, Any]], frames: int) -> dict[str, Plan]:
+    """How each artifact is counted; what takes longest comes first, so that no core waits for it in the end."""
+    plans, every = {}, range(frames)
+    for stem, manifest in manifests.items():
+        reference = reference_of(stem, manifests)
+        if reference is None or (stem == reference and manifest["gmac"] >= SLOW_GMAC):
+            plans[stem] = Plan(reference, tuple(every[:STEADY]), STEADY)
+        elif stem == reference or manifest["mode"] == "dynamic":
+            # FP32 is only held against this machine's, and nobody would drive a Pi with dynamic: both are slow.
+            plans[stem] = Plan(reference, thinned(every, COUNTED))
+        else:
+            plans[stem] = Plan(reference, tuple(every))
+    references = {plan.reference for plan in plans.values()}
+    return dict(sorted(plans.items(), key=lambda item: (item[0] not in references, -manifests[item[0]]["gmac"])))
+
+
+def _count_all(
+    core: Core,
+    artifacts: Mapping[str, Path],
+    plans: Mapping[str, Plan],
+    samples: Sequence[Any],
+    jobs: int,
+    progress: Progress,
+) -> dict[str, Counted]:
+    counts: dict[str, Callable[..., Counted]] = {}
+    for stem, plan in plans.items():
+        chosen = [samples[i] for i in plan.frames]
+        counts[stem] = partial(count_artifact, core, artifacts[stem], chosen, counted=plan.counted)
+    inferences = sum(max(len(plan.frames), plan.counted) for plan in plans.values())
+    return side_by_side(counts, inferences, "emulated inferences", jobs, progress)
+
+
+def _judged(
+    artifacts: Mapping[str, Path],
+    plans: Mapping[str, Plan],
+    counts: Mapping[str, Counted],
+    samples: Sequence[Any],
+    again: Opened,
+    progress: Progress,
+) -> dict[str, dict[str, Any]]:
+    """What the predictions of each artifact with a reference say, for arm.json.
+
+    Raises CountError if an FP32 artifact gives something else in the emulated Pi than on this machine.
+    """
+    rows: dict[str, dict[str, Any]] = {}
+    ranges = again.recordings.action_range()
+    for reference in sorted({plan.reference for plan in plans.values() if plan.reference}):
+        here = chunks_here(artifacts[reference], samples, progress)
+        difference = float(np.abs(counts[reference].chunks - here[list(plans[reference].frames)]).max())
+        if not difference <= params()["parity"]["fp32"]:
+            raise CountError(
+                f"{artifacts[reference]}: differs by {difference:.2g} on the core", remedy="quantize again"
+            )
+        for stem in (stem for stem, plan in plans.items() if plan.reference == reference):
+            frames = plans[stem].frames
+            expected, chosen = here[list(frames)], [samples[i] for i in frames]
+            at_home = expected if stem == reference else chunks_here(artifacts[stem], chosen, progress)
+            names = again.checkpoint.config.action_names
+            rows[stem] = errors_pct(expected, counts[stem].chunks, names, ranges)
+            rows[stem] |= {f"workstation_{k}": v for k, v in errors_pct(expected, at_home, names, ranges).items()}
+            rows[stem] |= {"reference": reference, "frames_on_the_core": len(frames)}
+            rows[stem]["reference_max_difference"] = difference
+    return rows
+
+
+def chunks_here(path: Path, samples: Sequence[Any], progress: Progress) -> np.ndarray:
+    """(n, C, A) float32: what an artifact predicts on this machine, in one thread."""
+    policy = load_policy(path, threads=1)
+    watched = progress(samples, desc=f"{path.stem} on this machine", total=len(samples))
+    return np.stack([policy.predict_chunk(s.frame_bgr(), s.state) for s in watched])
+
+
+def errors_pct(
+    reference: np.ndarray, chunks: np.ndarray, actions: Sequence[str], ranges: dict[str, tuple[float, float]]
+) -> dict[str, float | None]:
+    """<action>_mae_pct: mean difference of two sets of chunks (n, C, A), in percent of the recorded range.
+
+    None for an action that never changes in the recordings: not judged.
+    """
+    mean = np.abs(chunks.astype(np.float64) - reference).mean((0, 1))
+    return {f"{action}_mae_pct": pct_of_range(float(mean[i]), ranges[action]) for i, action in enumerate(actions)}
+
+
+def requantized(run_dir: Path, checkpoint: Checkpoint) -> q.QuantizedPolicy:
+    """The policy that a run's policy_static.pt was exported from, made again from the run's calibration.
+
+    Raises CountError if the run's files are not those that the artifact was made from.
+    """
+    stage = read_stage(run_dir / "quantize.json", "quantize")
+    made, calibrated = stage["metrics"]["modes"][STATIC.removeprefix("policy_")], run_dir / "calibration.pt"
+    hashes = content_hash(run_dir / f"{STATIC}.pt"), sha256_of(calibrated)
+    if hashes != (made["content_hash"], stage["inputs"]["calibration.pt"]):
+        raise CountError(
+            f"{run_dir}: {STATIC}.pt and calibration.pt are not those of quantize.json", remedy="quantize again"
+        )
+    scheme = q.Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
+    return q.quantize(checkpoint, scheme, q.Calibration.load(calibrated))
+
+
+def backbone_bits(run_dir: Path, core: Core, checkpoint: Checkpoint, samples: Sequence[Any]) -> dict[str, int]:
+    """Whether policy_static's INT8 backbone gives the same bits in the emulated Pi as on this machine.
+
+    The backbone (up to the image projection's INT8 output) is cut out of the same graph (see `requantized`) and run on
+    prepared frames on both. Returns {frames, values, differing}, the counts of frames, of values that were compared,
+    and of those that are not the same. Raises CountError if the run's files are not those that policy_static.pt was
+    made from.
+    """
+    backbone = q.backbone_of(requantized(run_dir, checkpoint)).eval()
+    inputs = [q.inputs_of(s, checkpoint.config) for s in samples]
+    with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch, torch.inference_mode():
+        folder = Path(scratch)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the trace: shapes are constants here, and meant to be
+            traced = torch.jit.freeze(torch.jit.trace(backbone, inputs[0], check_trace=False).eval())
+        traced.save(folder / "backbone.pt")
+        frames: dict[str, Any] = {f"frame_{i:04d}": frame.numpy() for i, (_, frame) in enumerate(inputs)}
+        np.savez(folder / "inputs.npz", state=torch.cat([state for state, _ in inputs]).numpy(), **frames)
+        with torch.jit.optimized_execution(False):
+            here = torch.cat([traced(*x) for x in inputs]).numpy()
+        emulate_script(core, OURS.script, ["--backbone", q.ENGINE, "backbone.pt", "inputs.npz"], folder)
+        there = np.load(folder / "backbone.npy")
+    if (here.dtype, here.shape) != (there.dtype, there.shape):
+        expected, given = f"{here.dtype} {here.shape}", f"{there.dtype} {there.shape}"
+        raise CountError(f"the backbone gives {expected} on this machine, and not on the core", found=given)
+    return {"frames": len(here), "values": here.size, "differing": int((there != here).sum())}

@@ -1,0 +1,178 @@
+"""What arm.json says of counts: its numbers by artifact, gates, groups of kernels, the computed time, and a table."""
+
+import re
+from typing import Any
+
+from lab.a76.count import Counted
+from rover_lib.workshop.compare import gate
+from rover_lib.workshop.judge import worst
+
+LABEL = "counted on an emulated Cortex-A76"
+STATIC = "policy_static"
+SDOT_MACS = 16  # multiply-accumulates of one SDOT: the floor is as if nothing else ran
+
+PI5_CORES, PI5_GHZ, SIMD_PER_CYCLE = 4, 2.4, 2
+PUBLISHED_GMAC_PER_S = 207  # ResNet18 at 224x224 in INT8, ExecuTorch with XNNPACK, 8.75 ms p50 on a Pi 5
+LOOP_PER_SDOT = 80 / 64  # instructions of XNNPACK's inner loop per SDOT, counted here
+IPC_SEEN = PUBLISHED_GMAC_PER_S / SDOT_MACS / (PI5_CORES * PI5_GHZ) * LOOP_PER_SDOT
+PREDICTED = (
+    f"low: SIMD instructions / ({SIMD_PER_CYCLE} per cycle x {PI5_CORES} cores x {PI5_GHZ} GHz); "
+    f"high: all instructions / ({IPC_SEEN:.2f} per cycle x {PI5_CORES} cores x {PI5_GHZ} GHz)"
+)
+
+SAME_POLICY = 0.01  # of the multiply-accumulates: the instructions' gates are for one policy
+# What kernels do, by their names; the first that matches counts.
+INT8_SDOT, INT8_OTHER, REST = "INT8 products: SDOT", "INT8 products: all else", "rest"
+GROUPS = (
+    (
+        INT8_OTHER,
+        r"with SDOT|xnn_q\w*(gemm|conv)|neondot|q8(gemm|conv)|Mlas\w*(GemmQuant|Gemm[SU]8|QGemm|Qgemm|ConvSym|ConvDw)",
+    ),
+    ("float products", r"sgemm_(kernel|nn|nt|tn|tt)|sgemv|arm_gemm|xnn_f32\w*(gemm|conv)|Mlas\w*Gemm"),
+    ("softmax and exp", r"exp(f|_|\d|minus|on)|[Ss]oftmax|attention"),
+    ("LayerNorm", r"[Ll]ayer_?[Nn]orm|RowwiseMoments"),
+    ("to and from INT8", r"[Qq]uantize|lrintf|vcvt"),
+    ("the frame (OpenCV)", r"^\[cv2"),
+    ("copies", r"[Cc]opy|mem(set|move)|im2col|unfold|[Tt]ranspose|indirection|(?<![Nn])[Pp]ack(?!ag)|^\[libc"),
+    ("element-wise", r"VectorizedLoop|vectorized_loop|max_?pool|v(add|mul|clamp|max)|(add|mul|relu|clamp)\w*_kernel"),
+)
+
+COLUMNS = {  # of the table, with their widths
+    **dict.fromkeys(("instructions_g", "simd_g", "x_floor", "first_g", "tenth_g", "load_instructions_g"), 7),
+    **{"peak_memory_mb": 6, "peak_memory_loading_mb": 7},
+    **{"steering_mae_pct": 8, "throttle_mae_pct": 8, "frames_on_the_core": 6},
+}
+
+
+def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, Any]:
+    """What arm.json says of one artifact; _g are 10**9 instructions. The floor is SDOT alone, for every mode."""
+    floor_g = manifest["gmac"] / SDOT_MACS
+    inferences_g = [n / 1e9 for n in counted.inferences]
+    low_ms, high_ms = predicted_ms(counted.simd / 1e9, counted.steady / 1e9)
+    return {
+        "instructions_g": counted.steady / 1e9,
+        "simd_g": counted.simd / 1e9,
+        "sdot_g": counted.sdot / 1e9,
+        "floor_g": floor_g,
+        "x_floor": counted.steady / 1e9 / floor_g,
+        "first_g": inferences_g[0],
+        "second_g": inferences_g[1],
+        "tenth_g": inferences_g[9] if len(inferences_g) >= 10 else None,
+        "load_instructions_g": counted.load / 1e9,
+        "gmac": manifest["gmac"],
+        "image_height": manifest["cameras"][0]["height"],
+        "image_width": manifest["cameras"][0]["width"],
+        "instructions_by_kernel": {name: row[0] / 1e9 for name, row in counted.kernels.items()},
+        "simd_by_kernel": {name: row[1] / 1e9 for name, row in counted.kernels.items()},
+        "sdot_by_kernel": {name: row[2] / 1e9 for name, row in counted.kernels.items()},
+        "peak_memory_mb": counted.peak_mb,
+        "peak_memory_loading_mb": counted.peak_loading_mb,
+        "emulator_memory_mb": counted.emulator_mb,
+        "threads": counted.versions["threads"],
+        "versions": counted.versions,
+        "computed_pi5_ms": {"low": low_ms, "high": high_ms, "formula": PREDICTED},
+    }
+
+
+def predicted_ms(simd_g: float, instructions_g: float) -> tuple[float, float]:
+    """A range for the time of one inference on a Raspberry Pi 5, in ms, computed from counts. Nothing here was timed.
+
+    low: the SIMD instructions alone at two per cycle, which is what a Cortex-A76 can issue (Arm's optimisation guide),
+    on four cores at 2.4 GHz, all of them always busy. No program with this count can be faster.
+    high: all instructions at the rate that such kernels have been seen to reach on a Pi 5. Published: ResNet18 at
+    224x224 with XNNPACK's INT8 kernels in 8.75 ms, which is 207 GMAC/s, 67 % of the chip's SDOT peak, or 1.35 SDOT per
+    cycle and core. Their inner loop executes 80 instructions for 64 SDOT, hence 1.68 instructions per cycle (more, if
+    what is outside the loop is counted too).
+    Not known, and in neither: how evenly the work divides over four threads, waiting for memory (the published network
+    has 11 MB of weights, the full policy 66), and whether float kernels, which are most of FP32's, reach that rate. So
+    high is a careful estimate and no bound.
+    """
+    cycles_per_ms = PI5_CORES * PI5_GHZ * 1e6
+    return simd_g * 1e9 / (SIMD_PER_CYCLE * cycles_per_ms), instructions_g * 1e9 / (IPC_SEEN * cycles_per_ms)
+
+
+def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any]]:
+    """What static artifacts must reach, as `compare.gate` rows. metrics: of arm.json; limits: arm.gates of
+    lab/params.yml.
+
+    A gate that this run has no artifact for is left out: the instructions are for the user's policy, known by its
+    multiply-accumulates. Errors are divided by this machine's, and the worse of the actions is judged.
+    """
+    rows = []
+    for stem, found in metrics["artifacts"].items():
+        known = limits["policies"].get(stem, {})
+        if known and abs(found["gmac"] / known["gmac"] - 1) < SAME_POLICY:
+            rows += [gate(f"{stem} {key}", found[key], "<=", known[key]) for key in known if key != "gmac"]
+        if not re.fullmatch(rf"{STATIC}(_\d+x\d+)?", stem) or found.get("reference") is None:
+            continue
+        times = []
+        for key, here in found.items():
+            if key.startswith("workstation_") and here is not None:
+                times.append(found[key.removeprefix("workstation_")] / here if here else float("inf"))
+        off_pct = 100 * abs(found["tenth_g"] / found["instructions_g"] - 1)
+        rows += [
+            gate(f"{stem} error, x workstation's", worst(times), "<=", limits["x_workstation_error"]),
+            gate(f"{stem} frames judged on the core", found["frames_on_the_core"], ">=", limits["frames"]),
+            gate(f"{stem} tenth off the third, %", off_pct, "<=", limits["tenth_pct"]),
+            gate(f"{stem} peak_memory_mb", found["peak_memory_mb"], "<=", limits["peak_memory_mb"]),
+            gate(
+                f"{stem} peak_memory_loading_mb",
+                found["peak_memory_loading_mb"],
+                "<=",
+                limits["peak_memory_loading_mb"],
+            ),
+        ]
+    if bits := metrics.get("backbone_bits"):
+        rows.append(
+            gate(f"{STATIC} backbone values that differ", bits["differing"], "<=", limits["backbone_differing"])
+        )
+    return rows
+
+
+def group_kernels(found: dict[str, Any]) -> dict[str, float]:
+    """An artifact's or a peer's instructions by what they do, 10**9 each, in a fixed order; the sum is instructions_g.
+
+    found: with instructions_by_kernel and, to part a product's SDOT from what feeds it, sdot_by_kernel.
+    """
+    groups = dict.fromkeys((INT8_SDOT, *(name for name, _ in GROUPS), REST), 0.0)
+    sdot = found.get("sdot_by_kernel", {})
+    for kernel, instructions_g in found["instructions_by_kernel"].items():
+        group = next((name for name, pattern in GROUPS if re.search(pattern, kernel)), REST)
+        products_g = sdot.get(kernel, 0.0) if group == INT8_OTHER else 0.0
+        groups[INT8_SDOT] += products_g
+        groups[group] += instructions_g - products_g
+    return groups
+
+
+def table(content: dict[str, Any]) -> str:
+    """arm.json for people: the counts, fewest instructions first; the computed time by itself; the gates."""
+    metrics = content["metrics"]
+    counted = metrics["artifacts"] | {n: m for n, m in metrics.get("peers", {}).items() if "artifact" not in m}
+    rows = sorted(counted.items(), key=lambda item: item[1]["instructions_g"])
+    wide = max(24, *(len(stem) for stem in counted))
+    lines = [
+        f"{LABEL}, G instructions per inference; errors against FP32 in percent of the recorded range",
+        f"{'':{wide}} {'steady':>7} {'SIMD':>7} {'x floor':>7} {'first':>7} {'tenth':>7} {'load':>7}"
+        f" {'MB':>6} {'loading':>7} {'steering':>8} {'throttle':>8} {'frames':>6}",
+    ]
+    for stem, m in rows:
+        cells = (_cell(m.get(key), key, width) for key, width in COLUMNS.items())
+        lines.append(" ".join([f"{stem:{wide}}", *cells]))
+    lines += ["", f"computed from these counts for a Raspberry Pi 5, ms, never timed ({PREDICTED})"]
+    for stem, m in rows:
+        low, high = predicted_ms(m["simd_g"], m["instructions_g"])
+        lines.append(f"{stem:{wide}} {low:7.3g} to {high:.3g}")
+    if note := metrics.get("note"):
+        lines += ["", f"note: {note}"]
+    if metrics.get("gates"):
+        lines += ["", "gates (lab/params.yml)"]
+        for row in metrics["gates"]:
+            verdict = {True: "pass", False: "FAIL", None: "not measured"}[row["passed"]]
+            shown = "-" if row["found"] is None else f"{row['found']:.4g}"
+            lines.append(f"{row['gate']:56} {shown:>8} {row['relation']} {row['limit']:<6g} {verdict}")
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, key: str, width: int) -> str:
+    form = ".3f" if key.endswith("_pct") else ".0f" if key.endswith("_mb") else ".2f" if key == "x_floor" else ".4g"
+    return f"{'-' if value is None else format(value, form):>{width}}"

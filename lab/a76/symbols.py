@@ -1,0 +1,118 @@
+"""From the addresses that a guest executed to the functions they belong to."""
+
+import re
+from bisect import bisect_right
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from elftools.common.exceptions import ELFError
+from elftools.elf.elffile import ELFFile
+
+from lab.a76.core import CountError
+from rover_lib.workshop.program import run
+
+KERNELS = 30  # named in the report, the rest summed up
+NAME_LENGTH = 140
+# By numpy: of the 778,000 symbols of libtorch_cpu.so it reads all in 0.3 s, pyelftools one by one in 40 s.
+SYMBOL = np.dtype(
+    [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("at", "<u8"), ("size", "<u8")]
+)
+FUNCTIONS = (0, 2, 10)  # symbol types none (assembly), function, indirect function
+
+
+class Functions:
+    """The functions of an ELF file, by address. Raises CountError if it is none of 64 bits."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        with path.open("rb") as file:
+            try:
+                elf = ELFFile(file)
+                if elf.elfclass != 64:
+                    raise ELFError("of 32 bits")
+            except ELFError as e:
+                raise CountError(f"{path}: not a 64-bit ELF file", found=e) from None
+            # By the first loaded segment, a mapping tells where the file was put.
+            self.base = min((s["p_vaddr"] & ~0xFFF for s in elf.iter_segments("PT_LOAD")), default=0)
+            whole = elf.get_section_by_name(".symtab")
+            self.complete = whole is not None  # a stripped file names only what it exports
+            table = whole or elf.get_section_by_name(".dynsym")
+            symbols: Any = np.frombuffer(table.data() if table else b"", SYMBOL)
+            self._names = elf.get_section(table["sh_link"]).data() if table else b"\0"
+        symbols = symbols[np.isin(symbols["info"] & 15, FUNCTIONS) & (symbols["section"] > 0) & (symbols["at"] > 0)]
+        # Mapping symbols ($x, $d) mark code and data, they name nothing.
+        first = np.frombuffer(self._names, "u1")[symbols["name"]]
+        symbols = symbols[(first != ord("$")) & (first != 0)]
+        self._symbols = symbols[np.lexsort((symbols["size"], symbols["at"]))]
+        self._at = self._symbols["at"].tolist()
+
+    def function_at(self, address: int) -> str:
+        """Mangled name of the function at an address of the file; the file's name where it names none."""
+        i = bisect_right(self._at, address) - 1
+        if i >= 0:
+            symbol = self._symbols[i]
+            if self.complete or address < int(symbol["at"]) + int(symbol["size"]):
+                start = int(symbol["name"])
+                return self._names[start : self._names.index(b"\0", start)].decode(errors="replace")
+        return f"[{self.path.name}]"
+
+
+class GuestFunctions:
+    """The functions of a guest, by its addresses. maps: /proc/self/maps as the guest sees it."""
+
+    def __init__(self, maps: str):
+        self._mappings = []
+        self._lowest: dict[str, int] = {}
+        for line in maps.splitlines():
+            fields = line.split(None, 5)
+            start, end = (int(address, 16) for address in fields[0].split("-"))
+            path = fields[5].strip() if len(fields) > 5 else ""
+            self._lowest[path] = min(self._lowest.get(path, start), start)
+            self._mappings.append((start, end, path))
+        self._mappings.sort()
+        self._starts = [start for start, _, _ in self._mappings]
+        self._files: dict[str, Functions] = {}
+
+    def __getitem__(self, address: int) -> str:
+        """Mangled name of the function at an address of the guest."""
+        i = bisect_right(self._starts, address) - 1
+        _, end, path = self._mappings[i] if i >= 0 else (0, 0, "")
+        if address >= end or not path.startswith("/"):
+            return "[unknown]"
+        if path not in self._files:
+            self._files[path] = Functions(Path(path))
+        file = self._files[path]
+        return file.function_at(address - self._lowest[path] + file.base)
+
+
+def by_kernel(blocks: np.ndarray, functions: Any, at_most: int = KERNELS) -> dict[str, tuple[int, int, int]]:
+    """Executed (instructions, SIMD, SDOT) by function, demangled, most first; what is beyond `at_most` is "other".
+
+    blocks: of core.BLOCK. functions: names by address. Where a library was stripped of names, its blocks that hold an
+    SDOT stand apart from the rest of it.
+    """
+    executed: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
+    for address, entered, *counts in blocks.tolist():
+        name = functions[address]
+        if name.startswith("[") and counts[2]:
+            name = f"{name} loops with SDOT"
+        _add(executed[name], [entered * count for count in counts])
+    mangled = sorted(executed, key=lambda n: -executed[n][0])
+    plain = run("c++filt", "--no-params", error=CountError, input="\n".join(mangled)).splitlines()
+    merged: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
+    for i, (name, demangled) in enumerate(zip(mangled, plain, strict=True)):
+        _add(merged[_short(demangled) if i < at_most else "other"], executed[name])
+    return {name: (row[0], row[1], row[2]) for name, row in merged.items()}
+
+
+def _add(row: list[int], counts: list[int]) -> None:
+    for i, count in enumerate(counts):
+        row[i] += count
+
+
+def _short(name: str) -> str:
+    """A C++ name without the wrapper that torch's element-wise loops are called through."""
+    name = re.sub(r"^c10::function_ref<.*?>::callback_fn<", "", name)
+    return name if len(name) <= NAME_LENGTH else name[: NAME_LENGTH - 3] + "..."
