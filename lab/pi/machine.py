@@ -14,26 +14,30 @@ tells its kernel that the counter of all its clocks and timers counts `slow` tim
 of the rover's has to be told other times. What takes a second for the machine takes `slow` seconds here.
 """
 
+import asyncio
 import contextlib
 import ctypes
 import gzip
-import json
+import logging
+import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lab.debian import fetch_packages
+from qemu.qmp import ExecuteError, QMPClient, QMPError
+
+from lab.debian import fetch_packages, missing_packages, unpack_packages, which
 from lab.pi.system import USER, System, emulation, free_port, make_sure, system
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.program import last_words, run
 
 PACKAGES = {  # commands, and the Debian packages that have them
     "qemu-system-aarch64": "qemu-system-arm",
@@ -86,15 +90,6 @@ class MachineError(RoverError):
     """The emulated machine cannot be made here, does not start, or does not do what it is told."""
 
 
-def missing_packages() -> list[str]:
-    """Debian packages that the machine needs and this host lacks."""
-    return sorted({package for command, package in PACKAGES.items() if not _which(command)})
-
-
-def _which(command: str) -> str | None:
-    return shutil.which(command) or shutil.which(command, path="/usr/sbin:/sbin")
-
-
 # ---- the card
 
 
@@ -116,7 +111,7 @@ def card() -> Card:
     Debian packages that are missing are installed when this runs as root. Raises RoverError where no card can be made.
     """
     why = "an emulated Pi's card is written with its owner's rights"
-    make_sure(missing_packages(), "the emulated machine", why, MachineError)
+    make_sure(missing_packages(PACKAGES), "the emulated machine", why, MachineError)
     with emulation():
         flashed = system()
     made = [RECIPE, CARD_GB, MODULES, FIRST_MODULES, INIT, NETWORK, MASKED, ROVER_PACKAGES, KERNEL_PACKAGES]
@@ -128,14 +123,14 @@ def _make_card(flashed: System, folder: Path) -> None:
     made = Card(folder)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".pi-card.") as scratch:
         work, root = Path(scratch), Path(scratch) / "root"
-        _run(["cp", "-a", "--reflink=auto", flashed.root, root])
+        _run("cp", "-a", "--reflink=auto", flashed.root, root)
         kernel, debs = work / "kernel", root / DEBS.lstrip("/")
         debs.mkdir(parents=True)
         for package in fetch_packages(work / "rover", ROVER_PACKAGES, flashed.root):
             shutil.move(package, debs)
         for package in fetch_packages(work / "linux", KERNEL_PACKAGES, flashed.root):
             if package.name.startswith(("linux-image-", "busybox-static_")):
-                _run(["dpkg-deb", "--extract", package, kernel])
+                unpack_packages([package], kernel)
         version = next((kernel / "lib/modules").iterdir()).name
         shutil.copy(kernel / f"boot/vmlinuz-{version}", made.kernel)
         _modules(kernel, root, version)
@@ -145,7 +140,7 @@ def _make_card(flashed: System, folder: Path) -> None:
         made.key.chmod(0o600)
         # Without checksums of its own: the kernel would need modules for them before it has the card.
         options = ["-t", "ext4", "-E", "lazy_itable_init=1,lazy_journal_init=1", "-O", "^metadata_csum"]
-        _run(["mke2fs", "-q", *options, "-d", root, made.disk, f"{CARD_GB}G"])
+        _run("mke2fs", "-q", *options, "-d", root, made.disk, f"{CARD_GB}G")
 
 
 def _modules(kernel: Path, root: Path, version: str) -> None:
@@ -159,7 +154,7 @@ def _modules(kernel: Path, root: Path, version: str) -> None:
         elif found.exists():
             (target / "kernel" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(found, target / "kernel" / name)
-    _run(["depmod", "--basedir", root, version])
+    _run("depmod", "--basedir", root, version)
 
 
 def _initramfs(busybox: Path, root: Path, version: str, output: Path, scratch: Path) -> None:
@@ -171,11 +166,9 @@ def _initramfs(busybox: Path, root: Path, version: str, output: Path, scratch: P
     (tree / "bin/sh").symlink_to("busybox")
     order: list[str] = []
     for module in FIRST_MODULES:
-        shown = ["modprobe", "--dirname", root, "--set-version", version, "--show-depends", module]
-        for line in _run(shown).splitlines():
-            word, _, path = line.partition(" ")
-            path = Path(path.strip())
-            if word == "insmod" and path.name not in order:
+        shown = _run("modprobe", "--dirname", root, "--set-version", version, "--show-depends", module)
+        for path in map(Path, re.findall(r"^insmod (\S+)", shown, re.MULTILINE)):
+            if path.name not in order:
                 order.append(path.name)
                 shutil.copy(path, tree / "m")
     (tree / "m/order").write_text("".join(f"{name}\n" for name in order))
@@ -208,82 +201,62 @@ def _configure(root: Path) -> None:
     for kind in ("ed25519", "rsa"):
         host_key = root / f"etc/ssh/ssh_host_{kind}_key"
         if not host_key.exists():
-            _run(["ssh-keygen", "-q", "-t", kind, "-N", "", "-C", "emulated Pi", "-f", host_key])
+            _run("ssh-keygen", "-q", "-t", kind, "-N", "", "-C", "emulated Pi", "-f", host_key)
 
 
-def _run(command: Sequence[object], **options: Any) -> str:
-    """Run a command and return its stdout; MachineError with the end of what it said if it fails."""
-    words = [str(word) for word in command]
-    words[0] = _which(words[0]) or words[0]
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, **options)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise MachineError(f"{command[0]} failed: {error}") from None
-    if done.returncode:
-        said = " ".join((done.stderr or done.stdout).split())[-400:] or f"exit code {done.returncode}"
-        raise MachineError(f"{command[0]} failed: {said}")
-    return done.stdout
+def _run(command: str, *arguments: object) -> str:
+    """A program's output; of root's folders too, which a user's PATH may lack."""
+    return run(which(command) or command, *arguments, error=MachineError)
 
 
 # ---- QEMU's own console
 
 
+logging.getLogger("qemu.qmp").addHandler(logging.NullHandler())  # what it logs, it raises too
+
+
 class Qmp:
-    """QEMU's machine protocol on a Unix socket: a command, its answer, and what it reports in between."""
+    """QEMU's machine protocol on a Unix socket: a command and its answer, and what QEMU reports by itself."""
 
     def __init__(self, path: Path | str, timeout_s: float = QMP_S):
-        self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.settimeout(timeout_s)
-        self._events: list[dict[str, Any]] = []
+        self._timeout_s = timeout_s
+        self._runner = asyncio.Runner()
+        self._client = QMPClient()
         try:
-            self._socket.connect(str(path))
-            self._file = self._socket.makefile("rwb")
-            self._next()  # its greeting
-            self.command("qmp_capabilities")
-        except BaseException as error:
-            self._socket.close()
-            if isinstance(error, OSError):
-                raise MachineError(f"{path}: QEMU does not answer ({error}); has it ended?") from None
+            self._run(self._client.connect(str(path)))
+        except BaseException:
+            self._runner.close()
             raise
 
-    def command(self, name: str, **arguments: Any) -> Any:
-        """What QEMU returns. Raises MachineError if it refuses, or says nothing any more."""
-        self._file.write(json.dumps({"execute": name, "arguments": arguments}).encode() + b"\n")
-        self._file.flush()
-        while True:
-            answer = self._next()
-            if "return" in answer:
-                return answer["return"]
-            if "error" in answer:
-                raise MachineError(f"QEMU refused {name}: {answer['error'].get('desc', answer['error'])}")
+    def command(self, name: str, **arguments: object) -> object:
+        """What QEMU returns. Raises MachineError if it refuses, or does not answer any more."""
+        return self._run(self._client.execute(name, arguments))
 
-    def wait_for(self, event: str, **data: Any) -> None:
-        """Until QEMU has reported this event, with these data. Raises MachineError if it does not."""
+    def wait_for(self, event: str, device: str) -> None:
+        """Until QEMU has reported this event of a device. Raises MachineError if it does not."""
 
-        def fits(found: dict[str, Any]) -> bool:
-            return found["event"] == event and data.items() <= found.get("data", {}).items()
+        async def wait() -> None:
+            async for reported in self._client.events:
+                data = reported.get("data")
+                if reported["event"] == event and isinstance(data, dict) and data.get("device") == device:
+                    return
 
-        while not (found := next(filter(fits, self._events), None)):
-            self._next()
-        self._events.remove(found)
+        self._run(wait())
 
     def close(self) -> None:
         """Raises nothing."""
-        with contextlib.suppress(OSError):
-            self._file.close()
-        self._socket.close()
+        with contextlib.suppress(MachineError):
+            self._run(self._client.disconnect())
+        self._runner.close()
 
-    def _next(self) -> dict[str, Any]:
+    def _run(self, conversation: Coroutine[Any, Any, Any]) -> Any:
         try:
-            line = self._file.readline()
-        except OSError as error:
-            raise MachineError(f"QEMU does not answer ({error}); is this host busy?") from None
-        if not line:
-            raise MachineError("QEMU has ended in the middle of a conversation; its console log may say why")
-        said = json.loads(line)
-        if "event" in said:
-            self._events.append(said)
-        return said
+            return self._runner.run(asyncio.wait_for(conversation, self._timeout_s))
+        except ExecuteError as error:
+            raise MachineError(f"QEMU refused {error.sent['execute']}: {error}") from None
+        except (QMPError, OSError, EOFError, TimeoutError) as error:
+            ended = "the console's log may say why, if it has ended"
+            raise MachineError("QEMU does not answer", found=repr(error), remedy=ended) from None
 
 
 # ---- the machine
@@ -314,54 +287,45 @@ class Machine:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.console = self.folder / "console.log"
         self.disk = self.folder / "disk.qcow2"
-        self._work = Path(tempfile.mkdtemp(prefix="rover-pi-"))  # a socket's path must be short
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115, open as long as the process
-        self._process: subprocess.Popen | None = None
-        self._qmp: Qmp | None = None
-        try:
+        with contextlib.ExitStack() as stack:
+            self._work = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rover-pi-")))  # sockets: short
+            self._errors = stack.enter_context(tempfile.TemporaryFile())
+            stack.callback(self.disk.unlink, missing_ok=True)
             base, kind = (layer, "qcow2") if layer else (card.disk, "raw")
-            _run(["qemu-img", "create", "-q", "-f", "qcow2", "-b", base.resolve(), "-F", kind, self.disk])
-            self._start(drives)
-        except BaseException:
-            self.close()
-            raise
+            _run("qemu-img", "create", "-q", "-f", "qcow2", "-b", base.resolve(), "-F", kind, self.disk)
+            stack.callback(self._log_out)
+            self._process = self._start(drives)
+            stack.callback(self._end)
+            self._qmp = self._connect()
+            stack.callback(self._quit)
+            self._stack = stack.pop_all()
 
     def __enter__(self) -> "Machine":
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self.close()
+        """Cuts its power, and removes its disk. Raises nothing."""
+        self._stack.close()
 
-    @property
-    def pid(self) -> int | None:
-        """Of QEMU's process."""
-        return self._process.pid if self._process else None
-
-    def _start(self, drives: Sequence[Path]) -> None:
+    def _start(self, drives: Sequence[Path]) -> subprocess.Popen:
         machine = ["-cpu", CPU, "-smp", str(CORES), "-m", str(MEMORY_MB), "-display", "none", "-nodefaults"]
         tree = self._work / "tree.dtb"
-        _run(["qemu-system-aarch64", "-machine", f"virt,dumpdtb={tree}", *machine])
-        _run(["fdtput", "-t", "u", tree, "/timer", "clock-frequency", round(TIMER_HZ * self.slow)])
-        command = ["qemu-system-aarch64", "-machine", "virt", *machine, "-accel", "tcg,thread=multi,tb-size=512"]
-        command += ["-kernel", self.card.kernel, "-initrd", self.card.initramfs, "-dtb", tree, "-append", KERNEL_LINE]
+        _run("qemu-system-aarch64", "-machine", f"virt,dumpdtb={tree}", *machine)
+        _run("fdtput", "-t", "u", tree, "/timer", "clock-frequency", round(TIMER_HZ * self.slow))
+        command: list[object] = ["qemu-system-aarch64", "-machine", "virt", *machine]
+        command += ["-accel", "tcg,thread=multi,tb-size=512", "-dtb", tree, "-append", KERNEL_LINE]
+        command += ["-kernel", self.card.kernel, "-initrd", self.card.initramfs]
         # Nothing is synchronized to the host's disk: a machine that ends early is thrown away.
-        for i, (file, options) in enumerate(
-            [(self.disk, "format=qcow2,cache=unsafe"), *((d, "format=raw,readonly=on") for d in drives)]
-        ):
+        disks = [(self.disk, "format=qcow2,cache=unsafe"), *((d, "format=raw,readonly=on") for d in drives)]
+        for i, (file, options) in enumerate(disks):
             command += ["-drive", f"if=none,id=d{i},file={_comma(file)},{options}"]
             command += ["-device", f"virtio-blk-pci,drive=d{i},romfile="]
         # restrict: it reaches nothing, as at a track; only its ssh is reached.
         command += ["-netdev", f"user,id=n,restrict=on,hostfwd=tcp:127.0.0.1:{self.port}-:22"]
-        command += [
-            "-device",
-            "virtio-net-pci,netdev=n,romfile=",
-            "-device",
-            "virtio-rng-pci",
-            "-device",
-            "qemu-xhci,id=xhci",
-        ]
+        for device in ("virtio-net-pci,netdev=n,romfile=", "virtio-rng-pci", "qemu-xhci,id=xhci"):
+            command += ["-device", device]
         command += ["-serial", f"file:{_comma(self.console)}", "-qmp", f"unix:{self._work}/qmp,server=on,wait=off"]
-        self._process = subprocess.Popen(
+        return subprocess.Popen(
             [str(word) for word in command],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -369,10 +333,12 @@ class Machine:
             start_new_session=True,  # a terminal's ^C is not for it
             preexec_fn=_end_with_parent,
         )
+
+    def _connect(self) -> Qmp:
         end = time.monotonic() + QMP_S
-        while self._qmp is None:
+        while True:
             try:
-                self._qmp = Qmp(self._work / "qmp")
+                return Qmp(self._work / "qmp")
             except MachineError:
                 self._check()
                 if time.monotonic() > end:
@@ -382,8 +348,8 @@ class Machine:
     def _check(self) -> None:
         if self._process.poll() is not None:
             self._errors.seek(0)
-            said = " ".join(self._errors.read()[-600:].decode(errors="replace").split())
-            raise MachineError(f"QEMU has ended (exit code {self._process.returncode}): {said or 'it said nothing'}")
+            said = last_words(self._errors.read().decode(errors="replace"))
+            raise MachineError(f"QEMU has ended (exit code {self._process.returncode}): {said}")
 
     # -- ssh
 
@@ -417,7 +383,7 @@ class Machine:
         except subprocess.TimeoutExpired:
             raise MachineError(f"'{command}' took more than {timeout_s:g} s in the emulated machine") from None
         if check and done.returncode:
-            said = " ".join((done.stderr or done.stdout).split())[-400:]
+            said = last_words(done.stderr or done.stdout)
             raise MachineError(f"'{command}' failed in the emulated machine ({done.returncode}): {said}")
         return done.stdout + done.stderr
 
@@ -455,25 +421,22 @@ class Machine:
         except subprocess.TimeoutExpired:
             raise MachineError(f"the machine was not off after {timeout_s:g} s; see {self.console}") from None
 
-    def close(self) -> None:
-        """Cuts its power, and removes its disk. Raises nothing."""
-        if self._process and self._process.poll() is None:
-            if self._qmp:
-                with contextlib.suppress(MachineError, OSError, ValueError):
-                    self._qmp.command("quit")
-            try:
-                self._process.wait(5)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-        if self._qmp:
-            self._qmp.close()
+    def _quit(self) -> None:
+        with contextlib.suppress(MachineError):
+            self._qmp.command("quit")
+        self._qmp.close()
+
+    def _end(self) -> None:
+        try:
+            self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _log_out(self) -> None:
         with contextlib.suppress(OSError, subprocess.SubprocessError):
             options = [*self.ssh_options, "-p", str(self.port), f"{USER}@127.0.0.1"]
             subprocess.run(["ssh", "-O", "exit", *options], capture_output=True, timeout=10)
-        self._errors.close()
-        self.disk.unlink(missing_ok=True)
-        shutil.rmtree(self._work, ignore_errors=True)
 
 
 def _comma(path: Path) -> str:

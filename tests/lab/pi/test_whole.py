@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from lab import debian
 from lab.pi import machine, system, whole
 from lab.pi import usb_camera as camera
 from lab.pi.machine import MachineError, Qmp
@@ -37,17 +38,16 @@ def qemu(tmp_path):
 
     def serve():
         connection, _ = listener.accept()
-        with connection, connection.makefile("rwb") as file:
-            file.write(b'{"QMP": {"version": {}}}\n')
-            file.flush()
-            for line in file:
-                command = json.loads(line)
+        with connection:
+            connection.sendall(b'{"QMP": {"version": {}, "capabilities": []}}\n')
+            while sent := connection.recv(4096):  # one at a time: the next comes after its answer
+                command = json.loads(sent)
                 qemu.heard.append(command)
                 for answer in qemu.says.get(command["execute"], [{"return": {}}]):
                     if answer is None:
                         return
-                    file.write(json.dumps(answer).encode() + b"\n")
-                file.flush()
+                    whose = {"id": command["id"]} if "id" in command and "event" not in answer else {}
+                    connection.sendall(json.dumps({**answer, **whose}).encode() + b"\n")
 
     qemu = threading.Thread(target=serve, daemon=True)
     qemu.path, qemu.heard, qemu.says = path, [], {}
@@ -86,7 +86,7 @@ def test_an_event_of_another_device_is_not_taken_for_it(qemu):
 def test_a_qemu_that_ends_or_is_not_there(qemu, tmp_path):
     qemu.says = {"quit": [None]}
     qmp = Qmp(qemu.path)
-    with pytest.raises(MachineError, match="has ended"):
+    with pytest.raises(MachineError, match=r"QEMU does not answer.*log may say why, if it has ended"):
         qmp.command("quit")
     qmp.close()
     with pytest.raises(MachineError, match="QEMU does not answer"):
@@ -97,8 +97,7 @@ def test_a_qemu_that_ends_or_is_not_there(qemu, tmp_path):
 
 
 def test_what_is_missing_is_said_in_a_sentence(monkeypatch, tmp_path):
-    monkeypatch.setattr(machine, "_which", lambda command: None if command == "qemu-img" else command)
-    assert machine.missing_packages() == ["qemu-utils"]
+    monkeypatch.setattr(debian, "which", lambda command: None if command == "qemu-img" else command)
     monkeypatch.setattr(system.os, "geteuid", lambda: 1000)
     with pytest.raises(MachineError, match=r"needs root \(and of the Debian packages qemu-utils\)"):
         machine.card()
