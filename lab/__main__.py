@@ -119,9 +119,9 @@ def pi_fast(ctx: click.Context, output: Path, demo: Path, short: bool, faults: b
     Real systemd and sshd, aarch64 programs, the real firmware on an emulated Arduino. OUTPUT is JSON, what the
     playbooks said is beside it; exit code 1 if anything is not as expected.
     """
-    from lab.pi.fast import run_fast
+    from lab.pi.container_run import run_container
 
-    outcome = run_fast(output, demo, short=short, faults=faults, say=click.echo)
+    outcome = run_container(output, demo, short=short, faults=faults, say=click.echo)
     for gate in outcome.metrics.get("gates", []):
         click.echo(f"{'ok  ' if gate['holds'] else 'FAIL'}  {gate['gate']}: {gate['wanted']}")
     _end_pi(ctx, outcome.wrong, output)
@@ -139,9 +139,9 @@ def pi_whole(ctx: click.Context, output: Path, **options: Any) -> None:
     QEMU's Cortex-A76 with kernel, camera and USB; the real firmware on an emulated Arduino. Cables are pulled while
     it drives. OUTPUT is JSON; exit code 1 if anything is not as expected, the machine's console is beside it then.
     """
-    from lab.pi.whole import run_whole
+    from lab.pi.machine_run import run_machine
 
-    outcome = run_whole(output, **options, say=click.echo)
+    outcome = run_machine(output, **options, say=click.echo)
     _end_pi(ctx, outcome.wrong, output)
 
 

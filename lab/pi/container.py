@@ -2,9 +2,9 @@
 
     with Container("rover1") as pi:
         pi.boot()
-        pi.ssh("uname -m")                  # aarch64
-        with VirtualCar(board=BOARD) as car:
-            pi.plug(camera=car.camera, arduino=car.port)    # CAMERA and PORT in there
+        pi.inside("uname", "-m")            # aarch64
+        with EmulatedArduino() as board:
+            pi.plug(board.port)             # PORT in there
             ...
         pi.cut_power()
         pi.boot()
@@ -34,13 +34,14 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from lab.pi.system import USER, EmulationError, emulation, free_port, in_cgroup, run, system
+from lab.pi.debian_image import debian_image
+from lab.pi.emulation import EmulationError, emulation, free_port, in_cgroup
 from rover_lib.workshop.cache import cache_root
+from rover_lib.workshop.program import last_words, run
 
 BOOT_S = 180.0  # until sshd answers; 10 on two quiet cores
 OFF_S = 60.0
 KILL_S = 20.0
-SSH_S = 30.0
 BENCH, PTS = "/srv/bench", "/srv/pts"  # in the container: what is plugged in, and the host's pseudo terminals
 CAMERA, PORT = f"{BENCH}/camera", "/dev/rover-arduino"
 DIALOUT = 20  # Debian's number for the group
@@ -73,7 +74,7 @@ class Container:
     def __enter__(self) -> "Container":
         with contextlib.ExitStack() as stack:
             stack.enter_context(emulation())
-            made = system()
+            made = debian_image()
             self.key = made.key
             # Not in /tmp, which may be in memory: torch alone has half a gigabyte.
             disk = Path(tempfile.mkdtemp(prefix=f".pi-{self.name}-", dir=cache_root()))
@@ -88,11 +89,9 @@ class Container:
             below = ":".join(str(p) for p in (*reversed(self._below), made.root))
             # redirect_dir: a folder of a layer below can be renamed, as on any disk.
             how = f"lowerdir={below},upperdir={self._upper},workdir={disk / 'work'},redirect_dir=on"
-            run(
-                ["mount", "-t", "overlay", self.machine, "-o", how, self.root],
-                f"{cache_root()} cannot hold a layered file system; put ROVER_CACHE on a plain disk",
-            )
-            stack.callback(subprocess.run, ["umount", "--lazy", self.root], capture_output=True)
+            remedy = f"put ROVER_CACHE on a plain disk if {cache_root()} cannot hold a layered file system"
+            run("mount", "-t", "overlay", self.machine, "-o", how, self.root, error=EmulationError, remedy=remedy)
+            stack.callback(lambda: subprocess.run(["umount", "--lazy", self.root], capture_output=True))
             self._enter_cgroup = stack.enter_context(in_cgroup(self.machine))
             stack.callback(_forget, self.machine)
             stack.callback(self.cut_power)
@@ -101,10 +100,6 @@ class Container:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._stack.close()
-
-    def close(self) -> None:
-        """Ends it and removes all that it was."""
         self._stack.close()
 
     @property
@@ -119,10 +114,10 @@ class Container:
 
     # Power
 
-    def boot(self, *, within_s: float = BOOT_S) -> float:
+    def boot(self) -> float:
         """Switches it on; seconds until sshd answers. Raises EmulationError with the last of its console if not."""
         if self.on:
-            raise EmulationError(f"{self.name} is on already: cut its power, or power it off")
+            raise EmulationError(f"{self.name} is on already", remedy="cut its power, or power it off")
         started = time.monotonic()
         console = (self._own / "console.log").open("wb")
         command = ["systemd-nspawn", "--quiet", "--boot", "--register=no", "--keep-unit", "--link-journal=no"]
@@ -131,7 +126,7 @@ class Container:
         command += ["--resolv-conf=replace-host", "--timezone=off", "--console=pipe"]
         command += [f"--bind={self.bench}:{BENCH}", f"--bind=/dev/pts:{PTS}"]
         with console:
-            self._process = subprocess.Popen(
+            process = self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=console,
@@ -146,12 +141,12 @@ class Container:
                 s.settimeout(10)
                 if s.recv(4) == b"SSH-":
                     break
-            if time.monotonic() > started + within_s:
+            if time.monotonic() > started + BOOT_S:
                 said = self._console()
                 self.cut_power()
-                raise EmulationError(f"{self.name} has no sshd after {within_s:g} s, its console's last: {said}")
+                raise EmulationError(f"{self.name} has no sshd after {BOOT_S:g} s, its console's last: {said}")
             time.sleep(0.2)
-        self._leader = self._find_leader()
+        self._leader = self._find_leader(process.pid)
         return time.monotonic() - started
 
     def cut_power(self) -> None:
@@ -169,7 +164,7 @@ class Container:
 
     def power_off(self) -> None:
         """Shuts it down as `systemctl poweroff` does."""
-        if self.on:
+        if self._process and self.on:
             self.inside("systemctl", "poweroff")
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(OFF_S)
@@ -177,66 +172,45 @@ class Container:
 
     # Work in it
 
-    def ssh(
-        self, command: str, *, check: bool = True, timeout_s: float | None = None, stdin: bytes | None = None
-    ) -> subprocess.CompletedProcess:
-        """Runs a command for its user, as a human would; bytes. Raises EmulationError if it fails and check is set."""
-        return self._ran([*self.ssh_command, command], command, check, timeout_s, stdin)
-
     def inside(
         self, *command: object, check: bool = True, timeout_s: float | None = None
-    ) -> subprocess.CompletedProcess:
-        """Runs a program as root, past sshd; otherwise as ssh()."""
+    ) -> subprocess.CompletedProcess[str]:
+        """Runs a program as root, past sshd. Raises EmulationError if it takes longer, or fails and check is set."""
         enter = ["nsenter", f"--target={self.leader}", "--mount", "--uts", "--ipc", "--pid", "--root", "--wd=/"]
         enter += ["--", "/usr/bin/env", "--ignore-environment", "PATH=/usr/local/bin:/usr/sbin:/usr/bin", "LC_ALL=C"]
-        return self._ran([*enter, *map(str, command)], " ".join(map(str, command)), check, timeout_s, None)
-
-    @property
-    def ssh_command(self) -> list[str]:
-        """To be followed by a command; one connection for all of them."""
-        return ["ssh", "-q", "-i", str(self.key), "-p", str(self.port), *SSH, f"{USER}@127.0.0.1"]
+        words = [str(word) for word in command]
+        what = f"{self.name}: '{' '.join(words)}'"
+        try:
+            done = subprocess.run([*enter, *words], capture_output=True, text=True, errors="replace", timeout=timeout_s)
+        except subprocess.TimeoutExpired:
+            raise EmulationError(f"{what} took more than {timeout_s:g} s") from None
+        if check and done.returncode:
+            raise EmulationError(f"{what} ended with {done.returncode}: {last_words(done.stderr or done.stdout)}")
+        return done
 
     @property
     def leader(self) -> int:
         """Its first process, as this machine numbers it. Raises EmulationError while it is off."""
         if not self.on or not self._leader:
-            raise EmulationError(f"{self.name} is off: boot it")
+            raise EmulationError(f"{self.name} is off", remedy="boot it")
         return self._leader
 
     def pid_of(self, pid: int) -> int:
         """This machine's number of one of its processes. Raises EmulationError if there is none."""
         inner = Path(f"/proc/{self.leader}/ns/pid").readlink()
-        for status in Path("/proc").glob("[0-9]*/status"):
-            with contextlib.suppress(OSError, StopIteration):
-                numbers = next(x for x in status.read_text().splitlines() if x.startswith("NSpid:")).split()[1:]
-                if int(numbers[-1]) == pid and (status.parent / "ns" / "pid").readlink() == inner:
-                    return int(numbers[0])
+        for process in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                numbers = _pids(process)
+                if numbers[-1] == pid and (process / "ns" / "pid").readlink() == inner:
+                    return numbers[0]
         raise EmulationError(f"{self.name} has no process {pid}")
 
-    # Devices
-
-    def plug(self, *, camera: str | Path | None = None, arduino: str | Path | None = None) -> None:
-        """Plugs in a camera, a FIFO of JPEGs in /tmp, and an Arduino, a pseudo terminal of this machine; on or off.
-
-        None: as it was. They are CAMERA and PORT in there; both stay plugged in when it boots again.
-        """
-        if camera is not None:
-            Path(camera).chmod(0o666)
-            self.unplug(camera=True)
-            (self.bench / "camera").hardlink_to(camera)
-        if arduino is not None:
-            terminal = Path(arduino).resolve()
-            os.chown(terminal, 0, DIALOUT)
-            terminal.chmod(0o660)
-            self.unplug(arduino=True)
-            (self.bench / "arduino").symlink_to(f"{PTS}/{terminal.name}")
-
-    def unplug(self, *, camera: bool = False, arduino: bool = False) -> None:
-        """Their names are gone; who has them open notices nothing: close camera or Arduino itself for that."""
-        if camera:
-            (self.bench / "camera").unlink(missing_ok=True)
-        if arduino:
-            (self.bench / "arduino").unlink(missing_ok=True)
+    def plug(self, arduino: str | Path) -> None:
+        """Plugs in an Arduino, a pseudo terminal of this machine: PORT in there, when it boots again too."""
+        terminal = Path(arduino).resolve()
+        os.chown(terminal, 0, DIALOUT)
+        terminal.chmod(0o660)
+        (self.bench / "arduino").symlink_to(f"{PTS}/{terminal.name}")
 
     # What is done to the disk before it boots
 
@@ -259,18 +233,6 @@ class Container:
         _lend_systemd(self.root)
         _lend_registries(self.root)
 
-    def _ran(
-        self, command: list[str], what: str, check: bool, timeout_s: float | None, stdin: bytes | None
-    ) -> subprocess.CompletedProcess:
-        try:
-            done = subprocess.run(command, capture_output=True, timeout=timeout_s, input=stdin)
-        except subprocess.TimeoutExpired:
-            raise EmulationError(f"{self.name}: '{what}' took more than {timeout_s:g} s") from None
-        if check and done.returncode:
-            said = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-600:]
-            raise EmulationError(f"{self.name}: '{what}' ended with {done.returncode}: {said}")
-        return done
-
     def _enter(self) -> None:
         self._enter_cgroup()
         os.setpriority(os.PRIO_PROCESS, 0, self._nice)
@@ -279,24 +241,23 @@ class Container:
         text = (self._own / "console.log").read_text(errors="replace")
         return " | ".join(text.strip().splitlines()[-8:]) or "nothing"
 
-    def _find_leader(self, nspawn: int | None = None) -> int:
+    def _find_leader(self, nspawn: int) -> int:
         """The child of nspawn that is the first process of another pid namespace."""
-        waiting = [nspawn or self._process.pid]
+        waiting = [nspawn]
         while waiting:
-            pid = waiting.pop()
+            process = Path("/proc", str(waiting.pop()))
             with contextlib.suppress(OSError):
-                status = Path(f"/proc/{pid}/status").read_text()
-                numbers = next(x for x in status.splitlines() if x.startswith("NSpid:")).split()[1:]
-                if numbers[1:] and numbers[-1] == "1":
-                    return pid
-                waiting += map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
+                numbers = _pids(process)
+                if numbers[1:] and numbers[-1] == 1:
+                    return numbers[0]
+                waiting += map(int, (process / "task" / process.name / "children").read_text().split())
         raise EmulationError(f"{self.name}: systemd-nspawn has no first process")
 
 
-SSH = [
-    *("-o", "UserKnownHostsFile=/dev/null", "-o", "StrictHostKeyChecking=no", "-o", "IdentitiesOnly=yes"),
-    *("-o", "BatchMode=yes", "-o", f"ConnectTimeout={SSH_S:g}"),
-]
+def _pids(process: Path) -> list[int]:
+    """Numbers of a process of /proc: this machine's, and then that of each pid namespace which it is in."""
+    lines = (process / "status").read_text().splitlines()
+    return next([int(word) for word in line.split()[1:]] for line in lines if line.startswith("NSpid:"))
 
 
 def _forget(machine: str) -> None:
@@ -315,16 +276,13 @@ def _lend_systemd(root: Path) -> None:
     What sets up a service's sandbox runs in it, and under qemu-user that fails (PrivateNetwork=, credentials) or does
     nothing (seccomp). The sandbox holds for the emulator that a service runs in just as well.
     """
-    told = run(["ldd", SYSTEMD], f"{SYSTEMD} cannot be examined")
-    libraries = {Path(word) for line in told.splitlines() for word in line.split() if word.startswith("/")}
-    ask = ["--show", "--showformat=${Version}"]
-    here = run(["dpkg-query", *ask, "systemd"], "this machine's systemd is no Debian package")
-    theirs = ["dpkg-query", f"--admindir={root}/var/lib/dpkg", *ask, "systemd:arm64"]
-    there = run(theirs, "the emulated Pi has no systemd")
+    libraries = {Path(word) for word in _run("ldd", SYSTEMD).split() if word.startswith("/")}
+    ask = ["dpkg-query", "--show", "--showformat=${Version}"]
+    here = _run(*ask, "systemd")
+    there = _run(*ask, f"--admindir={root}/var/lib/dpkg", "systemd:arm64")
     if here.partition(".")[0] != there.partition(".")[0]:
-        raise EmulationError(
-            f"systemd is {here} here and {there} on the emulated Pi: remove {cache_root()}/pi-system-*"
-        )
+        what = f"systemd is {here} here and {there} on the emulated Pi"
+        raise EmulationError(what, remedy=f"remove {cache_root()}/pi-system-*")
     for path in (SYSTEMD, *libraries):
         target = root / path.relative_to("/")
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -335,33 +293,36 @@ def _lend_systemd(root: Path) -> None:
 def _lend_registries(root: Path) -> None:
     """This machine's own ways to Debian's and Python's packages: sources, proxies, certificates, pip's settings."""
     form = "$(REPO_URI) $(RELEASE) $(COMPONENT)"
-    told = run(["apt-get", "indextargets", "--format", form, "Identifier: Packages"], "apt-get names no sources")
+    listed = _run("apt-get", "indextargets", "--format", form, "Identifier: Packages")
     release = (root / "etc" / "os-release").read_text()
     codename = next(x.partition("=")[2] for x in release.splitlines() if x.startswith("VERSION_CODENAME="))
     suites = {codename, f"{codename}-updates", f"{codename}-security"}
-    sources = sorted({line for line in told.splitlines() if set(line.split()[1:2]) & suites})
+    sources = sorted({line for line in listed.splitlines() if set(line.split()[1:2]) & suites})
     if not sources:
         raise EmulationError(f"this machine's apt sources have no Debian {codename}, whose packages the Pi installs")
     (root / "etc" / "apt" / "sources.list").write_text("".join(f"deb {line}\n" for line in sources))
-    apt = run(["apt-config", "dump"], "apt-config does not work").splitlines()
+    apt = _run("apt-config", "dump").splitlines()
     settings = [line for line in apt if line.startswith(("Acquire::http", "Acquire::https"))]
     settings += [f'Acquire::{k}::Proxy "{v}";' for k in ("http", "https") if (v := _proxy(k))]
-    (root / "etc" / "apt" / "apt.conf.d" / "90emulated").write_text(
-        "\n".join([*settings, 'Acquire::Languages "none";\n'])
-    )
+    settings += ['Acquire::Languages "none";\n']
+    (root / "etc" / "apt" / "apt.conf.d" / "90emulated").write_text("\n".join(settings))
     if CERTIFICATES.exists():
         shutil.copy(CERTIFICATES, root / CERTIFICATES.relative_to("/"))
-    told = run([sys.executable, "-m", "pip", "config", "list"], "pip does not tell its settings")
-    (root / "etc" / "pip.conf").write_text(pip_settings(told, _proxy("https")))
+    config = _run(sys.executable, "-m", "pip", "config", "list")
+    (root / "etc" / "pip.conf").write_text(pip_settings(config, _proxy("https")))
 
 
-def pip_settings(told: str, proxy: str = "") -> str:
+def _run(*command: object) -> str:
+    return run(*command, error=EmulationError)
+
+
+def pip_settings(config: str, proxy: str = "") -> str:
     """A pip.conf for another machine from what `pip config list` told here: where packages are, not how they are used.
 
     Folders of this machine are left out; so are its certificates, since the other has them where its own were.
     """
     found = {"cert": str(CERTIFICATES), "proxy": proxy}
-    for line in told.splitlines():
+    for line in config.splitlines():
         key, _, value = line.partition("=")
         name = key.rpartition(".")[2]
         if name in ("index-url", "extra-index-url", "trusted-host", "proxy", "timeout", "default-timeout", "retries"):

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lab.pi.bench import Bench, give_first_model, in_parallel, rovers
+from lab.pi.deployment_bench import DeploymentBench, give_first_model, in_parallel, rovers
 
 Say = Callable[[str], None]
 NAMES = ("canary", "second", "third")
@@ -33,17 +33,17 @@ def fleet(layers: Sequence[Path], artifacts: Mapping[str, Path], *, say: Say = l
     return {"rovers": len(NAMES), "cases": cases, "good": all(case["good"] for case in cases)}
 
 
-def _case(benches: Sequence[Bench], broken: str, batches: list[int] | None) -> dict[str, Any]:
+def _case(benches: Sequence[DeploymentBench], broken: str, batches: list[int] | None) -> dict[str, Any]:
     new = list(benches[0].artifacts)[1]
     before = {bench.pi.name: bench.mode_in_use()[0] for bench in benches}
     for bench in benches:
         if bench.pi.name == broken:
             bench.make_read_only()
-    variables = {"rover_batches": batches} if batches else {}
+    variables: dict[str, Any] = {"rover_batches": batches} if batches else {}
     artifact = str(benches[0].artifacts[new])
-    others = [bench.wire for bench in benches[1:]]
+    others = [bench.network for bench in benches[1:]]
     play = benches[0].play("deploy", others=others, rover_artifact=artifact, **variables)
-    healthy = in_parallel(Bench.healthy, benches)
+    healthy = in_parallel(DeploymentBench.healthy, benches)
     models = {bench.pi.name: bench.mode_in_use()[0] for bench in benches}
     for bench in benches:
         bench.clean()

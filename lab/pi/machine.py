@@ -34,7 +34,8 @@ from typing import Any
 from qemu.qmp import ExecuteError, QMPClient, QMPError
 
 from lab.debian import fetch_packages, missing_packages, unpack_packages, which
-from lab.pi.system import USER, System, emulation, free_port, make_sure, system
+from lab.pi.debian_image import USER, DebianImage, debian_image
+from lab.pi.emulation import emulation, free_port, make_sure
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.program import last_words, run
@@ -106,20 +107,20 @@ class Card:
 
 
 def card() -> Card:
-    """The card with system()'s Debian on it, from the cache or made now (a minute, and what system() takes).
+    """The card with Debian on it, from the cache or made now (a minute, and what debian_image() takes).
 
     Debian packages that are missing are installed when this runs as root. Raises RoverError where no card can be made.
     """
     why = "an emulated Pi's card is written with its owner's rights"
     make_sure(missing_packages(PACKAGES), "the emulated machine", why, MachineError)
     with emulation():
-        flashed = system()
+        flashed = debian_image()
     made = [RECIPE, CARD_GB, MODULES, FIRST_MODULES, INIT, NETWORK, MASKED, ROVER_PACKAGES, KERNEL_PACKAGES]
     key = key_of({"system": str(flashed.root), "made": made})
     return Card(cached_folder("pi-card", key, lambda folder: _make_card(flashed, folder)))
 
 
-def _make_card(flashed: System, folder: Path) -> None:
+def _make_card(flashed: DebianImage, folder: Path) -> None:
     made = Card(folder)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".pi-card.") as scratch:
         work, root = Path(scratch), Path(scratch) / "root"
@@ -263,7 +264,7 @@ class Qmp:
 
 
 class Machine:
-    """An emulated Pi that runs; a context manager. name, port, key: for plays.run(), and whoever logs in.
+    """An emulated Pi that runs; a context manager. name, port, key: for playbooks.run(), and whoever logs in.
 
     card: what it boots from. folder: for its console, its own disk and sockets; emptied of the last two at the end.
     layer: a disk to build on, of an earlier machine on the same card, instead of the card itself. slow: so many times

@@ -9,6 +9,7 @@ import numpy as np
 from lab.arduino.emulator import EmulatedArduino
 from lab.driving.pins import NEUTRAL_US, PERIOD_US, STEP_US
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.pwm import STOPPED_THROTTLE_US
 from rover_lib.onboard.telemetry import Flight
 from rover_lib.world.standin import PinEvent
 
@@ -87,7 +88,12 @@ def compare(
     return result
 
 
-def stopped(events: Sequence[PinEvent], at_s: float, slow: float, throttle_max_us: float) -> dict[str, Any]:
+def moving(events: Sequence[PinEvent]) -> list[float]:
+    """When (monotonic seconds) pulses that move the car began."""
+    return [e.monotonic_s for e in events if e.pin == "throttle" and e.pulse_us > STOPPED_THROTTLE_US]
+
+
+def stopped(events: Sequence[PinEvent], at_s: float, slow: float = 1.0) -> dict[str, Any]:
     """How the pins went to neutral after `at_s` (by the host's clock), in the Arduino's milliseconds.
 
     after_line_ms: from the last whole line of the rover until the throttle was off, which the firmware promises after
@@ -96,7 +102,7 @@ def stopped(events: Sequence[PinEvent], at_s: float, slow: float, throttle_max_u
     lines = [e.monotonic_s for e in events if e.kind == "line"]
     throttle = [e for e in events if e.pin == "throttle" and e.kind == "pulse"]
     steering = [e for e in events if e.pin == "steering" and e.kind == "pulse"]
-    moving = [i for i, e in enumerate(throttle) if e.pulse_us > throttle_max_us]
+    moving = [i for i, e in enumerate(throttle) if e.pulse_us > STOPPED_THROTTLE_US]
     drove = any(at_s - slow < throttle[i].monotonic_s <= at_s for i in moving)
     off = throttle[moving[-1] + 1].monotonic_s if moving and moving[-1] + 1 < len(throttle) else None
     last_line = max((s for s in lines if off is None or s < off), default=None)

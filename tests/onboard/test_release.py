@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from lab.pi.bench import changed_artifact
+from lab.pi.deployment_bench import changed_artifact
 from rover_lib.cli import main
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import ArtifactError, RoverError

@@ -1,8 +1,8 @@
 """The network between the laptop and a rover's sshd, so that it can be cut, go silent and garble what it carries.
 
-with Wire(pi) as wire:
-    plays.run("deploy", [wire], ...)    # a host like the rover itself, by another port
-    wire.cut()
+with Network(pi) as network:
+    playbooks.run("deploy", [network], ...)     # a host like the rover itself, by another port
+    network.cut()
 """
 
 import contextlib
@@ -10,16 +10,16 @@ import socket
 import threading
 from pathlib import Path
 
-from lab.pi.plays import Host
+from lab.pi.playbooks import Host
 
 AT_ONCE = 1 << 15  # bytes
 CONNECT_S = 5.0
 
 
-class Wire:
+class Network:
     """Forwards a port of the loopback to a rover's; a context manager.
 
-    name, port, key: of a plays.Host. sent: bytes that went to the rover so far, by all connections.
+    name, port, key: of a playbooks.Host. sent: bytes that went to the rover so far, by all connections.
     """
 
     def __init__(self, pi: Host):
@@ -34,8 +34,8 @@ class Wire:
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
 
-    def __enter__(self) -> "Wire":
-        threading.Thread(target=self._accept, name=f"wire of {self.name}", daemon=True).start()
+    def __enter__(self) -> "Network":
+        threading.Thread(target=self._accept, name=f"network of {self.name}", daemon=True).start()
         return self
 
     def __exit__(self, *exc: object) -> None:

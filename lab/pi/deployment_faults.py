@@ -28,9 +28,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lab.pi.bench import (
+from lab.pi.deployment_bench import (
     STATE,
-    Bench,
+    DeploymentBench,
     Disk,
     Missed,
     changed_artifact,
@@ -39,7 +39,7 @@ from lab.pi.bench import (
     in_parallel,
     rovers,
 )
-from lab.pi.system import EmulationError
+from lab.pi.emulation import EmulationError
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.release import ORIGIN, POLICY, SPARE_BYTES
 
@@ -56,7 +56,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Fault:
+class DeploymentFault:
     """A row. inject: makes a deployment meet it. says: what must be said of it, a regular expression. how: it is made.
 
     heal: what a human does about the cause before deploying again. fresh: the model to be deployed is not on the rover
@@ -64,32 +64,32 @@ class Fault:
     """
 
     name: str
-    inject: Callable[[Bench], object]
+    inject: Callable[[DeploymentBench], object]
     says: str
     how: str
     fresh: bool = False
-    heal: Callable[[Bench], object] = lambda bench: None
+    heal: Callable[[DeploymentBench], object] = lambda bench: None
 
 
-FAULTS: list[Fault] = []
+FAULTS: list[DeploymentFault] = []
 LOST = "UNREACHABLE!|does not answer any more"  # when ssh ends
 
 
 def _fault(name: str, says: str, how: str, **more: Any) -> Callable[[Callable], Callable]:
-    def add(inject: Callable[[Bench], object]) -> Callable[[Bench], object]:
-        FAULTS.append(Fault(name, inject, says, how, **more))
+    def add(inject: Callable[[DeploymentBench], object]) -> Callable[[DeploymentBench], object]:
+        FAULTS.append(DeploymentFault(name, inject, says, how, **more))
         return inject
 
     return add
 
 
 def _power_cut(
-    when: str, moment: Callable[[Bench, Disk], bool], how: str, *, in_check: bool = False, fresh: bool = True
+    when: str, moment: Callable[[DeploymentBench, Disk], bool], how: str, *, in_check: bool = False, fresh: bool = True
 ) -> None:
     """in_check: not at that moment, but in the health check that it begins with."""
 
     @_fault(f"power cut {when}", LOST, how, fresh=fresh)
-    def inject(bench: Bench) -> None:
+    def inject(bench: DeploymentBench) -> None:
         cut = bench.cut_power(lambda disk: moment(bench, disk))
 
         def strike() -> None:
@@ -100,11 +100,11 @@ def _power_cut(
         bench.deploy_until(lambda disk: moment(bench, disk) and (not in_check or bench.proves()), strike)
 
 
-def _arriving(bench: Bench, disk: Disk) -> bool:
+def _arriving(bench: DeploymentBench, disk: Disk) -> bool:
     return any(name.startswith("part-") for name in disk.arrived) and not disk.complete(bench.about)
 
 
-def _written_in_part(bench: Bench, disk: Disk) -> bool:
+def _written_in_part(bench: DeploymentBench, disk: Disk) -> bool:
     return 0 < disk.staging.get(POLICY, 0) < bench.about["bytes"]
 
 
@@ -153,10 +153,10 @@ _power_cut(
     "disk full in the transfer",
     "No space left on device",
     f"{ROOM >> 20} MB are free",
-    heal=Bench.make_room,
+    heal=DeploymentBench.make_room,
     fresh=True,
 )
-def _no_room_to_arrive(bench: Bench) -> None:
+def _no_room_to_arrive(bench: DeploymentBench) -> None:
     bench.small_disk(ROOM)
     bench.deploy()
 
@@ -165,10 +165,10 @@ def _no_room_to_arrive(bench: Bench) -> None:
     "too little room for a release",
     r"\d+ MB free, \d+ are needed; prune releases",
     "it can arrive, but the release does not fit beside it",
-    heal=Bench.make_room,
+    heal=DeploymentBench.make_room,
     fresh=True,
 )
-def _no_room_to_stage(bench: Bench) -> None:
+def _no_room_to_stage(bench: DeploymentBench) -> None:
     bench.small_disk(2 * bench.about["bytes"] + ROOM)
     bench.deploy()
 
@@ -177,10 +177,10 @@ def _no_room_to_stage(bench: Bench) -> None:
     "disk full while the release is written",
     "the disk is full; what was in use still is",
     "something else takes all that is free, once there was room enough",
-    heal=Bench.make_room,
+    heal=DeploymentBench.make_room,
     fresh=True,
 )
-def _fill_while_staging(bench: Bench) -> None:
+def _fill_while_staging(bench: DeploymentBench) -> None:
     bench.small_disk(2 * bench.about["bytes"] + SPARE_BYTES + 2 * ROOM)
 
     def fill() -> None:
@@ -197,8 +197,8 @@ def _fill_while_staging(bench: Bench) -> None:
     "in the network, once a part has come through: ssh notices and ends, and Ansible may send it again",
     fresh=True,
 )
-def _flip_on_the_wire(bench: Bench) -> None:
-    bench.deploy_until(lambda disk: _arriving(bench, disk), lambda: bench.wire.flip(after=1 << 20))
+def _flip_on_the_wire(bench: DeploymentBench) -> None:
+    bench.deploy_until(lambda disk: _arriving(bench, disk), lambda: bench.network.flip(after=1 << 20))
 
 
 @_fault(
@@ -207,7 +207,7 @@ def _flip_on_the_wire(bench: Bench) -> None:
     "in a part on the rover's disk",
     fresh=True,
 )
-def _flip_on_disk(bench: Bench) -> None:
+def _flip_on_disk(bench: DeploymentBench) -> None:
     bench.deploy_until(lambda disk: disk.complete(bench.about), lambda: flip(bench.incoming / "part-0000"))
 
 
@@ -217,20 +217,20 @@ def _flip_on_disk(bench: Bench) -> None:
     "the network is cut a megabyte after the first part; the transfer goes on",
     fresh=True,
 )
-def _lose_ssh_in_transfer(bench: Bench) -> dict[str, Any]:
+def _lose_ssh_in_transfer(bench: DeploymentBench) -> dict[str, Any]:
     def strike() -> None:
-        until = bench.wire.sent + (1 << 20)
-        while bench.wire.sent < until and not bench.disk.complete(bench.about) and not bench.stop.is_set():
+        until = bench.network.sent + (1 << 20)
+        while bench.network.sent < until and not bench.disk.complete(bench.about) and not bench.stop.is_set():
             time.sleep(0.001)
-        bench.wire.cut()
+        bench.network.cut()
 
-    sent = bench.wire.sent
+    sent = bench.network.sent
     bench.deploy_until(lambda disk: _arriving(bench, disk), strike)
-    first = bench.wire.sent - sent
-    bench.wire.mend()
+    first = bench.network.sent - sent
+    bench.network.mend()
     arrived = {p.name: p.stat().st_ino for p in bench.incoming.glob("part-*")}
     kept: dict[str, int] = {}
-    sent = bench.wire.sent
+    sent = bench.network.sent
 
     def look() -> None:
         kept.update({p.name: p.stat().st_ino for p in bench.incoming.glob("part-*")})
@@ -243,21 +243,25 @@ def _lose_ssh_in_transfer(bench: Bench) -> dict[str, Any]:
     return {
         "had_arrived": sorted(arrived),
         "travelled_then": travelled,
-        "sent_mb": [round(first / 1e6, 1), round((bench.wire.sent - sent) / 1e6, 1)],
+        "sent_mb": [round(first / 1e6, 1), round((bench.network.sent - sent) / 1e6, 1)],
     }
 
 
 @_fault("ssh lost in the health check", LOST, "the network is cut while the rover proves the new model; it goes on")
-def _lose_ssh_in_check(bench: Bench) -> None:
-    bench.deploy_until(lambda disk: bench.proves(), lambda: (bench.wait_for_check(), bench.wire.cut()))
+def _lose_ssh_in_check(bench: DeploymentBench) -> None:
+    def strike() -> None:
+        bench.wait_for_check()
+        bench.network.cut()
+
+    bench.deploy_until(lambda disk: bench.proves(), strike)
 
 
 @_fault(
     "network silent in the transfer", LOST, "out of reach: no packet comes through, and no connection ends", fresh=True
 )
-def _go_silent(bench: Bench) -> None:
+def _go_silent(bench: DeploymentBench) -> None:
     # Of each try to reach it again; ssh's own limit is that of inventory.ini.
-    bench.deploy_until(lambda disk: _arriving(bench, disk), bench.wire.silence, ansible_ssh_timeout=RETRY_S)
+    bench.deploy_until(lambda disk: _arriving(bench, disk), bench.network.silence, ansible_ssh_timeout=RETRY_S)
 
 
 @_fault(
@@ -266,7 +270,7 @@ def _go_silent(bench: Bench) -> None:
     "what describes the parts names another artifact",
     fresh=True,
 )
-def _wrong_hash(bench: Bench) -> None:
+def _wrong_hash(bench: DeploymentBench) -> None:
     def strike() -> None:
         path = bench.incoming / ORIGIN
         other = bench.packed[bench.before]["name"]
@@ -275,7 +279,7 @@ def _wrong_hash(bench: Bench) -> None:
     bench.deploy_until(lambda disk: disk.complete(bench.about), strike)
 
 
-def _refused(bench: Bench, artifact: Path, says: str) -> None:
+def _refused(bench: DeploymentBench, artifact: Path, says: str) -> None:
     """By the laptop, before anything travels; and by the rover, brought there by hand."""
     if bench.deploy(artifact).ok:
         raise EmulationError(f"{bench.pi.name}: {artifact.name} was deployed")
@@ -292,7 +296,7 @@ OTHER_TORCH = r"made with torch 9\.9\.9, rovers have"
 
 
 @_fault("artifact of another torch", OTHER_TORCH, "its manifest says so; refused by laptop and rover")
-def _other_torch(bench: Bench) -> None:
+def _other_torch(bench: DeploymentBench) -> None:
     versions = {"torch": "9.9.9", "rover_lib": ""}
     bad = changed_artifact(bench.artifacts[bench.target], bench.folder / "torch.pt", versions=versions)
     _refused(bench, bad, OTHER_TORCH)
@@ -302,13 +306,13 @@ A_LIE = "its manifest says dynamic, its code is not"
 
 
 @_fault("manifest that lies", A_LIE, "it says dynamic of INT8 convolutions; refused by laptop and rover")
-def _lie(bench: Bench) -> None:
+def _lie(bench: DeploymentBench) -> None:
     bad = changed_artifact(bench.artifacts[bench.target], bench.folder / "lie.pt", mode="dynamic")
     _refused(bench, bad, A_LIE)
 
 
 @_fault("parity vectors that fail", "computes something else here", "the manifest tolerates less than no difference")
-def _fail_parity(bench: Bench) -> None:
+def _fail_parity(bench: DeploymentBench) -> None:
     with zipfile.ZipFile(bench.artifacts[bench.target]) as z:
         manifest = json.loads(z.read(next(n for n in z.namelist() if n.endswith("/extra/manifest.json"))))
     parity = {"tolerance": dict.fromkeys(manifest["action_names"], -1.0), "reason": "to fail"}
@@ -320,7 +324,7 @@ def _fail_parity(bench: Bench) -> None:
     "another deployment is at work",
     "the second is of the model in use, and begins while the first one's is proven",
 )
-def _two_at_once(bench: Bench) -> None:
+def _two_at_once(bench: DeploymentBench) -> None:
     with ThreadPoolExecutor(1) as pool:
         second: list[Any] = []
 
@@ -336,10 +340,10 @@ def _wrong_clock(years: int) -> None:
     @_fault(
         f"clock wrong by {years:+d} years", ": deployed", "libfaketime is loaded into all that systemd and sshd start"
     )
-    def inject(bench: Bench) -> dict[str, str]:
+    def inject(bench: DeploymentBench) -> dict[str, str]:
         bench.set_clock(years)
         bench.deploy()
-        return {"date": bench.pi.ssh("sudo date +%Y").stdout.decode().strip()}
+        return {"date": bench.pi.inside("date", "+%Y").stdout.strip()}
 
 
 @_fault(
@@ -347,7 +351,7 @@ def _wrong_clock(years: int) -> None:
     r"is not what policy\.pt\.sha256 says",
     "a byte of it, as its health check begins",
 )
-def _tamper_before(bench: Bench) -> None:
+def _tamper_before(bench: DeploymentBench) -> None:
     bench.deploy_until(lambda disk: bench.proves(), lambda: flip(bench.released))
 
 
@@ -356,7 +360,7 @@ def _tamper_before(bench: Bench) -> None:
     "failed after the switch, [0-9a-f]{12} is in use again",
     "a byte of it, once it is in use: the health check fails, and the rover goes back by itself",
 )
-def _tamper_after(bench: Bench) -> None:
+def _tamper_after(bench: DeploymentBench) -> None:
     bench.deploy_until(lambda disk: disk.switched, lambda: flip(bench.released))
 
 
@@ -365,7 +369,7 @@ def _tamper_after(bench: Bench) -> None:
     ": deployed",
     "a byte of it; status says so, its health check fails, and the next deployment replaces it",
 )
-def _tamper_in_use(bench: Bench) -> dict[str, Any]:
+def _tamper_in_use(bench: DeploymentBench) -> dict[str, Any]:
     flip(bench.releases.policy)
     shown, wrong = bench.status(bench.healthy())
     bench.deploy(bench.artifacts[bench.before])
@@ -378,7 +382,7 @@ def _tamper_in_use(bench: Bench) -> dict[str, Any]:
     "rollback.yml on a rover with one release, then deploy.yml",
     fresh=True,
 )
-def _roll_back(bench: Bench) -> None:
+def _roll_back(bench: DeploymentBench) -> None:
     play = bench.play("rollback")
     bench.said.append(play.output)
     if play.ok:
@@ -398,7 +402,7 @@ class Nobody(NamedTuple):
 
 
 @_fault("a host in the inventory that does not exist", r"nobody: unreachable", "after this one, which gets its model")
-def _nobody_there(bench: Bench) -> dict[str, Any]:
+def _nobody_there(bench: DeploymentBench) -> dict[str, Any]:
     nobody = Nobody("nobody", bench.pi.key)
     play = bench.deploy(others=[nobody])
     table = bench.play("status", others=[nobody]).output
@@ -434,7 +438,7 @@ def break_deployments(
     telling = threading.Lock()
     with rovers([f"breaks{i + 1}" for i in range(min(workers, len(waiting)))], layers, artifacts) as benches:
 
-        def work(bench: Bench) -> None:
+        def work(bench: DeploymentBench) -> None:
             give_first_model([bench])
             while waiting and not bench.stop.is_set():
                 fault = waiting.pop(0)
@@ -462,12 +466,12 @@ def wrong_rows(rows: Sequence[Mapping[str, Any]], at_least: int) -> list[str]:
     return found
 
 
-def row_of(name: str, bench: Bench) -> dict[str, Any]:
+def row_of(name: str, bench: DeploymentBench) -> dict[str, Any]:
     """Of one fault, on a rover that has one of the bench's models."""
     return _row(next(fault for fault in FAULTS if fault.name == name), bench)
 
 
-def _row(fault: Fault, bench: Bench) -> dict[str, Any]:
+def _row(fault: DeploymentFault, bench: DeploymentBench) -> dict[str, Any]:
     started = time.monotonic()
     row: dict[str, Any] = {"fault": fault.name, "how": fault.how}
     try:
@@ -489,7 +493,7 @@ def _row(fault: Fault, bench: Bench) -> dict[str, Any]:
     return {**row, "seconds": round(time.monotonic() - started, 1)}
 
 
-def _after(fault: Fault, bench: Bench) -> dict[str, Any]:
+def _after(fault: DeploymentFault, bench: DeploymentBench) -> dict[str, Any]:
     """A fault, and what the rover is like after it."""
     bench.begin(fault.fresh)
     with bench.timed("fault"):
@@ -499,7 +503,7 @@ def _after(fault: Fault, bench: Bench) -> dict[str, Any]:
         row["disk"] = bench.found.row()
         with bench.timed("boot"):
             bench.pi.boot()
-    bench.wire.mend()
+    bench.network.mend()
     said = " ".join(" ".join(bench.said).replace("\\n", " ").split())
     match = re.search(fault.says, said)
     if not match:
@@ -530,10 +534,10 @@ def _after(fault: Fault, bench: Bench) -> dict[str, Any]:
     return {**row, "seconds_of": {k: round(v, 1) for k, v in bench.seconds.items()}}
 
 
-def _restore(bench: Bench) -> None:
+def _restore(bench: DeploymentBench) -> None:
     """After a row that did not come to its end."""
     bench.clean()
-    bench.wire.mend()
+    bench.network.mend()
     if not bench.pi.on:
         bench.pi.boot()
     bench.begin()

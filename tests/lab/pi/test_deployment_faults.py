@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import pytest
 
 from lab.params import lab_params
-from lab.pi import breakage, fast
-from lab.pi.bench import Bench, Disk, Line, line_of
-from lab.pi.breakage import FAULTS, wrong_rows
+from lab.pi import container_run, deployment_faults
+from lab.pi.deployment_bench import DeploymentBench, Disk, Line, line_of
+from lab.pi.deployment_faults import FAULTS, wrong_rows
+from lab.pi.emulation import EmulationError
 from lab.pi.fleet import results_of, wanted_of
-from lab.pi.system import EmulationError
 
 ABOUT = {"name": "a" * 64, "sha256": "b" * 64, "bytes": 100, "parts": 2}
 GOOD = {"healthy": True, "status_true": True, "healed_by_rerun": True}
@@ -32,7 +32,7 @@ def test_every_fault_has_its_own_name_and_there_are_enough():
         "at once",
     ):
         assert any(part in name for name in names), part
-    assert fast.ONE_FAULT in names
+    assert container_run.ONE_FAULT in names
 
 
 def test_how_far_a_deployment_has_come_is_on_the_disk(tmp_path):
@@ -122,7 +122,7 @@ def test_what_is_not_well_is_said():
 
 
 def test_a_row_may_begin_with_no_release_but_the_one_in_use(tmp_path):
-    bench = object.__new__(Bench)  # its making packs real artifacts
+    bench = object.__new__(DeploymentBench)  # its making packs real artifacts
     bench.pi = SimpleNamespace(on=False, root=tmp_path)
     bench.artifacts = {"static": Path("a"), "mixed": Path("b")}
     bench.packed = {"static": {"name": "a" * 64}, "mixed": {"name": "b" * 64}}
@@ -140,4 +140,4 @@ def test_a_row_may_begin_with_no_release_but_the_one_in_use(tmp_path):
 
 def test_a_fault_that_is_not_there_is_told():
     with pytest.raises(EmulationError, match="no fault has 'earthquake' in its name; there are: power cut"):
-        breakage.break_deployments([Path("/nowhere")], {}, only="earthquake")
+        deployment_faults.break_deployments([Path("/nowhere")], {}, only="earthquake")

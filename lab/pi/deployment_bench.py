@@ -1,4 +1,4 @@
-"""A rover that is deployed to while something goes wrong, and the network to it: what breakage.py and fleet.py work on.
+"""A rover that is deployed to while something goes wrong, and the network to it; for its faults, and for a fleet.
 
 When a deployment has come to a certain point is seen on the rover's disk, looked at from this machine every millisecond
 or so: no hook in what runs is needed for that.
@@ -19,12 +19,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lab.debian import fetch_packages
-from lab.pi import plays
+from lab.debian import fetch_packages, unpack_packages
+from lab.pi import playbooks
 from lab.pi.container import Container
-from lab.pi.plays import Play
-from lab.pi.system import EmulationError, run
-from lab.pi.wire import Wire
+from lab.pi.emulation import EmulationError
+from lab.pi.network import Network
+from lab.pi.playbooks import Play
 from rover_lib.onboard.release import POLICY, Releases, pack
 from rover_lib.workshop.cache import cached_folder, key_of
 
@@ -134,7 +134,7 @@ def changed_artifact(artifact: Path, target: Path, **changes: Any) -> Path:
 # One rover, and what is done to it
 
 
-class Bench:
+class DeploymentBench:
     """A rover that is deployed to, and the network to it. before, target: the mode in use, and the one to be deployed.
 
     artifacts: two that are fit to be deployed, by their mode. allow: as rover_allow, what they may differ in.
@@ -155,19 +155,19 @@ class Bench:
         self.pi, self.artifacts, self.stop, self.allow = pi, dict(artifacts), stop, list(allow)
         self.folder = folder / pi.name
         self.folder.mkdir(parents=True)
-        self.wire = Wire(pi)
+        self.network = Network(pi)
         self.undo = contextlib.ExitStack()
         self.seconds: dict[str, float] = {}
         self.said: list[str] = []
         self.packed = {mode: pack(path, self.folder / "packed", allow=allow) for mode, path in self.artifacts.items()}
 
-    def __enter__(self) -> "Bench":
-        self.wire.__enter__()
+    def __enter__(self) -> "DeploymentBench":
+        self.network.__enter__()
         return self
 
     def __exit__(self, *exc: object) -> None:
         self.undo.close()
-        self.wire.__exit__(*exc)
+        self.network.__exit__(*exc)
 
     @property
     def state(self) -> Path:
@@ -209,7 +209,7 @@ class Bench:
                 if release.name != self.releases.current:
                     shutil.rmtree(release)
 
-    def play(self, book: str, *, others: Sequence[plays.Host] = (), name: str = "", **variables: Any) -> Play:
+    def play(self, book: str, *, others: Sequence[playbooks.Host] = (), name: str = "", **variables: Any) -> Play:
         """Runs a playbook on this rover, and on others after it. name: of a laptop of its own."""
         if self.stop.is_set():
             raise EmulationError("told to stop")
@@ -217,7 +217,7 @@ class Bench:
         folder.mkdir(exist_ok=True)
         command = Path(sys.executable).with_name("rover")
         given = {"rover_packed": str(folder / "packed"), "rover_command": str(command), **variables}
-        return plays.run(book, [self.wire, *others], folder=folder, variables=given, timeout_s=PLAY_S)
+        return playbooks.run(book, [self.network, *others], folder=folder, variables=given, timeout_s=PLAY_S)
 
     def deploy(self, artifact: Path | None = None, **more: Any) -> Play:
         """Runs deploy.yml with an artifact, or with the one to be deployed; what it said is noted."""
@@ -296,7 +296,7 @@ class Bench:
     def rover(self, *command: object) -> str:
         """Runs `rover` on the rover, by hand; what it said is noted."""
         done = self.pi.inside(ROVER, *command, check=False, timeout_s=CHECK_S)
-        said = (done.stdout + done.stderr).decode(errors="replace")
+        said = done.stdout + done.stderr
         self.said.append(said)
         return said
 
@@ -377,7 +377,9 @@ def flip(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def rovers(names: Sequence[str], layers: Sequence[Path], artifacts: Mapping[str, Path]) -> Iterator[list[Bench]]:
+def rovers(
+    names: Sequence[str], layers: Sequence[Path], artifacts: Mapping[str, Path]
+) -> Iterator[list[DeploymentBench]]:
     """Rovers that are on. Whatever ends the block, nothing of them is left."""
     stop = threading.Event()
     with contextlib.ExitStack() as stack:
@@ -385,7 +387,7 @@ def rovers(names: Sequence[str], layers: Sequence[Path], artifacts: Mapping[str,
         benches = []
         for name in names:
             pi = stack.enter_context(Container(name, layers=layers))
-            benches.append(stack.enter_context(Bench(pi, artifacts, folder, stop)))
+            benches.append(stack.enter_context(DeploymentBench(pi, artifacts, folder, stop)))
             pi.boot()
         try:
             yield benches
@@ -393,7 +395,7 @@ def rovers(names: Sequence[str], layers: Sequence[Path], artifacts: Mapping[str,
             stop.set()
 
 
-def in_parallel(task: Callable[[Bench], Any], benches: Sequence[Bench]) -> list[Any]:
+def in_parallel(task: Callable[[DeploymentBench], Any], benches: Sequence[DeploymentBench]) -> list[Any]:
     with ThreadPoolExecutor(len(benches)) as pool:
         futures = [pool.submit(task, bench) for bench in benches]
         try:
@@ -406,13 +408,13 @@ def in_parallel(task: Callable[[Bench], Any], benches: Sequence[Bench]) -> list[
             raise
 
 
-def give_first_model(benches: Sequence[Bench]) -> None:
+def give_first_model(benches: Sequence[DeploymentBench]) -> None:
     without = [bench for bench in benches if bench.mode_in_use()[0] not in bench.artifacts]
     if not without:
         return
     first = without[0]
     artifact = next(iter(first.artifacts.values()))
-    play = first.play("deploy", others=[bench.wire for bench in without[1:]], rover_artifact=str(artifact))
+    play = first.play("deploy", others=[bench.network for bench in without[1:]], rover_artifact=str(artifact))
     if not play.ok:
         raise EmulationError(f"{first.pi.name}: the first model cannot be deployed: {play.end}")
 
@@ -422,8 +424,7 @@ def _faketime() -> Path:
 
     def make(folder: Path) -> None:
         with tempfile.TemporaryDirectory() as scratch:
-            for package in fetch_packages(Path(scratch), ["libfaketime"]):
-                if package.name.startswith("libfaketime_"):
-                    run(["dpkg-deb", "--extract", package, folder], f"{package.name} cannot be unpacked")
+            packages = fetch_packages(Path(scratch), ["libfaketime"])
+            unpack_packages([p for p in packages if p.name.startswith("libfaketime_")], folder)
 
     return cached_folder("pi-faketime", key_of({"library": LIBRARY}), make)

@@ -5,11 +5,14 @@ from types import SimpleNamespace
 
 import pytest
 
+from lab import debian
 from lab.params import lab_params
-from lab.pi import container, fast, plays, system
-from lab.pi.fast import environment, hashed, moving, run_fast, stopped_s, unit_for
-from lab.pi.outcome import Outcome
-from lab.pi.system import EmulationError
+from lab.pi import container, container_run, emulation, playbooks
+from lab.pi.container_run import run_container
+from lab.pi.emulation import EmulationError
+from lab.pi.pulses import moving, stopped
+from lab.pi.report import PiReport
+from lab.pi.service_proofs import environment, hashed, unit_for
 from rover_lib.onboard.stage import read_stage
 from rover_lib.world.standin import PinEvent
 
@@ -28,20 +31,20 @@ rover2                     : ok=2    changed=0    unreachable=1    failed=0    s
 
 
 def test_a_recap_is_read_by_host():
-    found = plays.recap(OUTPUT)
+    found = playbooks.recap(OUTPUT)
     assert list(found) == ["rover1", "rover2"]
     assert (found["rover1"]["changed"], found["rover1"]["skipped"], found["rover2"]["unreachable"]) == (20, 7, 1)
 
 
 def test_without_a_recap_nothing_worked():
-    assert plays.recap("ERROR! the playbook could not be found") == {}
-    assert not plays.Play("status", 0, 1.0, {}, "").ok
-    assert plays.Play("status", 0, 1.0, plays.recap(OUTPUT), OUTPUT).ok
-    assert not plays.Play("status", 2, 1.0, plays.recap(OUTPUT), OUTPUT).ok
+    assert playbooks.recap("ERROR! the playbook could not be found") == {}
+    assert not playbooks.Play("status", 0, 1.0, {}, "").ok
+    assert playbooks.Play("status", 0, 1.0, playbooks.recap(OUTPUT), OUTPUT).ok
+    assert not playbooks.Play("status", 2, 1.0, playbooks.recap(OUTPUT), OUTPUT).ok
 
 
 def test_a_play_has_what_is_reported():
-    play = plays.Play("provision", 0, 12.34, plays.recap(OUTPUT), OUTPUT)
+    play = playbooks.Play("provision", 0, 12.34, playbooks.recap(OUTPUT), OUTPUT)
     assert play.changed == 20 and len(play.recap_lines) == 2 and play.recap_lines[0].startswith("rover1 ")
     assert play.end.endswith("ok: [rover1]")
     assert play.row()["seconds"] == 12.3
@@ -49,7 +52,7 @@ def test_a_play_has_what_is_reported():
 
 def test_the_inventory_is_the_users_with_other_rovers(tmp_path):
     hosts = [SimpleNamespace(name=f"rover{n}", port=2220 + n, key=tmp_path / "key") for n in (1, 2)]
-    text = plays.inventory(hosts)
+    text = playbooks.inventory(hosts)
     assert "rover1.local" not in text and "rover2 ansible_host=127.0.0.1 ansible_port=2222" in text
     assert "ansible_pipelining=true" in text and "ControlPersist" in text  # as in inventory.ini
     assert text.index("rover1 ") < text.index("rover2 ") < text.index("[rovers:vars]")
@@ -76,26 +79,26 @@ def test_pip_finds_packages_elsewhere_as_it_does_here():
 
 def test_no_artifacts(tmp_path):
     with pytest.raises(EmulationError, match=r"no policy_static.pt and no policy_mixed.pt to deploy; make demo leaves"):
-        run_fast(tmp_path / "pi-fast.json", tmp_path)
+        run_container(tmp_path / "pi-fast.json", tmp_path)
     assert not (tmp_path / "pi-fast.json").exists()
 
 
 def test_without_root_it_says_what_it_needs(monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    monkeypatch.setattr(system.shutil, "which", lambda name: None)
+    monkeypatch.setattr(debian, "which", lambda name: None)
     with pytest.raises(EmulationError, match=r"needs root \(and of the Debian packages .*systemd-container.*use sudo"):
-        system.require()
-    monkeypatch.setattr(system.shutil, "which", lambda name: f"/usr/bin/{name}")
+        emulation.require()
+    monkeypatch.setattr(debian, "which", lambda name: f"/usr/bin/{name}")
     with pytest.raises(EmulationError, match=r"which needs root: use sudo"):
-        system.require()
+        emulation.require()
 
 
 def test_as_root_what_is_missing_is_installed(monkeypatch):
     asked = []
     monkeypatch.setattr(os, "geteuid", lambda: 0)
-    monkeypatch.setattr(system.shutil, "which", lambda name: None if name == "ssh" else f"/usr/bin/{name}")
-    monkeypatch.setattr(system, "install_packages", lambda packages, what: asked.append((packages, what)))
-    system.require()
+    monkeypatch.setattr(debian, "which", lambda name: None if name == "ssh" else f"/usr/bin/{name}")
+    monkeypatch.setattr(emulation, "install_packages", lambda packages, what: asked.append((packages, what)))
+    emulation.require()
     assert asked == [(["openssh-client"], "an emulated Pi")]
 
 
@@ -104,7 +107,7 @@ def test_as_root_what_is_missing_is_installed(monkeypatch):
 
 def test_what_nobody_vouches_for_is_found(tmp_path):
     site = tmp_path / "opt" / "rover" / "venv" / "lib" / "python3.11" / "site-packages"
-    torch = next(iter(hashed(plays.REPOSITORY / "requirements_pi.txt")["torch"]))
+    torch = next(iter(hashed(playbooks.REPOSITORY / "requirements_pi.txt")["torch"]))
     for name, version in (
         ("torch", torch),
         ("numpy", "0.1"),
@@ -149,27 +152,25 @@ def test_the_probes_run_in_all_of_the_services_sandbox():
 # The pins
 
 
-def pins(*throttle: tuple[float, float]) -> SimpleNamespace:
-    events = [PinEvent(at, "pulse", "throttle", us, 1016.0) for at, us in throttle]
-    return SimpleNamespace(since=lambda s: [e for e in events if e.monotonic_s >= s])
+def pulses(*throttle: tuple[float, float]) -> list[PinEvent]:
+    return [PinEvent(at, "pulse", "throttle", us, 1016.0) for at, us in throttle]
 
 
 def test_when_the_car_stopped():
-    assert stopped_s(pins((1.0, 120.0), (2.0, 300.0), (3.0, 304.0), (3.4, 120.0)), 3.1) == 3.4
-    assert stopped_s(pins((1.0, 120.0)), 3.1) == 3.1
-    assert stopped_s(pins((2.0, 300.0), (3.2, 120.0), (5.0, 300.0)), 3.1) == float("inf")
-    assert stopped_s(pins(), 3.1) == float("inf")
-    assert moving(pins((1.0, 300.0), (2.0, 124.0), (3.0, 125.0)), 1.5) == [3.0]
+    assert stopped(pulses((1.0, 120.0), (2.0, 300.0), (3.0, 304.0), (3.4, 120.0)), 3.1)["after_ms"] == 300.0
+    assert stopped(pulses((2.0, 300.0), (3.2, 120.0), (5.0, 300.0)), 3.1)["after_ms"] is None
+    assert stopped([], 3.1)["after_ms"] is None
+    assert moving(pulses((1.0, 300.0), (2.0, 124.0), (3.0, 125.0))) == [1.0, 3.0]
 
 
 # The report
 
 
 def test_a_promise_that_is_broken_is_said_and_written(tmp_path):
-    outcome = Outcome(fast.STAGE, tmp_path / "pi-fast.json", inputs={"a.pt": "00"})
-    outcome.gate("provision a second time", "changed=0", 0, True)
-    outcome.gate("start limit", "5 tries", {"tries": 7}, False)
-    outcome.write()
+    report = PiReport(container_run.STAGE, tmp_path / "pi-fast.json", inputs={"a.pt": "00"})
+    report.gate("provision a second time", "changed=0", 0, True)
+    report.gate("start limit", "5 tries", {"tries": 7}, False)
+    report.write()
     content = read_stage(tmp_path / "pi-fast.json", "pi-fast")
     assert content["metrics"]["wrong"] == ["start limit: wanted 5 tries, found {'tries': 7}"]
     assert [g["holds"] for g in content["metrics"]["gates"]] == [True, False]
@@ -178,10 +179,10 @@ def test_a_promise_that_is_broken_is_said_and_written(tmp_path):
 
 def test_a_step_that_fails_is_in_the_report_at_once(tmp_path):
     said = []
-    outcome = Outcome(fast.STAGE, tmp_path / "pi-fast.json", said.append)
-    with outcome.step("boot"):
+    report = PiReport(container_run.STAGE, tmp_path / "pi-fast.json", said.append)
+    with report.step("boot"):
         pass
-    with pytest.raises(EmulationError), outcome.step("deploy"):
+    with pytest.raises(EmulationError), report.step("deploy"):
         raise EmulationError("no")
     steps = read_stage(tmp_path / "pi-fast.json", "pi-fast")["metrics"]["steps"]
     assert [(s["step"], s["ok"]) for s in steps] == [("boot", True), ("deploy", False)]

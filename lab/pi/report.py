@@ -12,7 +12,7 @@ from rover_lib.onboard.stage import write_stage
 
 
 @dataclass
-class Outcome:
+class PiReport:
     """stage: pi-fast or pi, whose gates are in lab/params.yml (with _). inputs: hashes of what was deployed.
 
     say: told of each step. wrong: a sentence for all that is not as it should be; nothing, if all is. The report is
@@ -44,6 +44,10 @@ class Outcome:
         self.metrics.setdefault("gates", []).append({"gate": name, "wanted": wanted, "found": found, "holds": holds})
         if not holds:
             self.wrong.append(f"{name}: wanted {wanted}, found {found}")
+
+    def limit(self, name: str, found: float | None, most: float, unit: str) -> None:
+        """A gate that a figure holds if it is there and at most so large."""
+        self.gate(name, f"at most {most} {unit}", found, found is not None and found <= most)
 
     @contextlib.contextmanager
     def step(self, name: str) -> Iterator[dict[str, Any]]:

@@ -21,15 +21,14 @@ import cv2
 import numpy as np
 
 from lab.arduino.emulator import EmulatedArduino
-from lab.pi import machine, plays
+from lab.pi import machine, playbooks
+from lab.pi.emulation import interruptible, require_arduino, wait_for
 from lab.pi.machine import DEBS, Card, Machine, card
-from lab.pi.outcome import Outcome
-from lab.pi.pulses import READ_S, Pins, compare, stopped
-from lab.pi.system import interruptible, require_arduino
+from lab.pi.pulses import READ_S, Pins, compare, moving, stopped
+from lab.pi.report import PiReport
 from lab.pi.usb_camera import UsbCamera
 from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.pwm import STOPPED_THROTTLE_US
 from rover_lib.onboard.service import UNIT
 from rover_lib.onboard.telemetry import Flight, read_log
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
@@ -59,18 +58,18 @@ HIDE = f"systemctl stop {SCREEN}; modprobe -r vivid"
 WATCH_S = 2.0  # of the rover's time, after a fault
 
 
-class WholeError(RoverError):
+class MachineRunError(RoverError):
     """A step of the whole machine that did not do what it should."""
 
 
-def run_whole(
+def run_machine(
     output: Path | str,
     artifact: Path | str,
     recordings: Path | str,
     *,
     fresh: bool = False,
     say: Callable[[str], None] = print,
-) -> Outcome:
+) -> PiReport:
     """All of it; what was found, which is written to `output` even where a step fails.
 
     artifact: to deploy. recordings: episodes, whose frames the camera shows. fresh: provision anew, even if a card that
@@ -80,8 +79,8 @@ def run_whole(
     output, artifact, recordings = Path(output), Path(artifact), Path(recordings)
     require_arduino()
     if not artifact.is_file():
-        raise WholeError(f"{artifact}: no artifact to deploy; make demo leaves one")
-    outcome = Outcome(STAGE, output, say, {artifact.name: content_hash(artifact)})
+        raise MachineRunError(f"{artifact}: no artifact to deploy; make demo leaves one")
+    report = PiReport(STAGE, output, say, {artifact.name: content_hash(artifact)})
     kept = output.with_suffix("")
     shutil.rmtree(kept, ignore_errors=True)
     with (
@@ -89,18 +88,18 @@ def run_whole(
         tempfile.TemporaryDirectory(prefix=".pi-whole.", dir=_cache()) as scratch,  # large, so not in /tmp
         tempfile.TemporaryDirectory(prefix="rover-plays-") as ansible,  # ssh's sockets want a short path
     ):
-        run = _Run(outcome, Path(scratch), Path(ansible))
+        run = _Run(report, Path(scratch), Path(ansible))
         try:
             run.all(artifact, recordings, fresh)
         except RoverError as error:
-            outcome.wrong.append(str(error))
-        if outcome.wrong:
+            report.wrong.append(str(error))
+        if report.wrong:
             kept.mkdir(parents=True)
             for file in Path(scratch).rglob("*.log"):
                 shutil.copy(file, kept / "-".join(file.relative_to(scratch).parts))
-            outcome.metrics["kept"] = str(kept)
-    outcome.write()
-    return outcome
+            report.metrics["kept"] = str(kept)
+    report.write()
+    return report
 
 
 def _cache() -> Path:
@@ -109,45 +108,45 @@ def _cache() -> Path:
 
 
 class _Run:
-    def __init__(self, outcome: Outcome, folder: Path, ansible: Path):
-        self.outcome, self.folder, self.ansible = outcome, folder, ansible
-        self.gates = outcome.gates
+    def __init__(self, report: PiReport, folder: Path, ansible: Path):
+        self.report, self.folder, self.ansible = report, folder, ansible
+        self.gates = report.gates
         self.slow = float(self.gates["slow"])
         self.zero_s = 0.0
-        outcome.metrics |= {"slow": self.slow, "faults": []}
+        report.metrics |= {"slow": self.slow, "faults": []}
         self.pi: Machine
         self.pins: Pins
 
     def all(self, artifact: Path, recordings: Path, fresh: bool) -> None:
         start = time.monotonic()
-        metrics = self.outcome.metrics
-        with self.outcome.step("the card, as flashed"):
+        metrics = self.report.metrics
+        with self.report.step("the card, as flashed"):
             flashed = card()
         layer = self.provisioned(flashed, fresh)
-        with self.outcome.step("the frames that the camera will show"):
+        with self.report.step("the frames that the camera will show"):
             frames = _frames(recordings, self.folder / "frames.yuyv")
         with contextlib.ExitStack() as on:
             self.pi = on.enter_context(Machine(flashed, self.folder, layer=layer, slow=self.slow, drives=[frames]))
             board = on.enter_context(EmulatedArduino(transmitter=REST_US, slow=self.slow, nice=-5))
             self.pins = on.enter_context(Pins(board))
             self.pi.plug(board.port)
-            with self.outcome.step("boot, until ssh answers"):
+            with self.report.step("boot, until ssh answers"):
                 self.pi.wait_for_ssh()
             self.zero_s = self.clock()
             metrics["machine"] = self.machine()
-            with self.outcome.step("camera and Arduino"):
+            with self.report.step("camera and Arduino"):
                 self.sudo(SHOW)
                 self.until(f"test -e {PORT}", f"no {PORT} although the adapter is plugged in")
-            with self.outcome.step("provision.yml again") as row:
+            with self.report.step("provision.yml again") as row:
                 row["recap"] = self.provision()
-            with self.outcome.step("deploy.yml") as row:
+            with self.report.step("deploy.yml") as row:
                 row["recap"] = self.play(
                     "deploy", rover_artifact=artifact.resolve(), rover_packed=self.folder / "packed"
                 )
-            with self.outcome.step("drive.yml: doctor, start, arm, drive, stop, fetch") as row:
+            with self.report.step("drive.yml: doctor, start, arm, drive, stop, fetch") as row:
                 row["recap"] = self.drive(metrics)
             self.fault("USB serial unplugged while driving, by QMP", self.pi.unplug, lambda: self.pi.plug(board.port))
-            with self.outcome.step("another camera, on USB"):
+            with self.report.step("another camera, on USB"):
                 self.sudo(HIDE)
                 usb = on.enter_context(UsbCamera([p.read_bytes() for p in _pictures(recordings)], slow=self.slow))
                 self.pi.plug_camera(usb.path)
@@ -177,18 +176,18 @@ class _Run:
         def make(folder: Path) -> None:
             made.append(True)
             with Machine(flashed, self.folder / "first", slow=self.slow) as self.pi:
-                with self.outcome.step("first boot, until ssh answers"):
+                with self.report.step("first boot, until ssh answers"):
                     self.pi.wait_for_ssh()
-                with self.outcome.step("Debian packages for a rover without internet"):
+                with self.report.step("Debian packages for a rover without internet"):
                     self.sudo(f"DEBIAN_FRONTEND=noninteractive dpkg --install {DEBS}/*.deb")
-                with self.outcome.step("provision.yml, from a flashed card") as row:
+                with self.report.step("provision.yml, from a flashed card") as row:
                     row["recap"] = self.provision()
-                with self.outcome.step("shut down"):
+                with self.report.step("shut down"):
                     self.pi.power_off()
                 shutil.move(self.pi.disk, folder / "disk.qcow2")
 
         folder = cached_folder("pi-provisioned", key, make)
-        self.outcome.metrics["provisioned"] = "now" if made else "from the cache, and again"
+        self.report.metrics["provisioned"] = "now" if made else "from the cache, and again"
         return folder / "disk.qcow2"
 
     def provision(self) -> dict[str, int]:
@@ -229,31 +228,30 @@ class _Run:
     def fetched(self) -> Flight:
         logs = sorted((self.folder / "fetched").rglob("flight.log"))
         if not logs:
-            raise WholeError("drive.yml fetched no flight log; its words are in drive.log")
+            raise MachineRunError("drive.yml fetched no flight log; its words are in drive.log")
         return read_log(logs[-1])
 
     def fault(self, name: str, pull: Callable[[], object], put_back: Callable[[], object]) -> None:
         """Pulls something while the car drives: pins, service, and whether all is well once it is back."""
-        with self.outcome.step(name):
+        with self.report.step(name):
             self.sudo(f"systemctl reset-failed {UNIT}; systemctl start {UNIT}", timeout_s=900)
             self.sudo("rover arm-car --yes")
             began = time.monotonic()
-            while not (moving := self.moving(began)):
-                if time.monotonic() - began > 5 * self.slow:
-                    raise WholeError(f"{name}: the car did not begin to drive within 5 s of its clock")
-                time.sleep(READ_S)
+            if not wait_for(lambda: moving(self.pins.since(began)), 5 * self.slow):
+                raise MachineRunError(f"{name}: the car did not begin to drive within 5 s of its clock")
+            drove_s = moving(self.pins.since(began))[0]
             time.sleep(1.0 * self.slow)
             at_s = time.monotonic()
             pull()
             time.sleep(WATCH_S * self.slow)
-            row = {"fault": name, **stopped(self.pins.since(moving), at_s, self.slow, STOPPED_THROTTLE_US)}
+            row = {"fault": name, **stopped(self.pins.since(drove_s), at_s, self.slow)}
             row |= {"service": self.service(), "says": self.journal()}
             put_back()
             self.sudo(f"systemctl stop {UNIT}")
             self.until(f"test -e {PORT} -a -e {CAMERA}", f"{PORT} or {CAMERA} is not back")
-            self.outcome.metrics["doctor"] = self.doctor()
-            row["doctor"] = self.outcome.metrics["doctor"]["drives"]
-            self.outcome.metrics["faults"].append(row)
+            self.report.metrics["doctor"] = self.doctor()
+            row["doctor"] = self.report.metrics["doctor"]["drives"]
+            self.report.metrics["faults"].append(row)
             if not row["drove"] or not row["neutral"] or row["after_line_ms"] > self.gates["neutral_ms"]:
                 self.wrong(f"{name}: the pins did not go to neutral as promised: {row}")
             if row["service"].get("StatusText", "").startswith("driving"):
@@ -262,13 +260,6 @@ class _Run:
                 self.wrong(f"{name}: the service said nothing about it")
             if not row["doctor"]:
                 self.wrong(f"{name}: rover doctor is not content after it was put back")
-
-    def moving(self, since_s: float) -> float | None:
-        """When the throttle rose above neutral."""
-        limit = STOPPED_THROTTLE_US
-        return next(
-            (e.monotonic_s for e in self.pins.since(since_s) if e.pin == "throttle" and e.pulse_us > limit), None
-        )
 
     def service(self) -> dict[str, str]:
         """What systemd knows of it."""
@@ -292,7 +283,7 @@ class _Run:
         try:
             found = json.loads(told[told.index("{") : told.rindex("}") + 1])
         except ValueError:
-            raise WholeError(f"rover doctor gave no JSON: {' '.join(told.split())[-400:]}") from None
+            raise MachineRunError(f"rover doctor gave no JSON: {' '.join(told.split())[-400:]}") from None
         if not found["drives"]:
             failed = [f"{c['name']}: {c['found']}" for c in found["checks"] if c["verdict"] == "fail"]
             self.wrong(f"rover doctor: {'; '.join(failed)}")
@@ -333,27 +324,27 @@ class _Run:
         end = time.monotonic() + timeout_s
         while self.pi.ssh(f"{test} && echo yes", check=False).strip() != "yes":
             if time.monotonic() > end:
-                raise WholeError(otherwise)
+                raise MachineRunError(otherwise)
             time.sleep(1)
 
     def play(self, name: str, **variables: object) -> dict[str, int]:
-        """Runs one of ansible/'s playbooks on the machine; its recap. Raises WholeError if it fails."""
+        """Runs one of ansible/'s playbooks on the machine; its recap. Raises MachineRunError if it fails."""
         given = {k: str(v) if isinstance(v, Path) else v for k, v in variables.items()}
-        play = plays.run(name, [self.pi], folder=self.ansible, variables=given)
+        play = playbooks.run(name, [self.pi], folder=self.ansible, variables=given)
         (self.folder / f"{name}.log").write_text(play.output)
         if not play.ok:
-            raise WholeError(f"{name}.yml failed: {' '.join(play.end.split())[-500:]}")
+            raise MachineRunError(f"{name}.yml failed: {' '.join(play.end.split())[-500:]}")
         return play.recap[self.pi.name]
 
     def wrong(self, sentence: str) -> None:
-        self.outcome.wrong.append(sentence)
+        self.report.wrong.append(sentence)
 
 
 def _pictures(recordings: Path) -> list[Path]:
     """The first frames of the recordings."""
     pictures = sorted(recordings.glob("*/frames/*.jpg"))[:FRAMES]
     if not pictures:
-        raise WholeError(f"{recordings}: no recorded frames in it; make demo leaves some")
+        raise MachineRunError(f"{recordings}: no recorded frames in it; make demo leaves some")
     return pictures
 
 
@@ -364,6 +355,6 @@ def _frames(recordings: Path, file: Path) -> Path:
             image = cv2.imread(str(path))
             if image is None or image.shape[1::-1] != SIZE:
                 found = None if image is None else image.shape
-                raise WholeError(f"{path}: a frame must be {SIZE[0]}x{SIZE[1]}, found {found}")
+                raise MachineRunError(f"{path}: a frame must be {SIZE[0]}x{SIZE[1]}, found {found}")
             out.write(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_YUY2).tobytes() * TWICE)
     return file

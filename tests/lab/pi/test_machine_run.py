@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lab import debian
-from lab.pi import machine, system, whole
+from lab.pi import emulation, machine, machine_run
 from lab.pi import usb_camera as camera
 from lab.pi.machine import MachineError, Qmp
 from lab.pi.pulses import compare, stopped
@@ -98,37 +98,37 @@ def test_a_qemu_that_ends_or_is_not_there(qemu, tmp_path):
 
 def test_what_is_missing_is_said_in_a_sentence(monkeypatch, tmp_path):
     monkeypatch.setattr(debian, "which", lambda command: None if command == "qemu-img" else command)
-    monkeypatch.setattr(system.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(emulation.os, "geteuid", lambda: 1000)
     with pytest.raises(MachineError, match=r"needs root \(and of the Debian packages qemu-utils\)"):
         machine.card()
     with pytest.raises(MachineError, match="1 to 60 times slower, found 0"):
         machine.Machine(machine.Card(tmp_path), tmp_path, slow=0)
     with pytest.raises(RoverError, match="no recorded frames"):
-        whole._pictures(tmp_path)
+        machine_run._pictures(tmp_path)
 
 
 def test_a_report_is_left_where_a_step_fails_too(monkeypatch, tmp_path):
     def fails():
         raise MachineError("no card for a test")
 
-    monkeypatch.setattr(whole, "card", fails)
-    monkeypatch.setattr(system.arduino, "missing_packages", list)
+    monkeypatch.setattr(machine_run, "card", fails)
+    monkeypatch.setattr(emulation.arduino, "missing_packages", list)
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
     with pytest.raises(RoverError, match="no artifact to deploy"):
-        whole.run_whole(tmp_path / "pi.json", tmp_path / "none.pt", tmp_path)
+        machine_run.run_machine(tmp_path / "pi.json", tmp_path / "none.pt", tmp_path)
     (tmp_path / "policy.pt").write_bytes(b"x")
-    monkeypatch.setattr(whole, "content_hash", lambda path: "abc")
+    monkeypatch.setattr(machine_run, "content_hash", lambda path: "abc")
     said = []
-    outcome = whole.run_whole(tmp_path / "pi.json", tmp_path / "policy.pt", tmp_path, say=said.append)
-    assert outcome.wrong == ["no card for a test"]
+    report = machine_run.run_machine(tmp_path / "pi.json", tmp_path / "policy.pt", tmp_path, say=said.append)
+    assert report.wrong == ["no card for a test"]
     written = read_stage(tmp_path / "pi.json", "pi")
-    assert written["metrics"]["wrong"] == outcome.wrong
+    assert written["metrics"]["wrong"] == report.wrong
     assert [s["step"] for s in written["metrics"]["steps"]] == ["the card, as flashed"]
     assert not list((tmp_path / "cache").iterdir())
 
 
 def test_sigterm_ends_a_run_as_ctrl_c_does():
-    with pytest.raises(KeyboardInterrupt, match="SIGTERM"), system.interruptible():
+    with pytest.raises(KeyboardInterrupt, match="SIGTERM"), emulation.interruptible():
         signal.raise_signal(signal.SIGTERM)
 
 
@@ -138,14 +138,14 @@ def test_frames_for_vivid_are_the_recorded_ones(tmp_path):
     image = np.zeros((360, 640, 3), np.uint8)
     image[:, :320] = (200, 60, 20)
     cv2.imwrite(str(folder / "frame_000001.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 100])
-    data = whole._frames(tmp_path, tmp_path / "frames").read_bytes()
-    assert len(data) == whole.TWICE * 640 * 360 * 2
+    data = machine_run._frames(tmp_path, tmp_path / "frames").read_bytes()
+    assert len(data) == machine_run.TWICE * 640 * 360 * 2
     assert len(data) % 512 == 0  # a disk has whole sectors
     back = cv2.cvtColor(np.frombuffer(data, np.uint8)[: 640 * 360 * 2].reshape(360, 640, 2), cv2.COLOR_YUV2BGR_YUY2)
     assert np.abs(back.astype(int) - image).max(initial=0, where=(np.abs(np.arange(640) - 320) > 8)[None, :, None]) < 6
     with pytest.raises(RoverError, match="must be 640x360"):
         cv2.imwrite(str(folder / "frame_000001.jpg"), image[:100])
-        whole._frames(tmp_path, tmp_path / "frames")
+        machine_run._frames(tmp_path, tmp_path / "frames")
 
 
 # ---- the USB camera
@@ -363,9 +363,9 @@ def test_when_the_pins_went_to_neutral():
     events += [PinEvent(at(t), "pulse", "throttle", 120, 1016) for t in range(140, 400)]
     events += [PinEvent(at(t), "line", "", 0, 0) for t in (-40, -7)]
     events += [PinEvent(at(t), "pulse", "steering", 1700 if t < 150 else 1456, 21316) for t in range(-500, 400, 21)]
-    found = stopped(sorted(events), at(0), SLOW, 124)
+    found = stopped(sorted(events), at(0), SLOW)
     assert found == {"drove": True, "after_ms": 140.0, "after_line_ms": 147.0, "steering_us": 1456, "neutral": True}
     driving = [e for e in events if e.monotonic_s < at(100)]
-    assert not stopped(sorted(driving), at(0), SLOW, 124)["neutral"]
+    assert not stopped(sorted(driving), at(0), SLOW)["neutral"]
     parked = [e._replace(pulse_us=120) if e.pin == "throttle" else e for e in events]
-    assert not stopped(sorted(parked), at(0), SLOW, 124)["drove"]
+    assert not stopped(sorted(parked), at(0), SLOW)["drove"]

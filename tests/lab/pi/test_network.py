@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from lab.pi.wire import Wire
+from lab.pi.network import Network
 
 
 @pytest.fixture
@@ -38,48 +38,48 @@ def ask(connection: socket.socket, what: bytes) -> bytes:
     return connection.recv(100)
 
 
-def connected(wire: Wire) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", wire.port), 5)
+def connected(network: Network) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", network.port), 5)
 
 
 def test_it_carries_and_counts(pi):
-    with Wire(pi) as wire, connected(wire) as one, connected(wire) as other:
+    with Network(pi) as network, connected(network) as one, connected(network) as other:
         assert ask(one, b"abc") == b"ABC" and ask(other, b"de") == b"DE"
-        assert wire.sent == 5
+        assert network.sent == 5
 
 
 def test_cut_ends_what_is_and_refuses_what_comes(pi):
-    with Wire(pi) as wire, connected(wire) as one:
+    with Network(pi) as network, connected(network) as one:
         assert ask(one, b"abc") == b"ABC"
-        wire.cut()
+        network.cut()
         assert one.recv(100) == b""
-        with connected(wire) as another:
+        with connected(network) as another:
             another.settimeout(5)
             assert another.recv(100) == b""
-        wire.mend()
-        with connected(wire) as another:
+        network.mend()
+        with connected(network) as another:
             assert ask(another, b"abc") == b"ABC"
 
 
 def test_silence_tells_nobody(pi):
-    with Wire(pi) as wire, connected(wire) as one:
-        wire.silence()
+    with Network(pi) as network, connected(network) as one:
+        network.silence()
         with pytest.raises(TimeoutError):
             ask(one, b"abc")
-        wire.mend()
+        network.mend()
         assert one.recv(100) == b""
-        with connected(wire) as another:
+        with connected(network) as another:
             assert ask(another, b"abc") == b"ABC"
 
 
 def test_one_bit_is_turned_once(pi):
-    with Wire(pi) as wire, connected(wire) as one:
-        wire.flip(after=4)
+    with Network(pi) as network, connected(network) as one:
+        network.flip(after=4)
         assert [ask(one, b"aaa") for _ in range(3)] == [b"AAA", b"AA`", b"AAA"]
 
 
 def test_nothing_listens_afterwards(pi):
-    with Wire(pi) as wire:
-        assert ask(connected(wire), b"abc") == b"ABC"
+    with Network(pi) as network:
+        assert ask(connected(network), b"abc") == b"ABC"
     with pytest.raises(OSError):
-        connected(wire)
+        connected(network)

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from lab.pi.system import USER, EmulationError
+from lab.pi.debian_image import USER
+from lab.pi.emulation import EmulationError
 
 REPOSITORY = Path(__file__).parents[2]
 INVENTORY = REPOSITORY / "inventory.ini"
@@ -27,9 +28,12 @@ NO_KNOWN_HOSTS = "-o UserKnownHostsFile=/dev/null -o StrictHostKeyChecking=no -o
 class Host(Protocol):
     """What the inventory says of a rover: sshd on a port of the loopback, and the key of its user."""
 
-    name: str
-    port: int
-    key: Path
+    @property
+    def name(self) -> str: ...
+    @property
+    def port(self) -> int: ...
+    @property
+    def key(self) -> Path: ...
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ def run(
 def inventory(hosts: Sequence[Host]) -> str:
     """The repository's inventory.ini with these hosts in it."""
     given = configparser.RawConfigParser(allow_no_value=True, delimiters=("=",))
-    given.optionxform = str
+    given.optionxform = str  # type: ignore[assignment,method-assign]  # as its documentation says to keep the case
     given.read(INVENTORY)
     lines = ["[rovers]"]
     for host in hosts:

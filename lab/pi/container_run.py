@@ -1,0 +1,318 @@
+"""`make pi-fast`: every playbook on an emulated Pi that is up in seconds, and what they promise proven from within.
+
+    report = run_container("runs/pi-fast.json", "runs/demo")
+
+From a flashed card to a driving service (provision, twice, and checked; deploy, status, benchmark, drive, a second
+model, rollback), then: what is installed, what the service's sandbox lets through, what systemd does with a loop that
+hangs, with a camera that is gone, and at boot. The Pi is a container (container.py); its Arduino is the real firmware
+in simavr, its camera a FIFO of JPEGs. Debian's and Python's packages come online, by this machine's own settings, as
+they would for a newcomer; without internet is tested in the whole machine (`make pi`).
+
+Times of the emulated programs say nothing about a Pi: they are some ten times slower. What systemd does takes its real
+time, and so does the Arduino. An INT8 plan takes half a second here, which is too long to drive by; so what drives is
+the small policy of the fault bench, deployed as any other, at HZ. The INT8 policy is deployed, proven by its parity
+vectors in the service's sandbox, loaded by the service until it could drive, and timed. It drives in `make pi`, whose
+clock is slower.
+
+runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
+    steps          [{step, seconds, ok, ...}], of a playbook also play and recap (Ansible's counts by host)
+    second_run     Ansible's own recap of provisioning a second time, as lines
+    driving_after_s  from switching on until a human could arm the car; plays_s: of all playbooks before the proofs
+    system_cached  whether the Pi's file system was in the cache
+    environment    {packages: [{name, version, from}], unhashed, lerobot, size_mb}
+    sandbox        {exposure, writable, probes: [{probe, inside, outside}]}; inside: "" is "it worked"
+    service        {hang: {...}, start_limit: {...}, boot: {...}}, in seconds, see the functions of those names
+    drive          {ticks, driven, ended} of the fetched flight log; recorded: {episodes, left, frames, commands}
+    faults         [{fault, model_after, healthy, healed_by_rerun, ...}], see deployment_faults.py
+    fleet          {cases: [{broken, results, models, healthy, ...}], good}, see fleet.py
+    gates          [{gate, wanted, found, holds}], the limits from lab/params.yml
+What is not as it should be is a sentence in `wrong`. Beside it, pi-fast.log has all that the playbooks said.
+"""
+
+import contextlib
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from lab.arduino.emulator import NICE as ARDUINO_NICE
+from lab.arduino.emulator import EmulatedArduino
+from lab.driving.policy import PLAIN, make_artifact, pictures
+from lab.pi import playbooks
+from lab.pi.container import CAMERA, PORT, Container
+from lab.pi.debian_image import debian_image
+from lab.pi.deployment_bench import DeploymentBench
+from lab.pi.deployment_faults import break_deployments, row_of, wrong_rows
+from lab.pi.emulation import EmulationError, emulation, interruptible, require, require_arduino, wait_for
+from lab.pi.fleet import fleet
+from lab.pi.playbooks import Play
+from lab.pi.pulses import Pins, moving
+from lab.pi.report import PiReport
+from lab.pi.service_proofs import READY_S, STATE, environment, hang, sandbox, show, start_limit
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.recording import read_controls
+from rover_lib.onboard.service import UNIT
+from rover_lib.onboard.stage import sha256_of
+from rover_lib.onboard.telemetry import read_log
+from rover_lib.world.car import CameraFeed
+from rover_lib.world.standin import REST_US
+
+STAGE = "pi-fast"
+ROVER = "rover1"
+ARTIFACTS = ("policy_static.pt", "policy_mixed.pt")
+HZ = 10  # of the service: what the emulator manages on a busy machine; a Pi has 30
+NICE = -5  # of the emulated Pi, which has a processor of its own
+ONE_FAULT = "a byte flipped in what has arrived"  # of those in deployment_faults.py the one that CI meets
+
+
+def run_container(
+    output: Path | str,
+    demo: Path | str,
+    *,
+    short: bool = False,
+    faults: bool = True,
+    say: Callable[[str], None] = lambda text: None,
+) -> PiReport:
+    """All of it; the report is written to `output` whatever fails.
+
+    demo: a run's folder with ARTIFACTS. short: provision, deploy, one fault of a deployment and an armed drive, which
+    is what CI has time for. faults: of deployments, and the fleet, too. say: told a line for each step.
+    Raises RoverError where it cannot begin: no root, packages that cannot be installed, no artifacts.
+    """
+    output, demo = Path(output), Path(demo)
+    artifacts = [demo / name for name in ARTIFACTS]
+    if gone := [a.name for a in artifacts if not a.is_file()]:
+        raise EmulationError(f"{demo}: no {' and no '.join(gone)} to deploy", remedy="make demo leaves them")
+    require()
+    require_arduino()
+    report = PiReport(STAGE, output, say, {a.name: sha256_of(a) for a in artifacts})
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        interruptible(),
+        emulation(),
+        tempfile.TemporaryDirectory(prefix="rover-plays-") as folder,  # ssh's sockets want a short path
+        output.with_suffix(".log").open("w") as log,
+    ):
+        run = _Run(report, Path(folder), log)
+        try:
+            run.all(artifacts[0], artifacts[1], short=short, faults=faults)
+        except RoverError as error:
+            report.wrong.append(str(error))
+        finally:
+            report.write()
+    return report
+
+
+class _Run:
+    def __init__(self, report: PiReport, folder: Path, log: Any):
+        self.report, self.folder, self.log = report, folder, log
+        self.metrics = report.metrics
+        self.variables: dict[str, Any] = {
+            "rover_wheels": str(folder / "wheels"),
+            "rover_packed": str(folder / "packed"),
+            "rover_fetched": str(folder / "fetched"),
+            "rover_command": str(Path(sys.executable).with_name("rover")),
+            "rover_camera": CAMERA,
+            "rover_port": PORT,
+            "rover_hz": HZ,
+            "rover_ready_s": READY_S,
+            "rover_record": True,
+        }
+
+    def all(self, static: Path, mixed: Path, *, short: bool, faults: bool) -> None:
+        begun = time.monotonic()
+        with self.report.step("system") as row:
+            debian_image()
+            cached = row["cached"] = self.metrics["system_cached"] = time.monotonic() - begun < 5
+        with Container(ROVER, nice=NICE) as pi:
+            with self.report.step("boot"):
+                pi.boot()
+            with _car(pi) as pins:
+                if short:
+                    self.one_fault(pi, static)
+                    return
+                driving_s = self.playbooks(pi, static, mixed)
+                self.metrics["driving_after_s"] = round(driving_s - begun, 1)
+                self.metrics["plays_s"] = round(time.monotonic() - begun, 1)
+                what = f"from nothing to a driving service, image {'' if cached else 'not '}cached"
+                minutes = self.report.gates["minutes" if cached else "minutes_uncached"]
+                self.report.limit(what, round((driving_s - begun) / 60, 1), minutes, "min")
+                self.proofs(pi, pins)
+            if faults:
+                self.deployment_faults(pi, static, mixed)
+
+    # The playbooks
+
+    def playbooks(self, pi: Container, static: Path, mixed: Path) -> float:
+        """All playbooks; when the service could drive for the first time (monotonic seconds)."""
+        gate = self.report.gate
+        self.play("provision", pi)
+        self.play("deploy", pi, rover_artifact=str(static))
+        self.play("drive", pi, "drive, not armed")
+        driving_s = time.monotonic()
+        state = show(pi, "ActiveState", "StatusText")
+        could = state["ActiveState"] == "active" and state["StatusText"].startswith("disarmed")
+        gate("the service could drive", "active, disarmed", state, could)
+        again = self.play("provision", pi, "provision again")
+        self.metrics["second_run"] = again.recap_lines
+        self.report.say("\n".join(again.recap_lines))
+        gate("provision a second time", "changed=0", again.changed, again.changed == 0)
+        checked = self.play("provision", pi, "provision --check", check=True)
+        gate("provision in check mode", "changed=0", checked.changed, checked.changed == 0)
+        self.play("status", pi)
+        self.play("benchmark", pi, rover_iterations=3)
+        fetched = self.folder / "fetched" / f"benchmark-{ROVER}.json"
+        gate("benchmark fetched", "a file", fetched.name, fetched.is_file())
+        current = pi.root / "var/lib/rover/models/current"
+        first = current.readlink().name
+        self.play("deploy", pi, "deploy another", rover_artifact=str(mixed))
+        second = current.readlink().name
+        gate("another model deployed", "another content hash", second[:12], first != second != "")
+        self.play("rollback", pi)
+        back = current.readlink().name
+        gate("rolled back", first[:12], back[:12], back == first)
+        self.play("deploy", pi, "deploy a quick one", rover_artifact=str(self.quick()), rover_allow=["mode"])
+        self.play("drive", pi, rover_arm=True, rover_seconds=10)
+        self.flight(pi)
+        self.play("status", pi, "status again")
+        return driving_s
+
+    def one_fault(self, pi: Container, static: Path) -> None:
+        """A deployment that fails, leaves the rover as it was and is healed by another; it then drives what came."""
+        self.play("provision", pi)
+        self.play("deploy", pi, rover_artifact=str(static))
+        artifacts = {"static": static, "fp32": self.quick()}
+        with (
+            self.report.step(ONE_FAULT),
+            DeploymentBench(pi, artifacts, self.folder, threading.Event(), ("mode",)) as bench,
+        ):
+            row = row_of(ONE_FAULT, bench)
+            self.metrics["faults"] = [row]
+        wrong = wrong_rows([row], 1)
+        self.report.gate(ONE_FAULT, "the rover healthy, and healed", wrong or "healed", not wrong)
+        self.play("drive", pi, rover_arm=True, rover_seconds=10)
+        self.flight(pi)
+
+    def quick(self) -> Path:
+        """A policy that an emulated Pi can drive by."""
+        path = self.folder / "policy_quick.pt"
+        make_artifact(path, camera="cam_front", size=(72, 128), engine="qnnpack")
+        return path
+
+    def play(self, book: str, pi: Container, name: str = "", *, check: bool = False, **variables: Any) -> Play:
+        """Runs one, which has to work. Raises EmulationError with the end of what it said if not."""
+        with self.report.step(name or book) as row:
+            done = playbooks.run(book, [pi], folder=self.folder, check=check, variables={**self.variables, **variables})
+            self.log.write(f"===== {name or book}\n{done.output}\n")
+            self.log.flush()
+            row |= {**done.row(), "seconds": row.get("seconds")}
+            if not done.ok:
+                raise EmulationError(f"{book}.yml failed, and said at its end: {done.end}")
+        return done
+
+    def flight(self, pi: Container) -> None:
+        """What the flight log and the episode say that drive.yml brought home."""
+        fetched = self.folder / "fetched" / ROVER
+        log = next(iter(fetched.rglob("flight.log")), None)
+        if log is None:
+            self.report.wrong.append("drive.yml fetched no flight log")
+            return
+        flight = read_log(log)
+        states = list(flight.ticks["state"])
+        driven = sum(s == "A" for s in states)
+        self.report.gate("ticks driven", "at least 10", driven, driven >= 10)
+        home = fetched / "episodes"
+        left = [p.name for p in (pi.root / STATE.lstrip("/") / "episodes").glob("*")]
+        episodes = [p.name for p in home.glob("*")]
+        frames = len(list(home.glob("*/frames/*.jpg")))
+        commands = sum(len(read_controls(home / name).times_s) for name in episodes)
+        recorded = {"episodes": episodes, "left": left, "frames": frames, "commands": commands}
+        whole = len(episodes) == 1 and not left and min(frames, commands) >= 10
+        self.report.gate("the drive, recorded and brought home", "an episode, none left on the rover", recorded, whole)
+        ended = next((str(e) for e in reversed(flight.events) if "ended" in str(e)), "")
+        self.metrics["drive"] = {"ticks": len(states), "driven": driven, "ended": ended, "recorded": recorded}
+
+    # The proofs
+
+    def proofs(self, pi: Container, pins: Pins) -> None:
+        gate, gates = self.report.gate, self.report.gates
+        with self.report.step("environment"):
+            installed = self.metrics["environment"] = environment(pi.root)
+        size_mb, limit_mb = installed["size_mb"], gates["environment_mb"]
+        gate("the Pi's environment", f"under {limit_mb} MB", size_mb, size_mb < limit_mb)
+        gate("all of it hashed, no lerobot", "none else", installed["unhashed"], not installed["unhashed"])
+        with self.report.step("sandbox"):
+            sandboxed = self.metrics["sandbox"] = sandbox(pi)
+        self.report.limit("systemd-analyze security", sandboxed["exposure"], gates["exposure"], "of 10")
+        leaks = [p["probe"] for p in sandboxed["probes"] if p["refused"] and not p["inside"]]
+        blunt = [p["probe"] for p in sandboxed["probes"] if p["outside"]]
+        gate("sandbox, from within", "all refused", leaks or "all refused", not leaks)
+        gate("the same, outside of it", "all work", blunt or "all work", not blunt)
+        with self.report.step("hang"):
+            hung = hang(pi, pins)
+        with self.report.step("start_limit"):
+            limited = start_limit(pi)
+        self.metrics["service"] = {"hang": hung, "start_limit": limited}
+        self.report.limit("hung loop restarted", hung["restarted_s"], gates["restart_s"], "s")
+        self.report.limit("hung loop, throttle off", hung["stopped_s"], gates["stopped_s"], "s")
+        gate("hung loop, the car", "disarmed", hung, hung["disarmed"])
+        left = limited["tries"] == 5 and limited["state"] == "failed"
+        gate("start limit", "5 tries, then failed", limited, left)
+        self.boot(pi, pins)
+
+    def boot(self, pi: Container, pins: Pins) -> None:
+        """Disabled at boot by default; with rover_start_at_boot it is up, and disarmed, and the car stands."""
+        with self.report.step("boot without the service"):
+            default = show(pi, "UnitFileState")["UnitFileState"]
+        enabled = self.play("provision", pi, "provision, to start at boot", rover_start_at_boot=True)
+        with self.report.step("power cut and boot"):
+            pi.cut_power()
+            at_s = time.monotonic()
+            pi.boot()
+            ready = wait_for(lambda: show(pi, "StatusText")["StatusText"].startswith("disarmed"), READY_S)
+            time.sleep(2)
+            moved = moving(pins.since(at_s))
+            booted = {"by_default": default, "changed": enabled.changed, "disarmed": ready, "moved": moved}
+            booted["ready_s"] = round(time.monotonic() - at_s, 1)
+            self.metrics["service"]["boot"] = booted
+        ok = default == "disabled" and ready and not moved
+        self.report.gate("boot", "disabled by default; enabled it is disarmed", booted, ok)
+
+    def deployment_faults(self, pi: Container, static: Path, mixed: Path) -> None:
+        """What can go wrong with a deployment, and a fleet, on rovers that start from what this one has become."""
+        pi.inside("systemctl", "disable", UNIT)  # their own service would only look for a camera
+        pi.power_off()
+        artifacts, least = {"static": static, "mixed": mixed}, self.report.gates["rows"]
+        rows = self.metrics["faults"] = []
+
+        def done(row: dict[str, Any]) -> None:
+            rows.append(row)
+            self.report.write()
+
+        with self.report.step("faults of a deployment"):
+            rows[:] = break_deployments(pi.layers, artifacts, done=done, say=self.report.say)
+        wrong = wrong_rows(rows, least)
+        self.report.gate("faults of a deployment", f"{least} rows, healthy and healed", wrong or len(rows), not wrong)
+        with self.report.step("fleet"):
+            fleet_row = self.metrics["fleet"] = fleet(pi.layers, artifacts, say=self.report.say)
+        cases = [case["results"] for case in fleet_row["cases"]]
+        self.report.gate("fleet of three, one broken", "the rest untouched, all reported", cases, fleet_row["good"])
+
+
+# The car
+
+
+@contextlib.contextmanager
+def _car(pi: Container) -> Iterator[Pins]:
+    """Camera and Arduino, plugged in; what the pins do."""
+    with (
+        CameraFeed(pi.bench / "camera", *pictures(PLAIN, (180, 320)), rate_hz=HZ),
+        EmulatedArduino(every_pulse=False, transmitter=REST_US, nice=ARDUINO_NICE) as board,
+        Pins(board) as pins,
+    ):
+        (pi.bench / "camera").chmod(0o666)
+        pi.plug(board.port)
+        yield pins

@@ -1,0 +1,143 @@
+"""Debian arm64 as a freshly flashed Raspberry Pi OS Lite has it, for the emulated Pis: built once, then cached.
+
+    with emulation():
+        debian_image().root      # /etc, /usr, ... of the Pi, owned by root; never written to
+
+The packages are this machine's own Debian's (12 or 13), fetched by a private apt. dpkg unpacks them natively, which
+under emulation takes minutes; only what they do when they are configured is emulated. Nothing is in it that
+provision.yml has to install.
+"""
+
+import contextlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from lab.debian import fetch_packages
+from lab.pi.emulation import EmulationError, in_cgroup
+from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.program import run
+
+USER, HOST_NAME = "pi", "raspberrypi"
+PACKAGES = (
+    *("?essential", "?priority(^required$)", "debian-archive-keyring", "ca-certificates"),
+    *("systemd", "systemd-sysv", "dbus", "udev", "libpam-systemd", "kmod", "procps"),
+    *("openssh-server", "sudo", "python3", "python3-apt", "iproute2", "netbase", "less"),
+)
+RECIPE = 2  # one more when it is made in another way: older ones are then not used
+FIRST = "base-passwd"  # whose users and groups the other packages' scripts ask for
+FORCE = ("architecture", "depends", "overwrite", "unsafe-io")
+GROUPS = "adm,dialout,cdrom,sudo,audio,video,plugdev,games,users,input,render,netdev"  # of Raspberry Pi OS's user
+CONFIGURE = f"""set -e
+dpkg --configure --pending --force-depends
+for group in {GROUPS.replace(",", " ")}; do getent group $group > /dev/null || groupadd --system $group; done
+useradd --create-home --shell /bin/bash --groups {GROUPS} {USER}
+"""
+# While the packages are configured: no service is started, and nothing is made of certificates, a minute's work under
+# emulation: a container gets this machine's, and the whole machine has no network.
+STAND_INS = {"policy-rc.d": "exit 101", "update-ca-certificates": "exit 0"}
+
+
+class DebianImage(NamedTuple):
+    """root: the file system. key: the private ssh key of its user, USER, who may use sudo without a password."""
+
+    root: Path
+    key: Path
+
+
+def debian_image() -> DebianImage:
+    """The Pi's file system and the key to it, from the cache or made now (two minutes, most of them emulated).
+
+    Call it within emulation(). Raises EmulationError or DebianError, with what was not to be had.
+    """
+    recipe = {"made": [PACKAGES, CONFIGURE, RECIPE], "debian": _codename()}
+    folder = cached_folder("pi-system", key_of(recipe), _make)
+    return DebianImage(folder / "root", folder / "key")
+
+
+def _codename() -> str:
+    about = platform.freedesktop_os_release()
+    if about["ID"] != "debian" or not shutil.which("dpkg"):
+        what = "the emulated Pi's packages come by the apt sources of a Debian 12 or 13"
+        raise EmulationError(what, found=about["PRETTY_NAME"])
+    return about["VERSION_CODENAME"]
+
+
+def _make(folder: Path) -> None:
+    folder.chmod(0o755)
+    root = folder / "root"
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".apt.") as scratch:
+        _unpack(root, fetch_packages(Path(scratch), PACKAGES))
+    run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "emulated Pi", "-f", folder / "key", error=EmulationError)
+    name = f"rover-make-{os.getpid()}"
+    with _stand_ins(root / "usr" / "sbin"), in_cgroup(name) as enter:
+        chroot = ["systemd-nspawn", "--quiet", "--register=no", "--keep-unit", f"--machine={name}"]
+        chroot += ["--timezone=off", "--resolv-conf=off", "--link-journal=no", f"--directory={root}"]
+        chroot += ["--setenv=DEBIAN_FRONTEND=noninteractive", "--setenv=LC_ALL=C.UTF-8"]
+        run(*chroot, "/bin/sh", "-c", CONFIGURE, error=EmulationError, preexec_fn=enter)
+    _personalize(root, (folder / "key.pub").read_text())
+
+
+def _unpack(root: Path, packages: list[Path]) -> None:
+    """All files, so that the packages' scripts have what they call, and then by dpkg, so that it knows of them."""
+    (root / "usr").mkdir(parents=True)
+    root.chmod(0o755)
+    for name in ("bin", "sbin", "lib"):
+        (root / "usr" / name).mkdir()
+        (root / name).symlink_to(f"usr/{name}")
+    for package in packages:
+        with subprocess.Popen(["dpkg-deb", "--fsys-tarfile", package], stdout=subprocess.PIPE) as tar:
+            run("tar", "-x", "-C", root, "--keep-directory-symlink", error=EmulationError, stdin=tar.stdout)
+        if tar.returncode:
+            raise EmulationError(f"{package.name} cannot be unpacked: dpkg-deb ended with {tar.returncode}")
+    status = root / "var" / "lib" / "dpkg"
+    for name in ("info", "updates"):
+        (status / name).mkdir(parents=True, exist_ok=True)
+    for name in ("status", "available"):
+        (status / name).touch()
+    (root / "etc" / "dpkg" / "dpkg.cfg.d").mkdir(parents=True, exist_ok=True)
+    (root / "etc" / "dpkg" / "dpkg.cfg.d" / "emulated").write_text("force-unsafe-io\n")  # a cache loses nothing
+    forced = [f"--force-{what}" for what in FORCE]
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C.UTF-8"}
+    for part in ([p for p in packages if p.name.startswith(f"{FIRST}_")], packages):
+        command = ["dpkg", f"--root={root}", "--log=/dev/null", *forced, "--unpack", *part]
+        run(*command, error=EmulationError, env=environment)
+
+
+@contextlib.contextmanager
+def _stand_ins(sbin: Path) -> Iterator[None]:
+    for name, line in STAND_INS.items():
+        program = sbin / name
+        if program.exists():
+            program.rename(program.with_suffix(".real"))
+        program.write_text(f"#!/bin/sh\n{line}\n")
+        program.chmod(0o755)
+    yield
+    for name in STAND_INS:
+        program = sbin / name
+        program.unlink()
+        if program.with_suffix(".real").exists():
+            program.with_suffix(".real").rename(program)
+
+
+def _personalize(root: Path, public_key: str) -> None:
+    """What Raspberry Pi Imager writes: a name, a user with a key, and sudo without a password."""
+    (root / "etc" / "hostname").write_text(f"{HOST_NAME}\n")
+    (root / "etc" / "hosts").write_text(f"127.0.0.1\tlocalhost\n127.0.1.1\t{HOST_NAME}\n")
+    (root / "etc" / "machine-id").write_text("")  # each boot of a copy makes its own
+    sudoers = root / "etc" / "sudoers.d" / "010_pi-nopasswd"
+    sudoers.write_text(f"{USER} ALL=(ALL) NOPASSWD: ALL\n")
+    sudoers.chmod(0o440)
+    home = root / "home" / USER
+    (home / ".ssh").mkdir(mode=0o700)
+    keys = home / ".ssh" / "authorized_keys"
+    keys.write_text(public_key)
+    keys.chmod(0o600)
+    owner = home.stat()
+    for path in (home / ".ssh", keys):
+        os.chown(path, owner.st_uid, owner.st_gid)
