@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from rover_lib.cli.progress import progress
 from rover_lib.onboard.cli import FILE, Rover, drive_options, run_drive, show
+from rover_lib.workshop.progress import terminal
 
 
 @click.group("lab", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -50,11 +50,11 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, as_json: bool
     from rover_lib.onboard.stage import read_stage
     from rover_lib.workshop.run import execute
 
-    count_run(run_dir, frames=frames, jobs=jobs, progress=progress())
+    count_run(run_dir, frames=frames, jobs=jobs, progress=terminal())
     if peers:
         from lab.a76.peers import count_peers
 
-        count_peers(run_dir, jobs=jobs, progress=progress())
+        count_peers(run_dir, jobs=jobs, progress=terminal())
     execute("06_arm", run_dir)
     content = read_stage(run_dir / "arm.json", "arm")
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
@@ -71,7 +71,7 @@ def full(run_dir: Path, **options: Any) -> None:
     """
     from lab.a76.full import NOTE, full_run
 
-    click.echo(f"made: {full_run(run_dir, progress=progress(), **options)} ({NOTE})")
+    click.echo(f"made: {full_run(run_dir, progress=terminal(), **options)} ({NOTE})")
 
 
 @main.command()

@@ -2,6 +2,7 @@
 
 import click
 
+import rover_lib
 from rover_lib.cli import drive, prepare, world
 from rover_lib.onboard import cli as onboard
 from rover_lib.onboard.cli import Rover
@@ -9,7 +10,7 @@ from rover_lib.onboard.cli import Rover
 
 @click.group("rover", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
-@click.version_option(package_name="rover-policy")
+@click.version_option(rover_lib.__version__)
 def main(debug: bool) -> None:
     """Put a learned driving policy on a small computer.
 

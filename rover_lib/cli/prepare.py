@@ -6,8 +6,8 @@ from typing import Any
 
 import click
 
-from rover_lib.cli.progress import progress
-from rover_lib.onboard.cli import FILE, show
+from rover_lib.onboard.cli import AS_JSON, FILE, describe_artifact, show
+from rover_lib.workshop.progress import terminal
 
 
 @click.command()
@@ -26,24 +26,21 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     from rover_lib.workshop.run import run as run_notebooks
 
     chosen = {k: v for k, v in options.items() if v is not None}
-    folder = run_notebooks(checkpoint, episodes, progress=progress(), **chosen)
+    folder = run_notebooks(checkpoint, episodes, progress=terminal(), **chosen)
     click.echo(f"done: {folder}")
 
 
 @click.command()
 @click.argument("file", type=FILE)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@AS_JSON
 def inspect(file: Path, as_json: bool) -> None:
     """Say what FILE is: an artifact, a checkpoint, or a folder of recordings."""
-    from rover_lib.onboard.artifact import check_integrity, content_hash, read_manifest
-
     if file.is_file() and _is_scripted(file):
-        check_integrity(file)
-        return show({"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}, as_json)
+        return show(describe_artifact(file), as_json)
     if file.is_dir() and not (file / "config.json").exists():
         from rover_lib.workshop.episodes import load_recordings
 
-        return show({"recordings": load_recordings(file, progress=progress()).summary()}, as_json)
+        return show({"recordings": load_recordings(file, progress=terminal()).summary()}, as_json)
     from rover_lib.workshop.checkpoint import load_checkpoint
 
     checkpoint = load_checkpoint(file)
@@ -84,7 +81,7 @@ def quantize(checkpoint: Path, episodes: Path, output: Path, mode: str, samples:
     p = params()
     how_many, seed = samples or p["calibration"]["samples"], p["calibration"]["seed"]
     ck = load_checkpoint(checkpoint)
-    recordings = load_recordings(episodes, ck.config.chunk, p["calibration"]["sync_s"], progress())
+    recordings = load_recordings(episodes, ck.config.chunk, p["calibration"]["sync_s"], terminal())
     parts = split(recordings, p["calibration"]["held_out_share"], seed)
     chosen, note = choose_calibration(parts.calibration, how_many, seed)
     if note:
@@ -97,7 +94,7 @@ def quantize(checkpoint: Path, episodes: Path, output: Path, mode: str, samples:
         mode = "mixed" if mode == "static" and how["float_blocks"] else mode
         smooth = p["quantization"]["smooth"]
         scheme = q.Scheme(mode, smooth=smooth, percentile=p["quantization"]["percentile"], **how)
-        calibration = q.calibrate(ck, chosen, smooth=smooth, progress=progress())
+        calibration = q.calibrate(ck, chosen, smooth=smooth, progress=terminal())
         quantized = q.quantize(ck, scheme, calibration)
         for warning in quantized.report["warnings"]:
             click.echo(f"rover: warning: {warning}", err=True)
@@ -109,7 +106,7 @@ def quantize(checkpoint: Path, episodes: Path, output: Path, mode: str, samples:
 @click.argument("reference", type=FILE)
 @click.argument("artifacts", type=FILE, nargs=-1, required=True)
 @click.option("--episodes", type=FILE, required=True, help="Recordings; their held-out part judges.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@AS_JSON
 def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_json: bool) -> None:
     """Compare ARTIFACTS with REFERENCE (the FP32 artifact) on recorded frames.
 
@@ -122,10 +119,10 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_jso
 
     p = params()["calibration"]
     fp32 = load_policy(reference)
-    recordings = load_recordings(episodes, fp32.chunk, p["sync_s"], progress())
+    recordings = load_recordings(episodes, fp32.chunk, p["sync_s"], terminal())
     held_out = split(recordings, p["held_out_share"], p["seed"]).held_out
     others = {a.stem.removeprefix("policy_"): load_policy(a) for a in artifacts}
-    report = c.fidelity(fp32, others, held_out, recordings.action_range(), progress())
+    report = c.fidelity(fp32, others, held_out, recordings.action_range(), terminal())
     show({name: report.summary(name) for name in others}, as_json)
 
 

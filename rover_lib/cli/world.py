@@ -6,8 +6,8 @@ from typing import Any
 
 import click
 
-from rover_lib.cli.progress import progress
-from rover_lib.onboard.cli import FILE, show
+from rover_lib.onboard.cli import AS_JSON, FILE, show
+from rover_lib.workshop.progress import terminal
 
 
 @click.group()
@@ -23,7 +23,7 @@ def record(out_dir: Path, count: int, seed: int) -> None:
     """Record COUNT drives of the expert to OUT_DIR, in the format of the real car's recorder."""
     from rover_lib.world.record import record_episodes
 
-    click.echo(f"recorded: {record_episodes(out_dir, count, seed, progress())}")
+    click.echo(f"recorded: {record_episodes(out_dir, count, seed, terminal())}")
 
 
 @world.command()
@@ -40,20 +40,20 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
     """
     from rover_lib.world.train import train as train_policy
 
-    click.echo(f"trained: {train_policy(episodes, output, progress=progress(), **options)}")
+    click.echo(f"trained: {train_policy(episodes, output, progress=terminal(), **options)}")
 
 
 @world.command()
 @click.argument("artifact", type=FILE)
 @click.option("--worlds", type=click.IntRange(min=1), default=40, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@AS_JSON
 def trial(artifact: Path, worlds: int, seed: int, as_json: bool) -> None:
     """Drive ARTIFACT through worlds that it has never seen, and count the balloons it hits."""
     from rover_lib.onboard.policy import load_policy
     from rover_lib.world.trial import run_trials
 
-    report = run_trials(load_policy(artifact), worlds, seed, progress=progress())
+    report = run_trials(load_policy(artifact), worlds, seed, progress=terminal())
     low, high = report.wilson
     result = {"hits": report.hits, "trials": report.trials, "wilson_low": low, "wilson_high": high}
     show(result, as_json)
@@ -62,7 +62,7 @@ def trial(artifact: Path, worlds: int, seed: int, as_json: bool) -> None:
 @world.command("latency")
 @click.argument("run_dir", type=FILE)
 @click.option("--worlds", type=click.IntRange(min=1), default=40, show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@AS_JSON
 def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
     """Drive RUN_DIR's static policy with late plans, by the car's loop in virtual time, and count the balloons it hits.
 

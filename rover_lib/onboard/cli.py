@@ -21,10 +21,14 @@ LONG_LIST = 12  # longer ones are for programs
 CAMERA = click.option(
     "--camera", default="0", show_default=True, help="Number, /dev/videoN, video, folder or FIFO of JPEGs."
 )
+AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
 LOG_DRIVE = click.option(
     "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
 )
+
+
+WORKSTATION_COMMANDS = frozenset({"run", "quantize", "compare", "wheelhouse", "world"})  # rover_lib.cli's
 
 
 class Rover(click.Group):
@@ -52,6 +56,19 @@ class Rover(click.Group):
         ctx.exit(1)
 
 
+class OnlyOnboard(Rover):
+    """The rover's commands alone: one of the workstation's ends in a sentence that says so, and exit code 2."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] in WORKSTATION_COMMANDS:
+            sentence = f"`rover {args[0]}` is a workstation's command: type it there, in a checkout of the project"
+            click.echo(f"rover: {sentence}", err=True)
+            ctx.exit(2)
+        return super().resolve_command(ctx, args)
+
+
 def show(value: Any, as_json: bool) -> None:
     """Print a nested dict for people, or as JSON."""
     from rover_lib.onboard.stage import plain
@@ -75,7 +92,9 @@ def show(value: Any, as_json: bool) -> None:
     lines(value, "")
 
 
-@click.group("rover", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    "rover", cls=OnlyOnboard, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+)
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
 @click.version_option(rover_lib.__version__)
 def main(debug: bool) -> None:
@@ -195,7 +214,7 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -
 @CAMERA
 @PORT
 @click.option("--hz", type=click.FloatRange(1, 120), default=30.0, show_default=True, help="Frames a second wanted.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@AS_JSON
 @click.pass_context
 def doctor(ctx: click.Context, artifact: Path | None, camera: str, port: str, hz: float, as_json: bool) -> None:
     """Look at all that driving needs: camera, Arduino, ARTIFACT, power, disk. Say what to do.
@@ -220,6 +239,22 @@ def doctor(ctx: click.Context, artifact: Path | None, camera: str, port: str, hz
 
 
 @main.command()
+@click.argument("file", type=FILE)
+@AS_JSON
+def inspect(file: Path, as_json: bool) -> None:
+    """Say what the artifact FILE is. A workstation's `rover inspect` knows checkpoints and recordings too."""
+    show(describe_artifact(file), as_json)
+
+
+def describe_artifact(file: Path) -> dict[str, Any]:
+    """What `rover inspect` says of an artifact that is whole. Raises ArtifactError for another."""
+    from rover_lib.onboard.artifact import check_integrity, content_hash, read_manifest
+
+    check_integrity(file)
+    return {"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}
+
+
+@main.command()
 @click.argument("artifacts", type=FILE, nargs=-1, required=True)
 @click.option("--warmup", type=click.IntRange(min=0), default=10, show_default=True)
 @click.option("--iterations", type=click.IntRange(min=1), default=100, show_default=True)
@@ -227,7 +262,7 @@ def doctor(ctx: click.Context, artifact: Path | None, camera: str, port: str, hz
 @click.option("--duration", type=float, help="Soak for so many seconds instead, with a time series.")
 @click.option("--output", type=FILE, help="Write benchmark JSON there, for notebook 05.")
 @click.option("--gates", is_flag=True, help="Hold the first artifact against the original's gates in params.yml.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@AS_JSON
 def benchmark(
     artifacts: tuple[Path, ...],
     warmup: int,
@@ -388,7 +423,7 @@ def status(releases: Any, as_json: bool) -> None:
 @main.command()
 @click.argument("file", type=FILE)
 @LOG_DRIVE
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@AS_JSON
 def log(file: Path, drive: int, as_json: bool) -> None:
     """Sum up the flight log FILE of `rover drive`. A workstation's `rover log` draws it too.
 

@@ -1,0 +1,143 @@
+"""The two wheels where nothing else of the project is: the rover's in its runtime alone, the workstation's anywhere."""
+
+import importlib.metadata
+import json
+import os
+import re
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from rover_lib import cli as workstation
+from rover_lib.onboard import cli as onboard
+from rover_lib.onboard.telemetry import FlightLog, Tick
+from rover_lib.workshop.wheelhouse import REQUIREMENTS, make
+
+ROOT = Path(__file__).parents[2]
+
+
+class Installed:
+    """A virtual environment with one wheel of ours, and of others those that requirements_pi.txt pins."""
+
+    def __init__(self, folder: Path, wheel: Path):
+        self.folder = folder
+        venv.create(folder / "venv", with_pip=False, symlinks=True)
+        self.bin = folder / "venv" / "bin"
+        self.packages = next((folder / "venv" / "lib").glob("python3*/site-packages"))
+        for name in re.findall(r"^([\w.-]+)==", REQUIREMENTS.read_text(), re.MULTILINE):
+            self.borrow(name)
+        pip = [sys.executable, "-m", "pip", "--python", self.bin / "python", "install", "--no-deps", "--no-index"]
+        subprocess.run([*pip, "--quiet", "--disable-pip-version-check", wheel], check=True)
+
+    def borrow(self, name: str) -> None:
+        """A package of this environment, linked: installing torch takes minutes."""
+        try:
+            files = importlib.metadata.distribution(name).files or []
+        except importlib.metadata.PackageNotFoundError:  # only another Python needs it
+            return
+        for top in {f.parts[0] for f in files} - {"..", "__pycache__"}:
+            there, here = Path(str(importlib.metadata.distribution(name).locate_file(top))), self.packages / top
+            if there.exists() and not here.exists():
+                here.symlink_to(there)
+
+    def run(self, *command: object) -> subprocess.CompletedProcess:
+        # Neither this checkout nor this environment is to be seen.
+        env = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV", "COV"))}
+        words = [str(self.bin / str(command[0])), *map(str, command[1:])]
+        return subprocess.run(words, capture_output=True, text=True, cwd=self.folder, env=env)
+
+
+@pytest.fixture(scope="module")
+def rover(tmp_path_factory) -> Installed:
+    folder = tmp_path_factory.mktemp("rover")
+    return Installed(folder, make(folder / "wheels", only_rover=True).wheel)
+
+
+def test_onboard_alone_is_there(rover):
+    ours = rover.packages / "rover_lib"
+    assert {p.name for p in ours.iterdir()} - {"__pycache__"} == {"__init__.py", "LICENSE", "onboard"}
+    assert rover.run("python", "-c", "import rover_lib.workshop").returncode != 0
+
+
+def test_help_lists_the_rovers_commands_alone(rover):
+    done = rover.run("rover", "--help")
+    assert done.returncode == 0, done.stderr
+    commands = re.findall(r"^  ([a-z-]+) ", done.stdout.partition("Commands:")[2], re.MULTILINE)
+    assert commands == sorted(onboard.main.commands) and "drive" in commands
+    assert not set(commands) & onboard.WORKSTATION_COMMANDS
+    for name in commands:
+        assert rover.run("rover", name, "--help").returncode == 0
+
+
+@pytest.mark.parametrize("command", sorted(onboard.WORKSTATION_COMMANDS))
+def test_a_workstations_command_says_where_to_run_it(rover, command):
+    done = rover.run("rover", command, "--help")
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr == (
+        f"rover: `rover {command}` is a workstation's command: type it there, in a checkout of the project\n"
+    )
+
+
+def test_the_workstations_commands_are_known_on_the_rover():
+    assert set(workstation.main.commands) - set(onboard.main.commands) == onboard.WORKSTATION_COMMANDS
+    assert set(workstation.main.commands) >= set(onboard.main.commands)
+
+
+def test_log_prints_its_summary(rover, tmp_path):
+    with FlightLog(tmp_path / "flight.log", header={"hz": 30}, max_bytes=1_000_000, keep=2) as log:
+        for i in range(30):
+            log.tick(Tick(i / 30, 0.2, "A", "a", 0.0, 0.05, 1456, 150, 1456, 150, 1, 150.0, 152.5, 1.0, i))
+        log.event("armed")
+    done = rover.run("rover", "log", tmp_path / "flight.log")
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    assert re.search(r"^ticks +30$", done.stdout, re.MULTILINE) and "armed" in done.stdout
+    summary = json.loads(rover.run("rover", "log", tmp_path / "flight.log", "--json").stdout)
+    assert summary["ticks"] == 30
+
+
+def test_inspects_an_artifact(rover, artifacts):
+    done = rover.run("rover", "inspect", artifacts["static"], "--json")
+    assert done.returncode == 0 and json.loads(done.stdout)["artifact"]["mode"] == "static", done.stderr
+
+
+def test_all_of_it_can_be_imported(rover):
+    names = [f"rover_lib.onboard.{p.stem}" for p in (rover.packages / "rover_lib" / "onboard").glob("*.py")]
+    done = rover.run("python", "-c", f"import importlib; [importlib.import_module(name) for name in {names}]")
+    assert done.returncode == 0 and len(names) > 20, done.stderr
+
+
+def test_bad_input_is_one_sentence(rover, tiny_file):
+    for command in (["log", "nothing.log"], ["inspect", tiny_file], ["release", "stage", "nothing.pt"]):
+        done = rover.run("rover", *command)
+        assert done.returncode == 1 and done.stdout == "", done.stdout
+        assert done.stderr.startswith("rover: ") and len(done.stderr.splitlines()) == 1, done.stderr
+
+
+def test_the_rovers_params_are_what_the_rover_reads(rover):
+    script = "import json; from rover_lib.onboard.params import params; print(json.dumps(params()))"
+    assert set(json.loads(rover.run("python", "-c", script).stdout)) == {"drive", "flight_log", "gates"}
+
+
+def test_a_workstations_wheel_finds_its_params_out_of_a_checkout(tmp_path):
+    command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", tmp_path]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as z:
+        z.extractall(tmp_path / "installed")
+    assert not (tmp_path / "installed" / "lab").exists() and not (tmp_path / "installed" / "tests").exists()
+    script = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+import rover_lib.cli
+from rover_lib.onboard.params import params
+print(json.dumps([rover_lib.cli.__file__, params()]))
+"""
+    command = [sys.executable, "-I", "-c", script, tmp_path / "installed"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=True)
+    file, params = json.loads(done.stdout)
+    assert Path(file).is_relative_to(tmp_path)
+    assert {"calibration", "quantization", "benchmark", "drive", "flight_log"} <= set(params)
+    assert {"steering_mae_pct", "original"} <= set(params["gates"])
