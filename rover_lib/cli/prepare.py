@@ -123,6 +123,8 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_jso
     held_out = split(recordings, p["held_out_share"], p["seed"]).held_out
     others = {a.stem.removeprefix("policy_"): load_policy(a) for a in artifacts}
     report = c.fidelity(fp32, others, held_out, recordings.action_range(), terminal())
+    for warning in report.warnings():
+        click.echo(f"rover: warning: {warning}", err=True)
     show({name: report.summary(name) for name in others}, as_json)
 
 

@@ -9,6 +9,7 @@ imitates is another question, whose answer (`recorded_error`) is given beside it
 Padding: a sample near its episode's end has fewer recorded actions than a chunk is long. Both policies plan
 the whole chunk all the same and the car would drive it, so every step counts in `mae`; `mae_recorded_steps`
 counts only the steps that were recorded, and the error against the recording knows no others.
+An action that never changes in the recordings has no range to be a share of: it is not judged (see judge).
 """
 
 import math
@@ -26,6 +27,7 @@ from rover_lib.onboard.errors import PolicyError, PwmError
 from rover_lib.onboard.policy import ACTION_LIMITS, Policy, load_policy
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.workshop import judge
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint import Checkpoint
 
@@ -82,52 +84,59 @@ class Fidelity:
         """(n, C, A) float64 absolute difference to FP32, in units of the action."""
         return np.abs(self.chunks[mode].astype(np.float64) - self.reference)
 
-    def pct(self, action: str) -> float:
-        """One unit of an action in percent of its recorded range; NaN if the recording never moved it."""
-        low, high = self.action_range[action]
-        return 100 / (high - low) if high > low else math.nan
+    def pct(self, action: str) -> float | None:
+        """One unit of an action in percent of its recorded range; None for an action that is not judged."""
+        return judge.pct_of_range(1.0, self.action_range[action])
+
+    def in_pct(self, errors: Any, action: str) -> Any:
+        """Errors of an action, one or an array, in percent of its recorded range; None if it is not judged."""
+        pct = self.pct(action)
+        return None if pct is None else errors * pct
 
     def us(self, action: str) -> float:
         """What one unit of an action is in microseconds of pulse; NaN for an action that is no servo's."""
         return us_per_unit(action)
 
-    def per_step_pct(self, mode: str) -> np.ndarray:
-        """(C, A) mean error of each step of the chunk, in percent of the recorded range."""
-        return self.errors(mode).mean(0) * [self.pct(a) for a in self.action_names]
+    def warnings(self) -> list[str]:
+        """A sentence for each action that is not judged; its percentages are None."""
+        return judge.not_judged(self.action_range)
 
     def summary(self, mode: str) -> dict[str, Any]:
-        """Everything about one mode, keys by action name and unit."""
-        found: dict[str, Any] = {}
+        """Everything about one mode, keys by action name and unit; percentages of an action not judged are None."""
+        summary: dict[str, Any] = {}
         errors = self.errors(mode)
         for i, action in enumerate(self.action_names):
-            e, pct, us = errors[..., i], self.pct(action), self.us(action)
-            found[f"{action}_mae_pct"] = e.mean() * pct
-            found[f"{action}_p95_pct"] = np.quantile(e, 0.95) * pct
-            found[f"{action}_max_pct"] = e.max() * pct
-            found[f"{action}_mae_recorded_steps_pct"] = e[~self.is_pad].mean() * pct
-            found[f"{action}_mae_per_step_pct"] = e.mean(0) * pct
+            e, us = errors[..., i], self.us(action)
+            summary[f"{action}_mae_pct"] = self.in_pct(e.mean(), action)
+            summary[f"{action}_p95_pct"] = self.in_pct(np.quantile(e, 0.95), action)
+            summary[f"{action}_max_pct"] = self.in_pct(e.max(), action)
+            summary[f"{action}_mae_recorded_steps_pct"] = self.in_pct(e[~self.is_pad].mean(), action)
+            summary[f"{action}_mae_per_step_pct"] = self.in_pct(e.mean(0), action)
             if math.isfinite(us):
-                found[f"{action}_mae_us"] = e.mean() * us
-                found[f"{action}_p95_us"] = np.quantile(e, 0.95) * us
-                found[f"{action}_max_us"] = e.max() * us
-        return found | self.recorded_error(self.chunks[mode])
+                summary[f"{action}_mae_us"] = e.mean() * us
+                summary[f"{action}_p95_us"] = np.quantile(e, 0.95) * us
+                summary[f"{action}_max_us"] = e.max() * us
+        return summary | self.recorded_error(self.chunks[mode])
 
-    def recorded_error(self, chunks: np.ndarray) -> dict[str, float]:
+    def recorded_error(self, chunks: np.ndarray) -> dict[str, float | None]:
         """How far plans (n, C, A) are from what the driver did, mean over the recorded steps."""
         if self.recorded is None:
             return {}
         e = np.abs(chunks.astype(np.float64) - self.recorded)[~self.is_pad].mean(0)
-        return {f"{a}_vs_recorded_pct": e[i] * self.pct(a) for i, a in enumerate(self.action_names)}
+        return {f"{a}_vs_recorded_pct": self.in_pct(e[i], a) for i, a in enumerate(self.action_names)}
 
     def worst(self, mode: str, count: int = 3) -> list[WorstFrame]:
-        """The `count` frames with the largest mean error over the plan, in whichever action, worst first."""
-        pct = [self.pct(a) for a in self.action_names]
-        per_frame = np.nan_to_num(self.errors(mode).mean(1) * pct)  # (n, A)
+        """The `count` frames with the largest mean error over the plan, in whichever judged action, worst first."""
+        units = {i: pct for i, a in enumerate(self.action_names) if (pct := self.pct(a)) is not None}
+        if not units:
+            return []
+        judged = list(units)
+        per_frame = self.errors(mode).mean(1)[:, judged] * list(units.values())  # (n, judged actions)
         order = np.argsort(-per_frame.max(1), kind="stable")[:count]
         return [
             WorstFrame(
                 mode,
-                self.action_names[int(per_frame[i].argmax())],
+                self.action_names[judged[int(per_frame[i].argmax())]],
                 int(i),
                 float(per_frame[i].max()),
                 self.samples[i],
@@ -325,6 +334,7 @@ def metrics(
         "fp32": common("fp32") | report.recorded_error(report.reference),
         "modes": modes,
         "action_range": report.action_range,
+        "warnings": report.warnings(),
         "frames": len(report.samples),
         "padded_steps_pct": 100 * report.is_pad.mean(),
         "driven_frames": len(on_drives.samples) if on_drives else 0,
@@ -379,8 +389,7 @@ def gates(found: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GATED
         gate(f"{mode} size_mb", judged["size_mb"], "<=", limits["size_full_mb"]),
     ]
     original = limits["original"]
-    losses = [v for k, v in judged.items() if k.endswith("_mae_pct") and not math.isnan(v)]
-    loss = max(losses, default=None)
+    loss = judge.worst(v for k, v in judged.items() if k.endswith("_mae_pct"))
     rows += [
         gate(f"{mode} model_size_mb", judged["size_mb"], "<=", original["model_size_mb"]),
         gate(f"{mode} accuracy_loss_pct", loss, "<=", original["accuracy_loss_pct"]),

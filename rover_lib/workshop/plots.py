@@ -102,6 +102,21 @@ def _values(ax: Axes, y: Sequence[float], x: Sequence[float], form: str) -> None
     ax.margins(x=0.16)
 
 
+def _note(ax: Axes, text: str) -> None:
+    """A sentence where there is nothing to draw."""
+    ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes, fontsize=11)
+    ax.set_axis_off()
+
+
+def _judged(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
+    """The keys <action>_mae_pct of actions that are judged; those that are not are named in the legend of `ax`."""
+    keys = [k for k in errors if k.endswith("_mae_pct")]
+    for key in keys:
+        if errors[key] is None:
+            ax.plot([], [], " ", label=f"{key.removesuffix('_mae_pct')}: not judged")
+    return [k for k in keys if errors[k] is not None]
+
+
 def save(figure: Figure, run_dir: Path | str, name: str) -> Figure:
     """Write run_dir/figures/<name>.png and return the figure, so that a cell that ends with this also shows it."""
     path = Path(run_dir) / "figures" / f"{name}.png"
@@ -218,8 +233,7 @@ def faults(recordings: Recordings) -> Figure:
         ax.invert_yaxis()
         ax.set_xlabel("times")
     else:
-        ax.text(0.5, 0.5, "no faults found", ha="center", va="center", transform=ax.transAxes, fontsize=11)
-        ax.set_axis_off()
+        _note(ax, "no faults found")
     ax.set_title(f"{len(recordings.episodes)} episodes give {used} samples; faults that were skipped:", fontsize=11)
     return fig
 
@@ -409,11 +423,15 @@ def _simd_bars(ax: Axes, y: np.ndarray, total: np.ndarray, simd: np.ndarray) -> 
     _values(ax, y, total, "{:.3g}")
 
 
-def errors_by_choice(table: Mapping[str, Mapping[str, float]], title: str, budget_pct: float | None = None) -> Figure:
+def errors_by_choice(
+    table: Mapping[str, Mapping[str, float | None]], title: str, budget_pct: float | None = None
+) -> Figure:
     """Error of each action for each choice, say of observers. table: {choice: {<action>_mae_pct}}."""
-    choices, keys = list(table), [k for k in next(iter(table.values())) if k.endswith("_mae_pct")]
+    choices = list(table)
     fig, axes = _axes(1, height_in=1.3 + 0.42 * len(choices))
-    ax, height = axes[0, 0], 0.8 / len(keys)
+    ax = axes[0, 0]
+    keys = _judged(ax, next(iter(table.values())))
+    height = 0.8 / max(len(keys), 1)
     for i, key in enumerate(keys):
         y = np.arange(len(choices)) + (i - (len(keys) - 1) / 2) * height
         values = [table[c][key] for c in choices]
@@ -434,16 +452,17 @@ def _action_colour(key: str, index: int) -> str:
 
 
 def sensitivity(
-    table: Mapping[str, Mapping[str, float]], steps: Sequence[Mapping[str, Any]], budget_pct: float
+    table: Mapping[str, Mapping[str, float | None]], steps: Sequence[Mapping[str, Any]], budget_pct: float
 ) -> Figure:
     """Left: each block quantized alone. Right: what leaving the worst ones in float buys.
 
     table: {block: {<action>_mae_pct}}; steps: of `choose_mixed`, {float_blocks, <action>_mae_pct}.
     """
-    blocks, keys = list(table), [k for k in next(iter(table.values())) if k.endswith("_mae_pct")]
+    blocks = list(table)
     fig, axes = _axes(1, 2, height_in=max(3.6, 1.2 + 0.26 * len(blocks)), width_ratios=(1.5, 1))
     left, right = axes[0]
-    height = 0.8 / len(keys)
+    keys = _judged(right, next(iter(table.values())))
+    height = 0.8 / max(len(keys), 1)
     for i, key in enumerate(keys):
         name, colour = key.removesuffix("_mae_pct"), _action_colour(key, i)
         y = np.arange(len(blocks)) + (i - (len(keys) - 1) / 2) * height
@@ -509,18 +528,23 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure:
     fig, axes = _axes(1, len(actions), height_in=3.6)
     times_s = np.arange(steps) / rate_hz
     for i, action in enumerate(actions):
-        ax = axes[0, i]
+        ax, pct = axes[0, i], report.pct(action)
+        ax.set_title(action, fontsize=11)
+        if pct is None:
+            _note(ax, "never changes in these\nrecordings: not judged")
+            continue
         for mode in report.chunks:
-            error = report.per_step_pct(mode)[:, i]
+            error = report.in_pct(report.errors(mode)[..., i].mean(0), action)
             ax.plot(times_s, error, color=COLOURS.get(mode, GREY), lw=1.8, label=NAMES.get(mode, mode))
         ax.set(xlabel="step of the plan (s ahead)", ylabel="mean error (% of the recorded range)", ylim=(0, None))
-        us = report.us(action) / report.pct(action)
+        us = report.us(action) / pct
         if np.isfinite(us):
             other = ax.secondary_yaxis("right", functions=(lambda p, u=us: p * u, lambda e, u=us: e / u))
             other.set_ylabel("the same as pulse (us)")
             other.tick_params(labelsize=9)
-        ax.set_title(action, fontsize=11)
-    _legend_below(fig, axes[0, 0], 5)
+    judged = [ax for ax in axes[0] if ax.get_lines()]
+    if judged:
+        _legend_below(fig, judged[0], 5)
     return fig
 
 
@@ -528,7 +552,11 @@ def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz
     """The frames on which a mode differs most from FP32: the picture and both plans, with the recording's own."""
     found = report.worst(mode, count)
     names = report.action_names
-    fig, axes = _axes(len(found), 1 + len(names), height_in=0.9 + 1.9 * len(found))
+    fig, axes = _axes(max(len(found), 1), 1 + len(names), height_in=0.9 + 1.9 * max(len(found), 1))
+    if not found:
+        for ax in axes[0]:
+            _note(ax, "not judged")
+        return fig
     times_s = np.arange(report.reference.shape[1]) / rate_hz
     for row, worst in zip(axes, found, strict=True):
         row[0].imshow(worst.sample.frame_bgr()[..., ::-1])
@@ -781,9 +809,13 @@ def counted(metrics: Mapping[str, Any]) -> Figure:
     left.invert_yaxis()
     left.set_xlabel("instructions of one inference (10^9)")
     left.set_title("counted on an emulated Cortex-A76", fontsize=11)
-    keys = [k for k in next(iter(metrics["artifacts"].values())) if k.endswith("_mae_pct") and "workstation" not in k]
+    first = next(iter(metrics["artifacts"].values()))
+    keys = _judged(right, {k: v for k, v in first.items() if "workstation" not in k})
     height = 0.8 / max(len(keys), 1)
-    judged = [m if keys and keys[0] in m and m.get("reference") != f"policy_{n}" else None for n, m in rows.items()]
+    judged = [
+        m if keys and m.get(keys[0]) is not None and m.get("reference") != f"policy_{n}" else None
+        for n, m in rows.items()
+    ]
     frames = sorted({m["frames_on_the_core"] for m in judged if m})
     over = " to ".join(str(n) for n in frames[:: len(frames) - 1 or 1])
     for i, key in enumerate(keys):

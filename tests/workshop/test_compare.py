@@ -1,6 +1,8 @@
 """The comparison against values computed by hand."""
 
+import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,7 +13,8 @@ from hypothesis import strategies as st
 
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.workshop import compare
+from rover_lib.onboard.stage import plain
+from rover_lib.workshop import compare, plots
 
 CHUNK = 3
 RANGE = {"steering": (-0.2, 0.6), "throttle": (0.0, 0.1)}
@@ -109,12 +112,62 @@ def test_a_policy_does_not_differ_from_itself(values, frames, pads):
     assert numbers and all(v == 0 for v in numbers.values())
 
 
-def test_an_action_that_never_moved_has_no_share_of_its_range():
-    base = np.zeros((3, 2))
-    found = compare.fidelity(Fixed(base), {"static": Fixed(base)}, [sample()], RANGE | {"throttle": (0, 0)})
-    assert math.isnan(found.summary("static")["throttle_mae_pct"])
-    assert found.summary("static")["throttle_mae_us"] == 0
-    assert len(found.worst("static")) == 1
+@pytest.fixture
+def still(policies):
+    """metrics and report of recordings whose throttle never changed; the plans' differ by 0.001 all the same."""
+    base, off = np.full((3, 2), 0.05), [np.full((3, 2), [0.008, 0.001])]
+    static = Fixed(base, off)
+    report = compare.fidelity(Fixed(base), {"static": static}, [sample()], RANGE | {"throttle": (0.04, 0.04)})
+    return compare.metrics(report, policies, on_drives=report), report
+
+
+def test_an_action_that_never_changed_is_not_judged(still):
+    metrics, report = still
+    static = metrics["modes"]["static"]
+    shares = {k: v for k, v in static.items() if k.startswith("throttle") and k.endswith("_pct")}
+    assert len(shares) == 6 and set(shares.values()) == {None}
+    assert static["throttle_mae_us"] == pytest.approx(0.001 * 0.5819 * 1016, rel=1e-4)
+    assert static["steering_mae_pct"] == pytest.approx(1.0, rel=1e-4)
+    assert static["driven"]["throttle_mae_pct"] is None and metrics["fp32"]["throttle_vs_recorded_pct"] is None
+    assert metrics["warnings"] == ["throttle never changes in these recordings: not judged"]
+    assert [w.action for w in report.worst("static")] == ["steering"]
+    assert "NaN" not in json.dumps(plain(metrics["modes"]))
+
+
+def test_an_action_that_is_not_judged_is_in_no_gate(still):
+    metrics, _ = still
+    limits = LIMITS | {"steering_mae_pct": 1.1}
+    rows = {r["gate"]: r for r in compare.gates(metrics, limits)}
+    assert rows["static throttle_mae_pct"]["passed"] is None
+    assert rows["static steering_mae_pct"]["passed"] is True
+    assert rows["static accuracy_loss_pct"]["found"] == pytest.approx(1.0, rel=1e-4)
+
+
+@pytest.mark.filterwarnings("error")
+def test_figures_leave_out_what_is_not_judged(still):
+    """And name it; one in which nothing is judged is drawn too."""
+    metrics, report = still
+    error, worst = plots.action_error(report), plots.worst_frames(report, count=1)
+    gates = plots.gates(compare.gates(metrics, LIMITS))
+    for figure in (error, worst, gates):
+        figure.draw_without_rendering()
+    steering, throttle = (ax for ax in error.axes if ax.get_title())
+    assert steering.get_lines() and not throttle.get_lines()
+    assert [t.get_text() for t in throttle.texts] == ["never changes in these\nrecordings: not judged"]
+    nothing = replace(report, action_range={"steering": (0.1, 0.1), "throttle": (0.0, 0.0)})
+    assert nothing.worst("static") == []
+    for figure in (plots.action_error(nothing), plots.worst_frames(nothing)):
+        figure.draw_without_rendering()
+
+
+@pytest.mark.filterwarnings("error")
+def test_choices_are_drawn_without_what_is_not_judged():
+    table = {name: {"steering_mae_pct": 0.5, "throttle_mae_pct": None} for name in ("minmax", "histogram")}
+    steps = [{"float_blocks": [], "steering_mae_pct": 0.5, "throttle_mae_pct": None}]
+    for figure in (plots.errors_by_choice(table, "observers"), plots.sensitivity(table, steps, 1.0)):
+        figure.draw_without_rendering()
+        words = [t.get_text() for ax in figure.axes for t in (ax.get_legend().get_texts() if ax.get_legend() else ())]
+        assert "steering" in words and "throttle: not judged" in words
 
 
 def test_other_actions_are_keyed_by_name_and_have_no_pulses():
@@ -206,8 +259,8 @@ def test_gates_fail(changed, failing):
     assert {r["gate"] for r in compare.gates(metrics_of(**changed), LIMITS) if not r["passed"]} == failing
 
 
-def test_gates_are_exact_at_the_limit_and_blind_to_nan():
-    rows = {r["gate"]: r for r in compare.gates(metrics_of(throttle_mae_pct=1.0, steering_mae_pct=math.nan), LIMITS)}
+def test_gates_are_exact_at_the_limit_and_blind_to_what_is_not_judged():
+    rows = {r["gate"]: r for r in compare.gates(metrics_of(throttle_mae_pct=1.0, steering_mae_pct=None), LIMITS)}
     assert rows["static throttle_mae_pct"]["passed"] is True
     assert rows["static steering_mae_pct"]["passed"] is None
     assert rows["static accuracy_loss_pct"]["found"] == 1.0
