@@ -39,7 +39,7 @@ def tiny(tiny_file):
 
 @pytest.fixture(scope="session")
 def calibration(tiny):
-    from rover_lib.workshop.quantize import calibrate
+    from rover_lib.workshop.observe import calibrate
 
     return calibrate(tiny, memory_samples(12))
 
@@ -48,7 +48,9 @@ def calibration(tiny):
 def artifacts(tiny, calibration, tmp_path_factory) -> dict[str, Path]:
     """One artifact per mode of the tiny policy."""
     from rover_lib.workshop.act import ACT
-    from rover_lib.workshop.quantize import Scheme, export, quantize
+    from rover_lib.workshop.export import export
+    from rover_lib.workshop.quantize import quantize
+    from rover_lib.workshop.scheme import Scheme
 
     folder = tmp_path_factory.mktemp("artifacts")
     samples = memory_samples(4, seed=1)

@@ -36,6 +36,8 @@ from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.episodes import Sample, choose_calibration
+from rover_lib.workshop.export import export
+from rover_lib.workshop.pipeline import Recipe
 from rover_lib.workshop.program import run
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.session import Opened, opened
@@ -196,11 +198,10 @@ def check_int8(name: str, made: dict[str, Any], expected: int) -> None:
 def affine(run_dir: Path, again: Opened) -> Made:
     """Our static artifact by the recipe of the tutorials (quint8 activations), from the run's own calibration."""
     calibration = q.Calibration.load(run_dir / "calibration.pt")
-    path, v = run_dir / "peers" / f"{AFFINE}.pt", params()["parity"]
+    path = run_dir / "peers" / f"{AFFINE}.pt"
     policy = q.quantize(again.checkpoint, q.Scheme("static", kind="affine", smooth=calibration.smooth), calibration)
-    options = {"tolerance": v["fp32"], "int8_errors": v["int8_errors"], "vectors": v["vectors"]}
     samples = thinned(again.parts.choosing, 8)
-    q.export(policy, again.checkpoint, path, samples=samples, calibration=calibration, **options)
+    export(policy, again.checkpoint, path, samples, calibration, Recipe.of(params()).parity)
     return Made(path, {})
 
 

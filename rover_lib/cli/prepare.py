@@ -1,6 +1,7 @@
 """Commands that make artifacts of a checkpoint, and look at them."""
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,32 +74,17 @@ def quantize(checkpoint: Path, episodes: Path, output: Path, mode: str, samples:
     `rover run` does this for all modes, chooses the observer and the blocks by measurement, and compares.
     """
     from rover_lib.onboard.params import params
-    from rover_lib.workshop import quantize as q
-    from rover_lib.workshop.act import ACT
-    from rover_lib.workshop.checkpoint import load_checkpoint
-    from rover_lib.workshop.episodes import choose_calibration, load_recordings, split
+    from rover_lib.workshop.pipeline import Recipe, make_artifact
+    from rover_lib.workshop.session import load
 
-    p = params()
-    how_many, seed = samples or p["calibration"]["samples"], p["calibration"]["seed"]
-    ck = load_checkpoint(checkpoint)
-    recordings = load_recordings(episodes, ck.config.chunk, p["calibration"]["sync_s"], terminal())
-    parts = split(recordings, p["calibration"]["held_out_share"], seed)
-    chosen, note = choose_calibration(parts.calibration, how_many, seed)
-    if note:
-        click.echo(f"rover: note: {note}", err=True)
-    vectors = parts.choosing[:: max(1, len(parts.choosing) // 16)] or chosen[:16]
-    options = {"samples": vectors, "tolerance": p["parity"]["fp32"], "int8_errors": p["parity"]["int8_errors"]}
-    if mode == "fp32":
-        digest = q.export(ACT(ck.config, ck.weights), ck, output, **options)
-    else:
+    recipe = Recipe.of(params(), samples)
+    if mode != "fp32":
         mode = "mixed" if mode == "static" and how["float_blocks"] else mode
-        smooth = p["quantization"]["smooth"]
-        scheme = q.Scheme(mode, smooth=smooth, percentile=p["quantization"]["percentile"], **how)
-        calibration = q.calibrate(ck, chosen, smooth=smooth, progress=terminal())
-        quantized = q.quantize(ck, scheme, calibration)
-        for warning in quantized.report["warnings"]:
-            click.echo(f"rover: warning: {warning}", err=True)
-        digest = q.export(quantized, ck, output, calibration=calibration, **options)
+        recipe = replace(recipe, scheme=replace(recipe.scheme, mode=mode, **how))
+    loaded = load(checkpoint, episodes, terminal())
+    digest, warnings = make_artifact(loaded, output, recipe, fp32=mode == "fp32", progress=terminal())
+    for warning in warnings:
+        click.echo(f"rover: warning: {warning}", err=True)
     click.echo(f"{output}: {mode}, {output.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
 
 

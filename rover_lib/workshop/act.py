@@ -9,13 +9,20 @@ Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions,
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD
+from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
+from rover_lib.workshop.episodes import Sample
+
+Projection = nn.Linear | nn.Conv2d
+Layer = TypeVar("Layer", nn.Linear, nn.Conv2d, nn.LayerNorm)
 
 # (block, convolutions per block, blocks per stage, channels out of layer4), from torchvision.models.resnet
 BACKBONES = {
@@ -108,7 +115,7 @@ class Weights:
         return Weights(self.tensors, f"{self.prefix}{name}.")
 
 
-def _load(module: nn.Module, weight: Tensor, bias: Tensor) -> nn.Module:
+def _load(module: Layer, weight: Tensor, bias: Tensor) -> Layer:
     module.weight = nn.Parameter(weight.clone(), requires_grad=False)
     module.bias = nn.Parameter(bias.clone(), requires_grad=False)
     return module
@@ -162,6 +169,10 @@ class Columns(nn.Module):
         self.out_width = (width - 1) // 2 + 1
         self.rows = 2 * ((height - 1) // 2) + 7
         self.pitch = 2 * (self.out_width - 1) + self.WINDOW  # padded pixels in a row
+        self.left: Tensor
+        self.right: Tensor
+        self.top: Tensor
+        self.bottom: Tensor
         colour = torch.tensor(zero_colour(norm)).round().to(torch.uint8)
         for name, rows, pixels in (
             ("left", height, 3),
@@ -203,6 +214,7 @@ def column_conv(conv: nn.Conv2d, norm: Affine) -> nn.Conv2d:
     weight = conv.weight * (pixel_scale / scale)[None, :, None, None]  # (out, 3, 7, 7)
     windows = F.pad(weight.permute(0, 2, 3, 1), (0, 0, 0, 1)).flatten(2)  # (out, 7, 24): as pixels lie in a row
     offset = pixel_scale * zero_pixel + torch.tensor(norm.shift)
+    assert conv.bias is not None
     bias = conv.bias + (conv.weight.sum((2, 3)) * offset).sum(1)
     columns = nn.Conv2d(windows.shape[2], windows.shape[0], (7, 1), (2, 1), device="meta")
     return _load(columns, windows.transpose(1, 2)[..., None], bias)
@@ -243,10 +255,14 @@ class Backbone(nn.Module):
     def __init__(self, w: Weights, config: ActConfig, columns: bool):
         super().__init__()
         kind, depths, _ = BACKBONES[config.backbone]
-        first = folded_conv(w.at("conv1"), w.at("bn1"), 2, 3)
+        conv = folded_conv(w.at("conv1"), w.at("bn1"), 2, 3)
         if columns:
-            first = column_conv(first, config.image_norm[0])
-        self.stem = nn.Sequential(first, nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+            conv = column_conv(conv, config.image_norm[0])
+        self.stem = nn.Sequential(conv, nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+        self.layer1: nn.Sequential
+        self.layer2: nn.Sequential
+        self.layer3: nn.Sequential
+        self.layer4: nn.Sequential
         dilation = 1
         for i, depth in enumerate(depths):
             stride = 1 if i == 0 else 2
@@ -263,6 +279,7 @@ class Backbone(nn.Module):
         return self.layer4(self.layer3(self.layer2(self.layer1(self.stem(x)))))
 
 
+# Buffers have their types in __init__: torch.jit would read those of a class body, and want to compile them.
 class Pointwise(nn.Module):
     """Where token projections live: as linears over (1, T, D), or as 1x1 convolutions over (1, D, 1, T).
 
@@ -274,7 +291,7 @@ class Pointwise(nn.Module):
         super().__init__()
         self.as_conv = as_conv
 
-    def project(self, weight: Tensor, bias: Tensor) -> nn.Module:
+    def project(self, weight: Tensor, bias: Tensor) -> Projection:
         if not self.as_conv:
             return linear(weight, bias)
         out_features, in_features = weight.shape
@@ -305,6 +322,13 @@ class Attention(Pointwise):
         self.k = self.project(wk, bk)
         self.v = self.project(wv, bv)
         self.o = self.project(w["out_proj.weight"], w["out_proj.bias"])
+        self.constant_q: Tensor | None
+        self.q_in: Tensor | None
+        self.k_in: Tensor | None
+        self.v_in: Tensor | None
+        self.q_out: Tensor | None
+        self.v_out: Tensor | None
+        self.o_out: Tensor | None
         for name in ("constant_q", "q_in", "k_in", "v_in", "q_out", "v_out", "o_out"):
             self.register_buffer(name, None)
 
@@ -320,6 +344,7 @@ class Attention(Pointwise):
         if self.constant_q is not None:
             q = self.constant_q
         else:
+            assert query is not None
             # Self-attention asks and answers with one tensor: one scale and one quantized input for Q and K.
             q = k if query is key else self.enter(_times(query, self.q_in))
             q = _times(self.leave(self.q(q)), self.q_out)
@@ -335,6 +360,8 @@ class Memory(Pointwise):
 
     def __init__(self, as_conv: bool):
         super().__init__(as_conv)
+        self.k_in: Tensor | None
+        self.v_in: Tensor | None
         for name in ("k_in", "v_in"):  # channel scales, as in Attention
             self.register_buffer(name, None)
 
@@ -350,6 +377,9 @@ class FeedForward(Pointwise):
         self.up = self.project(w["linear1.weight"], w["linear1.bias"])
         self.act = ACTIVATIONS[config.activation]()
         self.down = self.project(w["linear2.weight"], w["linear2.bias"])
+        self.up_in: Tensor | None
+        self.down_in: Tensor | None
+        self.down_out: Tensor | None
         for name in ("up_in", "down_in", "down_out"):
             self.register_buffer(name, None)
 
@@ -397,6 +427,7 @@ class DecoderLayer(nn.Module):
         self.attention = Attention(w.at("self_attn"), config, as_conv)
         self.cross_attention = Attention(w.at("multihead_attn"), config, as_conv, cross=True)
         self.feed_forward = FeedForward(w, config, as_conv)
+        self.start: Tensor
         self.register_buffer("start", None)
         if first:
             with torch.no_grad():
@@ -412,7 +443,7 @@ class DecoderLayer(nn.Module):
 
     def forward(self, x: Tensor | None, q_pos: Tensor, key: Tensor, value: Tensor) -> Tensor:
         """x, q_pos: (1, C, D), x None for the first layer; key, value: from `Memory`."""
-        x = self.start if self.first else self._self_attend(x, q_pos)
+        x = self.start if x is None else self._self_attend(x, q_pos)
         y = self.norm2(x) if self.pre_norm else x
         x = self.cross_attention(x, None if self.first else y + q_pos, key, value)
         if self.pre_norm:
@@ -428,6 +459,8 @@ class Normalise(nn.Module):
         super().__init__()
         self.acts = affine is not None
         if affine is not None:
+            self.scale: Tensor
+            self.shift: Tensor
             self.register_buffer("scale", torch.tensor(affine.scale, dtype=torch.float32).reshape(shape))
             self.register_buffer("shift", torch.tensor(affine.shift, dtype=torch.float32).reshape(shape))
 
@@ -459,10 +492,14 @@ class ACT(nn.Module):
         self.backbone = Backbone(w.at("backbone"), config, columns)
         project = w.at("encoder_img_feat_input_proj")
         weight = project["weight"]
-        self.image_project = _load(nn.Conv2d(*weight.shape[1::-1], 1, device="meta"), weight, project["bias"])
+        out_channels, in_channels, _, _ = weight.shape
+        self.image_project = _load(nn.Conv2d(in_channels, out_channels, 1, device="meta"), weight, project["bias"])
         state = w.at("encoder_robot_state_input_proj")
         self.state_project = linear(state["weight"], state["bias"])
         # The latent is zero when driving, so what its projection gives is its bias.
+        self.latent: Tensor
+        self.pos: Tensor
+        self.q_pos: Tensor
         self.register_buffer("latent", w["encoder_latent_input_proj.bias"][None, None])
         pos = [w["encoder_1d_feature_pos_embed.weight"]]
         pos += [positions_2d(config.dim, -(-h // config.stride), -(-v // config.stride)) for h, v in config.image_sizes]
@@ -527,7 +564,7 @@ def multiply_accumulates(model: ACT) -> dict[str, int]:
                 add(name, 2 * residual.shape[1] * key.numel())  # queries x tokens x width
             elif isinstance(module, nn.Conv2d):
                 add(name, out.numel() * module.weight[0].numel())
-            else:
+            elif isinstance(module, nn.Linear):
                 add(name, out.numel() * module.in_features)
 
         return hook
@@ -555,3 +592,15 @@ def example_inputs(config: ActConfig) -> tuple[Tensor, ...]:
     """A neutral observation of the right shapes: zero state, grey frames."""
     frames = (torch.full((h, w, 3), 128, dtype=torch.uint8) for h, w in config.image_sizes)
     return torch.zeros(1, len(config.state_names)), *frames
+
+
+def inputs_of(sample: Sample, config: ActConfig) -> tuple[Tensor, Tensor]:
+    """A recorded sample as the graph's inputs: (1, 2) float32 and (height, width, 3) uint8 RGB."""
+    frame = prepare_frame(sample.frame_bgr(), *config.image_sizes[0])
+    return torch.from_numpy(np.asarray(sample.state, np.float32))[None], torch.from_numpy(frame)
+
+
+@torch.inference_mode()
+def predictions(module: nn.Module, inputs: Iterable[tuple[Tensor, ...]]) -> Tensor:
+    """(n, C, A) of raw, unclipped actions."""
+    return torch.cat([module(*x) for x in inputs])

@@ -25,7 +25,8 @@ from rover_lib.onboard.plan import Follower, Plan, Settings
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.workshop.compare import Fidelity
 from rover_lib.workshop.episodes import Episode, Recordings, Sample
-from rover_lib.workshop.quantize import OBSERVERS, Calibration, RangeObserver
+from rover_lib.workshop.observe import Calibration, RangeObserver
+from rover_lib.workshop.scheme import OBSERVERS
 
 WIDTH_IN, DPI = 9.0, 100
 BLACK, ORANGE, SKY, GREEN, BLUE, RED, PURPLE = (

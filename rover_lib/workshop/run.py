@@ -27,7 +27,7 @@ from PIL import Image
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.session import TTY_VARIABLE
+from rover_lib.workshop.progress import TTY_VARIABLE
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
@@ -189,8 +189,9 @@ def _sentence(error: Any) -> str:
     return f"{error.ename}: {text}; 'rover --debug run' shows the traceback"
 
 
-def _subclasses(kind: type) -> set[type]:
-    return set(kind.__subclasses__()).union(*(_subclasses(c) for c in kind.__subclasses__()))
+def _subclasses(kind: type[RoverError]) -> set[type[RoverError]]:
+    direct: list[type[RoverError]] = kind.__subclasses__()
+    return set(direct).union(*(_subclasses(c) for c in direct))
 
 
 # --- publishing what they showed --------------------------------------------------------------------------------------

@@ -54,8 +54,7 @@ def test_drives(artifacts, mode):
 
 
 def test_equals_the_policy_it_was_made_of(tiny, artifacts):
-    from rover_lib.workshop.act import ACT
-    from rover_lib.workshop.quantize import inputs_of
+    from rover_lib.workshop.act import ACT, inputs_of
 
     sample = memory_samples(1, seed=9)[0]
     policy = load_policy(artifacts["fp32"])

@@ -20,10 +20,9 @@ from safetensors.torch import save_file
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError
-from rover_lib.workshop.act import ACT
+from rover_lib.workshop.act import ACT, inputs_of
 from rover_lib.workshop.checkpoint import PICKLE_BYTES, expected_shapes, load_checkpoint
 from rover_lib.workshop.compare import LerobotEager
-from rover_lib.workshop.quantize import inputs_of
 
 
 def write(content, path):

@@ -10,17 +10,22 @@ from hypothesis import strategies as st
 from policies import TINY, lerobot_policy, memory_samples, trainer_content
 
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.workshop import act
+from rover_lib.workshop import act, observe
 from rover_lib.workshop import quantize as q
-from rover_lib.workshop.act import ACT
+from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint import load_checkpoint
-from rover_lib.workshop.quantize import Bench, Calibration, RangeObserver, Scheme, calibrate, quantize
+from rover_lib.workshop.choose import Chooser
+from rover_lib.workshop.export import export
+from rover_lib.workshop.observe import Calibration, RangeObserver, calibrate, observed_graph, qconfig_mapping
+from rover_lib.workshop.quantize import quantize
+from rover_lib.workshop.scales import apply_channel_scales, channel_maxima, projections
+from rover_lib.workshop.scheme import ENGINE, KINDS, OBSERVERS, SMALLEST_SCALE, Scheme
 
 RANGE = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.5)}
 
 
 def inputs(checkpoint, count=4, seed=3):
-    return [q.inputs_of(s, checkpoint.config) for s in memory_samples(count, *checkpoint.config.image_sizes[0], seed)]
+    return [inputs_of(s, checkpoint.config) for s in memory_samples(count, *checkpoint.config.image_sizes[0], seed)]
 
 
 @pytest.mark.parametrize("for_int8", [False, True])
@@ -35,11 +40,11 @@ def test_channel_scales_are_exact_in_float(variant, smooth, for_int8, tmp_path):
     checkpoint = load_checkpoint(tmp_path)
     model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
     seen = inputs(checkpoint, 3)
-    before = q.predictions(model, seen)
-    maxima = q.channel_maxima(model, seen)
-    q.apply_channel_scales(model, maxima, smooth)
+    before = predictions(model, seen)
+    maxima = channel_maxima(model, seen)
+    apply_channel_scales(model, maxima, smooth)
     assert any(b is not None for n, b in model.named_buffers() if n.endswith("v_in"))
-    assert (q.predictions(model, seen) - before).abs().max() < 1e-5
+    assert (predictions(model, seen) - before).abs().max() < 1e-5
 
 
 def test_channel_scales_even_out_an_outlier_channel(tiny):
@@ -63,14 +68,14 @@ def test_acts_on_every_layer_and_stays_close(tiny, calibration, mode, kind):
     scheme = Scheme(mode, kind, float_blocks=("backbone.stem",) if mode == "mixed" else ())
     quantized = quantize(tiny, scheme, calibration)
     convs = [n for n, m in ACT(tiny.config, tiny.weights).named_modules() if isinstance(m, torch.nn.Conv2d)]
-    projections = q._projections(ACT(tiny.config, tiny.weights))
-    expected = {"dynamic": len(projections), "static": len(projections) + len(convs)}
+    expected_dynamic = len(projections(ACT(tiny.config, tiny.weights)))
+    expected = {"dynamic": expected_dynamic, "static": expected_dynamic + len(convs)}
     expected["mixed"] = expected["static"] - 1
     assert quantized.report["int8_modules"] == expected[mode]
     assert set(quantized.report["embeddings"]) == {"encoder_1d_feature_pos_embed", "decoder_pos_embed"}
     x = inputs(tiny)
-    reference = q.predictions(ACT(tiny.config, tiny.weights), x)
-    error = (q.predictions(quantized.module, x) - reference).abs()
+    reference = predictions(ACT(tiny.config, tiny.weights), x)
+    error = (predictions(quantized.module, x) - reference).abs()
     assert 0 < error.mean() < 0.1 * reference.std()
 
 
@@ -82,7 +87,7 @@ def test_symmetric_means_what_the_fast_kernels_want(tiny, calibration):
             w = m.weight()
             assert w.qscheme() == torch.per_channel_affine and (w.q_per_channel_zero_points() == 0).all(), name
             assert w.int_repr().min() >= -127, name
-            assert w.q_per_channel_scales().min() >= q.SMALLEST_SCALE and m.scale >= q.SMALLEST_SCALE, name
+            assert w.q_per_channel_scales().min() >= SMALLEST_SCALE and m.scale >= SMALLEST_SCALE, name
     dtypes = {n.args[3] for n in module.graph.nodes if n.target is torch.quantize_per_tensor}
     assert dtypes == {torch.qint8}
     affine = quantize(tiny, Scheme("static", "affine"), calibration).module
@@ -92,7 +97,7 @@ def test_symmetric_means_what_the_fast_kernels_want(tiny, calibration):
 def slow_layers():
     """Layers that torch would not run on the fast kernels, made by hand: (what the guard says, policy)."""
 
-    torch.backends.quantized.engine = q.ENGINE  # weights are packed for it
+    torch.backends.quantized.engine = ENGINE  # weights are packed for it
 
     def linear(per_channel: bool):
         w = torch.randn(16, 16).clamp(-1, 1)
@@ -143,7 +148,7 @@ def test_the_guard_names_a_layer_that_misses_the_fast_kernels(reason, layer, x, 
 def test_the_guard_sees_observers_of_another_type(tiny, calibration, monkeypatch):
     """A symmetric scheme whose activations came out as quint8: what a wrong qconfig would do, without a word."""
     with monkeypatch.context() as m:
-        m.setitem(q.KINDS, "symmetric", q.KINDS["affine"])
+        m.setitem(KINDS, "symmetric", KINDS["affine"])
         with pytest.raises(QuantizeError, match=r"miss the fast kernels: backbone\.stem\.0: its input is quint8"):
             quantize(tiny, Scheme("static"), calibration)
     quantize(tiny, Scheme("static"), calibration)
@@ -153,7 +158,8 @@ def test_an_ignored_backend_config_is_an_error(tiny, calibration, monkeypatch):
     """With FX's default backend the mapping acts on nothing, and the policy would stay float."""
     from torch.ao.quantization.backend_config import get_native_backend_config
 
-    monkeypatch.setattr(q, "get_qnnpack_backend_config", get_native_backend_config)
+    for module in (observe, q):
+        monkeypatch.setattr(module, "get_qnnpack_backend_config", get_native_backend_config)
     with pytest.raises(QuantizeError):
         quantize(tiny, Scheme("static"), calibration)
 
@@ -201,7 +207,7 @@ def test_a_calibration_serves_one_image_size(tiny, calibration):
 def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration):
     """The first layer's INT8 output against quantize -> float convolution -> quantize, to one step."""
     quantized = quantize(tiny, Scheme("static"), calibration)
-    prepared = q._prepared(tiny, Scheme("static"), calibration)
+    prepared = observed_graph(tiny, Scheme("static"), calibration)
     seen = {}
     conv = quantized.module.get_submodule("backbone.stem.0")
     conv.register_forward_hook(lambda m, args, out: seen.update(x=args[0], y=out))
@@ -218,7 +224,7 @@ def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration):
 
 
 def test_a_mode_that_changed_nothing_is_an_error(tiny, calibration, monkeypatch):
-    monkeypatch.setattr(q, "_pattern", lambda block, relu: "no such module")
+    monkeypatch.setattr(observe, "_pattern", lambda block, relu: "no such module")
     with pytest.raises(QuantizeError):
         quantize(tiny, Scheme("static"), calibration)
     with pytest.raises(QuantizeError, match="nothing was quantized"):
@@ -228,7 +234,7 @@ def test_a_mode_that_changed_nothing_is_an_error(tiny, calibration, monkeypatch)
 
 
 def test_embedding_tables_would_be_weight_only(tiny):
-    mapping = q._mapping(tiny.config, Scheme())
+    mapping = qconfig_mapping(tiny.config, Scheme())
     assert mapping.object_type_qconfigs[torch.nn.Embedding] is torch.ao.quantization.float_qparams_weight_only_qconfig
 
 
@@ -252,7 +258,7 @@ def test_refusals(tiny, calibration, tmp_path):
     with pytest.raises(QuantizeError, match="needs samples"):
         calibrate(tiny, [])
     with pytest.raises(QuantizeError, match="choosing needs samples"):
-        Bench(tiny, calibration, [], RANGE)
+        Chooser(tiny, calibration, [], RANGE)
     with pytest.raises(QuantizeError, match="02_calibrate"):
         Calibration.load(tmp_path / "none.pt")
     (tmp_path / "bad.pt").write_bytes(b"x")
@@ -279,7 +285,7 @@ def test_a_calibration_survives_its_file(tiny, calibration, tmp_path):
     calibration.save(tmp_path / "c.pt")
     again = Calibration.load(tmp_path / "c.pt")
     x = inputs(tiny)
-    a, b = (q.predictions(quantize(tiny, Scheme(), c).module, x) for c in (calibration, again))
+    a, b = (predictions(quantize(tiny, Scheme(), c).module, x) for c in (calibration, again))
     assert torch.equal(a, b)
 
 
@@ -299,19 +305,19 @@ def test_inspect_layers_sees_clipping(tiny, calibration):
     assert any("layer1.0.body.0" in w for w in q.clipped_warnings(rows, 1.0))
 
 
-def test_bench_chooses_by_error(tiny, calibration):
-    bench = Bench(tiny, calibration, memory_samples(3, seed=8), RANGE)
-    scheme, table = bench.choose_observer(Scheme())
-    assert set(table) == set(q.OBSERVERS)
+def test_chooses_by_error(tiny, calibration):
+    chooser = Chooser(tiny, calibration, memory_samples(3, seed=8), RANGE)
+    scheme, table = chooser.observer(Scheme())
+    assert set(table) == set(OBSERVERS)
     assert max(table[scheme.observer].values()) == min(max(row.values()) for row in table.values())
-    sensitivity = bench.sensitivity(scheme)
+    sensitivity = chooser.sensitivity(scheme)
     assert list(sensitivity) == act.blocks(tiny.config)
     assert all(max(e.values()) > 0 for e in sensitivity.values())  # each block alone does something
-    mixed, steps = bench.choose_mixed(scheme, sensitivity, budget_pct=1e-6, max_blocks=2)
+    mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=1e-6, max_blocks=2)
     assert [len(s["float_blocks"]) for s in steps] == [0, 1, 2] and mixed.mode == "mixed"
     worst = max(sensitivity, key=lambda b: max(sensitivity[b].values()))
     assert steps[1]["float_blocks"] == [worst]
-    plain, steps = bench.choose_mixed(scheme, sensitivity, budget_pct=100, max_blocks=2)
+    plain, steps = chooser.mixed(scheme, sensitivity, budget_pct=100, max_blocks=2)
     assert plain.float_blocks == () and len(steps) == 1
 
 
@@ -323,7 +329,7 @@ def observer(choice="minmax"):
 
 
 @settings(deadline=None, max_examples=50)
-@given(st.lists(st.lists(finite, min_size=1, max_size=50), min_size=1, max_size=5), st.sampled_from(q.OBSERVERS))
+@given(st.lists(st.lists(finite, min_size=1, max_size=50), min_size=1, max_size=5), st.sampled_from(OBSERVERS))
 def test_an_observers_range_is_within_what_it_saw(batches, choice):
     o = observer(choice)
     for b in batches:
@@ -333,7 +339,7 @@ def test_an_observers_range_is_within_what_it_saw(batches, choice):
     assert min(values.min(), 0) - 1e-3 <= low <= 0 <= high <= max(values.max(), 0) + 1e-3
     assert o.histogram.sum() == len(values)  # no value falls off when the limit doubles
     scale, zero = o.calculate_qparams()
-    assert scale >= q.SMALLEST_SCALE and -128 <= zero <= 127
+    assert scale >= SMALLEST_SCALE and -128 <= zero <= 127
 
 
 def test_growing_the_histogram_keeps_it_exact():
@@ -350,7 +356,7 @@ def test_growing_the_histogram_keeps_it_exact():
 def test_percentile_and_histogram_drop_a_lone_outlier():
     x = torch.cat([torch.linspace(-1, 1, 100_000), torch.tensor([50.0])])
     ranges = {}
-    for choice in q.OBSERVERS:
+    for choice in OBSERVERS:
         o = observer(choice)
         o(x)
         ranges[choice] = o.range()[1]
@@ -368,7 +374,7 @@ def test_same_inputs_same_content(tiny, calibration, tmp_path):
     from rover_lib.onboard.artifact import content_hash
 
     hashes = {
-        q.export(
+        export(
             quantize(tiny, Scheme(), calibration),
             tiny,
             tmp_path / n,
@@ -378,7 +384,7 @@ def test_same_inputs_same_content(tiny, calibration, tmp_path):
         for n in ("a.pt", "b.pt")
     }
     assert hashes == {content_hash(tmp_path / "a.pt")}
-    other = q.export(ACT(tiny.config, tiny.weights), tiny, tmp_path / "c.pt", samples=memory_samples(2))
+    other = export(ACT(tiny.config, tiny.weights), tiny, tmp_path / "c.pt", samples=memory_samples(2))
     assert other not in hashes
 
 
@@ -409,6 +415,6 @@ def test_the_users_full_size_static_artifact_is_at_most_70_mb(tmp_path):
     ]
     calibration = calibrate(checkpoint, samples)
     quantized = quantize(checkpoint, Scheme("static"), calibration)
-    q.export(quantized, checkpoint, tmp_path / "static.pt", samples=samples, calibration=calibration)
+    export(quantized, checkpoint, tmp_path / "static.pt", samples=samples, calibration=calibration)
     assert 60 < (tmp_path / "static.pt").stat().st_size / 1e6 <= 70
     assert load_policy(tmp_path / "static.pt").manifest["gmac"] == pytest.approx(15.0, abs=0.1)

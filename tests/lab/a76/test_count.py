@@ -24,6 +24,8 @@ from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.export import export
+from rover_lib.workshop.observe import calibrate
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
 
@@ -129,14 +131,14 @@ def tiny_run(tiny_file, tmp_path_factory) -> Path:
     scheme, options = q.Scheme("static"), {"samples": samples[:3]}
     # Another image size, without an FP32 of its own.
     small = checkpoint.at_size(54, 96)
-    calibration = q.calibrate(small, samples[:4])
+    calibration = calibrate(small, samples[:4])
     static = q.quantize(small, scheme, calibration)
-    q.export(static, small, folder / "policy_static_54x96.pt", calibration=calibration, **options)
-    calibration = q.calibrate(checkpoint, samples)
+    export(static, small, folder / "policy_static_54x96.pt", calibration=calibration, **options)
+    calibration = calibrate(checkpoint, samples)
     calibration.save(folder / "calibration.pt")
-    q.export(ACT(checkpoint.config, checkpoint.weights), checkpoint, folder / "policy_fp32.pt", **options)
+    export(ACT(checkpoint.config, checkpoint.weights), checkpoint, folder / "policy_fp32.pt", **options)
     static = q.quantize(checkpoint, scheme, calibration)
-    digest = q.export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
+    digest = export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
     modes = {"static": {"scheme": asdict(scheme), "content_hash": digest}}
     inputs = {"calibration.pt": sha256_of(folder / "calibration.pt")}
     write_stage(folder / "quantize.json", "quantize", params={}, metrics={"modes": modes}, inputs=inputs)
@@ -228,7 +230,7 @@ def test_bits_that_differ_are_found(core, tiny_run, again, monkeypatch):
 def test_another_calibration_has_no_bits_to_compare(core, tiny_run, again, tmp_path):
     for name in ("policy_static.pt", "quantize.json"):
         (tmp_path / name).write_bytes((tiny_run / name).read_bytes())
-    q.calibrate(again.checkpoint, memory_samples(4, seed=5)).save(tmp_path / "calibration.pt")
+    calibrate(again.checkpoint, memory_samples(4, seed=5)).save(tmp_path / "calibration.pt")
     with pytest.raises(CountError, match=r"calibration\.pt are not those of quantize\.json"):
         counting.backbone_bits(tmp_path, core, again.checkpoint, memory_samples(1))
 

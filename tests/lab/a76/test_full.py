@@ -9,7 +9,9 @@ from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.compare import thinned
-from rover_lib.workshop.quantize import Calibration, Scheme, quantize
+from rover_lib.workshop.observe import Calibration
+from rover_lib.workshop.quantize import quantize
+from rover_lib.workshop.scheme import Scheme
 from rover_lib.workshop.session import opened
 
 SIZE = {"size": "small", "drives": 5, "samples": 6, "sizes": ((54, 96),), "curve": ((36, 64),)}

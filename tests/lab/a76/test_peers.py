@@ -29,6 +29,8 @@ from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT
+from rover_lib.workshop.export import export
+from rover_lib.workshop.observe import calibrate
 
 pytestmark = pytest.mark.emulated
 RANGES = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.1)}
@@ -65,12 +67,12 @@ def tiny_run(tiny, tmp_path_factory) -> SimpleNamespace:
     folder = tmp_path_factory.mktemp("run")
     pictures = tmp_path_factory.mktemp("pictures")
     calibrating, held_out = file_samples(pictures, 16, seed=0), file_samples(pictures, 12, seed=1)
-    calibration = q.calibrate(tiny, calibrating)
+    calibration = calibrate(tiny, calibrating)
     calibration.save(folder / "calibration.pt")
     write_stage(folder / "calibrate.json", "calibrate", params={"samples": 16, "seed": 0, "smooth": 0.5}, metrics={})
-    q.export(ACT(tiny.config, tiny.weights), tiny, folder / "policy_fp32.pt", samples=calibrating[:3])
+    export(ACT(tiny.config, tiny.weights), tiny, folder / "policy_fp32.pt", samples=calibrating[:3])
     static = q.quantize(tiny, q.Scheme("static"), calibration)
-    q.export(static, tiny, folder / "policy_static.pt", samples=calibrating[:3], calibration=calibration)
+    export(static, tiny, folder / "policy_static.pt", samples=calibrating[:3], calibration=calibration)
     parts = SimpleNamespace(calibration=calibrating, choosing=calibrating[:4], held_out=held_out)
     opened = SimpleNamespace(
         checkpoint=tiny, parts=parts, recordings=SimpleNamespace(action_range=lambda: dict(RANGES))

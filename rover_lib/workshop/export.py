@@ -1,0 +1,145 @@
+"""The artifact: one file with the graph, its manifest and its parity vectors, which is all that a rover needs.
+
+export(quantized, checkpoint, "policy_static.pt", samples, calibration)
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+import rover_lib
+from rover_lib.onboard import artifact
+from rover_lib.onboard.errors import QuantizeError
+from rover_lib.workshop.act import ACT, example_inputs, inputs_of, multiply_accumulates, predictions
+from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.episodes import Sample
+from rover_lib.workshop.observe import Calibration
+from rover_lib.workshop.quantize import QuantizedPolicy, int8_layers
+from rover_lib.workshop.scheme import ENGINE
+
+
+@dataclass(frozen=True)
+class Parity:
+    """What an artifact must answer when it is loaded elsewhere, and how far its answers may differ.
+
+    tolerance: of FP32, in action units. int8_errors: INT8 may differ by at least `tolerance`, and by this many times
+    its own largest error against FP32, because flipped roundings are of the size of quantization itself. vectors: so
+    many samples are stored in the artifact.
+    """
+
+    tolerance: float = 1e-4
+    int8_errors: float = 2.0
+    vectors: int = 3
+
+
+def export(
+    policy: ACT | QuantizedPolicy,
+    checkpoint: Checkpoint,
+    path: Path | str,
+    samples: Sequence[Sample],
+    calibration: Calibration | None = None,
+    parity: Parity | None = None,
+) -> str:
+    """Trace, freeze and write the artifact; return its content hash.
+
+    samples: recorded observations, of which `parity.vectors`, evenly chosen, become the parity vectors; INT8's largest
+    error is that over all of them. calibration: of a quantized policy, for the manifest. Raises QuantizeError if the
+    traced graph does not give what the policy gave, or anything that is not finite.
+    """
+    parity = parity or Parity()
+    config = checkpoint.config
+    inputs = [inputs_of(s, config) for s in samples]
+    if not inputs:
+        raise QuantizeError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
+    if isinstance(policy, QuantizedPolicy):
+        module: nn.Module = policy.module
+        reference = ACT(config, checkpoint.weights)
+    else:
+        module = reference = policy
+    with warnings.catch_warnings(), torch.inference_mode():
+        warnings.simplefilter("ignore")
+        traced = torch.jit.freeze(torch.jit.trace(module, example_inputs(config), check_trace=False).eval())
+    stored = np.unique(np.linspace(0, len(inputs) - 1, parity.vectors).round().astype(int))
+    for i in stored:
+        inputs[i] = (inputs[i][0], _in_blocks(inputs[i][1]))
+    expected = predictions(module, inputs)
+    with torch.jit.optimized_execution(False):
+        actions = predictions(traced, inputs)
+    if not torch.isfinite(actions).all():
+        raise QuantizeError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
+    allowed = dict.fromkeys(config.action_names, parity.tolerance)
+    if module is not reference:
+        errors = (actions - predictions(reference, inputs)).abs().amax((0, 1))
+        for name, error in zip(config.action_names, errors, strict=True):
+            allowed[name] = max(parity.tolerance, parity.int8_errors * error.item())
+    gap = (actions - expected).abs().max().item()
+    if gap > max(allowed.values()):
+        raise QuantizeError(f"{path}: the traced graph differs from the policy by {gap:.3g}; nothing was written")
+    vectors = {
+        "state": np.stack([inputs[i][0][0].numpy() for i in stored]),
+        f"frame_{config.cameras[0]}": np.stack([inputs[i][1].numpy() for i in stored]),
+        "chunk": np.stack([actions[i].numpy() for i in stored]),
+    }
+    manifest = _manifest(policy, checkpoint, calibration) | {
+        "weights_mb": _weights_mb(module),
+        "gmac": sum(multiply_accumulates(reference).values()) / 1e9,
+        "parity": {
+            "tolerance": allowed,
+            "reason": "another processor sums in another order"
+            if module is reference
+            else "float parts round differently on another processor, and flipped INT8 roundings grow over layers",
+        },
+    }
+    return artifact.save_artifact(path, traced, manifest, vectors)
+
+
+def _manifest(policy: ACT | QuantizedPolicy, checkpoint: Checkpoint, calibration: Calibration | None) -> dict[str, Any]:
+    """What the artifact says of itself, apart from what only its graph can tell."""
+    config = checkpoint.config
+    scheme = policy.scheme if isinstance(policy, QuantizedPolicy) else None
+    mode = scheme.mode if scheme else "fp32"
+    arithmetic = {"fp32": "float", "dynamic": "dynamic"}
+    return {
+        "schema": artifact.SCHEMA,
+        "mode": mode,
+        "scheme": scheme.kind if scheme and mode not in arithmetic else arithmetic[mode],
+        "engine": ENGINE,
+        "cameras": [
+            {"name": n, "height": h, "width": w} for n, (h, w) in zip(config.cameras, config.image_sizes, strict=True)
+        ],
+        "state_names": list(config.state_names),
+        "action_names": list(config.action_names),
+        "chunk": config.chunk,
+        "rate_hz": config.rate_hz,
+        "normalisation": "inside the graph: uint8 RGB frames and raw states in, raw actions out",
+        "checkpoint": {"sha256": checkpoint.sha256, "format": checkpoint.format},
+        "calibration": None
+        if calibration is None
+        else {
+            "samples": calibration.samples,
+            "observer": scheme.observer if scheme and mode not in arithmetic else None,
+            "channel_scales": calibration.smooth,
+            "float_blocks": list(scheme.float_blocks) if scheme else [],
+        },
+        "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": rover_lib.__version__},
+    }
+
+
+def _in_blocks(frame: Tensor, size: int = 4) -> Tensor:
+    """The frame in squares of one colour: as good a question, and a twentieth of the bytes in the artifact."""
+    height, width, _ = frame.shape
+    return frame[::size, ::size].repeat_interleave(size, 0).repeat_interleave(size, 1)[:height, :width].contiguous()
+
+
+def _weights_mb(module: nn.Module) -> float:
+    """Weights and biases alone: INT8 weights at a byte, the rest at four."""
+    total = sum(p.numel() * 4 for p in module.parameters())
+    for m in int8_layers(module).values():
+        total += m.weight().numel() + (m.bias().numel() * 4 if m.bias() is not None else 0)
+    return total / 1e6

@@ -1,0 +1,320 @@
+"""What flows through a policy: observers in its graph, and the calibration that fills them.
+
+    calibration = calibrate(checkpoint, samples)
+
+One calibration serves every scheme with the same `smooth`. This module and `quantize`, and no other, touch
+torch.ao.quantization (its last version is torch 2.8's): here the graph gets its observers, there it becomes INT8.
+"""
+
+import re
+import time
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.ao.quantization import (
+    PerChannelMinMaxObserver,
+    QConfig,
+    QConfigMapping,
+    float_qparams_weight_only_qconfig,
+)
+from torch.ao.quantization.backend_config import get_qnnpack_backend_config
+from torch.ao.quantization.fx.custom_config import PrepareCustomConfig
+from torch.ao.quantization.observer import UniformQuantizationObserverBase
+from torch.ao.quantization.quantize_fx import prepare_fx
+from torch.fx import GraphModule, Node
+
+from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.stage import atomic_path
+from rover_lib.workshop.act import ACT, ActConfig, Columns, block_of, blocks, example_inputs, inputs_of
+from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.episodes import Sample
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.scales import Maxima, apply_channel_scales, channel_maxima
+from rover_lib.workshop.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
+
+BROKEN_INPUT = "check the checkpoint and the recordings"
+
+
+class RangeObserver(UniformQuantizationObserverBase):
+    """Sees a tensor's values during calibration; the range is chosen afterwards, in any of three ways.
+
+    Keeps the exact minimum and maximum and a histogram over [-limit, limit] whose limit doubles when it is outgrown:
+    two neighbouring bins merge into one, so nothing is ever re-binned by guess. One calibration serves all observers.
+    """
+
+    BINS = 4096
+
+    def __init__(self, *, dtype: torch.dtype, quant_min: int, quant_max: int, choice: str, percentile: float):
+        super().__init__(
+            dtype=dtype,
+            qscheme=torch.per_tensor_affine,
+            quant_min=quant_min,
+            quant_max=quant_max,
+            eps=SMALLEST_SCALE,
+        )
+        self.choice, self.percentile, self.observing = choice, percentile, True
+        self.min_val: Tensor
+        self.max_val: Tensor
+        self.limit: Tensor
+        self.histogram: Tensor
+        self.register_buffer("min_val", torch.tensor(torch.inf))
+        self.register_buffer("max_val", torch.tensor(-torch.inf))
+        self.register_buffer("limit", torch.tensor(0.0))
+        self.register_buffer("histogram", torch.zeros(self.BINS))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.observing:
+            return x
+        v = x.detach().flatten()
+        low, high = torch.aminmax(v)
+        if not (torch.isfinite(low) and torch.isfinite(high)):
+            raise QuantizeError("calibration met NaN or Inf in an activation", remedy=BROKEN_INPUT)
+        self.min_val.copy_(torch.minimum(self.min_val, low))
+        self.max_val.copy_(torch.maximum(self.max_val, high))
+        largest = max(abs(low.item()), abs(high.item()), 1e-6)
+        if self.limit == 0:
+            self.limit.fill_(largest)
+        while largest > self.limit:
+            merged = self.histogram.view(-1, 2).sum(1)
+            quarter = self.BINS // 4
+            self.histogram.zero_()[quarter : 3 * quarter] = merged
+            self.limit.mul_(2)
+        limit = self.limit.item()
+        # A feature map has millions of values: every 17th draws the same histogram.
+        self.histogram += torch.histc(v[::17] if v.numel() > 1 << 18 else v, self.BINS, -limit, limit)
+        return x
+
+    def range(self) -> tuple[float, float]:
+        """The range [low, high] to represent, containing 0, by this observer's choice."""
+        low, high = self.min_val.item(), self.max_val.item()
+        if low > high:
+            raise QuantizeError(
+                "an observer saw nothing: the calibration did not reach its layer", remedy="calibrate again"
+            )
+        if self.choice == "percentile":
+            low, high = self._percentiles(low, high)
+        elif self.choice == "histogram":
+            low, high = self._least_squares(low, high)
+        return min(low, 0.0), max(high, 0.0)
+
+    def _centres(self) -> Tensor:
+        limit = self.limit.item()
+        return (torch.arange(self.BINS) + 0.5) * (2 * limit / self.BINS) - limit
+
+    def _percentiles(self, low: float, high: float) -> tuple[float, float]:
+        share = self.histogram.cumsum(0) / self.histogram.sum()
+        tail = (1 - self.percentile / 100) / 2
+        centres = self._centres()
+        inside = centres[(share >= tail) & (share <= 1 - tail)]
+        if len(inside) == 0:
+            return low, high
+        return max(low, inside[0].item()), min(high, inside[-1].item())
+
+    def _least_squares(self, low: float, high: float) -> tuple[float, float]:
+        """The range whose rounding plus clipping has the least squared error over the histogram."""
+        shrink = torch.linspace(1.0, 0.1, 31)
+        lows, highs = torch.meshgrid(low * shrink, high * shrink, indexing="ij")
+        lows, highs = lows.flatten(), highs.flatten()
+        used = self.histogram > 0
+        weight, x = self.histogram[used] / self.histogram.sum(), self._centres()[used]
+        step = (highs.clamp(min=0) - lows.clamp(max=0)).clamp(min=1e-12) / 255
+        clipped = torch.relu(x - highs[:, None]) ** 2 + torch.relu(lows[:, None] - x) ** 2
+        best = int((step**2 / 12 + clipped @ weight).argmin())
+        return lows[best].item(), highs[best].item()
+
+    def calculate_qparams(self, **_: object) -> tuple[Tensor, Tensor]:
+        low, high = self.range()
+        return self._calculate_qparams(torch.tensor(low), torch.tensor(high))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What flowed through the policy: enough for every scheme with the same `smooth`, without the recordings."""
+
+    samples: int
+    smooth: float | None
+    checkpoint: str  # sha256
+    image_sizes: tuple[tuple[int, int], ...]  # (height, width), one per camera
+    channels: Maxima = field(repr=False)  # in_max, out_max, and the same after scaling
+    observers: dict[str, Tensor] = field(repr=False)  # state of the prepared graph's observers
+    ranges: dict[str, dict[str, float]] = field(repr=False)  # of each quantized layer's output: min, max
+    seconds: float = 0.0
+
+    def save(self, path: Path | str) -> None:
+        with atomic_path(path) as temporary:
+            torch.save(self.__dict__, temporary)
+
+    @classmethod
+    def load(cls, path: Path | str) -> "Calibration":
+        """Raises QuantizeError if the file is missing or not a calibration."""
+        try:
+            return cls(**torch.load(path, weights_only=True))
+        except FileNotFoundError:
+            raise QuantizeError(f"{path}: not found", remedy="run notebook 02_calibrate first") from None
+        except Exception as e:  # torch wraps what it meets in many types
+            reason = str(e).splitlines()[0][:120]
+            raise QuantizeError(f"{path}: not a calibration ({reason})", remedy="calibrate again") from None
+
+
+def _check_recordable(checkpoint: Checkpoint) -> None:
+    c = checkpoint.config
+    if len(c.cameras) != 1 or len(c.state_names) != 2 or len(c.action_names) != 2:
+        raise QuantizeError(
+            f"{checkpoint.path}: the recordings have one camera and [steering, throttle], this policy has "
+            f"{len(c.cameras)} cameras, {len(c.state_names)} states and {len(c.action_names)} actions"
+        )
+
+
+def calibrate(
+    checkpoint: Checkpoint,
+    samples: Sequence[Sample],
+    *,
+    smooth: float | None = 0.5,
+    progress: Progress = silent,
+) -> Calibration:
+    """Run the float policy over the samples, twice: for the channel scales, then for the observers behind them.
+
+    smooth: SmoothQuant's a, None for no channel scales. progress: like tqdm. Raises QuantizeError without samples, for
+    a policy that the recordings do not fit, and for activations that are not finite.
+    """
+    if not samples:
+        remedy = "give recordings with matching frames and controls"
+        raise QuantizeError("calibration needs samples", found="none", remedy=remedy)
+    _check_recordable(checkpoint)
+    torch.backends.quantized.engine = ENGINE
+    start = time.monotonic()
+    config = checkpoint.config
+
+    def inputs(what: str) -> Iterable[tuple[Tensor, Tensor]]:
+        return (inputs_of(s, config) for s in progress(samples, desc=what))
+
+    model = ACT(config, checkpoint.weights, for_int8=True)
+    channels = channel_maxima(model, inputs("channel maxima"))
+    if bad := [n for n, s in channels.items() if not all(torch.isfinite(t).all() for t in s.values())]:
+        raise QuantizeError(f"calibration met NaN or Inf at {bad[:3]}", remedy=BROKEN_INPUT)
+    if smooth is not None:
+        apply_channel_scales(model, channels, smooth)
+        few = samples[:: max(1, len(samples) // 16)]
+        for name, after in channel_maxima(model, (inputs_of(s, config) for s in few)).items():
+            channels[name] |= {f"{k}_scaled": v for k, v in after.items()}
+    prepared = _prepare(model, Scheme(smooth=smooth))
+    with torch.inference_mode():
+        for x in inputs("observers"):
+            prepared(*x)
+    observers = {k: v.clone() for k, v in prepared.state_dict().items() if "activation_post_process" in k}
+    ranges = {}
+    for node in prepared.graph.nodes:
+        if node.op != "call_module" or block_of(str(node.target)) in STAYS_FLOAT:
+            continue
+        if (observer := _observer_behind(prepared, node)) is not None:
+            ranges[str(node.target)] = {"min": observer.min_val.item(), "max": observer.max_val.item()}
+    return Calibration(
+        samples=len(samples),
+        smooth=smooth,
+        checkpoint=checkpoint.sha256,
+        image_sizes=config.image_sizes,
+        channels=channels,
+        observers=observers,
+        ranges=ranges,
+        seconds=time.monotonic() - start,
+    )
+
+
+def _observer_behind(prepared: nn.Module, node: Node) -> RangeObserver | None:
+    for user in node.users:
+        if user.op == "call_module" and isinstance(m := prepared.get_submodule(str(user.target)), RangeObserver):
+            return m
+    return None
+
+
+def _pattern(block: str, relu: bool) -> str:
+    """FX's regex of what is INT8 in a block: not the attention's own functions, whose products must stay float."""
+    name = re.escape(block)
+    if block.endswith("attention"):
+        return rf"{name}\.(q|k|v|o)$"
+    if block.endswith("feed_forward"):
+        return rf"{name}\.(up|act|down)$" if relu else rf"{name}\.(up|down)$"
+    return rf"{name}(\..*)?$"
+
+
+def qconfig_mapping(config: ActConfig, scheme: Scheme, only: Iterable[str] | None = None) -> QConfigMapping:
+    """The blocks to quantize (all but the scheme's float blocks, or `only` those); others map to None."""
+    known = blocks(config)
+    if unknown := [b for b in scheme.float_blocks if b not in known]:
+        raise QuantizeError(f"scheme: float blocks {unknown} are not in this policy", remedy=f"known are {known}")
+    wanted = set(known) - set(scheme.float_blocks) if only is None else set(only)
+    mapping = QConfigMapping().set_global(None)
+    # No table is left in the graph of ACT (see act.EMBEDDINGS); where one is, only its rows are worth quantizing.
+    mapping.set_object_type(nn.Embedding, float_qparams_weight_only_qconfig)
+    for block in known:
+        qconfig = _qconfig(scheme) if block in wanted else None
+        mapping.set_module_name_regex(_pattern(block, config.activation == "relu"), qconfig)
+    return mapping
+
+
+def _qconfig(scheme: Scheme) -> QConfig:
+    dtype, low, high = KINDS[scheme.kind]
+    activation = RangeObserver.with_args(
+        dtype=dtype, quant_min=low, quant_max=high, choice=scheme.observer, percentile=scheme.percentile
+    )
+    weight = PerChannelMinMaxObserver.with_args(
+        dtype=torch.qint8,
+        qscheme=torch.per_channel_symmetric,
+        quant_min=-127,
+        quant_max=127,
+        eps=SMALLEST_SCALE,
+    )
+    return QConfig(activation, weight)
+
+
+def _prepare(model: ACT, scheme: Scheme) -> GraphModule:
+    full = replace(scheme, float_blocks=())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # deprecation: known, and the reason why only two modules touch it
+        return prepare_fx(
+            model,
+            qconfig_mapping(model.config, full),
+            example_inputs(model.config),
+            PrepareCustomConfig().set_non_traceable_module_classes([Columns]),
+            backend_config=get_qnnpack_backend_config(),
+        )
+
+
+def observed_graph(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:
+    """The observed graph as calibration left it, its observers seeing no more."""
+    if calibration.checkpoint != checkpoint.sha256:
+        raise QuantizeError("the calibration was made with another checkpoint", remedy="calibrate again")
+    if calibration.image_sizes != checkpoint.config.image_sizes:
+        raise QuantizeError(
+            f"the calibration was made with images of {calibration.image_sizes}, the policy takes "
+            f"{checkpoint.config.image_sizes} (height, width)",
+            remedy="calibrate again",
+        )
+    if scheme.smooth != calibration.smooth:
+        raise QuantizeError(
+            f"the calibration was made with smooth {calibration.smooth}, the scheme has {scheme.smooth}"
+        )
+    torch.backends.quantized.engine = ENGINE
+    prepared = _prepare(scaled_model(checkpoint, calibration, for_int8=True), scheme)
+    state = prepared.state_dict()
+    names = {k for k in state if "activation_post_process" in k}
+    if names != set(calibration.observers):
+        raise QuantizeError(
+            "the calibration's observers do not fit this graph", remedy="calibrate again with this version"
+        )
+    prepared.load_state_dict(state | calibration.observers)
+    for m in prepared.modules():
+        if isinstance(m, RangeObserver):
+            m.observing = False
+    return prepared
+
+
+def scaled_model(checkpoint: Checkpoint, calibration: Calibration, *, for_int8: bool) -> ACT:
+    model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
+    if calibration.smooth is not None:
+        apply_channel_scales(model, calibration.channels, calibration.smooth)
+    return model

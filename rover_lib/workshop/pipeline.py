@@ -1,0 +1,152 @@
+"""From a checkpoint and recordings to artifacts, as params.yml says: calibrate -> quantize -> export.
+
+    recipe = Recipe.of(params())
+    loaded = session.load("best_model.pth", "episodes")
+    chosen, note = recipe.choose(loaded.parts.calibration)
+    calibration = calibrate(loaded.checkpoint, chosen, smooth=recipe.scheme.smooth)
+    policy = quantize(loaded.checkpoint, recipe.scheme, calibration)
+    export_policies("runs/mine", loaded.checkpoint, {"static": policy}, calibration, samples, recipe.parity)
+
+The steps themselves are in `observe`, `quantize`, `choose` and `export`. Here is what the notebooks, the command line
+and the laboratory share: which frames, which options, which files.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rover_lib.onboard.params import params
+from rover_lib.onboard.stage import sha256_of, write_stage
+from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block
+from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.compare import thinned
+from rover_lib.workshop.episodes import Sample, choose_calibration
+from rover_lib.workshop.export import Parity, export
+from rover_lib.workshop.observe import Calibration, calibrate
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.quantize import QuantizedPolicy, quantize
+from rover_lib.workshop.scheme import Scheme
+from rover_lib.workshop.session import Opened
+
+CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What params.yml says of making artifacts.
+
+    samples: at most this many frames calibrate. seed: of their choice. scheme: static INT8, before its observer is
+    chosen. parity: what an artifact must answer where it is loaded.
+    """
+
+    samples: int
+    seed: int
+    scheme: Scheme
+    parity: Parity
+
+    @classmethod
+    def of(cls, p: Mapping[str, Any], samples: int | None = None) -> "Recipe":
+        """p: params.yml's content. samples: instead of its own."""
+        quantization, parity = p["quantization"], p["parity"]
+        return cls(
+            samples=samples or p["calibration"]["samples"],
+            seed=p["calibration"]["seed"],
+            scheme=Scheme(
+                kind=quantization["scheme"], smooth=quantization["smooth"], percentile=quantization["percentile"]
+            ),
+            parity=Parity(parity["fp32"], parity["int8_errors"], parity["vectors"]),
+        )
+
+    def choose(self, samples: tuple[Sample, ...]) -> tuple[tuple[Sample, ...], str | None]:
+        """Those of the samples that calibrate, and a note if they are fewer than asked for."""
+        return choose_calibration(samples, self.samples, self.seed)
+
+
+def make_artifact(
+    loaded: Opened, path: Path | str, recipe: Recipe, *, fp32: bool = False, progress: Progress = silent
+) -> tuple[str, list[str]]:
+    """One artifact at `path`: calibrated on the recordings, quantized by the recipe's scheme, exported.
+
+    fp32: exported as it is. Returns its content hash, and warnings. Raises QuantizeError, in `calibrate`, `quantize`
+    and `export`.
+    """
+    checkpoint, parts = loaded.checkpoint, loaded.parts
+    samples = thinned(parts.choosing or parts.calibration, CHOOSING_FRAMES)
+    if fp32:
+        return export(ACT(checkpoint.config, checkpoint.weights), checkpoint, path, samples, parity=recipe.parity), []
+    chosen, note = recipe.choose(parts.calibration)
+    calibration = calibrate(checkpoint, chosen, smooth=recipe.scheme.smooth, progress=progress)
+    policy = quantize(checkpoint, recipe.scheme, calibration)
+    digest = export(policy, checkpoint, path, samples, calibration, recipe.parity)
+    return digest, ([note] if note else []) + policy.report["warnings"]
+
+
+def export_policies(
+    folder: Path | str,
+    checkpoint: Checkpoint,
+    policies: Mapping[str, ACT | QuantizedPolicy],
+    calibration: Calibration,
+    samples: Sequence[Sample],
+    parity: Parity,
+) -> dict[str, dict[str, Any]]:
+    """Write policy_<name>.pt of each policy into `folder`. Returns what quantize.json says of each."""
+    described = {}
+    for name, policy in policies.items():
+        path = Path(folder) / f"policy_{name}.pt"
+        if isinstance(policy, QuantizedPolicy):
+            digest = export(policy, checkpoint, path, samples, calibration, parity)
+            described[name] = policy.report | {"scheme": asdict(policy.scheme), "content_hash": digest}
+        else:
+            described[name] = {"content_hash": export(policy, checkpoint, path, samples, parity=parity)}
+    return described
+
+
+# --- what the stages of a run leave -----------------------------------------------------------------------------------
+
+
+def write_load(run_dir: Path | str, loaded: Opened, note: str = "") -> None:
+    """load.json: where a run starts from. note: what is special about its policy."""
+    checkpoint, recordings = loaded.checkpoint, loaded.recordings
+    model = ACT(checkpoint.config, checkpoint.weights)
+    work = {"macs_by_block": multiply_accumulates(model), "parameters_by_block": parameters_by_block(model)}
+    metrics: dict[str, Any] = {
+        "checkpoint": checkpoint.report | {"sha256": checkpoint.sha256} | work,
+        "recordings": recordings.summary(),
+        "split": loaded.parts.episodes,
+    }
+    if note:
+        metrics["note"] = note
+    given = {"checkpoint": checkpoint.path.resolve(), "episodes": recordings.root.resolve()}
+    inputs = {checkpoint.path.name: checkpoint.sha256} | recordings.hashes()
+    write_stage(Path(run_dir) / "load.json", "load", params=given, metrics=metrics, inputs=inputs)
+
+
+def write_calibrate(
+    run_dir: Path | str,
+    checkpoint: Checkpoint,
+    calibration: Calibration,
+    samples: Sequence[Sample],
+    recipe: Recipe,
+    note: str | None = None,
+) -> None:
+    """calibration.pt, and calibrate.json: which frames calibrated, and what they showed. note: from `Recipe.choose`."""
+    calibration.save(Path(run_dir) / "calibration.pt")
+    metrics = {
+        "samples": calibration.samples,
+        "note": note,
+        "seconds_s": calibration.seconds,
+        "ranges": calibration.ranges,
+        "episodes": sorted({s.episode for s in samples}),
+    }
+    inputs = {f"{s.episode}/{s.frame_path.name}": sha256_of(s.frame_path) for s in samples}
+    inputs["checkpoint"] = checkpoint.sha256
+    given = {"samples": recipe.samples, "seed": recipe.seed, "smooth": recipe.scheme.smooth}
+    write_stage(Path(run_dir) / "calibrate.json", "calibrate", params=given, metrics=metrics, inputs=inputs)
+
+
+def write_quantize(run_dir: Path | str, checkpoint: Checkpoint, metrics: dict[str, Any]) -> None:
+    """quantize.json. metrics: `modes` from `export_policies`, and what choosing found."""
+    inputs = {"calibration.pt": sha256_of(Path(run_dir) / "calibration.pt"), "checkpoint": checkpoint.sha256}
+    given = params()["quantization"]
+    write_stage(Path(run_dir) / "quantize.json", "quantize", params=given, metrics=metrics, inputs=inputs)
