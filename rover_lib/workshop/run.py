@@ -7,6 +7,7 @@ policy_<mode>.pt, figures/*.png and the executed notebooks. The notebooks know e
 """
 
 import io
+import json
 import logging
 import os
 import re
@@ -15,7 +16,7 @@ import socket
 import sys
 import tempfile
 from base64 import b64decode, b64encode
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from PIL import Image
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.progress import TTY_VARIABLE
+from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
@@ -40,8 +41,6 @@ KERNEL_ENVIRONMENT = {
 }
 IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
 NOTEBOOK_LIMIT = 1_000_000  # bytes, of a committed notebook
-
-Progress = Callable[..., Iterable]
 
 
 class NotebookError(RoverError):
@@ -74,43 +73,110 @@ def run(
     name: str = "mine",
     *,
     runs_dir: Path | str = "runs",
-    progress: Progress | None = None,
+    progress: Progress = silent,
     notebooks: Path | str = NOTEBOOKS,
     **overrides: Any,
 ) -> Path:
     """Execute the five notebooks in order; return the run's folder.
 
     overrides: any of the notebooks' parameters, say worlds=40, samples=200, iterations=100. progress: called like
-    tqdm.tqdm(iterable, desc=, total=), or None.
-    What an earlier run of that name left is removed first, except for benchmarks of other hosts. Raises NotebookError,
-    in one sentence with the notebook, the cell and its error; what the stages before it made stays, nothing
-    half-written does.
+    tqdm.tqdm(iterable, desc=, total=).
+
+    The new run is made beside the old one of that name, in .<name>.new, and takes its place when it is whole: stage by
+    stage a run that fails at its third notebook would have cost the policies of the last good one, and left reports of
+    two runs side by side. So for a while both are on the disk, about 120 MB each for a full-size policy. Only a run's
+    own files are replaced (`_own`); recordings, a checkpoint and benchmarks of other hosts in its folder stay.
+
+    Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C, the old run
+    is as it was and nothing is left of the new one.
     """
     if not re.fullmatch(r"\w[\w.-]*", name):
-        raise NotebookError(f"a run's name must be a plain folder name, found {name!r}; use letters, digits and _")
+        raise NotebookError(
+            "a run's name must be a plain folder name", found=repr(name), remedy="use letters, digits and _"
+        )
     sources = [Path(notebooks) / f"{n}.ipynb" for n in NAMES]
     if missing := [s.name for s in sources if not s.is_file()]:
-        raise NotebookError(f"{notebooks}: no {missing[0]} in it; run from a checkout of the project")
+        raise NotebookError(f"{notebooks}: no {missing[0]} in it", remedy="run from a checkout of the project")
     known = set().union(*(parameters_of(s) for s in sources))
     if unknown := sorted(set(overrides) - known):
-        raise NotebookError(f"no notebook has a parameter {unknown}; known are {sorted(known)}")
+        raise NotebookError(f"no notebook has a parameter {unknown}", remedy=f"known are {sorted(known)}")
     folder = Path(runs_dir).resolve() / name
-    fresh = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
-    _clear(folder)
+    new, old = folder.with_name(f".{name}.new"), folder.with_name(f".{name}.old")
+    if old.exists():  # the last one was killed while it took its place
+        _put_back(old, folder)
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir(parents=True)
     given = {
-        "run_dir": str(folder),
+        "run_dir": str(new),
         "checkpoint": str(Path(checkpoint).resolve()),
         "episodes": str(Path(episodes).resolve()),
         **overrides,
     }
     try:
-        for source in progress(sources, desc="notebooks", total=len(sources)) if progress else sources:
-            _execute(source, folder, {k: v for k, v in given.items() if k in parameters_of(source)}, bool(progress))
+        others = _benchmarks_of_other_hosts(folder)
+        for path in others:  # notebook 05 shows them
+            shutil.copy2(path, new)
+        for source in progress(sources, desc="notebooks", total=len(sources)):
+            known_to_it = {k: v for k, v in given.items() if k in parameters_of(source)}
+            _execute(source, new, known_to_it, progress is not silent)
+        for path in others:
+            (new / path.name).unlink()
+        _say_final_paths(new, folder)
+        _take_place(new, folder, old)
     finally:
-        if fresh and not any(folder.iterdir()):
-            folder.rmdir()  # nothing came of it
+        shutil.rmtree(new, ignore_errors=True)
     return folder
+
+
+def _own(folder: Path) -> list[Path]:
+    """What a run leaves in its folder, and what was made of its artifacts later: none of it is of another run's."""
+    stages = ("load", "calibrate", "quantize", "compare", "arm", "parts", "drive", f"benchmark-{socket.gethostname()}")
+    names = [*(f"{s}.json" for s in stages), *(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures"]
+    own = [folder / n for n in names] + [*folder.glob("calibration*.pt"), *folder.glob("policy_*.pt")]
+    return [path for path in own if path.exists()]
+
+
+def _benchmarks_of_other_hosts(folder: Path) -> list[Path]:
+    return [p for p in folder.glob("benchmark-*.json") if p.stem != f"benchmark-{socket.gethostname()}"]
+
+
+def _say_final_paths(new: Path, folder: Path) -> None:
+    """Files that name the folder in which they were made name the one in which they will be."""
+    for path in [*new.glob("*.json"), *new.glob("*.ipynb")]:
+        text = path.read_text()
+        final = text.replace(str(new), str(folder)).replace(json.dumps(str(new))[1:-1], json.dumps(str(folder))[1:-1])
+        if final != text:
+            path.write_text(final)
+
+
+def _take_place(new: Path, folder: Path, old: Path) -> None:
+    """Move a whole run to its folder, and what was its predecessor's out of it. If that is interrupted, move back."""
+    folder.mkdir(exist_ok=True)
+    old.mkdir()
+    made = [p.name for p in new.iterdir()]
+    replaced = {p.name for p in _own(folder)} | {name for name in made if (folder / name).exists()}
+    try:
+        for name in replaced:
+            (folder / name).rename(old / name)
+        for name in made:
+            (new / name).rename(folder / name)
+    except BaseException:
+        for name in made:
+            if not (new / name).exists():
+                (folder / name).rename(new / name)
+        _put_back(old, folder)
+        raise
+    shutil.rmtree(old)
+
+
+def _put_back(old: Path, folder: Path) -> None:
+    """Move a run that was being replaced back into its folder, over what of the new one is there."""
+    for path in old.iterdir():
+        place = folder / path.name
+        if place.is_dir():
+            shutil.rmtree(place)
+        path.rename(place)
+    old.rmdir()
 
 
 def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:
@@ -120,18 +186,10 @@ def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS
     """
     folder, source = Path(run_dir).resolve(), Path(notebooks) / f"{name}.ipynb"
     if not source.is_file() or not folder.is_dir():
-        raise NotebookError(f"{folder if source.is_file() else source}: not found; run from a checkout, on a run of it")
+        missing = folder if source.is_file() else source
+        raise NotebookError(f"{missing}: not found", remedy="run from a checkout, on a run of it")
     _execute(source, folder, {"run_dir": str(folder), **overrides}, False)
     return folder / source.name
-
-
-def _clear(folder: Path) -> None:
-    """Remove what an earlier run left, so that no file of it can be taken for this one's."""
-    stages = ("load", "calibrate", "quantize", "compare", "arm", "parts", "drive", f"benchmark-{socket.gethostname()}")
-    old = [folder / f"{s}.json" for s in stages] + [folder / "calibration.pt", *folder.glob("policy_*.pt")]
-    for path in [*old, *(folder / f"{n}.ipynb" for n in NAMES + AFTERWARDS)]:
-        path.unlink(missing_ok=True)
-    shutil.rmtree(folder / "figures", ignore_errors=True)
 
 
 def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> None:
@@ -155,7 +213,7 @@ def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> N
         except papermill.PapermillExecutionError as e:
             raise NotebookError(f"{source.name}, cell {e.cell_index + 1}: {_sentence(e)}") from e
         except DeadKernelError as e:
-            raise NotebookError(f"{source.name}: its kernel died; is there enough memory?") from e
+            raise NotebookError(f"{source.name}: its kernel died", remedy="is there enough memory?") from e
 
 
 @contextmanager

@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 import zipfile
+from pathlib import Path
 from types import SimpleNamespace
 
 import nbformat
@@ -255,21 +256,94 @@ def test_what_a_run_was_not_asked_to_know_is_refused(one_notebook, tmp_path):
         runs.run("ck", "episodes", "../up", runs_dir=tmp_path, notebooks=one_notebook)
 
 
-def test_an_old_run_is_cleared_but_for_other_hosts(tmp_path):
-    for name in (
-        "load.json",
-        "arm.json",
-        "parts.json",
-        "drive.json",
-        "06_arm.ipynb",
-        "07_drive.ipynb",
-        "policy_static.pt",
-    ):
-        (tmp_path / name).touch()
-    for name in ("benchmark-pi.json", "best_model.pth"):
-        (tmp_path / name).touch()
-    runs._clear(tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} == {"benchmark-pi.json", "best_model.pth"}
+OF_ARTIFACTS = ("load.json", "arm.json", "drive.json", "06_arm.ipynb", "07_drive.ipynb", "policy_static.pt")
+OF_OTHERS = ("benchmark-pi.json", "best_model.pth", "episodes/frame.jpg")
+
+
+@pytest.fixture
+def old_run(one_notebook, tmp_path):
+    """A run of the name `mine`, with a checkpoint and recordings in its folder, as the demo's."""
+    written(one_notebook, "01_load", ("parameters", 'run_dir = "."  # here'))
+    folder = tmp_path / "runs" / "mine"
+    for name in (*OF_ARTIFACTS, *OF_OTHERS, "figures/01_old.png"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("old")
+    return folder
+
+
+def contents(folder):
+    return {str(p.relative_to(folder)): p.read_text() for p in folder.rglob("*") if p.is_file()}
+
+
+def run_with(monkeypatch, notebooks, folder, execute):
+    monkeypatch.setattr(runs, "_execute", execute)
+    return runs.run("ck", "episodes", folder.name, runs_dir=folder.parent, notebooks=notebooks)
+
+
+def whole(source, folder, given, bars):
+    assert (folder / "benchmark-pi.json").read_text() == "old"  # for notebook 05
+    write_stage(folder / "load.json", "load", params=given, metrics={})
+    (folder / "01_load.ipynb").write_text(f"ran in {folder}")
+    (folder / "policy_static.pt").write_text("new")
+    (folder / "figures").mkdir()
+    (folder / "figures" / "01_new.png").write_text("new")
+
+
+@pytest.mark.parametrize("error", [runs.NotebookError("no such checkpoint"), KeyboardInterrupt()], ids=repr)
+def test_a_run_that_does_not_end_costs_nothing_of_the_last_one(one_notebook, old_run, monkeypatch, error):
+    def ends_early(source, folder, given, bars):
+        whole(source, folder, given, bars)
+        raise error
+
+    before = contents(old_run.parent)
+    with pytest.raises(type(error)):
+        run_with(monkeypatch, one_notebook, old_run, ends_early)
+    assert contents(old_run.parent) == before
+
+
+def test_a_whole_run_takes_the_place_of_the_last_one(one_notebook, old_run, monkeypatch):
+    assert run_with(monkeypatch, one_notebook, old_run, whole) == old_run
+    after = contents(old_run)
+    made = {"load.json", "01_load.ipynb", "policy_static.pt", "figures/01_new.png"}
+    assert set(after) == made | set(OF_OTHERS)  # what belongs to the old artifacts is gone
+    assert after["policy_static.pt"] == "new" and all(after[name] == "old" for name in OF_OTHERS)
+    assert after["01_load.ipynb"] == f"ran in {old_run}" and f'"run_dir": "{old_run}"' in after["load.json"]
+    assert [p.name for p in old_run.parent.iterdir()] == ["mine"]
+
+
+@pytest.mark.parametrize("count", range(0, 12, 2))
+def test_an_interrupt_while_it_takes_its_place_leaves_the_last_one(one_notebook, old_run, monkeypatch, count):
+    before, moved = contents(old_run.parent), []
+    rename = Path.rename
+
+    def interrupted(path, target):
+        moved.append(path)
+        if len(moved) == count + 1:
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_with(monkeypatch, one_notebook, old_run, whole)
+    monkeypatch.undo()
+    assert contents(old_run.parent) == before
+
+
+def test_a_run_that_was_killed_while_it_took_its_place_is_undone_by_the_next(one_notebook, old_run, monkeypatch):
+    before = contents(old_run)
+    beside = old_run.with_name(".mine.old")
+    beside.mkdir()
+    (old_run / "policy_static.pt").rename(beside / "policy_static.pt")
+    (old_run / "figures").rename(beside / "figures")
+    (old_run / "figures").mkdir()
+    (old_run / "policy_static.pt").write_text("new")
+
+    def fails(source, folder, given, bars):
+        raise runs.NotebookError("no such checkpoint")
+
+    with pytest.raises(runs.NotebookError):
+        run_with(monkeypatch, one_notebook, old_run, fails)
+    assert contents(old_run) == before and not beside.exists()
 
 
 def stream(text, name="stdout"):
