@@ -45,7 +45,9 @@ def with_few(parameters: str) -> str:
     """A parameters cell whose literals are those of FEW."""
     tree = ast.parse(parameters)
     for statement in tree.body:
-        assert isinstance(statement, ast.Assign) and isinstance(name := statement.targets[0], ast.Name)
+        assert isinstance(statement, ast.Assign)
+        (name,) = statement.targets
+        assert isinstance(name, ast.Name)
         if name.id in FEW:
             statement.value = ast.Constant(FEW[name.id])
     return ast.unparse(tree)
