@@ -25,6 +25,9 @@ def make_artifact(
     import torch
 
     class Obedient(torch.nn.Module):
+        plan: torch.Tensor
+        other: torch.Tensor
+
         def __init__(self):
             super().__init__()
             self.register_buffer("plan", torch.tensor([PLAN] * CHUNK)[None])
@@ -72,7 +75,7 @@ def make_artifact(
         "versions": {"torch": torch.__version__, "rover_lib": ""},
     }
     frames = np.zeros((1, height, width, 3), np.uint8)
-    parity = {
+    parity: dict[str, np.ndarray] = {
         "state": np.zeros((1, 2), np.float32),
         f"frame_{camera}": frames,
         "chunk": np.full((1, CHUNK, 2), PLAN, np.float32),

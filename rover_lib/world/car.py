@@ -300,13 +300,11 @@ class VirtualCar:
             while (answer := self._answer(ANSWER_S))["asked"] != self._asked:
                 pass  # an answer that came too late
         report = answer["report"]
-        drives = [
-            Drive(
-                **{k: v for k, v in drive.items() if k not in ("track", "balloon_xy_m")},
-                trajectory=Trajectory(*np.array(drive["track"]).T, balloon_xy_m=tuple(drive["balloon_xy_m"])),
-            )
-            for drive in report.pop("drives")
-        ]
+        drives = []
+        for drive in report.pop("drives"):
+            track, balloon_xy_m = np.array(drive.pop("track")), tuple(drive.pop("balloon_xy_m"))
+            x_m, y_m, steering, throttle = track.T
+            drives.append(Drive(**drive, trajectory=Trajectory(x_m, y_m, steering, throttle, balloon_xy_m)))
         outcomes = [(seed, outcome) for seed, outcome in report.pop("outcomes")]
         wilson = wilson_interval(report["hits"], report["trials"]) if report["trials"] else None
         return CarReport(wilson=wilson, outcomes=outcomes, drives=drives, **report)
@@ -417,7 +415,7 @@ class _Car:
         balloon = world.balloon.x_m, world.balloon.y_m
         self.trials += 1
         self.hits += world.hit
-        self.outcomes.append((world.seed, world.outcome))
+        self.outcomes.append((world.seed, str(world.outcome)))
         points = [*track[: -1 : self._steps_per_frame], track[-1]]
         self.drives.append(
             {

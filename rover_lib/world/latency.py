@@ -10,7 +10,7 @@ import copy
 import os
 import queue
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -29,6 +29,7 @@ from rover_lib.onboard.plan import Commanded, Plan, Settings
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.stage import plain, read_stage, write_stage
 from rover_lib.workshop.compare import GATED, gate
+from rover_lib.workshop.progress import Progress, silent
 from rover_lib.world.trial import Trajectory, wilson_interval
 from rover_lib.world.world import RATE_HZ, CarState, World
 
@@ -37,8 +38,6 @@ ROUNDING = 1e-6  # of times, in ticks
 ENSEMBLE = 0.01  # LeRobot's coefficient
 JUDGED_MS = 150.0
 SEED = 10_000
-
-Progress = Callable[..., Iterable]
 
 
 class Plans(Protocol):
@@ -62,7 +61,7 @@ class Condition:
 
     def __post_init__(self):
         if not 0 <= self.latency_s <= LATENCY_MOST_S:
-            raise WorldError(f"a latency must be 0 to {LATENCY_MOST_S:g} s, found {self.latency_s}")
+            raise WorldError(f"a latency must be 0 to {LATENCY_MOST_S:g} s", found=self.latency_s)
 
 
 @dataclass(frozen=True)
@@ -185,7 +184,8 @@ class _Pilot(PolicyPilot):
     """Whose orders move the car, and are kept."""
 
     def __init__(self, car: _Car, commanded: Commanded, settings: Settings, rate_hz: float):
-        super().__init__(car, car, commanded, settings, rate_hz)
+        camera_and_planner: Any = car
+        super().__init__(camera_and_planner, camera_and_planner, commanded, settings, rate_hz)
         self.orders: list[Order] = []
         self._car = car
 
@@ -212,17 +212,15 @@ def drive_late(policy: Plans, seed: int, condition: Condition) -> LateDrive:
     pilot = _Pilot(car, commanded, condition.settings, policy.rate_hz)
     try:
         drive(pilot, None, _NoLog(), rate_hz=RATE_HZ, until=Until(stop=car.stop), clock=car.clock, sleep=car.sleep)
-        outcome = car.world.outcome
+        outcome = str(car.world.outcome)
     except DriveFault as fault:
         if fault.__cause__:  # the policy failed: it is not that a plan is too old
             raise fault.__cause__ from None
         outcome = "stopped"
-    world, track = car.world, car.world.trajectory
-    balloon = world.balloon.x_m, world.balloon.y_m
-    names = "x_m", "y_m", "steering_command", "throttle_command"
-    trajectory = Trajectory(*(np.array([getattr(s, name) for s in track]) for name in names), balloon)
-    nearest_m = float(np.hypot(trajectory.x_m - balloon[0], trajectory.y_m - balloon[1]).min())
-    return LateDrive(seed, outcome, world.state.time_s, nearest_m, trajectory, pilot.orders, car.plans)
+    path = Trajectory.of(car.world)
+    balloon_x_m, balloon_y_m = path.balloon_xy_m
+    nearest_m = float(np.hypot(path.x_m - balloon_x_m, path.y_m - balloon_y_m).min())
+    return LateDrive(seed, outcome, car.world.state.time_s, nearest_m, path, pilot.orders, car.plans)
 
 
 def run_latencies(
@@ -230,16 +228,15 @@ def run_latencies(
     conditions: Sequence[Condition],
     worlds: int = 40,
     seed: int = SEED,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> list[LatencyReport]:
     """Drive through `worlds` worlds, of seeds from `seed` on, under each condition; reports in their order.
 
     policies: the same one, once for each thread that drives: results do not depend on how many there are.
-    progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
     Raises WorldError for parameters that make no trial, RoverError for what a policy raises.
     """
     if worlds < 1 or seed < 0 or not policies:
-        raise WorldError(f"drives need a policy, at least 1 world and a seed from 0, found {worlds} and {seed}")
+        raise WorldError("drives need a policy, at least 1 world and a seed from 0", found=f"{worlds} and {seed}")
     free: queue.SimpleQueue[Plans] = queue.SimpleQueue()
     for policy in policies:
         free.put(policy)
@@ -256,16 +253,16 @@ def run_latencies(
         every = [future for futures in running for future in futures]
         try:
             done = as_completed(every)
-            for future in progress(done, desc="driving", total=len(every)) if progress else done:
+            for future in progress(done, desc="driving", total=len(every)):
                 future.result()
         finally:
             pool.shutdown(cancel_futures=True)
         drives = [[future.result() for future in futures] for futures in running]
-    hits = [sum(d.outcome == "hit" for d in found) for found in drives]
-    return [
-        LatencyReport(c, n, worlds, wilson_interval(n, worlds), found)
-        for c, n, found in zip(conditions, hits, drives, strict=True)
-    ]
+    reports = []
+    for condition, per_world in zip(conditions, drives, strict=True):
+        hits = sum(d.outcome == "hit" for d in per_world)
+        reports.append(LatencyReport(condition, hits, worlds, wilson_interval(hits, worlds), per_world))
+    return reports
 
 
 def beside_path(drive: LateDrive, other: LateDrive) -> float:
@@ -310,12 +307,12 @@ def measured(
     pushes: int = 0,
     pushed_latencies_ms: Sequence[float] = (),
     shown_ms: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """How a run's static policy drives when its plans are late: the content of drive.json, stage 'drive'.
 
     Each latency with and without compensation, as params.yml's section `drive` has everything else; those of
-    pushed_latencies_ms once more with so many pushes in each world; and LeRobot's temporal ensembling at the first
+    pushed_latencies_ms once more with that many pushes in each world; and LeRobot's temporal ensembling at the first
     latency. shown_ms: of this latency the world whose drives part most is kept, with its plans.
     A drive.json that was made of the same policy and parameters is read, not made again.
     Sets torch to one thread: there is one for each world. Raises WorldError if there is no policy, or nothing to do.
@@ -323,9 +320,9 @@ def measured(
     run_dir, p = Path(run_dir), params()
     artifact, path = run_dir / f"policy_{GATED}.pt", run_dir / "drive.json"
     if not artifact.is_file():
-        raise WorldError(f"{artifact}: not there; run notebooks 01 to 03, or `make demo`, first")
+        raise WorldError(f"{artifact}: not there", remedy="run notebooks 01 to 03, or `make demo`, first")
     if not latencies_ms:
-        raise WorldError("there is no latency to drive with: give at least one, say latencies_ms=[0]")
+        raise WorldError("there is no latency to drive with", remedy="give at least one, say latencies_ms=[0]")
     limit = p["gates"]["hits_lost_at_150_ms"]
     given = {
         "worlds": worlds,
@@ -343,12 +340,11 @@ def measured(
         if (there["params"], there["inputs"]) == (plain(given), inputs):
             return there
     settings = Settings.of(p["drive"])
-    conditions = [
-        Condition(ms / 1e3, replace(settings, compensate=compensate), many)
-        for many, some_ms in ((0, latencies_ms), (pushes, pushed_latencies_ms))
-        for ms in some_ms
-        for compensate in ((True, False) if ms else (True,))  # of a plan that takes no time there is nothing to make up
-    ]
+    conditions = []
+    for ms, count in [(ms, 0) for ms in latencies_ms] + [(ms, pushes) for ms in pushed_latencies_ms]:
+        conditions.append(Condition(ms / 1e3, replace(settings, compensate=True), count))
+        if ms:  # for a plan that takes no time there is nothing to make up
+            conditions.append(Condition(ms / 1e3, replace(settings, compensate=False), count))
     conditions.append(Condition(latencies_ms[0] / 1e3, replace(settings, ensemble=ENSEMBLE)))
     policies = [load_policy(artifact, threads=1) for _ in range(os.cpu_count() or 1)]
     reports = run_latencies(policies, conditions, worlds, progress=progress)
@@ -384,8 +380,10 @@ def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]
     """What params.yml promises of late plans: hits lost at 150 ms against 0 ms, compensated. rows: of drive.json."""
 
     def hits(latency_ms: float) -> int | None:
-        found = (r for r in rows if r["latency_ms"] == latency_ms and not r["pushes"] and r["ensemble"] is None)
-        return next((r["hits"] for r in found if r["compensate"]), None)
+        for row in rows:
+            if row["latency_ms"] == latency_ms and row["compensate"] and not row["pushes"] and row["ensemble"] is None:
+                return row["hits"]
+        return None
 
     before, late = hits(0.0), hits(JUDGED_MS)
     lost = None if before is None or late is None else before - late

@@ -1,11 +1,10 @@
 """Episodes of an expert in balloon worlds, in the user's format, and the cache of what was made."""
 
-import inspect
 import json
 import os
 import shutil
+import sys
 import tempfile
-from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,6 +18,7 @@ from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.recording import EpisodeWriter
 from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.progress import Progress, silent
 from rover_lib.world import world as world_module
 from rover_lib.world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World, expert
 
@@ -37,18 +37,17 @@ def record_episodes(
     out_dir: Path | str,
     count: int = 80,
     seed: int = 0,
-    progress: Callable[..., Iterable] | None = None,
+    progress: Progress = silent,
 ) -> Path:
     """Let the expert drive `count` worlds, with shoves that it corrects; one episode folder per drive.
 
     out_dir: appears complete; if it holds the same recording already it is left as it is.
-    progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
     Returns out_dir. The same count and seed give the same bytes on one machine.
     Raises WorldError for a count below 1, a negative seed, or an out_dir with something else in it.
     """
     out_dir = Path(out_dir)
     if count < 1 or seed < 0:
-        raise WorldError(f"a recording needs at least 1 episode and a seed from 0, found {count} and {seed}")
+        raise WorldError("a recording needs at least 1 episode and a seed from 0", found=f"{count} and {seed}")
     params = {
         "count": count,
         "seed": seed,
@@ -56,11 +55,13 @@ def record_episodes(
         "jpeg_quality": JPEG_QUALITY,
         "cv2": cv2.__version__,
     }
-    key = key_of(params, world_module, recording, pwm_module, inspect.getmodule(record_episodes))
+    key = key_of(params, world_module, recording, pwm_module, sys.modules[__name__])
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
         if _marker_of(out_dir) == key:
             return out_dir
-        raise WorldError(f"{out_dir}: exists and is not this recording: name another folder, or move it away first")
+        raise WorldError(
+            f"{out_dir}: exists and is not this recording", remedy="name another folder, or move it away first"
+        )
     made = cached_folder("episodes", key, lambda folder: _record_all(folder, count, seed, key, progress))
     out_dir.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=out_dir.parent, prefix=f".{out_dir.name}."))
@@ -85,13 +86,11 @@ def _marker_of(folder: Path) -> str | None:
         return None
 
 
-def _record_all(folder: Path, count: int, seed: int, key: str, progress: Callable[..., Iterable] | None) -> None:
+def _record_all(folder: Path, count: int, seed: int, key: str, progress: Progress) -> None:
     # OpenCV lets go of the interpreter's lock while it draws and compresses, so threads help.
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
         drives = pool.map(lambda index: record_drive(folder, index, seed), range(count))
-        if progress is not None:
-            drives = progress(drives, desc="recording", total=count)
-        hits = sum(drives)
+        hits = sum(progress(drives, desc="recording", total=count))
     (folder / MARKER).write_text(json.dumps({"key": key, "count": count, "seed": seed, "hits": hits}) + "\n")
 
 
@@ -119,6 +118,7 @@ def record_drive(folder: Path, index: int, seed: int) -> bool:
             episode.control(start_s + t_s + CONTROL_LATENCY_S, round(1000 * t_s), measured[0], measured[1], *periods)
             # The car obeys what was sent, and what was measured of it is what is recorded.
             sent = pwm.actions_from_pulses(*measured, *periods)
+            assert sent.steering is not None and sent.throttle is not None, "the expert's pulses are measurable"
             world.step(sent.steering, sent.throttle)
     return world.hit
 

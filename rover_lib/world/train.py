@@ -7,10 +7,10 @@ features, computed once; then all together at a tenth of the rate.
 
 from __future__ import annotations
 
-import inspect
 import math
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+import sys
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -29,6 +29,7 @@ from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop import episodes as episodes_module
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.episodes import Sample, load_recordings, split
+from rover_lib.workshop.progress import Progress, silent
 from rover_lib.world import record
 
 if TYPE_CHECKING:
@@ -47,8 +48,6 @@ SWAPPED_STATES = 0.5  # the share of samples that get another's state, so that i
 SMALL_DIM = 256
 STANDING_THROTTLE = 0.01  # below it the car stands, which no frame shows: these states are never swapped
 
-Progress = Callable[..., Iterable] | None
-
 
 @dataclass(frozen=True)
 class Size:
@@ -66,7 +65,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How long and how fast each phase trains. samples: at most so many of the recordings' are used."""
+    """How long and how fast each phase trains. samples: how many of the recordings' are used at most."""
 
     backbone_steps: int
     transformer_steps: int
@@ -78,7 +77,7 @@ class Recipe:
     transformer_rate: float = 5e-4
 
     def of_steps(self, steps: int) -> Recipe:
-        """The same recipe with so many steps in all, at least one in each phase."""
+        """The same recipe with that many steps in all, at least one in each phase."""
         planned = self.backbone_steps, self.transformer_steps, self.together_steps
         backbone, transformer, together = (max(1, round(steps * p / sum(planned))) for p in planned)
         # few steps cannot use many frames
@@ -179,14 +178,13 @@ def train(
     seed: int = 0,
     steps: int | None = None,
     device: str | None = None,
-    progress: Progress = None,
+    progress: Progress = silent,
 ) -> Path:
     """Train a policy on recordings and write its checkpoint in the format of the user's trainer.
 
     size: 'small' (72x128, minutes on two cores) or 'full' (the user's policy, 360x640).
     steps: optimiser steps of all three phases together; the recipe's when left out.
     device: 'cpu', 'cuda' or None for the best there is.
-    progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
     The calibration part of params.yml's split is trained on, the choosing part gives best_val_loss, and the
     held-out part is left alone, so that it may judge later.
     Returns out_path, which appears complete or not at all. The same input gives the same weights on one
@@ -196,11 +194,11 @@ def train(
     out_path, episodes_dir = Path(out_path), Path(episodes_dir)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     if size not in SIZES:
-        raise WorldError(f"a policy's size must be one of {', '.join(SIZES)}, found {size!r}")
+        raise WorldError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))
     if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
-        raise WorldError(f"device must be cpu, or cuda where torch finds one, found {device!r}: leave it out")
+        raise WorldError("device must be cpu, or cuda where torch finds one", found=repr(device), remedy="leave it out")
     if (steps is not None and steps < 1) or seed < 0:
-        raise WorldError(f"training needs at least 1 step and a seed from 0, found {steps} and {seed}")
+        raise WorldError("training needs at least 1 step and a seed from 0", found=f"{steps} and {seed}")
     recipe = RECIPES[size, device]
     if steps is not None:
         recipe = recipe.of_steps(steps)
@@ -214,7 +212,7 @@ def train(
         "split": params()["calibration"],
         "names": [episodes_dir.name, out_path.parent.name],
     }
-    key = key_of(made_of, inspect.getmodule(train), preprocess, episodes_module)
+    key = key_of(made_of, sys.modules[__name__], preprocess, episodes_module)
 
     def make(folder: Path) -> None:
         checkpoint = _train(episodes_dir, out_path, SIZES[size], recipe, seed, torch.device(device), progress)
@@ -232,7 +230,7 @@ def make_checkpoint(
     episodes_dir: Path | str | None = None,
     seed: int = 0,
     steps: int = 12,
-    progress: Progress = None,
+    progress: Progress = silent,
 ) -> Path:
     """A checkpoint of a few steps: real in format, size and ranges, but it cannot drive.
 
@@ -252,6 +250,28 @@ def make_checkpoint(
 def _files(episodes_dir: Path) -> list[Path]:
     """All files of the recordings, hidden ones left out."""
     return sorted(p for p in episodes_dir.rglob("*") if p.is_file() and not p.name.startswith("."))
+
+
+@dataclass(frozen=True)
+class _Training:
+    """What every phase works with."""
+
+    policy: ACTPolicy
+    data: Frames
+    recipe: Recipe
+    loss_weights: Tensor  # (2,), on the device that is trained on
+    rng: np.random.Generator
+    progress: Progress
+
+    def rows(self, batch: int) -> np.ndarray:
+        return self.rng.choice(len(self.data), min(batch, len(self.data)), replace=False)
+
+    def batch(self) -> dict[str, Tensor]:
+        """The next one of frames."""
+        return _batch(self.data, self.rows(self.recipe.batch), self.rng, self.loss_weights.device)
+
+    def steps(self, count: int, desc: str) -> Iterable[int]:
+        return self.progress(range(count), desc=desc, total=count)
 
 
 def _train(
@@ -280,9 +300,10 @@ def _train(
             policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
             policy.model.action_head.bias.copy_(torch.from_numpy(recorded.mean(axis=0)))
         policy.to(device)
-        _train_backbone(policy, data, recipe, loss_weights, rng, progress)
-        _train_transformer(policy, data, recipe, loss_weights, rng, progress)
-        optimizer, scheduler = _train_together(policy, data, recipe, loss_weights, rng, progress)
+        training = _Training(policy, data, recipe, loss_weights, rng, progress)
+        _train_backbone(training)
+        _train_transformer(training)
+        optimizer, scheduler = _train_together(training)
     return {
         "epoch": recipe.together_steps,
         "model_state_dict": {k: v.cpu() for k, v in policy.state_dict().items()},
@@ -332,9 +353,9 @@ def _config(
 def _load(samples: tuple[Sample, ...], most: int, size: Size, desc: str, progress: Progress) -> Frames:
     """At most `most` samples, evenly over all drives, with their frames at the policy's size."""
     if len(samples) > most:
-        samples = [samples[i] for i in np.linspace(0, len(samples) - 1, most).round().astype(int)]
+        samples = tuple(samples[i] for i in np.linspace(0, len(samples) - 1, most).round().astype(int))
     images = []
-    for sample in progress(samples, desc=desc, total=len(samples)) if progress else samples:
+    for sample in progress(samples, desc=desc, total=len(samples)):
         images.append(prepare_frame(sample.frame_bgr(), size.image_height, size.image_width))
     return Frames(
         np.stack(images),
@@ -385,14 +406,6 @@ def _error(predicted: Tensor, batch: dict[str, Tensor], loss_weights: Tensor) ->
     return error.sum() / (recorded.sum() * loss_weights.numel())
 
 
-def _rows(data: Frames, batch: int, rng: np.random.Generator) -> np.ndarray:
-    return rng.choice(len(data), min(batch, len(data)), replace=False)
-
-
-def _steps(count: int, desc: str, progress: Progress) -> Iterable[int]:
-    return progress(range(count), desc=desc, total=count) if progress else range(count)
-
-
 def _optimiser(
     parameters: Iterable[nn.Parameter], rate: float, steps: int
 ) -> tuple[torch.optim.AdamW, torch.optim.lr_scheduler.LRScheduler]:
@@ -408,7 +421,7 @@ def _optimiser(
 
 def _descend(loss: Tensor, module: nn.Module, optimizer: torch.optim.Optimizer, scheduler: Any) -> None:
     if not torch.isfinite(loss):
-        raise WorldError(f"training went wrong: the loss is {loss.item()}; try another seed")
+        raise WorldError(f"training went wrong: the loss is {loss.item()}", remedy="try another seed")
     optimizer.zero_grad()
     loss.backward()
     nn.utils.clip_grad_norm_(module.parameters(), GRAD_CLIP)
@@ -422,39 +435,29 @@ class _ChunkFromFeatures(nn.Module):
     def __init__(self, backbone: nn.Module, height: int, width: int, features: int = 512, width_after: int = 32):
         super().__init__()
         self.backbone = backbone
-        self.head = nn.Sequential(
-            nn.Conv2d(features, width_after, 1),
-            nn.ReLU(),
-            nn.Flatten(),
-            nn.Linear(width_after * -(-height // 32) * -(-width // 32), 2 * CHUNK),
-        )
-        nn.init.zeros_(self.head[-1].weight)  # from "no action": actions are small, and an untrained head's are not
-        nn.init.zeros_(self.head[-1].bias)
+        convolution = nn.Conv2d(features, width_after, 1)
+        last = nn.Linear(width_after * -(-height // 32) * -(-width // 32), 2 * CHUNK)
+        nn.init.zeros_(last.weight)  # from "no action": actions are small, and an untrained head's are not
+        nn.init.zeros_(last.bias)
+        self.head = nn.Sequential(convolution, nn.ReLU(), nn.Flatten(), last)
 
     def forward(self, image: Tensor) -> Tensor:
         return self.head(self.backbone(image)["feature_map"]).unflatten(1, (CHUNK, 2))
 
 
-def _train_backbone(
-    policy: ACTPolicy,
-    data: Frames,
-    recipe: Recipe,
-    loss_weights: Tensor,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> None:
+def _train_backbone(training: _Training) -> None:
     """Phase one: live batch norm; its statistics, measured on the data, become the frozen ones."""
-    device = loss_weights.device
+    recipe, data = training.recipe, training.data
     height, width = data.images.shape[1:3]
     import torchvision
 
     resnet = torchvision.models.resnet18(weights=None)
     live = torchvision.models._utils.IntermediateLayerGetter(resnet, {"layer4": "feature_map"})
-    model = _ChunkFromFeatures(live, height, width).to(device).train()
+    model = _ChunkFromFeatures(live, height, width).to(training.loss_weights.device).train()
     optimizer, scheduler = _optimiser(model.parameters(), recipe.backbone_rate, recipe.backbone_steps)
-    for _ in _steps(recipe.backbone_steps, "training the backbone", progress):
-        batch = _batch(data, _rows(data, recipe.batch, rng), rng, device)
-        _descend(_error(model(batch[IMAGE]), batch, loss_weights), model, optimizer, scheduler)
+    for _ in training.steps(recipe.backbone_steps, "training the backbone"):
+        batch = training.batch()
+        _descend(_error(model(batch[IMAGE]), batch, training.loss_weights), model, optimizer, scheduler)
 
     norms = [m for m in live.modules() if isinstance(m, nn.BatchNorm2d)]
     for norm in norms:
@@ -462,9 +465,9 @@ def _train_backbone(
         norm.momentum = None  # a plain mean over the batches below
     with torch.no_grad():
         for _ in range(16 if len(data) >= 16 * recipe.batch else 4):
-            live(_batch(data, _rows(data, recipe.batch, rng), rng, device)[IMAGE])
+            live(training.batch()[IMAGE])
     weights = {k: v for k, v in live.state_dict().items() if not k.endswith("num_batches_tracked")}
-    policy.model.backbone.load_state_dict(weights)
+    training.policy.model.backbone.load_state_dict(weights)
 
 
 class _Given(nn.Module):
@@ -474,30 +477,25 @@ class _Given(nn.Module):
         return {"feature_map": features}
 
 
-def _train_transformer(
-    policy: ACTPolicy,
-    data: Frames,
-    recipe: Recipe,
-    loss_weights: Tensor,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> None:
+def _train_transformer(training: _Training) -> None:
     """Phase two: all but the backbone, on features computed once, of each frame as it is and mirrored."""
-    device = loss_weights.device
+    policy, data, batch = training.policy, training.data, training.recipe.batch
+    device = training.loss_weights.device
     backbone = policy.model.backbone.eval()
     views = {}
     for name in ("plain", "mirrored"):
         maps = []
         with torch.no_grad():
-            for first in _steps_over(len(data), recipe.batch, f"computing features, {name}", progress):
-                images = data.images[first : first + recipe.batch]
+            firsts = range(0, len(data), batch)
+            for first in training.progress(firsts, desc=f"computing features, {name}", total=len(firsts)):
+                images = data.images[first : first + batch]
                 images = images[:, :, ::-1] if name == "mirrored" else images
                 maps.append(backbone(torch.from_numpy(normalise(images)).to(device))["feature_map"].cpu())
         views[name] = torch.cat(maps)
     policy.model.backbone = _Given()
     policy.train()
     with _threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
-        _transformer_steps(policy, views, data, recipe, loss_weights, rng, progress)
+        _transformer_steps(training, views)
     policy.model.backbone = backbone
 
 
@@ -511,21 +509,14 @@ def _threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _transformer_steps(
-    policy: ACTPolicy,
-    views: dict[str, Tensor],
-    data: Frames,
-    recipe: Recipe,
-    loss_weights: Tensor,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> None:
-    device = loss_weights.device
+def _transformer_steps(training: _Training, views: dict[str, Tensor]) -> None:
+    policy, data, recipe = training.policy, training.data, training.recipe
+    device = training.loss_weights.device
     parameters = [p for p in policy.parameters() if p.requires_grad]
     optimizer, scheduler = _optimiser(parameters, recipe.transformer_rate, recipe.transformer_steps)
-    for step in _steps(recipe.transformer_steps, "training the transformer", progress):
-        rows = _rows(data, recipe.transformer_batch, rng)
-        states, chunks = _swapped_states(data, rows, rng), data.chunks[rows].copy()
+    for step in training.steps(recipe.transformer_steps, "training the transformer"):
+        rows = training.rows(recipe.transformer_batch)
+        states, chunks = _swapped_states(data, rows, training.rng), data.chunks[rows].copy()
         if step % 2:
             states[:, 0] *= -1
             chunks[:, :, 0] *= -1
@@ -535,12 +526,7 @@ def _transformer_steps(
             ACTION: torch.from_numpy(chunks).to(device),
             IS_PAD: torch.from_numpy(data.is_pad[rows]).to(device),
         }
-        _descend(_policy_loss(policy, batch, loss_weights), policy, optimizer, scheduler)
-
-
-def _steps_over(count: int, batch: int, desc: str, progress: Progress) -> Iterable[int]:
-    firsts = range(0, count, batch)
-    return progress(firsts, desc=desc, total=len(firsts)) if progress else firsts
+        _descend(_policy_loss(policy, batch, training.loss_weights), policy, optimizer, scheduler)
 
 
 def _policy_loss(policy: ACTPolicy, batch: dict[str, Tensor], loss_weights: Tensor) -> Tensor:
@@ -550,20 +536,14 @@ def _policy_loss(policy: ACTPolicy, batch: dict[str, Tensor], loss_weights: Tens
     return _error(actions, batch, loss_weights) + KL_WEIGHT * divergence
 
 
-def _train_together(
-    policy: ACTPolicy,
-    data: Frames,
-    recipe: Recipe,
-    loss_weights: Tensor,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> tuple[torch.optim.Optimizer, Any]:
+def _train_together(training: _Training) -> tuple[torch.optim.Optimizer, Any]:
     """Phase three: all parameters, at a tenth of the rate. Returns what the checkpoint keeps of it."""
+    policy, recipe = training.policy, training.recipe
     policy.train()
     optimizer, scheduler = _optimiser(policy.parameters(), recipe.transformer_rate / 10, recipe.together_steps)
-    for _ in _steps(recipe.together_steps, "training all together", progress):
-        batch = _batch(data, _rows(data, recipe.batch, rng), rng, loss_weights.device)
-        _descend(_policy_loss(policy, batch, loss_weights), policy, optimizer, scheduler)
+    for _ in training.steps(recipe.together_steps, "training all together"):
+        loss = _policy_loss(policy, training.batch(), training.loss_weights)
+        _descend(loss, policy, optimizer, scheduler)
     return optimizer, scheduler
 
 

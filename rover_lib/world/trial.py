@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rover_lib.onboard.errors import WorldError
+from rover_lib.workshop.progress import Progress, silent
 from rover_lib.world.world import RATE_HZ, World
 
 
@@ -30,6 +31,18 @@ class Trajectory:
     steering: np.ndarray
     throttle: np.ndarray
     balloon_xy_m: tuple[float, float]
+
+    @classmethod
+    def of(cls, world: World) -> "Trajectory":
+        """All that was driven in a world."""
+        track = world.trajectory
+        return cls(
+            np.array([s.x_m for s in track]),
+            np.array([s.y_m for s in track]),
+            np.array([s.steering_command for s in track]),
+            np.array([s.throttle_command for s in track]),
+            (world.balloon.x_m, world.balloon.y_m),
+        )
 
 
 @dataclass(frozen=True)
@@ -61,7 +74,7 @@ def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tup
     Raises WorldError for counts that are no counts.
     """
     if not 0 <= hits <= trials or trials < 1:
-        raise WorldError(f"an interval needs 0 <= hits <= trials and a trial, found {hits} of {trials}")
+        raise WorldError("an interval needs 0 <= hits <= trials and a trial", found=f"{hits} of {trials}")
     share = hits / trials
     centre = share + z * z / (2 * trials)
     half = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
@@ -74,27 +87,26 @@ def run_trials(
     worlds: int = 40,
     seed: int = 10_000,
     replan_every: int = 8,
-    progress: Callable[..., Iterable] | None = None,
+    progress: Progress = silent,
     keep_frames: int = 200,
 ) -> TrialReport:
     """Drive through `worlds` worlds, of seeds from `seed` on, in closed loop at 30 Hz.
 
-    replan_every: so many actions of each chunk are driven before the next frame is looked at. The state is
-    the action commanded before, neutral at the start. keep_frames: at most so many (frame_bgr, state) pairs,
-    evenly from all that the policy was shown.
-    progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
+    replan_every: actions of each chunk that are driven before the next frame is looked at. The state is the action
+    commanded before, neutral at the start. keep_frames: most (frame_bgr, state) pairs to keep, evenly from all that the
+    policy was shown.
     Raises WorldError for parameters that make no trial, or for actions that are not finite.
     """
     if worlds < 1 or seed < 0 or keep_frames < 0:
-        raise WorldError(f"trials need at least 1 world and a seed from 0, found {worlds} and {seed}")
+        raise WorldError("trials need at least 1 world and a seed from 0", found=f"{worlds} and {seed}")
     if not 1 <= replan_every <= policy.chunk:
-        raise WorldError(f"replan_every must be 1 to {policy.chunk}, the policy's chunk, found {replan_every}")
+        raise WorldError(f"replan_every must be 1 to {policy.chunk}, the policy's chunk", found=replan_every)
     seeds = range(seed, seed + worlds)
     results: list[WorldResult] = []
     seen: list[tuple[np.ndarray, np.ndarray]] = []
     stride = 1  # doubled when too many are kept, so that memory is bounded and all drives are in it
     shown = 0
-    for world_seed in progress(seeds, desc="driving", total=worlds) if progress else seeds:
+    for world_seed in progress(seeds, desc="driving", total=worlds):
         result, pairs = _drive(policy, World(world_seed), replan_every)
         results.append(result)
         for pair in pairs:
@@ -116,7 +128,7 @@ def run_trials_of(policies: Mapping[str, Drives], worlds: int = 40, **options: A
 
 
 def _drive(policy: Drives, world: World, replan_every: int) -> tuple[WorldResult, list[tuple[np.ndarray, np.ndarray]]]:
-    state = np.zeros(2, np.float32)
+    state: np.ndarray = np.zeros(2, np.float32)
     pairs = []
     nearest = world.balloon_seen()[0]
     while not world.done:
@@ -125,7 +137,7 @@ def _drive(policy: Drives, world: World, replan_every: int) -> tuple[WorldResult
         chunk = np.asarray(policy.predict_chunk(frame, state))
         if chunk.ndim != 2 or chunk.shape[0] < replan_every or chunk.shape[1] != 2 or not np.isfinite(chunk).all():
             raise WorldError(
-                f"the policy must plan finite (steps, 2) actions, found {chunk.shape} in world {world.seed}"
+                "the policy must plan finite (steps, 2) actions", found=f"{chunk.shape} in world {world.seed}"
             )
         for steering, throttle in chunk[:replan_every]:
             world.step(float(np.clip(steering, -1, 1)), float(np.clip(throttle, 0, 1)), 1 / RATE_HZ)
@@ -133,15 +145,5 @@ def _drive(policy: Drives, world: World, replan_every: int) -> tuple[WorldResult
             nearest = min(nearest, world.balloon_seen()[0])
             if world.done:
                 break
-    track = world.trajectory
-    trajectory = Trajectory(
-        np.array([s.x_m for s in track]),
-        np.array([s.y_m for s in track]),
-        np.array([s.steering_command for s in track]),
-        np.array([s.throttle_command for s in track]),
-        (world.balloon.x_m, world.balloon.y_m),
-    )
-    return (
-        WorldResult(world.seed, world.outcome, world.hit, world.state.time_s, nearest, trajectory),
-        pairs,
-    )
+    outcome, duration_s = str(world.outcome), world.state.time_s
+    return WorldResult(world.seed, outcome, world.hit, duration_s, nearest, Trajectory.of(world)), pairs

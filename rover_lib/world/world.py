@@ -105,7 +105,7 @@ class World:
 
     def __init__(self, seed: int, shoves: int = 0):
         if seed < 0 or shoves < 0:
-            raise WorldError(f"a world's seed and shoves must not be negative, found {seed} and {shoves}")
+            raise WorldError("a world's seed and shoves must not be negative", found=f"{seed} and {shoves}")
         self.seed = seed
         rng = np.random.default_rng([seed, 20_251])
         self.state = CarState()
@@ -140,9 +140,9 @@ class World:
     def step(self, steering: float, throttle: float, dt: float = 1 / RATE_HZ) -> None:
         """Drive for dt seconds. Raises WorldError for an action outside its range, or after the end."""
         if not (-1 <= steering <= 1 and 0 <= throttle <= 1):
-            raise WorldError(f"steering must be in [-1, 1] and throttle in [0, 1], found ({steering}, {throttle})")
+            raise WorldError("steering must be in [-1, 1] and throttle in [0, 1]", found=f"({steering}, {throttle})")
         if self.done:
-            raise WorldError(f"world {self.seed} has ended ({self.outcome}): make a new one")
+            raise WorldError(f"world {self.seed} has ended ({self.outcome})", remedy="make a new one")
         s = self.state
         wheels = s.steering + (steering - s.steering) * (1 - math.exp(-dt / STEERING_LAG_S))
         wanted = throttle * SPEED_PER_THROTTLE_MPS
@@ -253,7 +253,7 @@ def _distractors(rng: np.random.Generator, balloon: Thing) -> Iterator[Thing]:
     for _ in range(int(rng.integers(2, 7))):
         kind = str(rng.choice(["balloon", "box", "cone"]))
         base = _DISTRACTOR_BGR[int(rng.integers(len(_DISTRACTOR_BGR)))]
-        colour = tuple(int(c) for c in np.clip(np.array(base) * rng.uniform(0.75, 1.2), 0, 255))
+        blue, green, red = (int(c) for c in np.clip(np.array(base) * rng.uniform(0.75, 1.2), 0, 255))
         distance, bearing = rng.uniform(1.2, 6.0), rng.uniform(-0.9, 0.9)
         x, y = distance * math.cos(bearing), distance * math.sin(bearing)
         radius = rng.uniform(0.10, 0.18)
@@ -263,7 +263,7 @@ def _distractors(rng: np.random.Generator, balloon: Thing) -> Iterator[Thing]:
         aside = abs(x * balloon.y_m - y * balloon.x_m) / to_balloon
         if aside < 0.45 and along < to_balloon + 0.3:
             continue  # it would hide the balloon from a car that drives straight to it
-        yield Thing(kind, x, y, radius, height, colour)
+        yield Thing(kind, x, y, radius, height, (blue, green, red))
 
 
 def _shoves(rng: np.random.Generator, count: int) -> Iterator[Shove]:
@@ -353,10 +353,10 @@ def _draw_thing(frame: np.ndarray, ahead: float, left: float, thing: Thing) -> N
     half = thing.radius_m * scale
     upper = half if thing.kind == "box" else 0.1 * half
     corners = np.array([[column - upper, top], [column + upper, top], [column + half, foot], [column - half, foot]])
-    cv2.fillConvexPoly(frame, np.int32(corners * _ONE), thing.colour, cv2.LINE_AA, _SHIFT)
+    cv2.fillConvexPoly(frame, (corners * _ONE).astype(np.int32), thing.colour, cv2.LINE_AA, _SHIFT)
     lit = [min(255, c * 1.25 + 12) for c in thing.colour]
     corners[[1, 2], 0] = column + 0.15 * np.array([-upper, -half])
-    cv2.fillConvexPoly(frame, np.int32(corners * _ONE), lit, cv2.LINE_AA, _SHIFT)
+    cv2.fillConvexPoly(frame, (corners * _ONE).astype(np.int32), lit, cv2.LINE_AA, _SHIFT)
 
 
 def _draw_shadow(frame: np.ndarray, column: float, foot: float, radius_m: float, ahead: float) -> None:
