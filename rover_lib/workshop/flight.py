@@ -15,7 +15,7 @@ from rover_lib.onboard.host import THROTTLED_BITS
 from rover_lib.onboard.pwm import Channel, PwmCalibration
 from rover_lib.onboard.servo_link import State
 from rover_lib.onboard.telemetry import Event, Flight
-from rover_lib.workshop.plots import BLACK, BLUE, GREEN, GREY, NOW_BITS, ORANGE, RED, SKY, _axes
+from rover_lib.workshop.plots.style import BLACK, BLUE, GREEN, GREY, NOW_BITS, ORANGE, RED, SKY, new_figure
 
 STATES = {
     State.MANUAL.value: ("human", GREY),
@@ -35,7 +35,9 @@ def flight_figure(flight: Flight) -> Figure:
     listed = list(enumerate(flight.events, 1))[-EVENTS_LISTED:]  # the last ones say why it ended
     rows = ("who", "steering", "throttle", "plan", "late", "temperature")
     heights = [0.35, 1.6, 1.6, 1.6, 1.3, 0.9]
-    fig, axes = _axes(len(rows), height_in=sum(heights) + 3.4 + 0.19 * len(listed), height_ratios=heights, sharex=True)
+    fig, axes = new_figure(
+        len(rows), height_in=sum(heights) + 3.4 + 0.19 * len(listed), height_ratios=heights, sharex=True
+    )
     panel = dict(zip(rows, axes[:, 0], strict=True))
     t_s, calibration = ticks["t_s"], PwmCalibration()
     times_s = [t_s, flight.machine["t_s"], np.array([e.t_s for e in flight.events])]
@@ -156,8 +158,8 @@ def _temperature(ax: Axes, machine: Mapping[str, Any], summary: Mapping[str, Any
     bits = np.array([int(v or "0", 16) & NOW_BITS for v in machine["throttled"]], int)
     if bits.any():
         names = [name for bit, name in THROTTLED_BITS.items() if (bits >> bit & 1).any()]
-        options = {"step": "post", "transform": ax.get_xaxis_transform(), "color": ORANGE, "alpha": 0.4, "lw": 0}
-        ax.fill_between(t_s, 0, bits > 0, label=", ".join(names), **options)
+        options: dict[str, Any] = {"step": "post", "transform": ax.get_xaxis_transform()}
+        ax.fill_between(t_s, 0, bits > 0, label=", ".join(names), color=ORANGE, alpha=0.4, lw=0, **options)
     ax.set_ylabel("processor\n(°C)", fontsize=10)
 
 

@@ -1,0 +1,29 @@
+"""One function per figure; each returns a matplotlib Figure and touches nothing else.
+
+    plots.save(plots.action_error(report), run_dir, "04_action_error")
+
+A module for each subject; `style` has what all figures share.
+"""
+# ruff: noqa: F401, these are the names that notebooks use
+
+from rover_lib.workshop.plots.benchmarks import latency, soak
+from rover_lib.workshop.plots.comparison import action_error, drives_from_above, gates, hits, sizes, worst_frames
+from rover_lib.workshop.plots.counting import (
+    computed_times,
+    counted,
+    counted_by_kernel,
+    counted_by_size,
+    instruction_counts,
+    whole_size,
+)
+from rover_lib.workshop.plots.late_plans import beside_the_path, hits_by_latency, plans_from_above, throttle_over_age
+from rover_lib.workshop.plots.quantization import errors_by_choice, layers, outlier_channels, sensitivity
+from rover_lib.workshop.plots.recordings import (
+    calibration_coverage,
+    checkpoint_size,
+    episode_overview,
+    faults,
+    observer_ranges,
+    work_per_block,
+)
+from rover_lib.workshop.plots.style import save

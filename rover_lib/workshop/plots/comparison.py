@@ -1,0 +1,193 @@
+"""Notebook 04: INT8 beside FP32, in error, size and hits; and the table of gates, of every notebook."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from rover_lib.workshop.compare import Fidelity
+from rover_lib.workshop.plots.style import (
+    BLACK,
+    BLUE,
+    COLOURS,
+    GREY,
+    NAMES,
+    RED,
+    legend_below,
+    new_figure,
+    note,
+    plain_table,
+)
+
+
+def sizes(metrics: Mapping[str, Any]) -> Figure:
+    """Artifact files, weights with weights. metrics: of compare.json."""
+    found = {"fp32": metrics["fp32"]["size_mb"]} | {m: v["size_mb"] for m, v in metrics["modes"].items()}
+    fig, axes = new_figure(1, height_in=1.0 + 0.34 * len(found))
+    ax, y = axes[0, 0], range(len(found))
+    ax.barh(y, list(found.values()), color=[COLOURS.get(m, GREY) for m in found])
+    for at, size_mb in enumerate(found.values()):
+        text = f"{size_mb:.1f} MB" + (f", {found['fp32'] / size_mb:.1f}x smaller" if at else "")
+        ax.annotate(text, (size_mb, at), (4, 0), textcoords="offset points", va="center", fontsize=9)
+    ax.margins(x=0.25)
+    ax.set_yticks(y, [NAMES.get(m, m) for m in found])
+    ax.invert_yaxis()
+    ax.set_xlabel("artifact file (MB, 10^6 bytes)")
+    return fig
+
+
+def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure:
+    """Mean error of every mode against FP32 at each step of the plan: percent of the recorded range, and pulse."""
+    actions, steps = report.action_names, report.reference.shape[1]
+    fig, axes = new_figure(1, len(actions), height_in=3.6)
+    times_s = np.arange(steps) / rate_hz
+    for i, action in enumerate(actions):
+        ax, pct = axes[0, i], report.pct(action)
+        ax.set_title(action, fontsize=11)
+        if pct is None:
+            note(ax, "never changes in these\nrecordings: not judged")
+            continue
+        for mode in report.chunks:
+            error = report.in_pct(report.errors(mode)[..., i].mean(0), action)
+            ax.plot(times_s, error, color=COLOURS.get(mode, GREY), lw=1.8, label=NAMES.get(mode, mode))
+        ax.set(xlabel="step of the plan (s ahead)", ylabel="mean error (% of the recorded range)", ylim=(0, None))
+        us = report.us(action) / pct
+        if np.isfinite(us):
+            other = ax.secondary_yaxis("right", functions=(lambda p, u=us: p * u, lambda e, u=us: e / u))
+            other.set_ylabel("the same as pulse (us)")
+            other.tick_params(labelsize=9)
+    judged = [ax for ax in axes[0] if ax.get_lines()]
+    if judged:
+        legend_below(fig, judged[0], 5)
+    return fig
+
+
+def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0) -> Figure:
+    """The frames on which a mode differs most from FP32: the picture and both plans, with the recording's own."""
+    found = report.worst(mode, count)
+    names = report.action_names
+    fig, axes = new_figure(max(len(found), 1), 1 + len(names), height_in=0.9 + 1.9 * max(len(found), 1))
+    if not found:
+        for ax in axes[0]:
+            note(ax, "not judged")
+        return fig
+    times_s = np.arange(report.reference.shape[1]) / rate_hz
+    for row, worst in zip(axes, found, strict=True):
+        row[0].imshow(worst.sample.frame_bgr()[..., ::-1])
+        row[0].axis("off")
+        row[0].set_title(f"{worst.action} {worst.error_pct:.2f} % off", fontsize=10)
+        recorded = getattr(worst.sample, "chunk", None)
+        for i, name in enumerate(names):
+            ax = row[1 + i]
+            if recorded is not None:
+                known = ~worst.sample.is_pad
+                ax.plot(times_s[known], recorded[known, i], color=GREY, lw=3, label="driver")
+            ax.plot(times_s, worst.reference[:, i], color=BLACK, lw=1.8, label="FP32")
+            ax.plot(
+                times_s,
+                worst.other[:, i],
+                color=COLOURS.get(mode, BLUE),
+                lw=1.8,
+                ls="--",
+                label=f"{mode} INT8",
+            )
+            ax.set_ylabel(f"{name}", fontsize=9)
+            low, high = report.action_range[name]
+            ax.set_ylim(low - 0.05 * (high - low + 1e-6), high + 0.05 * (high - low + 1e-6))
+    for ax in axes[-1, 1:]:
+        ax.set_xlabel("step of the plan (s ahead)")
+    legend_below(fig, axes[0, 1], 3)
+    return fig
+
+
+def hits(metrics: Mapping[str, Any]) -> Figure:
+    """Balloons hit in unseen worlds, with Wilson's 95 % interval: how little so few drives say. metrics: of compare."""
+    rows = {"fp32": metrics["fp32"]} | dict(metrics["modes"])
+    rows = {m: v for m, v in rows.items() if v["trials"]}
+    fig, axes = new_figure(1, height_in=1.2 + 0.36 * max(len(rows), 1))
+    ax = axes[0, 0]
+    for y, (mode, v) in enumerate(rows.items()):
+        colour = COLOURS.get(mode, GREY)
+        ax.plot([100 * v["hits_wilson_low"], 100 * v["hits_wilson_high"]], [y, y], color=colour, lw=3, alpha=0.5)
+        ax.plot(100 * v["hits"] / v["trials"], y, "o", color=colour, ms=8)
+        ax.annotate(
+            f"{v['hits']} of {v['trials']}",
+            (1.01, y),
+            xycoords=("axes fraction", "data"),
+            va="center",
+            fontsize=10,
+        )
+    ax.set_yticks(range(len(rows)), [NAMES.get(m, m) for m in rows])
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    lows = [100 * v["hits_wilson_low"] for v in rows.values()]
+    ax.set_xlim(max(0, min(lows, default=0) - 5), 101)
+    ax.set_xlabel("worlds in which the balloon was hit (%), with the 95 % interval")
+    return fig
+
+
+def drives_from_above(trials: Mapping[str, Any], count: int = 4) -> Figure:
+    """The worlds in which the modes' drives part most. trials: closed-loop reports by mode, FP32 among them."""
+
+    def apart(index: int) -> float:
+        base, gap = trials["fp32"].per_world[index].trajectory, 0.0
+        for trial in trials.values():
+            other = trial.per_world[index].trajectory
+            n = min(len(base.x_m), len(other.x_m))
+            gap = max(gap, np.hypot(base.x_m[:n] - other.x_m[:n], base.y_m[:n] - other.y_m[:n]).max())
+        return gap
+
+    worlds = sorted(range(len(trials["fp32"].per_world)), key=lambda i: -apart(i))[:count]
+    fig, axes = new_figure(1, count, height_in=3.8)
+    for ax, i in zip(axes[0], worlds, strict=False):
+        for mode, trial in trials.items():
+            path = trial.per_world[i].trajectory
+            style = "-" if mode == "fp32" else "--"
+            # forward is up; positive y is to the left of the car
+            ax.plot(-path.y_m, path.x_m, style, color=COLOURS.get(mode, GREY), lw=1.8, label=NAMES.get(mode, mode))
+        x, y = trials["fp32"].per_world[i].trajectory.balloon_xy_m
+        ax.add_patch(Circle((-y, x), 0.16, color=RED))
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_xlabel("to the right (m)")
+        missed = [NAMES.get(m, m) for m, t in trials.items() if not t.per_world[i].hit]
+        outcome = "all hit" if not missed else "all missed" if len(missed) == len(trials) else ""
+        outcome = outcome or (f"{missed[0]} missed" if len(missed) == 1 else f"{len(missed)} of {len(trials)} missed")
+        ax.set_title(f"{100 * apart(i):.0f} cm apart, {outcome}", fontsize=9)
+    axes[0, 0].set_ylabel("ahead of the start (m)")
+    legend_below(fig, axes[0, 0], 5)
+    return fig
+
+
+def gates(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """The gates as a table: what was promised, what was found."""
+    verdict = {True: ("pass", "#DCF0E8"), False: ("FAIL", "#F9DDCB"), None: ("not measured", "#EFEFEF")}
+
+    def shown(value: Any) -> str:
+        return "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+
+    cells = [[r["gate"], _limit(r), shown(r["found"]), verdict[r["passed"]][0]] for r in rows]
+    fig, axes = new_figure(1, height_in=0.5 + 0.27 * (len(rows) + 1))
+    axes[0, 0].axis("off")
+    table = axes[0, 0].table(
+        cells,
+        colLabels=["gate", "promised", "found", "verdict"],
+        colWidths=(0.46, 0.2, 0.16, 0.18),
+        cellLoc="left",
+        colLoc="left",
+        bbox=(0, 0, 1, 1),
+    )
+    plain_table(table)
+    for (row, column), cell in table.get_celld().items():
+        if row and column == 3:
+            cell.set_facecolor(verdict[rows[row - 1]["passed"]][1])
+    return fig
+
+
+def _limit(row: Mapping[str, Any]) -> str:
+    """A gate's limit in words; a promised range as it was promised."""
+    limit = row["limit"]
+    if isinstance(limit, (list, tuple)):
+        return f"{limit[0]:g} to {limit[1]:g}"
+    words = {"<=": "at most ", ">=": "at least "}.get(row.get("relation", ""), "")
+    return words + (f"{limit:g}" if isinstance(limit, (int, float)) else str(limit))

@@ -1,0 +1,174 @@
+"""Notebooks 03 and 06: instructions counted on an emulated Cortex-A76."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from rover_lib.workshop.plots.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    NAMES,
+    ORANGE,
+    PURPLE,
+    RED,
+    SKY,
+    action_colour,
+    bar_values,
+    judged_keys,
+    legend,
+    legend_below,
+    new_figure,
+    plain_table,
+    simd_bars,
+)
+
+# Instructions of one inference of the full policy (15 GMAC, 360x640), in 1e9: label, all, SIMD among them. What
+# notebook 03 shows of a run that `make arm` has not counted. Source: `make arm NAME=full PEERS=1`, as in notebook 06.
+COUNTED = (
+    ("FP32, TorchScript", 6.08, 3.81),
+    ("INT8 affine (quint8): QNNPACK's kernels", 5.03, 4.34),
+    ("INT8 in ONNX Runtime 1.31.1", 1.66, 1.12),
+    ("INT8 in ExecuTorch 1.5.1: XNNPACK", 1.49, 1.08),
+    ("INT8 symmetric (qint8), ours: XNNPACK", 1.44, 1.08),
+    ("dot-product instructions alone", 0.94, 0.94),
+)
+
+NEAR = 2  # times the fewest instructions: shown once more, closer
+GROUP_COLOURS = (BLUE, SKY, BLACK, RED, PURPLE, ORANGE, "#F0E442", GREEN, "#8C6D31", GREY)
+
+
+def whole_size(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """Artifacts of the image size of training, by mode, and peers that are none of them, most instructions first.
+
+    metrics: of arm.json.
+    """
+    ours = {stem.removeprefix("policy_"): m for stem, m in metrics["artifacts"].items()}
+    ours = {mode: m for mode, m in ours.items() if not re.search(r"_\d+x\d+$", mode)}
+    counted = ours | {name: m for name, m in metrics.get("peers", {}).items() if "artifact" not in m}
+    return dict(sorted(counted.items(), key=lambda item: -item[1]["instructions_g"]))
+
+
+def counted(metrics: Mapping[str, Any]) -> Figure:
+    """Instructions against the floor, and beside them the error on the same core. metrics: of arm.json."""
+    rows = whole_size(metrics)
+    fig, axes = new_figure(1, 2, height_in=1.4 + 0.4 * len(rows), sharey=True, width_ratios=(1.5, 1))
+    (left, right), y = axes[0], np.arange(len(rows))
+    total, simd = (np.array([m[key] for m in rows.values()]) for key in ("instructions_g", "simd_g"))
+    simd_bars(left, y, total, simd)
+    floor_g = next(m["floor_g"] for m in rows.values())
+    left.axvline(floor_g, color=RED, ls="--", lw=1.2, label=f"floor: dot products alone, {floor_g:.2g}")
+    left.set_yticks(y, [NAMES.get(n, n) for n in rows])
+    left.invert_yaxis()
+    left.set_xlabel("instructions of one inference (10^9)")
+    left.set_title("counted on an emulated Cortex-A76", fontsize=11)
+    first = next(iter(metrics["artifacts"].values()))
+    keys = judged_keys(right, {k: v for k, v in first.items() if "workstation" not in k})
+    height = 0.8 / max(len(keys), 1)
+    judged = [
+        m if keys and m.get(keys[0]) is not None and m.get("reference") != f"policy_{n}" else None
+        for n, m in rows.items()
+    ]
+    frames = sorted({m["frames_on_the_core"] for m in judged if m})
+    over = " to ".join(str(n) for n in frames[:: len(frames) - 1 or 1])
+    for i, key in enumerate(keys):
+        known = [(at, m[key]) for at, m in enumerate(judged) if m is not None]
+        at, values = [at + (i - (len(keys) - 1) / 2) * height for at, _ in known], [value for _, value in known]
+        right.barh(at, values, height, color=action_colour(key, i), label=key.removesuffix("_mae_pct"))
+        bar_values(right, at, values, "{:.2f}")
+    right.set_xlabel("mean error against FP32\n(% of the recorded range)")
+    right.set_title(f"computed on it, {over} frames", fontsize=11)
+    legend(left, loc="lower right")
+    legend(right, loc="upper right")
+    return fig
+
+
+def counted_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
+    """What the instructions do. groups: {artifact or peer: {group: 10**9 instructions}}, groups in one order."""
+    totals = {name: sum(found.values()) for name, found in groups.items()}
+    near = {name: found for name, found in groups.items() if totals[name] < NEAR * min(totals.values())}
+    panels = [groups, near] if 1 < len(near) < len(groups) else [groups]
+    rows = [len(shown) for shown in panels]
+    fig, axes = new_figure(len(panels), height_in=1.3 + 0.5 * len(panels) + 0.36 * sum(rows), height_ratios=rows)
+    for ax, shown in zip(axes[:, 0], panels, strict=True):
+        y, left = np.arange(len(shown)), np.zeros(len(shown))
+        for colour, group in zip(GROUP_COLOURS, next(iter(shown.values())), strict=True):
+            width = np.array([found[group] for found in shown.values()])
+            ax.barh(y, width, left=left, color=colour, label=group)
+            left += width
+        bar_values(ax, y, left, "{:.3g}")
+        ax.set_yticks(y, [NAMES.get(n, n) for n in shown])
+        ax.invert_yaxis()
+    axes[0, 0].set_title("counted on an emulated Cortex-A76", fontsize=11)
+    if len(panels) > 1:
+        axes[1, 0].set_title("those of the fewest instructions, closer", fontsize=11)
+    axes[-1, 0].set_xlabel("instructions of one inference (10^9)")
+    legend_below(fig, axes[0, 0], 4)
+    return fig
+
+
+def counted_by_size(metrics: Mapping[str, Any]) -> Figure:
+    """What a smaller image saves: static INT8 and its floor by image size. metrics: of arm.json."""
+    rows = [m for stem, m in metrics["artifacts"].items() if re.fullmatch(r"policy_static(_\d+x\d+)?", stem)]
+    rows.sort(key=lambda m: m["gmac"])
+    fig, axes = new_figure(1, height_in=3.4)
+    ax, x = axes[0, 0], np.array([m["image_height"] * m["image_width"] for m in rows]) / 1e3
+    lines = (("instructions_g", BLUE, "o-", "all instructions"), ("simd_g", SKY, "s-", "SIMD instructions"))
+    for key, colour, style, label in (*lines, ("floor_g", RED, "--", "floor: dot products alone")):
+        ax.plot(x, [m[key] for m in rows], style, color=colour, lw=1.8, label=label)
+    for at, m in zip(x, rows, strict=True):
+        ax.annotate(f"{m['instructions_g']:.3g}", (at, m["instructions_g"]), (0, 7), textcoords="offset points",
+                    ha="center", fontsize=9)  # fmt: skip
+    ax.set_xticks(x, [f"{m['image_width']}x{m['image_height']}" for m in rows])
+    ax.set(ylim=(0, 1.12 * max(m["instructions_g"] for m in rows)), ylabel="instructions of one inference (10^9)")
+    ax.set_xlabel("image, width x height in pixels; the axis is in proportion to their number")
+    ax.set_title("static INT8, counted on an emulated Cortex-A76", fontsize=11)
+    ax.set_xlim(0, None)
+    legend(ax, loc="lower right")
+    return fig
+
+
+def computed_times(metrics: Mapping[str, Any]) -> Figure:
+    """The computed range of a Raspberry Pi 5's time, in a table of its own. metrics: of arm.json."""
+    rows = sorted(metrics["artifacts"].items(), key=lambda item: -item[1]["instructions_g"])
+    cells = []
+    for stem, m in rows:
+        mode, time_ms = re.sub(r"^policy_|_\d+x\d+$", "", stem), m["computed_pi5_ms"]
+        size = f"{m['image_width']}x{m['image_height']}"
+        cells.append([NAMES.get(mode, mode), size, f"{time_ms['low']:.3g} to {time_ms['high']:.3g}"])
+    fig, axes = new_figure(1, height_in=0.4 + 0.27 * (len(rows) + 1))
+    axes[0, 0].axis("off")
+    heads = ["artifact", "image", "computed time on a Pi 5 (ms), not measured"]
+    table = axes[0, 0].table(
+        cells, colLabels=heads, colWidths=(0.35, 0.2, 0.45), cellLoc="left", colLoc="left", bbox=(0, 0, 1, 1)
+    )
+    plain_table(table)
+    return fig
+
+
+def instruction_counts(found: Mapping[str, Any] | None = None) -> Figure:
+    """Why symmetric: instructions of one inference, by what ran.
+
+    found: metrics of the run's arm.json; if None, the full policy's, as recorded in COUNTED.
+    """
+    rows, title = list(COUNTED), "full policy at 360x640, recorded, not of this run"
+    if found is not None:
+        counted = whole_size(found)
+        rows = [(NAMES.get(n, n), m["instructions_g"], m["simd_g"]) for n, m in counted.items()]
+        floor_g, gmac = (next(iter(counted.values()))[key] for key in ("floor_g", "gmac"))
+        rows.append(("dot-product instructions alone", floor_g, floor_g))
+        title = f"this run's artifacts, {gmac:.3g} GMAC"
+    fig, axes = new_figure(1, height_in=1.2 + 0.36 * len(rows))
+    ax, y = axes[0, 0], np.arange(len(rows))
+    total, simd = (np.array([row[i] for row in rows]) for i in (1, 2))
+    simd_bars(ax, y, total, simd)
+    ax.set_yticks(y, [row[0] for row in rows])
+    ax.invert_yaxis()
+    ax.set_xlabel("instructions of one inference (10^9)")
+    ax.set_title(f"{title}; counted on an emulated Cortex-A76", fontsize=10, loc="right")
+    legend(ax, loc="lower right")
+    return fig

@@ -1,0 +1,119 @@
+"""Notebook 07: what latency does to a drive, and what compensation gives back."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from rover_lib.onboard.plan import Follower, Plan, Settings
+from rover_lib.workshop.plots.style import BLACK, BLUE, ORANGE, RED, legend, legend_below, new_figure
+
+HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", ORANGE, "s", 1)}  # label, colour, marker, side
+
+
+def _late(rows: Sequence[Mapping[str, Any]], *, pushed: bool = False) -> list[Mapping[str, Any]]:
+    """Those without ensembling. rows: of drive.json."""
+    return [r for r in rows if r["ensemble"] is None and bool(r["pushes"]) == pushed]
+
+
+def throttle_over_age(rows: Sequence[Mapping[str, Any]], settings: Settings, chunk: int, rate_hz: float) -> Figure:
+    """What the loop leaves of the throttle at each age of a plan, and the ages that each latency brings.
+
+    rows: of drive.json. chunk, rate_hz: of the policy's plans.
+    """
+    follower = Follower(settings, rate_hz)
+    follower.add(Plan(1, 0.0, 0.0, np.zeros((chunk, 2))), 0.0)
+    ages_s = np.arange(0, follower.stop_s() + 0.2, 0.001)
+    commands = [follower.command(float(age)) for age in ages_s]
+    ages = {r["latency_ms"]: (r["plan_age_min_ms"], r["plan_age_max_ms"]) for r in _late(rows) if r["compensate"]}
+    ages = {ms: ends for ms, ends in ages.items() if ends[0] is not None}
+    heights = (1.6, 0.3 + 0.22 * len(ages))
+    fig, axes = new_figure(2, height_in=2.6 + 0.26 * len(ages), sharex=True, height_ratios=heights)
+    upper, lower = axes[:, 0]
+    upper.plot(1e3 * ages_s, [100 * c.fade if c else 0 for c in commands], color=BLUE, lw=2)
+    upper.set_ylabel("throttle left (%)")
+    stop_ms = 1e3 * follower.stop_s()
+    for ax in axes[:, 0]:
+        ax.axvline(stop_ms, color=RED, ls="--", lw=1.2)
+    upper.annotate("stopped", (stop_ms, 60), (6, 0), textcoords="offset points", color=RED, fontsize=9)
+    for y, (low, high) in enumerate(ages.values()):
+        lower.plot([low, high], [y, y], "o-", color=BLACK, lw=4, ms=5)
+    lower.set_yticks(range(len(ages)), [f"{ms:g} ms" for ms in ages])
+    lower.set_ylim(len(ages) - 0.5, -0.5)
+    lower.set(xlabel="age of the plan in use, since its frame (ms)", ylabel="an inference takes", xlim=(-15, None))
+    return fig
+
+
+def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Balloons hit, with Wilson's 95 % interval, against how long an inference takes. rows: of drive.json."""
+    sets = [(title, _late(rows, pushed=pushed)) for title, pushed in (("left alone", False), ("pushed", True))]
+    sets = [(title, found) for title, found in sets if found]
+    counts = [len({r["latency_ms"] for r in found}) for _, found in sets]
+    fig, axes = new_figure(1, len(sets), height_in=3.8, sharey=True, width_ratios=[c + 1 for c in counts])
+    for ax, (title, found) in zip(axes[0], sets, strict=True):
+        places = {ms: x for x, ms in enumerate(sorted({r["latency_ms"] for r in found}))}
+        for compensate, (label, colour, marker, side) in HOW.items():
+            shown = [r for r in found if r["compensate"] == compensate]
+            x = [places[r["latency_ms"]] + 0.1 * side for r in shown]
+            share = np.array([100 * r["hits"] / r["trials"] for r in shown])
+            ends = 100 * np.array([[r["hits_wilson_low"], r["hits_wilson_high"]] for r in shown]).reshape(-1, 2).T
+            bars = np.clip(np.abs(ends - share), 0, None)
+            ax.errorbar(x, share, bars, fmt=marker, ms=6, color=colour, elinewidth=2, capsize=3, label=label)
+            for at, y, r in zip(x, share, shown, strict=True):
+                ax.annotate(f"{r['hits']}", (at, y), (9 * side, 0), textcoords="offset points", color=colour,
+                            ha="left" if side > 0 else "right", va="center", fontsize=8)  # fmt: skip
+        for ms, place in places.items():
+            if stopped := max(r["stopped"] for r in found if r["latency_ms"] == ms):
+                ax.annotate(f"{stopped} stopped:\nplan too old", (place, 30), ha="center", fontsize=9, color=RED)
+        pushes = max(r["pushes"] for r in found)
+        ax.set_title(f"{title} {pushes} times on its way" if pushes else title, fontsize=11)
+        ax.set_xticks(list(places.values()), [f"{ms:g}" for ms in places])
+        ax.set(xlabel="an inference takes (ms)", xlim=(-0.6, len(places) - 0.4), ylim=(-4, 104))
+    axes[0, 0].set_ylabel(f"worlds in which the balloon was hit\n(% of {rows[0]['trials']}), with the 95 % interval")
+    legend_below(fig, axes[0, 0], 2)
+    return fig
+
+
+def beside_the_path(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """How far a late drive leaves the path of the first latency's, at most: median of the worlds, and 90 % of them.
+
+    rows: of drive.json; latencies at which cars were stopped are left out.
+    """
+    found = [r for r in _late(rows) if not r["stopped"]]
+    places = {ms: x for x, ms in enumerate(sorted({r["latency_ms"] for r in found}))}
+    fig, axes = new_figure(1, height_in=3.0)
+    ax = axes[0, 0]
+    for compensate, (label, colour, _, side) in HOW.items():
+        shown = [r for r in found if r["compensate"] == compensate]
+        x = [places[r["latency_ms"]] + 0.19 * side for r in shown]
+        middle, most = (np.array([r[f"aside_p{q}_cm"] for r in shown]) for q in (50, 90))
+        ax.bar(x, middle, 0.36, color=colour, alpha=0.85, label=label)
+        ax.vlines(x, middle, most, color=BLACK, lw=1)
+        ax.plot(x, most, "_", color=BLACK, ms=10, mew=1.5)
+        for at, y, value in zip(x, most, middle, strict=True):
+            ax.annotate(f"{value:.1f}", (at, y), (0, 3), textcoords="offset points", ha="center", fontsize=9)
+    ax.set_xticks(list(places.values()), [f"{ms:g}" for ms in places])
+    ax.set(xlabel="an inference takes (ms)", ylabel=f"beside the path of\n{min(places, default=0):g} ms, at most (cm)")
+    ax.set_title("bar and number: median of the worlds; line: 90 % of them", fontsize=11)
+    legend(ax, loc="upper left")
+    return fig
+
+
+def plans_from_above(drives: Sequence[Mapping[str, Any]]) -> Figure:
+    """Drives of one world with all their plans, each from where it looked. drives: `from_above` of drive.json."""
+    fig, axes = new_figure(max(len(drives), 1), height_in=0.5 + 3.1 * max(len(drives), 1))
+    for ax, drive in zip(axes[:, 0], drives, strict=False):
+        label, colour, _, _ = HOW[drive["compensate"]]
+        ax.plot(drive["x_m"], drive["y_m"], color=colour, lw=7, alpha=0.35, label="driven")
+        for i, plan in enumerate(drive["plans"]):
+            ax.plot(plan["x_m"], plan["y_m"], color=BLACK, lw=0.9, label=None if i else "a plan, from where it looked")
+            ax.plot(plan["x_m"][0], plan["y_m"][0], "o", color=colour, mec=BLACK, mew=0.7, ms=5)
+        ax.add_patch(Circle(drive["balloon_xy_m"], 0.16, color=RED))
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_ylabel("to the left (m)")
+        ax.set_title(f"{drive['latency_ms']:g} ms, {label}: {drive['outcome']}", fontsize=11)
+    axes[-1, 0].set_xlabel("ahead of the start (m)")
+    legend(axes[0, 0], loc="best")
+    return fig

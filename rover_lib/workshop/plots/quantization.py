@@ -1,0 +1,148 @@
+"""Notebook 03: what quantization changes, layer by layer and block by block."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from rover_lib.workshop.observe import Calibration
+from rover_lib.workshop.plots.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    SKY,
+    action_colour,
+    bar_values,
+    judged_keys,
+    legend,
+    legend_below,
+    new_figure,
+)
+
+
+def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
+    """The largest activation per channel, before and after channel scales.
+
+    Left: a projection's largest channel over its median one, of the `count` projections where that was worst. Right:
+    the worst of all, channel by channel.
+    """
+    layers = {n: c for n, c in calibration.channels.items() if "in_max_scaled" in c}
+
+    def peak(x: torch.Tensor) -> float:
+        """How much larger the largest channel is than the middle one, of those that are not dead."""
+        x = x[x > 1e-6 * x.max()]
+        return float(x.max() / x.median()) if len(x) else 1.0
+
+    # Behind `up` INT8 sees the other side of the activation function, which is the input of `down`.
+    sides = {n: ("in",) if n.endswith(".up") else ("in", "out") for n in layers}
+    pairs = [(n, s) for n in layers for s in sides[n]]
+    worst, side = max(pairs, key=lambda row: peak(layers[row[0]][f"{row[1]}_max"]))
+    uneven = sorted(layers, key=lambda n: max(peak(layers[n][f"{s}_max"]) for s in sides[n]), reverse=True)[:count]
+    layers = {n: c for n, c in layers.items() if n in uneven}  # in the order of the data
+    fig, axes = new_figure(1, 2, height_in=max(3.4, 1.0 + 0.2 * len(layers)))
+    left, right = axes[0]
+    y = {name: i for i, name in enumerate(layers)}
+    for at, where, marker in (("in", "input", "o"), ("out", "output", "s")):
+        shown = [n for n in layers if at in sides[n]]
+        for key, colour, label in ((f"{at}_max", RED, "before"), (f"{at}_max_scaled", BLUE, "after")):
+            peaks = [peak(layers[n][key]) for n in shown]
+            face = "none" if label == "before" else colour
+            left.scatter(
+                peaks, [y[n] for n in shown], color=colour, marker=marker, s=16, fc=face, label=f"{where}, {label}"
+            )
+    left.set_yticks(list(y.values()), list(layers), fontsize=8)
+    left.invert_yaxis()
+    left.set(xscale="log", xlabel="largest channel / median channel")
+    left.set_title(f"the {len(layers)} most uneven projections", fontsize=11)
+    for key, colour, label in (
+        (f"{side}_max", RED, "before"),
+        (f"{side}_max_scaled", BLUE, "after channel scales"),
+    ):
+        x = np.sort(np.asarray(layers[worst][key]))[::-1]
+        right.plot(np.arange(1, len(x) + 1), 100 * x / x[0], color=colour, lw=1.8, label=label)
+    right.set(xlabel="channel, largest first", ylabel="activation (% of the largest)", ylim=(0, 105))
+    right.set_title(f"{worst}, {'input' if side == 'in' else 'output'}", fontsize=11)
+    legend(right)
+    legend_below(fig, left, 4)
+    return fig
+
+
+def errors_by_choice(
+    table: Mapping[str, Mapping[str, float | None]], title: str, budget_pct: float | None = None
+) -> Figure:
+    """Error of each action for each choice, say of observers. table: {choice: {<action>_mae_pct}}."""
+    choices = list(table)
+    fig, axes = new_figure(1, height_in=1.3 + 0.42 * len(choices))
+    ax = axes[0, 0]
+    keys = judged_keys(ax, next(iter(table.values())))
+    height = 0.8 / max(len(keys), 1)
+    for i, key in enumerate(keys):
+        y = np.arange(len(choices)) + (i - (len(keys) - 1) / 2) * height
+        values = [table[c][key] for c in choices]
+        ax.barh(y, values, height, color=action_colour(key, i), label=key.removesuffix("_mae_pct"))
+        bar_values(ax, y, values, "{:.2f}")
+    if budget_pct is not None:
+        ax.axvline(budget_pct, color=BLACK, ls="--", lw=1, label=f"limit, {budget_pct:g} %")
+    ax.set_yticks(range(len(choices)), choices)
+    ax.invert_yaxis()
+    ax.set_xlabel("mean error against FP32 (% of the recorded range)")
+    ax.set_title(title, fontsize=11)
+    legend(ax, loc="upper left", bbox_to_anchor=(1, 1))
+    return fig
+
+
+def sensitivity(
+    table: Mapping[str, Mapping[str, float | None]], steps: Sequence[Mapping[str, Any]], budget_pct: float
+) -> Figure:
+    """Left: each block quantized alone. Right: what leaving the worst ones in float buys.
+
+    table: {block: {<action>_mae_pct}}; steps: of `choose_mixed`, {float_blocks, <action>_mae_pct}.
+    """
+    blocks = list(table)
+    fig, axes = new_figure(1, 2, height_in=max(3.6, 1.2 + 0.26 * len(blocks)), width_ratios=(1.5, 1))
+    left, right = axes[0]
+    keys = judged_keys(right, next(iter(table.values())))
+    height = 0.8 / max(len(keys), 1)
+    for i, key in enumerate(keys):
+        name, colour = key.removesuffix("_mae_pct"), action_colour(key, i)
+        y = np.arange(len(blocks)) + (i - (len(keys) - 1) / 2) * height
+        left.barh(y, [table[b][key] for b in blocks], height, color=colour, label=name)
+        right.plot(range(len(steps)), [s[key] for s in steps], "o-", color=colour, label=name)
+    left.set_yticks(range(len(blocks)), blocks)
+    left.invert_yaxis()
+    left.set_xlabel("mean error (% of the recorded range)")
+    left.set_title("this block alone in INT8", fontsize=11)
+    right.axhline(budget_pct, color=BLACK, ls="--", lw=1, label=f"budget, {budget_pct:g} %")
+    right.set_xticks(range(len(steps)))
+    right.set(xlabel="blocks left in float", ylabel="mean error (% of the recorded range)", ylim=(0, None))
+    right.margins(x=0.15)
+    right.set_title("all others in INT8", fontsize=11)
+    legend(right)
+    return fig
+
+
+def layers(rows: Sequence[Mapping[str, Any]], clipped_warn_pct: float) -> Figure:
+    """Signal to noise and clipped share of every INT8 layer, in the order of the data. rows: `inspect_layers`."""
+    fig, axes = new_figure(2, 1, height_in=4.6, sharex=True)
+    upper, lower = axes[:, 0]
+    x = np.arange(len(rows))
+    parts = [r["block"].split(".")[0] for r in rows]
+    colours = [{"backbone": SKY, "encoder": GREEN, "decoder": ORANGE}.get(p, GREY) for p in parts]
+    upper.bar(x, [r["snr_db"] for r in rows], color=colours)
+    upper.set_ylabel("signal to noise (dB)")
+    upper.set_title("higher is better; errors from earlier layers are included", fontsize=11)
+    lower.bar(x, [r["clipped_pct"] for r in rows], color=colours)
+    lower.axhline(clipped_warn_pct, color=RED, ls="--", lw=1.2)
+    lower.text(len(rows) - 0.5, clipped_warn_pct, "warning ", color=RED, ha="right", va="bottom", fontsize=9)
+    lower.set(ylabel="clipped (% of values)", xlabel="INT8 layer, in the order of the data")
+    lower.set_ylim(0, 1.25 * max(clipped_warn_pct, *(r["clipped_pct"] for r in rows)))
+    for part, colour in (("backbone", SKY), ("encoder", GREEN), ("decoder", ORANGE), ("image_project", GREY)):
+        if part in parts:
+            lower.bar(0, 0, color=colour, label=part)
+    legend_below(fig, lower, 4)
+    return fig

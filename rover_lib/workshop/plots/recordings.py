@@ -1,0 +1,242 @@
+"""Notebooks 01 and 02: the checkpoint, the recordings, and what calibration saw of them."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.workshop.episodes import Episode, Recordings, Sample
+from rover_lib.workshop.observe import Calibration, RangeObserver
+from rover_lib.workshop.plots.style import (
+    BLACK,
+    BLUE,
+    DPI,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    SKY,
+    WIDTH_IN,
+    bar_values,
+    legend,
+    legend_below,
+    new_figure,
+    note,
+)
+from rover_lib.workshop.scheme import OBSERVERS
+
+
+def checkpoint_size(report: Mapping[str, Any]) -> Figure:
+    """Where a checkpoint's megabytes are, and what remains of them. report: `Checkpoint.report`."""
+    acting_mb = 4 * report["parameters_acting"] / 1e6
+    training_mb = 4 * report["parameters"] / 1e6 - acting_mb
+    other_mb = max(report["file_mb"] - report["optimizer_mb"] - acting_mb - training_mb, 0)
+    parts = {
+        "weights that act": (acting_mb, BLUE),
+        "weights of training only (VAE)": (training_mb, SKY),
+        "optimizer state": (report["optimizer_mb"], ORANGE),
+        "everything else": (other_mb, GREY),
+    }
+    rows = ["checkpoint file", "FP32, only what acts", "INT8, a byte per weight"]
+    fig, axes = new_figure(1, height_in=2.8)
+    ax, left = axes[0, 0], 0.0
+    for name, (size_mb, colour) in parts.items():
+        if size_mb > 0.005 * report["file_mb"]:
+            ax.barh(0, size_mb, left=left, color=colour, label=name)
+            left += size_mb
+    ax.barh([1, 2], [acting_mb, report["int8_floor_mb"]], color=BLUE)
+    bar_values(ax, range(3), [report["file_mb"], acting_mb, report["int8_floor_mb"]], "{:.1f} MB")
+    ax.set_yticks(range(3), rows)
+    ax.invert_yaxis()
+    ax.set_xlabel("size (MB, 10^6 bytes)")
+    ax.set_title(
+        f"{report['file_mb'] / report['int8_floor_mb']:.1f}x in all: {report['file_mb'] / acting_mb:.1f}x left out, "
+        f"{acting_mb / report['int8_floor_mb']:.1f}x by INT8",
+        fontsize=11,
+    )
+    legend(ax, loc="lower right")
+    return fig
+
+
+def work_per_block(parameters: Mapping[str, int], macs: Mapping[str, int]) -> Figure:
+    """Parameters and multiply-accumulates of every block, in the order of the data."""
+    blocks = [b for b in macs if macs[b] or parameters.get(b)]
+    fig, axes = new_figure(1, 2, height_in=1.2 + 0.21 * len(blocks), sharey=True)
+    left, right = axes[0]
+    y = np.arange(len(blocks))
+    colours = [{"backbone": SKY, "encoder": GREEN, "decoder": ORANGE}.get(b.split(".")[0], GREY) for b in blocks]
+    left.barh(y, [parameters.get(b, 0) / 1e6 for b in blocks], color=colours)
+    right.barh(y, [macs[b] / 1e6 for b in blocks], color=colours)
+    left.set_yticks(y, blocks)
+    left.invert_yaxis()
+    left.set_xlabel(f"parameters (10^6), {sum(parameters.values()) / 1e6:.2f} in all")
+    right.set_xlabel(f"multiply-accumulates (10^6), {sum(macs.values()) / 1e6:.0f} in all")
+    left.set_title("what must be stored", fontsize=11)
+    right.set_title("what must be computed", fontsize=11)
+    for part, colour in (("backbone", SKY), ("encoder", GREEN), ("decoder", ORANGE)):
+        right.barh(0, 0, color=colour, label=part)
+    legend(right, loc="lower right")
+    return fig
+
+
+def episode_overview(episode: Episode, pictures: int = 5) -> Figure:
+    """One drive: what the camera saw, what the driver did, and the pulses that the servos got."""
+    samples = episode.samples
+    shown = [samples[i] for i in np.linspace(0, len(samples) - 1, pictures).round().astype(int)]
+    fig = plt.figure(figsize=(WIDTH_IN, 6.2), dpi=DPI, layout="constrained")
+    plt.close(fig)
+    grid = fig.add_gridspec(3, pictures, height_ratios=(1.1, 1.3, 1.3))
+    for i, sample in enumerate(shown):
+        ax = fig.add_subplot(grid[0, i])
+        ax.imshow(sample.frame_bgr()[..., ::-1])
+        ax.set_title(f"{sample.time_s:.1f} s", fontsize=9)
+        ax.axis("off")
+    times_s = [s.time_s for s in samples]
+    actions = np.stack([s.chunk[0] for s in samples])
+    pulses = [PwmCalibration().pulses(*(float(v) for v in a)) for a in actions]
+    upper, lower = fig.add_subplot(grid[1, :]), fig.add_subplot(grid[2, :])
+    rows = (
+        (upper, actions[:, 0], actions[:, 1], "{} (share of full)"),
+        (lower, [p.steering_us for p in pulses], [p.throttle_us for p in pulses], "{} pulse (us)"),
+    )
+    for ax, steering, throttle, unit in rows:
+        other = ax.twinx()
+        ax.plot(times_s, steering, color=BLUE, lw=1.5)
+        other.plot(times_s, throttle, color=ORANGE, lw=1.5, ls="--")
+        ax.set_ylabel(unit.format("steering"), color=BLUE)
+        other.set_ylabel(unit.format("throttle"), color="#8A5F00")  # the same orange, dark enough to read
+        ax.spines["top"].set_visible(False)
+        other.spines["top"].set_visible(False)
+    lower.set_xlabel("time in the episode (s)")
+    fig.suptitle(
+        f"{episode.id}: {episode.label or 'no label'}, {len(samples)} samples of {episode.frames} frames",
+        fontsize=11,
+    )
+    return fig
+
+
+def faults(recordings: Recordings) -> Figure:
+    """What was wrong in the recordings, by kind; every count was skipped, none became an action."""
+    counts: dict[str, int] = {}
+    for fault in recordings.faults:
+        counts[fault.kind] = counts.get(fault.kind, 0) + fault.count
+    kinds = sorted(counts, key=lambda k: -counts[k])
+    fig, axes = new_figure(1, height_in=1.3 + 0.28 * max(len(kinds), 1))
+    ax = axes[0, 0]
+    used = len(recordings.samples)
+    if kinds:
+        ax.barh(range(len(kinds)), [counts[k] for k in kinds], color=RED)
+        bar_values(ax, range(len(kinds)), [counts[k] for k in kinds], "{:d}")
+        ax.set_yticks(range(len(kinds)), [k.replace("_", " ") for k in kinds])
+        ax.invert_yaxis()
+        ax.set_xlabel("times")
+    else:
+        note(ax, "no faults found")
+    ax.set_title(f"{len(recordings.episodes)} episodes give {used} samples; faults that were skipped:", fontsize=11)
+    return fig
+
+
+def calibration_coverage(
+    pool: Sequence[Sample],
+    chosen: Sequence[Sample],
+    held_out: Sequence[Sample],
+    names=("steering", "throttle"),
+) -> Figure:
+    """Which recorded actions the calibration samples cover, beside those that judge later."""
+    fig, axes = new_figure(1, 3, height_in=3.4)
+    sets = (
+        ("could calibrate", pool, GREY, "o", 8),
+        ("held out", held_out, ORANGE, "x", 14),
+        ("calibrate", chosen, BLUE, "o", 10),
+    )
+    for label, samples, colour, marker, size in sets:
+        first = np.stack([s.chunk[0] for s in samples])
+        axes[0, 0].scatter(
+            *first.T[:2],
+            s=size,
+            c=colour,
+            marker=marker,
+            lw=0.8,
+            alpha=0.8,
+            label=f"{label} ({len(samples)})",
+        )
+    axes[0, 0].set(xlabel=f"{names[0]} (share of full)", ylabel=f"{names[1]} (share of full)")
+    axes[0, 0].set_title("one point per frame", fontsize=11)
+    for i in range(2):
+        ax = axes[0, i + 1]
+        every = np.concatenate([s.chunk[:, i] for s in pool])
+        bins = np.linspace(every.min(), every.max(), 25) if every.max() > every.min() else 25
+        for samples, colour, style in ((pool, GREY, "stepfilled"), (chosen, BLUE, "step")):
+            values = np.concatenate([s.chunk[:, i] for s in samples])
+            ax.hist(
+                values,
+                bins,
+                weights=np.full(len(values), 100 / len(values)),
+                color=colour,
+                histtype=style,
+                lw=1.5,
+            )
+        ax.set(xlabel=f"{names[i]} (share of full)", ylabel="actions (%)")
+        ax.set_title(f"{names[i]} over whole plans", fontsize=11)
+    legend_below(fig, axes[0, 0], 3)
+    return fig
+
+
+def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
+    """What calibration saw in a few layers, and the range that each observer would give INT8's 256 steps to.
+
+    Of each part of the policy the layer where the observers disagree most.
+    """
+    rows = []
+    for layer, observers in _observers(calibration).items():
+        ranges = {name: observers[name].range() for name in OBSERVERS}
+        widths = [high - low for low, high in ranges.values()]
+        rows.append((max(widths) / max(min(widths), 1e-12), layer, observers["minmax"], ranges))
+    rows.sort(key=lambda row: -row[0])
+    worst_of_part: dict[str, Any] = {}
+    for row in rows:
+        worst_of_part.setdefault(row[1].split(".")[0], row)
+    shown = list(worst_of_part.values())[:count]
+    fig, axes = new_figure(1, len(shown), height_in=3.6)
+    styles = {"minmax": (BLACK, ":"), "percentile": (ORANGE, "--"), "histogram": (BLUE, "-")}
+    for ax, (_, layer, seen, ranges) in zip(axes[0], shown, strict=False):
+        share = 100 * seen.histogram / seen.histogram.sum()
+        limit = seen.limit.item()
+        edges = np.linspace(-limit, limit, 129)
+        ax.bar(edges[:-1], share.view(128, -1).sum(1), np.diff(edges), align="edge", color=GREY)
+        for name, (colour, style) in styles.items():
+            for i, x in enumerate(ranges[name]):
+                ax.axvline(x, color=colour, ls=style, lw=1.6, label=name if i == 0 else None)
+        low, high = ranges["minmax"]
+        ax.set_xlim(low - 0.06 * (high - low), high + 0.06 * (high - low))
+        ax.set_yscale("log")
+        ax.set_title(layer, fontsize=10)
+        ax.set_xlabel("activation (no unit)")
+    axes[0, 0].set_ylabel("values seen (%, logarithmic)")
+    legend_below(fig, axes[0, 0], 3)
+    return fig
+
+
+def _observers(calibration: Calibration) -> dict[str, dict[str, Any]]:
+    """For each layer with a recorded range: an observer of each choice with what calibration saw there."""
+    states: dict[str, dict[str, torch.Tensor]] = {}
+    for key, tensor in calibration.observers.items():
+        name, _, buffer = key.rpartition(".")
+        states.setdefault(name, {})[buffer] = tensor
+    by_range = {(s["min_val"].item(), s["max_val"].item()): s for s in states.values() if "histogram" in s}
+    observers: dict[str, dict[str, Any]] = {}
+    for layer, ends in calibration.ranges.items():
+        state = by_range.get((ends["min"], ends["max"]))
+        if state is None:
+            continue
+        observers[layer] = {}
+        for choice in OBSERVERS:
+            o = RangeObserver(dtype=torch.qint8, quant_min=-128, quant_max=127, choice=choice, percentile=99.99)
+            for buffer in ("min_val", "max_val", "limit", "histogram"):
+                getattr(o, buffer).copy_(state[buffer])
+            observers[layer][choice] = o
+    return observers

@@ -1,0 +1,120 @@
+"""What all figures share: axes, legends, colours, names of artifacts.
+
+Colours are Okabe and Ito's, which colour-blind people can tell apart; a mode has the same one in every figure.
+Figures are drawn for a notebook's width at 100 dots per inch.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.table import Table
+
+from rover_lib.onboard.host import THROTTLED_BITS
+
+WIDTH_IN, DPI = 9.0, 100
+BLACK = "#333333"
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+GREEN = "#009E73"
+BLUE = "#0072B2"
+RED = "#D55E00"
+PURPLE = "#CC79A7"
+GREY = "#B0B0B0"
+NOW_BITS = sum(1 << bit for bit in THROTTLED_BITS)  # of get_throttled; the others are since the machine's start
+COLOURS = {
+    "fp32": BLACK,
+    "dynamic": ORANGE,
+    "static": BLUE,
+    "mixed": GREEN,
+    "static_affine": RED,
+    "lerobot": PURPLE,
+    "steering": BLUE,
+    "throttle": ORANGE,
+}
+NAMES = {
+    "fp32": "FP32",
+    "dynamic": "dynamic",
+    "static": "static",
+    "mixed": "mixed",
+    "static_affine": "static, affine",
+    "lerobot": "LeRobot, eager FP32",
+    "torch_affine": "torch, affine",
+    "onnxruntime": "ONNX Runtime INT8",
+    "executorch": "ExecuTorch INT8",
+}
+
+
+def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: Any) -> tuple[Figure, np.ndarray]:
+    """A figure and its (rows, columns) axes, closed for pyplot: who shows the figure is the caller's affair."""
+    fig, axes = plt.subplots(
+        rows, columns, figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained", squeeze=False, **options
+    )
+    plt.close(fig)
+    for ax in axes.flat:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(labelsize=9)
+    return fig, axes
+
+
+def legend(ax: Axes, **options: Any) -> None:
+    ax.legend(frameon=False, fontsize=9, **options)
+
+
+def legend_below(fig: Figure, ax: Axes, columns: int) -> None:
+    """One legend for all of a figure's axes."""
+    handles, labels = ax.get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+
+
+def bar_values(ax: Axes, y: Iterable[float], x: Iterable[Any], form: str) -> None:
+    """The numbers behind horizontal bars, with room for them."""
+    for at, value in zip(y, x, strict=True):
+        ax.annotate(form.format(value), (value, at), (4, 0), textcoords="offset points", va="center", fontsize=9)
+    ax.margins(x=0.16)
+
+
+def note(ax: Axes, text: str) -> None:
+    """A sentence where there is nothing to draw."""
+    ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes, fontsize=11)
+    ax.set_axis_off()
+
+
+def judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
+    """The keys <action>_mae_pct of actions that are judged; those that are not are named in the legend of `ax`."""
+    keys = [k for k in errors if k.endswith("_mae_pct")]
+    for key in keys:
+        if errors[key] is None:
+            ax.plot([], [], " ", label=f"{key.removesuffix('_mae_pct')}: not judged")
+    return [k for k in keys if errors[k] is not None]
+
+
+def save(figure: Figure, run_dir: Path | str, name: str) -> Figure:
+    """Write run_dir/figures/<name>.png and return the figure, so that a cell that ends with this also shows it."""
+    path = Path(run_dir) / "figures" / f"{name}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=DPI)
+    return figure
+
+
+def simd_bars(ax: Axes, y: np.ndarray, total: np.ndarray, simd: np.ndarray) -> None:
+    ax.barh(y, simd, color=BLUE, label="SIMD (vector) instructions")
+    ax.barh(y, total - simd, left=simd, color=SKY, label="all others")
+    bar_values(ax, y, total, "{:.3g}")
+
+
+def action_colour(key: str, index: int) -> str:
+    return COLOURS.get(key.split("_")[0], (BLUE, ORANGE, GREEN, RED, PURPLE, SKY)[index % 6])
+
+
+def plain_table(table: Table) -> None:
+    table.auto_set_font_size(False)
+    table.set_fontsize(10)
+    for (row, _), cell in table.get_celld().items():
+        cell.set_edgecolor("#DDDDDD")
+        if row == 0:
+            cell.set_text_props(weight="bold")
