@@ -14,7 +14,7 @@ An action that never changes in the recordings has no range to be a share of: it
 
 import math
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,14 +30,13 @@ from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.workshop import judge
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.progress import Progress, silent
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
 ARTIFACTS = ("fp32", *MODES, "static_affine")
 GATED = "static"  # the mode that a Pi is meant to run, and that the gates judge
 
 RELATIONS = {"<=": operator.le, ">=": operator.ge}
-
-Progress = Callable[..., Iterable] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +210,7 @@ def _affine(x: np.ndarray, affine: Affine | None) -> torch.Tensor:
     """x * scale + shift over the last axis."""
     if affine is None:
         return torch.from_numpy(x)
-    return torch.from_numpy(x * np.float32(affine.scale) + np.float32(affine.shift))
+    return torch.from_numpy(x * np.asarray(affine.scale, np.float32) + np.asarray(affine.shift, np.float32))
 
 
 def us_per_unit(action: str) -> float:
@@ -259,13 +258,13 @@ def fidelity(
     others: Mapping[str, Any],
     samples: Sequence[Any],
     action_range: Mapping[str, tuple[float, float]],
-    progress: Progress = None,
+    progress: Progress = silent,
 ) -> Fidelity:
     """Run every policy on every sample.
 
     reference, others: policies with predict_chunk(frame_bgr, state) -> (C, A), chunk and action_names.
     samples: with frame_bgr() and state; chunk (C, A) and is_pad (C,) where there is a recording.
-    action_range: name -> (least, most). progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
+    action_range: name -> (least, most). progress: of the samples.
     Raises PolicyError for no samples, policies of other actions or chunks, or an action without a range.
     """
     names = tuple(reference.action_names)
@@ -279,12 +278,13 @@ def fidelity(
             )
     if missing := [n for n in names if n not in action_range]:
         raise PolicyError(f"no recorded range of action {missing} (found {sorted(action_range)}); use other recordings")
-    expected, found = [], {mode: [] for mode in others}
-    for sample in progress(samples, desc="comparing", total=len(samples)) if progress else samples:
+    expected: list[np.ndarray] = []
+    planned: dict[str, list[np.ndarray]] = {mode: [] for mode in others}
+    for sample in progress(samples, desc="comparing", total=len(samples)):
         frame = sample.frame_bgr()
         expected.append(reference.predict_chunk(frame, sample.state))
         for mode, policy in others.items():
-            found[mode].append(policy.predict_chunk(frame, sample.state))
+            planned[mode].append(policy.predict_chunk(frame, sample.state))
     recorded = all(getattr(s, "chunk", None) is not None for s in samples)
     pads = [s.is_pad for s in samples] if recorded else np.zeros((len(samples), reference.chunk), bool)
     return Fidelity(
@@ -292,7 +292,7 @@ def fidelity(
         action_range={n: (float(action_range[n][0]), float(action_range[n][1])) for n in names},
         samples=tuple(samples),
         reference=np.stack(expected),
-        chunks={mode: np.stack(chunks) for mode, chunks in found.items()},
+        chunks={mode: np.stack(chunks) for mode, chunks in planned.items()},
         recorded=np.stack([s.chunk for s in samples]) if recorded else None,
         is_pad=np.asarray(pads, bool),
     )

@@ -27,7 +27,6 @@ import json
 import math
 import os
 import stat
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -49,6 +48,8 @@ from rover_lib.onboard.recording import (
     number_of,
 )
 from rover_lib.onboard.stage import sha256_of
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.untrusted import listed, shown
 
 ACTION_NAMES = CHANNELS
 DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
@@ -214,15 +215,14 @@ def load_recordings(
     root: Path | str,
     chunk: int = 32,
     sync_s: float = 0.05,
-    progress: Callable[..., Iterable] | None = None,
+    progress: Progress = silent,
     pwm: PwmCalibration | None = None,
 ) -> Recordings:
     """Read every episode folder below `root` (or `root` itself, if it is one).
 
-    chunk: actions per sample. sync_s: how far a control may be from its frame. progress: called like
-    tqdm.tqdm(iterable, desc=, total=), or None. Faults are counted and skipped; pictures are only checked
-    for their ends here and decoded in `Sample.frame_bgr`. Raises EpisodeError when nothing usable is left,
-    with the most frequent reasons.
+    chunk: actions per sample. sync_s: how far a control may be from its frame. Faults are counted and skipped;
+    pictures are only checked for their ends here and decoded in `Sample.frame_bgr`. Raises EpisodeError when
+    nothing usable is left, with the most frequent reasons.
     """
     root = Path(root)
     root = root if root.name else root.resolve()  # "." has no name to give an episode
@@ -241,8 +241,11 @@ def load_recordings(
     if not folders:
         raise EpisodeError(f"{root}: no episode folders in it: give the folder that holds episode_YYYYMMDD_HHMMSS")
     faults = _Faults(root)
-    watched = progress(folders, desc="reading episodes", total=len(folders)) if progress else folders
-    episodes = tuple(e for folder in watched if (e := _load_episode(folder, chunk, sync_s, pwm, faults)))
+    read = (
+        _load_episode(folder, chunk, sync_s, pwm, faults)
+        for folder in progress(folders, desc="reading episodes", total=len(folders))
+    )
+    episodes = tuple(episode for episode in read if episode)
     if not episodes:
         kinds: dict[str, int] = {}
         for fault in faults.listed():
@@ -260,12 +263,6 @@ def _relative(path: Path, root: Path) -> str:
         return path.relative_to(root).as_posix()
     except ValueError:
         return path.name
-
-
-def _shown(value: object) -> str:
-    """A value from a file for a sentence: short, and on one line."""
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _load_episode(folder: Path, chunk: int, sync_s: float, pwm: PwmCalibration, faults: _Faults) -> Episode | None:
@@ -361,7 +358,7 @@ def _read_json(path: Path, faults: _Faults) -> dict[str, Any]:
     try:
         content = json.loads(data)
     except (ValueError, RecursionError) as e:  # bad syntax or encoding, or brackets nested without end
-        faults.add(path, "broken_json", _shown(str(e)))
+        faults.add(path, "broken_json", shown(str(e)))
         return {}
     if not isinstance(content, dict):
         faults.add(path, "wrong_type", f"holds a {type(content).__name__}, not an object")
@@ -375,14 +372,14 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict
         return []
     # What a cut row lacks is not "no pulse", which is empty.
     table = csv.DictReader(data.decode("utf-8-sig", errors="replace").splitlines(), restval="missing")
-    rows = []
+    rows: list[dict[str, Any]] = []
     try:
         if missing := [name for name in fields if name not in (table.fieldnames or ())]:
             faults.add(path, "wrong_header", f"no column {missing[0]}")
             return []
         rows.extend(table)
     except csv.Error as e:
-        faults.add(path, "broken_csv", _shown(str(e)))
+        faults.add(path, "broken_csv", shown(str(e)))
     return rows
 
 
@@ -395,22 +392,23 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
             continue
         lost = [name for name in ACTION_NAMES if no_pulse(row, name)]
         wanted = [name for name in CONTROL_FIELDS if name.split("_")[0] not in lost]
-        values = {name: number_of(row.get(name)) for name in wanted}
-        bad = [name for name, value in values.items() if value is None]
-        nan = [name for name, value in values.items() if value is not None and math.isnan(value)]
+        read = {name: number_of(row.get(name)) for name in wanted}
+        values = {name: value for name, value in read.items() if value is not None}
+        bad = [name for name in wanted if name not in values]
+        nan = [name for name, value in values.items() if math.isnan(value)]
         if bad:
-            faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {_shown(row.get(bad[0]))}")
+            faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {shown(row.get(bad[0]))}")
             continue  # such a row was not written by the recorder: nothing in it can be trusted
         if nan:
-            faults.add(path, "not_finite", f"control {i}: {nan[0]} is {_shown(row.get(nan[0]))}")
+            faults.add(path, "not_finite", f"control {i}: {nan[0]} is {shown(row.get(nan[0]))}")
         if "system_timestamp" in nan:
             continue  # without a time it can be no frame's action
         for name in lost:
             faults.add(path, f"{name}_no_pulse", f"control {i}: not measured; such values are missing, not 0")
-        actions = tuple(
+        steering, throttle = (
             None if name in lost else _read_action(name, values, i, path, pwm, faults) for name in ACTION_NAMES
         )
-        controls.append(_Control(values["system_timestamp"], values["arduino_timestamp"] / 1000, actions))
+        controls.append(_Control(values["system_timestamp"], values["arduino_timestamp"] / 1000, (steering, throttle)))
     return _sorted_by_time(controls, [c.system_s for c in controls], path, "control", faults)
 
 
@@ -488,7 +486,7 @@ def _inside(path: Path, folder: Path) -> bool:
 def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[_Frame]:
     """The listed frames with a time, ordered by it; `usable` says whether there is a whole picture."""
     frames: list[_Frame] = []
-    numbers: set[int] = set()
+    numbers: set[float] = set()
     for i, row in enumerate(rows):
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
@@ -499,10 +497,10 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
             row.get("image_path"),
         )
         if number is None or time_s is None or not isinstance(name, str) or not name:
-            faults.add(path, "wrong_type", f"frame {i}: {_shown({k: row.get(k) for k in FRAME_FIELDS})}")
+            faults.add(path, "wrong_type", f"frame {i}: {listed(row.get(name) for name in FRAME_FIELDS)}")
             continue
         if math.isnan(number) or math.isnan(time_s):
-            faults.add(path, "not_finite", f"frame {i}: {_shown(row.get('timestamp'))}")
+            faults.add(path, "not_finite", f"frame {i}: {shown(row.get('timestamp'))}")
             continue
         if number in numbers:
             faults.add(path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts")
@@ -525,17 +523,17 @@ def _check_picture(folder: Path, picture: Path, name: str, path: Path, faults: _
     """Whether a listed picture is there, within the episode, and whole. Cheap: reads its two ends only."""
     try:
         if Path(name).is_absolute() or not _inside(picture, folder):
-            faults.add(path, "path_leaves_folder", f"{_shown(name)} is outside of the episode")
+            faults.add(path, "path_leaves_folder", f"{shown(name)} is outside of the episode")
             return False
         if not stat.S_ISREG(picture.stat().st_mode):  # opening a pipe would wait for ever
-            faults.add(path, "frame_missing", f"{_shown(name)} is no file")
+            faults.add(path, "frame_missing", f"{shown(name)} is no file")
             return False
         with picture.open("rb") as f:
             head = f.read(2)
             f.seek(max(f.seek(0, os.SEEK_END) - JPEG_TAIL, 0))
             problem = _jpeg_problem(head, f.read())
     except (OSError, ValueError):  # not there, unreadable, a name too long, or with a zero byte in it
-        faults.add(path, "frame_missing", f"{_shown(name)} is listed but cannot be read")
+        faults.add(path, "frame_missing", f"{shown(name)} is listed but cannot be read")
         return False
     if problem:
         faults.add(picture, "broken_jpeg", problem)

@@ -107,7 +107,7 @@ def _mode(name: str) -> str:
 def _named(content: Mapping[str, Any], ours: Mapping[str, str]) -> dict[str, Any]:
     """With artifacts by mode; ours: {sha256: mode} of the run's. On a rover the file in use is always policy.pt."""
     metrics = content["metrics"]
-    names = {}
+    names: dict[str, str] = {}
     for name, v in metrics["artifacts"].items():
         sha = content["inputs"].get(f"{name}.pt")
         called = ours[sha] if sha in ours else f"{v.get('mode') or _mode(name)}, another"
