@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 from lab.debian import fetch_packages, unpack_packages
 from lab.pi import playbooks
 from lab.pi.container import Container
-from lab.pi.emulation import EmulationError
+from lab.pi.emulation import EmulationError, wait_for
 from lab.pi.network import Network
 from lab.pi.playbooks import Play
 from rover_lib.onboard.release import POLICY, Releases, pack
@@ -50,13 +50,16 @@ class Missed(EmulationError):
 class Disk:
     """How far a deployment has come, by what is on the rover's disk.
 
-    ready: there is a folder for what arrives. arrived: names of what has. staging: bytes of the files of a release
-    that has no name yet. released: it has. switched: it is in use. remembered: and was proven again since.
+    ready: there is a folder for what arrives. arrived: names of what has. complete: it is all. staging: bytes of the
+    files of a release that has no name yet. staged: its policy is whole. released: it has its name. switched: it is in
+    use. remembered: and was proven again since.
     """
 
     ready: bool = False
     arrived: tuple[str, ...] = ()
+    complete: bool = False
     staging: Mapping[str, int] = field(default_factory=dict)
+    staged: bool = False
     released: bool = False
     switched: bool = False
     remembered: bool = False
@@ -65,34 +68,51 @@ class Disk:
     def seen(cls, state: Path, about: Mapping[str, Any]) -> "Disk":
         """state: the folder of models/ and incoming/. about: what pack() returned."""
         models, incoming = state / "models", state / "incoming" / about["sha256"]
-        try:
+        ready, arrived, staging, current, last = False, (), {}, "", ""
+        with contextlib.suppress(OSError):
             arrived = tuple(sorted(p.name for p in incoming.iterdir() if not p.name.startswith(".")))
             ready = True
-        except OSError:
-            arrived, ready = (), False
-        staging = {}
         with contextlib.suppress(OSError):
             staging = {entry.name: entry.stat().st_size for entry in os.scandir(models / "releases" / ".new")}
-        try:
+        with contextlib.suppress(OSError):
             current = str((models / "current").readlink()).removeprefix("releases/")
-        except OSError:
-            current = ""
-        try:
+        with contextlib.suppress(OSError, ValueError, IndexError):
             last = json.loads((models / "history.json").read_text())[-1]
-        except (OSError, ValueError, IndexError):
-            last = ""
         name = str(about["name"])
         switched = current.startswith(name)
-        released = any(True for _ in (models / "releases").glob(f"{name}*/{POLICY}"))
-        return cls(ready, arrived, staging, released, switched, switched and last == current)
+        return cls(
+            ready=ready,
+            arrived=arrived,
+            complete=len(arrived) == about["parts"] + 1,  # and what describes them
+            staging=staging,
+            staged=staging.get(POLICY) == about["bytes"],
+            released=any(True for _ in (models / "releases").glob(f"{name}*/{POLICY}")),
+            switched=switched,
+            remembered=switched and last == current,
+        )
 
-    def complete(self, about: Mapping[str, Any]) -> bool:
-        """All parts have arrived, and what describes them."""
-        return len(self.arrived) == about["parts"] + 1
+    # Moments
 
-    def row(self) -> dict[str, Any]:
-        """For the report."""
-        return {**vars(self), "arrived": list(self.arrived), "staging": dict(self.staging)}
+    def awaiting(self) -> bool:
+        return self.ready and not self.arrived
+
+    def arriving(self) -> bool:
+        return any(name.startswith("part-") for name in self.arrived) and not self.complete
+
+    def unopened(self) -> bool:
+        return self.complete and not self.staging
+
+    def writing(self) -> bool:
+        return self.staging.get(POLICY, 0) > 0 and not self.staged
+
+    def written(self) -> bool:
+        return self.staged and not self.released
+
+    def named(self) -> bool:
+        return self.released and not self.switched
+
+    def just_switched(self) -> bool:
+        return self.switched and not self.remembered
 
 
 class Line(NamedTuple):
@@ -138,11 +158,11 @@ class DeploymentBench:
     """A rover that is deployed to, and the network to it. before, target: the mode in use, and the one to be deployed.
 
     artifacts: two that are fit to be deployed, by their mode. allow: as rover_allow, what they may differ in.
-    packed: what pack() says of them. found: the disk when its power was cut.
+    packed: what pack() says of them. disk_then: when its power was cut.
     """
 
     before = target = ""
-    found = Disk()
+    disk_then = Disk()
 
     def __init__(
         self,
@@ -255,16 +275,12 @@ class DeploymentBench:
             raise struck[0]
         return play
 
-    def cut_power(self, holds: Callable[[Disk], bool]) -> Callable[[], None]:
-        """To strike with. holds: what the disk is like then; another moment was hit if it is not."""
-
-        def strike() -> None:
-            self.pi.cut_power()
-            self.found = self.disk
-            if not holds(self.found):
-                raise Missed(f"{self.pi.name}: the power was cut a moment too late, there is {self.found.row()}")
-
-        return strike
+    def cut_power(self, moment: Callable[[Disk], bool]) -> None:
+        """Raises Missed if the disk is not as it is at that moment."""
+        self.pi.cut_power()
+        self.disk_then = self.disk
+        if not moment(self.disk_then):
+            raise Missed(f"{self.pi.name}: the power was cut a moment too late", found=vars(self.disk_then))
 
     def set_clock(self, years: int) -> None:
         """What starts from now on sees another year, until the row is over: by libfaketime, in every aarch64 program.
@@ -287,10 +303,8 @@ class DeploymentBench:
 
     def wait_for_check(self) -> None:
         """Until a health check has loaded something of what it needs. Raises Missed if there is none."""
-        until = time.monotonic() + 5
-        while not self.proves():
-            if time.monotonic() > until:
-                raise Missed(f"{self.pi.name}: no health check is at work")
+        if not wait_for(self.proves, 5, every_s=0.0):
+            raise Missed(f"{self.pi.name}: no health check is at work")
         self.stop.wait(INTO_CHECK_S)
 
     def rover(self, *command: object) -> str:

@@ -21,7 +21,6 @@ import re
 import shutil
 import threading
 import time
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -40,8 +39,9 @@ from lab.pi.deployment_bench import (
     rovers,
 )
 from lab.pi.emulation import EmulationError
+from rover_lib.onboard.artifact import read_manifest
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.release import ORIGIN, POLICY, SPARE_BYTES
+from rover_lib.onboard.release import ORIGIN, SPARE_BYTES
 
 ROOM = 4 << 20  # bytes free on a full disk
 TRIES = 2  # of a row whose moment was missed
@@ -50,9 +50,6 @@ RETRY_S = 30  # of trying to reach a rover that does not answer
 NOBODY = 9  # a port on which no sshd listens
 
 Say = Callable[[str], None]
-
-
-# The faults
 
 
 @dataclass(frozen=True)
@@ -71,115 +68,39 @@ class DeploymentFault:
     heal: Callable[[DeploymentBench], object] = lambda bench: None
 
 
-FAULTS: list[DeploymentFault] = []
-LOST = "UNREACHABLE!|does not answer any more"  # when ssh ends
+# How they are made
 
 
-def _fault(name: str, says: str, how: str, **more: Any) -> Callable[[Callable], Callable]:
-    def add(inject: Callable[[DeploymentBench], object]) -> Callable[[DeploymentBench], object]:
-        FAULTS.append(DeploymentFault(name, inject, says, how, **more))
-        return inject
+def _strike(
+    moment: Callable[[Disk], bool], action: Callable[[DeploymentBench], object], *, in_check: bool = False, **more: Any
+) -> Callable[[DeploymentBench], None]:
+    """Does something to a rover once its disk is so. in_check: and a second into the health check that begins then."""
 
-    return add
-
-
-def _power_cut(
-    when: str, moment: Callable[[DeploymentBench, Disk], bool], how: str, *, in_check: bool = False, fresh: bool = True
-) -> None:
-    """in_check: not at that moment, but in the health check that it begins with."""
-
-    @_fault(f"power cut {when}", LOST, how, fresh=fresh)
     def inject(bench: DeploymentBench) -> None:
-        cut = bench.cut_power(lambda disk: moment(bench, disk))
-
-        def strike() -> None:
+        def act() -> None:
             if in_check:
                 bench.wait_for_check()
-            cut()
+            action(bench)
 
-        bench.deploy_until(lambda disk: moment(bench, disk) and (not in_check or bench.proves()), strike)
+        bench.deploy_until(lambda disk: moment(disk) and (not in_check or bench.proves()), act, **more)
 
-
-def _arriving(bench: DeploymentBench, disk: Disk) -> bool:
-    return any(name.startswith("part-") for name in disk.arrived) and not disk.complete(bench.about)
+    return inject
 
 
-def _written_in_part(bench: DeploymentBench, disk: Disk) -> bool:
-    return 0 < disk.staging.get(POLICY, 0) < bench.about["bytes"]
+def _anytime(disk: Disk) -> bool:
+    return True
 
 
-_power_cut(
-    "before the transfer", lambda b, d: d.ready and not d.arrived, "once there is a folder for it, and nothing in it"
-)
-_power_cut("in the transfer", _arriving, "once a part of it is there")
-_power_cut(
-    "after the transfer",
-    lambda b, d: d.complete(b.about) and not d.staging,
-    "once all is there, and nothing made of it",
-)
-_power_cut("before fsync", _written_in_part, "while the new release's policy.pt is written")
-_power_cut(
-    "before the release has its name",
-    lambda b, d: d.staging.get(POLICY) == b.about["bytes"] and not d.released,
-    "once all its bytes are written, while they are looked at",
-)
-_power_cut("after fsync and rename", lambda b, d: d.released and not d.switched, "once its folder has its name")
-_power_cut(
-    "in the health check before the switch",
-    lambda b, d: d.released and not d.switched,
-    "a second into its parity vectors",
-    in_check=True,
-    fresh=False,
-)
-_power_cut(
-    "right after the switch", lambda b, d: d.switched and not d.remembered, "once current points to it", fresh=False
-)
-_power_cut(
-    "in the health check after the switch",
-    lambda b, d: d.switched and not d.remembered,
-    "a second into its parity vectors",
-    in_check=True,
-    fresh=False,
-)
-_power_cut(
-    "between switch and restart",
-    lambda b, d: d.remembered,
-    "once it was proven again; a power cut ends a service too, which then loads what current points to",
-    fresh=False,
-)
-
-
-@_fault(
-    "disk full in the transfer",
-    "No space left on device",
-    f"{ROOM >> 20} MB are free",
-    heal=DeploymentBench.make_room,
-    fresh=True,
-)
 def _no_room_to_arrive(bench: DeploymentBench) -> None:
     bench.small_disk(ROOM)
     bench.deploy()
 
 
-@_fault(
-    "too little room for a release",
-    r"\d+ MB free, \d+ are needed; prune releases",
-    "it can arrive, but the release does not fit beside it",
-    heal=DeploymentBench.make_room,
-    fresh=True,
-)
 def _no_room_to_stage(bench: DeploymentBench) -> None:
     bench.small_disk(2 * bench.about["bytes"] + ROOM)
     bench.deploy()
 
 
-@_fault(
-    "disk full while the release is written",
-    "the disk is full; what was in use still is",
-    "something else takes all that is free, once there was room enough",
-    heal=DeploymentBench.make_room,
-    fresh=True,
-)
 def _fill_while_staging(bench: DeploymentBench) -> None:
     bench.small_disk(2 * bench.about["bytes"] + SPARE_BYTES + 2 * ROOM)
 
@@ -188,44 +109,18 @@ def _fill_while_staging(bench: DeploymentBench) -> None:
             while True:
                 f.write(bytes(1 << 20))
 
-    bench.deploy_until(lambda disk: disk.complete(bench.about) and bool(disk.staging), fill)
+    bench.deploy_until(lambda disk: disk.complete and bool(disk.staging), fill)
 
 
-@_fault(
-    "a byte flipped on the way",
-    f"transfer mechanism failed|{LOST}",
-    "in the network, once a part has come through: ssh notices and ends, and Ansible may send it again",
-    fresh=True,
-)
-def _flip_on_the_wire(bench: DeploymentBench) -> None:
-    bench.deploy_until(lambda disk: _arriving(bench, disk), lambda: bench.network.flip(after=1 << 20))
-
-
-@_fault(
-    "a byte flipped in what has arrived",
-    "arrived damaged .* send it again",
-    "in a part on the rover's disk",
-    fresh=True,
-)
-def _flip_on_disk(bench: DeploymentBench) -> None:
-    bench.deploy_until(lambda disk: disk.complete(bench.about), lambda: flip(bench.incoming / "part-0000"))
-
-
-@_fault(
-    "ssh lost in the transfer",
-    LOST,
-    "the network is cut a megabyte after the first part; the transfer goes on",
-    fresh=True,
-)
 def _lose_ssh_in_transfer(bench: DeploymentBench) -> dict[str, Any]:
-    def strike() -> None:
+    def cut() -> None:
         until = bench.network.sent + (1 << 20)
-        while bench.network.sent < until and not bench.disk.complete(bench.about) and not bench.stop.is_set():
+        while bench.network.sent < until and not bench.disk.complete and not bench.stop.is_set():
             time.sleep(0.001)
         bench.network.cut()
 
     sent = bench.network.sent
-    bench.deploy_until(lambda disk: _arriving(bench, disk), strike)
+    bench.deploy_until(Disk.arriving, cut)
     first = bench.network.sent - sent
     bench.network.mend()
     arrived = {p.name: p.stat().st_ino for p in bench.incoming.glob("part-*")}
@@ -235,140 +130,67 @@ def _lose_ssh_in_transfer(bench: DeploymentBench) -> dict[str, Any]:
     def look() -> None:
         kept.update({p.name: p.stat().st_ino for p in bench.incoming.glob("part-*")})
 
-    bench.deploy_until(lambda disk: disk.complete(bench.about), look)
+    bench.deploy_until(lambda disk: disk.complete, look)
     travelled = [name for name, inode in kept.items() if arrived.get(name) != inode]
     if not arrived or set(arrived) & set(travelled):
         raise EmulationError(f"{bench.pi.name}: {sorted(arrived)} had arrived, and {travelled} travelled again")
     # All that Ansible sends is in these, its modules too.
-    return {
-        "had_arrived": sorted(arrived),
-        "travelled_then": travelled,
-        "sent_mb": [round(first / 1e6, 1), round((bench.network.sent - sent) / 1e6, 1)],
-    }
+    sent_mb = [round(first / 1e6, 1), round((bench.network.sent - sent) / 1e6, 1)]
+    return {"had_arrived": sorted(arrived), "travelled_then": travelled, "sent_mb": sent_mb}
 
 
-@_fault("ssh lost in the health check", LOST, "the network is cut while the rover proves the new model; it goes on")
-def _lose_ssh_in_check(bench: DeploymentBench) -> None:
-    def strike() -> None:
-        bench.wait_for_check()
-        bench.network.cut()
-
-    bench.deploy_until(lambda disk: bench.proves(), strike)
+def _name_another(bench: DeploymentBench) -> None:
+    path = bench.incoming / ORIGIN
+    other = bench.packed[bench.before]["name"]
+    path.write_text(json.dumps({**json.loads(path.read_text()), "name": other[::-1]}))
 
 
-@_fault(
-    "network silent in the transfer", LOST, "out of reach: no packet comes through, and no connection ends", fresh=True
-)
-def _go_silent(bench: DeploymentBench) -> None:
-    # Of each try to reach it again; ssh's own limit is that of inventory.ini.
-    bench.deploy_until(lambda disk: _arriving(bench, disk), bench.network.silence, ansible_ssh_timeout=RETRY_S)
+def _refused(says: str, **changes: Any) -> Callable[[DeploymentBench], None]:
+    """An artifact with another manifest: by the laptop, before anything travels; and by the rover, brought by hand."""
+
+    def inject(bench: DeploymentBench) -> None:
+        bad = changed_artifact(bench.artifacts[bench.target], bench.folder / "changed.pt", **changes)
+        if bench.deploy(bad).ok:
+            raise EmulationError(f"{bench.pi.name}: an artifact was deployed of which is true: {says}")
+        there = bench.state / "by-hand.pt"
+        shutil.copy(bad, there)
+        bench.undo.callback(there.unlink, missing_ok=True)
+        if not re.search(says, bench.rover("release", "stage", f"/{STATE}/by-hand.pt")):
+            raise EmulationError(f"{bench.pi.name}: the rover did not refuse it by '{says}'", found=bench.said[-1])
+
+    return inject
 
 
-@_fault(
-    "artifact with a wrong hash",
-    "contains [0-9a-f]{12}, not [0-9a-f]{12}; pack it again",
-    "what describes the parts names another artifact",
-    fresh=True,
-)
-def _wrong_hash(bench: DeploymentBench) -> None:
-    def strike() -> None:
-        path = bench.incoming / ORIGIN
-        other = bench.packed[bench.before]["name"]
-        path.write_text(json.dumps({**json.loads(path.read_text()), "name": other[::-1]}))
-
-    bench.deploy_until(lambda disk: disk.complete(bench.about), strike)
-
-
-def _refused(bench: DeploymentBench, artifact: Path, says: str) -> None:
-    """By the laptop, before anything travels; and by the rover, brought there by hand."""
-    if bench.deploy(artifact).ok:
-        raise EmulationError(f"{bench.pi.name}: {artifact.name} was deployed")
-    there = bench.state / "by-hand.pt"
-    shutil.copy(artifact, there)
-    bench.undo.callback(there.unlink, missing_ok=True)
-    if not re.search(says, bench.rover("release", "stage", f"/{STATE}/by-hand.pt")):
-        raise EmulationError(
-            f"{bench.pi.name}: the rover took {artifact.name}, or said another thing: {bench.said[-1]}"
-        )
-
-
-OTHER_TORCH = r"made with torch 9\.9\.9, rovers have"
-
-
-@_fault("artifact of another torch", OTHER_TORCH, "its manifest says so; refused by laptop and rover")
-def _other_torch(bench: DeploymentBench) -> None:
-    versions = {"torch": "9.9.9", "rover_lib": ""}
-    bad = changed_artifact(bench.artifacts[bench.target], bench.folder / "torch.pt", versions=versions)
-    _refused(bench, bad, OTHER_TORCH)
-
-
-A_LIE = "its manifest says dynamic, its code is not"
-
-
-@_fault("manifest that lies", A_LIE, "it says dynamic of INT8 convolutions; refused by laptop and rover")
-def _lie(bench: DeploymentBench) -> None:
-    bad = changed_artifact(bench.artifacts[bench.target], bench.folder / "lie.pt", mode="dynamic")
-    _refused(bench, bad, A_LIE)
-
-
-@_fault("parity vectors that fail", "computes something else here", "the manifest tolerates less than no difference")
 def _fail_parity(bench: DeploymentBench) -> None:
-    with zipfile.ZipFile(bench.artifacts[bench.target]) as z:
-        manifest = json.loads(z.read(next(n for n in z.namelist() if n.endswith("/extra/manifest.json"))))
-    parity = {"tolerance": dict.fromkeys(manifest["action_names"], -1.0), "reason": "to fail"}
-    bench.deploy(changed_artifact(bench.artifacts[bench.target], bench.folder / "parity.pt", parity=parity))
+    artifact = bench.artifacts[bench.target]
+    parity = {"tolerance": dict.fromkeys(read_manifest(artifact)["action_names"], -1.0), "reason": "to fail"}
+    bench.deploy(changed_artifact(artifact, bench.folder / "parity.pt", parity=parity))
 
 
-@_fault(
-    "two deployments at once",
-    "another deployment is at work",
-    "the second is of the model in use, and begins while the first one's is proven",
-)
 def _two_at_once(bench: DeploymentBench) -> None:
     with ThreadPoolExecutor(1) as pool:
         second: list[Any] = []
 
-        def strike() -> None:
-            bench.wait_for_check()
+        def begin(bench: DeploymentBench) -> None:
             second.append(pool.submit(bench.deploy, bench.artifacts[bench.before], name="second"))
 
-        bench.deploy_until(lambda disk: bench.proves(), strike)
+        _strike(_anytime, begin, in_check=True)(bench)
         second[0].result()
 
 
-def _wrong_clock(years: int) -> None:
-    @_fault(
-        f"clock wrong by {years:+d} years", ": deployed", "libfaketime is loaded into all that systemd and sshd start"
-    )
+def _wrong_clock(years: int) -> Callable[[DeploymentBench], dict[str, str]]:
     def inject(bench: DeploymentBench) -> dict[str, str]:
         bench.set_clock(years)
         bench.deploy()
         return {"date": bench.pi.inside("date", "+%Y").stdout.strip()}
 
+    return inject
 
-@_fault(
-    "release tampered with before it was proven",
-    r"is not what policy\.pt\.sha256 says",
-    "a byte of it, as its health check begins",
-)
+
 def _tamper_before(bench: DeploymentBench) -> None:
     bench.deploy_until(lambda disk: bench.proves(), lambda: flip(bench.released))
 
 
-@_fault(
-    "release tampered with after the switch",
-    "failed after the switch, [0-9a-f]{12} is in use again",
-    "a byte of it, once it is in use: the health check fails, and the rover goes back by itself",
-)
-def _tamper_after(bench: DeploymentBench) -> None:
-    bench.deploy_until(lambda disk: disk.switched, lambda: flip(bench.released))
-
-
-@_fault(
-    "release in use tampered with",
-    ": deployed",
-    "a byte of it; status says so, its health check fails, and the next deployment replaces it",
-)
 def _tamper_in_use(bench: DeploymentBench) -> dict[str, Any]:
     flip(bench.releases.policy)
     shown, wrong = bench.status(bench.healthy())
@@ -376,21 +198,11 @@ def _tamper_in_use(bench: DeploymentBench) -> dict[str, Any]:
     return {"status_before": shown, "status_before_true": not wrong}
 
 
-@_fault(
-    "rollback with nothing to roll back to",
-    "there is no release to roll back to",
-    "rollback.yml on a rover with one release, then deploy.yml",
-    fresh=True,
-)
 def _roll_back(bench: DeploymentBench) -> None:
     play = bench.play("rollback")
     bench.said.append(play.output)
     if play.ok:
         raise EmulationError(f"{bench.pi.name}: rolled back to nothing")
-
-
-for years in (-20, 20):
-    _wrong_clock(years)
 
 
 class Nobody(NamedTuple):
@@ -401,16 +213,193 @@ class Nobody(NamedTuple):
     port: int = NOBODY
 
 
-@_fault("a host in the inventory that does not exist", r"nobody: unreachable", "after this one, which gets its model")
 def _nobody_there(bench: DeploymentBench) -> dict[str, Any]:
     nobody = Nobody("nobody", bench.pi.key)
     play = bench.deploy(others=[nobody])
     table = bench.play("status", others=[nobody]).output
     if f"{bench.pi.name}: deployed" not in play.output or play.code == 0 or "does not answer" not in table:
-        raise EmulationError(
-            f"{bench.pi.name} was not deployed to or reported, because nobody is not there: {play.end}"
-        )
+        what = f"{bench.pi.name} was not deployed to or reported, because nobody is not there"
+        raise EmulationError(f"{what}: {play.end}")
     return {"status_of_nobody": "does not answer"}
+
+
+# The table
+
+LOST = "UNREACHABLE!|does not answer any more"  # when ssh ends
+FULL = "No space left on device"
+OTHER_TORCH, A_LIE = r"made with torch 9\.9\.9, rovers have", "its manifest says dynamic, its code is not"
+
+
+def _power_cut(
+    when: str, moment: Callable[[Disk], bool], how: str, *, in_check: bool = False, fresh: bool = True
+) -> DeploymentFault:
+    def cut(bench: DeploymentBench) -> None:
+        bench.cut_power(moment)
+
+    return DeploymentFault(f"power cut {when}", _strike(moment, cut, in_check=in_check), LOST, how, fresh)
+
+
+FAULTS = [
+    _power_cut("before the transfer", Disk.awaiting, "once there is a folder for it, and nothing in it"),
+    _power_cut("in the transfer", Disk.arriving, "once a part of it is there"),
+    _power_cut("after the transfer", Disk.unopened, "once all is there, and nothing made of it"),
+    _power_cut("before fsync", Disk.writing, "while the new release's policy.pt is written"),
+    _power_cut(
+        "before the release has its name", Disk.written, "once all its bytes are written, while they are looked at"
+    ),
+    _power_cut("after fsync and rename", Disk.named, "once its folder has its name"),
+    _power_cut(
+        "in the health check before the switch",
+        Disk.named,
+        "a second into its parity vectors",
+        in_check=True,
+        fresh=False,
+    ),
+    _power_cut("right after the switch", Disk.just_switched, "once current points to it", fresh=False),
+    _power_cut(
+        "in the health check after the switch",
+        Disk.just_switched,
+        "a second into its parity vectors",
+        in_check=True,
+        fresh=False,
+    ),
+    _power_cut(
+        "between switch and restart",
+        lambda disk: disk.remembered,
+        "once it was proven again; a power cut ends a service too, which then loads what current points to",
+        fresh=False,
+    ),
+    DeploymentFault(
+        "disk full in the transfer",
+        _no_room_to_arrive,
+        FULL,
+        f"{ROOM >> 20} MB are free",
+        fresh=True,
+        heal=DeploymentBench.make_room,
+    ),
+    DeploymentFault(
+        "too little room for a release",
+        _no_room_to_stage,
+        r"\d+ MB free, \d+ are needed; prune releases",
+        "it can arrive, but the release does not fit beside it",
+        fresh=True,
+        heal=DeploymentBench.make_room,
+    ),
+    DeploymentFault(
+        "disk full while the release is written",
+        _fill_while_staging,
+        "the disk is full; what was in use still is",
+        "something else takes all that is free, once there was room enough",
+        fresh=True,
+        heal=DeploymentBench.make_room,
+    ),
+    DeploymentFault(
+        "a byte flipped on the way",
+        _strike(Disk.arriving, lambda bench: bench.network.flip(after=1 << 20)),
+        f"transfer mechanism failed|{LOST}",
+        "in the network, once a part has come through: ssh notices and ends, and Ansible may send it again",
+        fresh=True,
+    ),
+    DeploymentFault(
+        "a byte flipped in what has arrived",
+        _strike(lambda disk: disk.complete, lambda bench: flip(bench.incoming / "part-0000")),
+        "arrived damaged .* send it again",
+        "in a part on the rover's disk",
+        fresh=True,
+    ),
+    DeploymentFault(
+        "ssh lost in the transfer",
+        _lose_ssh_in_transfer,
+        LOST,
+        "the network is cut a megabyte after the first part; the transfer goes on",
+        fresh=True,
+    ),
+    DeploymentFault(
+        "ssh lost in the health check",
+        _strike(_anytime, lambda bench: bench.network.cut(), in_check=True),
+        LOST,
+        "the network is cut while the rover proves the new model; it goes on",
+    ),
+    DeploymentFault(
+        "network silent in the transfer",
+        # Of each try to reach it again; ssh's own limit is that of inventory.ini.
+        _strike(Disk.arriving, lambda bench: bench.network.silence(), ansible_ssh_timeout=RETRY_S),
+        LOST,
+        "out of reach: no packet comes through, and no connection ends",
+        fresh=True,
+    ),
+    DeploymentFault(
+        "artifact with a wrong hash",
+        _strike(lambda disk: disk.complete, _name_another),
+        "contains [0-9a-f]{12}, not [0-9a-f]{12}; pack it again",
+        "what describes the parts names another artifact",
+        fresh=True,
+    ),
+    DeploymentFault(
+        "artifact of another torch",
+        _refused(OTHER_TORCH, versions={"torch": "9.9.9", "rover_lib": ""}),
+        OTHER_TORCH,
+        "its manifest says so; refused by laptop and rover",
+    ),
+    DeploymentFault(
+        "manifest that lies",
+        _refused(A_LIE, mode="dynamic"),
+        A_LIE,
+        "it says dynamic of INT8 convolutions; refused by laptop and rover",
+    ),
+    DeploymentFault(
+        "parity vectors that fail",
+        _fail_parity,
+        "computes something else here",
+        "the manifest tolerates less than no difference",
+    ),
+    DeploymentFault(
+        "two deployments at once",
+        _two_at_once,
+        "another deployment is at work",
+        "the second is of the model in use, and begins while the first one's is proven",
+    ),
+    DeploymentFault(
+        "release tampered with before it was proven",
+        _tamper_before,
+        r"is not what policy\.pt\.sha256 says",
+        "a byte of it, as its health check begins",
+    ),
+    DeploymentFault(
+        "release tampered with after the switch",
+        _strike(lambda disk: disk.switched, lambda bench: flip(bench.released)),
+        "failed after the switch, [0-9a-f]{12} is in use again",
+        "a byte of it, once it is in use: the health check fails, and the rover goes back by itself",
+    ),
+    DeploymentFault(
+        "release in use tampered with",
+        _tamper_in_use,
+        ": deployed",
+        "a byte of it; status says so, its health check fails, and the next deployment replaces it",
+    ),
+    DeploymentFault(
+        "rollback with nothing to roll back to",
+        _roll_back,
+        "there is no release to roll back to",
+        "rollback.yml on a rover with one release, then deploy.yml",
+        fresh=True,
+    ),
+    *(
+        DeploymentFault(
+            f"clock wrong by {years:+d} years",
+            _wrong_clock(years),
+            ": deployed",
+            "libfaketime is loaded into all that systemd and sshd start",
+        )
+        for years in (-20, 20)
+    ),
+    DeploymentFault(
+        "a host in the inventory that does not exist",
+        _nobody_there,
+        r"nobody: unreachable",
+        "after this one, which gets its model",
+    ),
+]
 
 
 # Rows
@@ -500,7 +489,7 @@ def _after(fault: DeploymentFault, bench: DeploymentBench) -> dict[str, Any]:
         details = fault.inject(bench)
     row = details if isinstance(details, dict) else {}
     if not bench.pi.on:
-        row["disk"] = bench.found.row()
+        row["disk"] = vars(bench.disk_then)
         with bench.timed("boot"):
             bench.pi.boot()
     bench.network.mend()

@@ -43,9 +43,9 @@ def test_how_far_a_deployment_has_come_is_on_the_disk(tmp_path):
     for name in ("part-0000", "part-0001", ".ansible_tmp"):
         (incoming / name).touch()
     seen = Disk.seen(tmp_path, ABOUT)
-    assert seen.arrived == ("part-0000", "part-0001") and not seen.complete(ABOUT)
+    assert seen.arrived == ("part-0000", "part-0001") and not seen.complete
     (incoming / "release.json").touch()
-    assert Disk.seen(tmp_path, ABOUT).complete(ABOUT)
+    assert Disk.seen(tmp_path, ABOUT).complete
     (releases / ".new").mkdir(parents=True)
     (releases / ".new" / "policy.pt").write_bytes(b"12345")
     seen = Disk.seen(tmp_path, ABOUT)
@@ -58,7 +58,7 @@ def test_how_far_a_deployment_has_come_is_on_the_disk(tmp_path):
     assert seen.switched and not seen.remembered
     (tmp_path / "models" / "history.json").write_text(json.dumps(["c" * 64, ABOUT["name"]]))
     assert Disk.seen(tmp_path, ABOUT).remembered
-    assert json.loads(json.dumps(seen.row()))["switched"]
+    assert json.loads(json.dumps(vars(seen)))["switched"]
 
 
 STATUS = """
