@@ -29,6 +29,7 @@ runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
 What is not as it should be is a sentence in `wrong`. Beside it, pi-fast.log has all that the playbooks said.
 """
 
+import compileall
 import contextlib
 import sys
 import tempfile
@@ -51,7 +52,7 @@ from lab.pi.fleet import fleet
 from lab.pi.playbooks import Play
 from lab.pi.pulses import Pins, moving
 from lab.pi.report import PiReport
-from lab.pi.service_proofs import READY_S, STATE, environment, hang, sandbox, show, start_limit
+from lab.pi.service_proofs import READY_S, STATE, VENV, environment, hang, sandbox, show, start_limit
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.recording import read_controls
 from rover_lib.onboard.service import UNIT
@@ -114,7 +115,6 @@ class _Run:
             "rover_wheels": str(folder / "wheels"),
             "rover_packed": str(folder / "packed"),
             "rover_fetched": str(folder / "fetched"),
-            "rover_command": str(Path(sys.executable).with_name("rover")),
             "rover_camera": CAMERA,
             "rover_port": PORT,
             "rover_hz": HZ,
@@ -182,7 +182,8 @@ class _Run:
 
     def one_fault(self, pi: Container, static: Path) -> None:
         """A deployment that fails, leaves the rover as it was and is healed by another; it then drives what came."""
-        self.play("provision", pi)
+        with _bytecode_from_here(pi.root):
+            self.play("provision", pi)
         self.play("deploy", pi, rover_artifact=str(static))
         artifacts = {"static": static, "fp32": self.quick()}
         with (
@@ -300,6 +301,18 @@ class _Run:
             fleet_row = self.metrics["fleet"] = fleet(pi.layers, artifacts, say=self.report.say)
         cases = [case["results"] for case in fleet_row["cases"]]
         self.report.gate("fleet of three, one broken", "the rest untouched, all reported", cases, fleet_row["good"])
+
+
+@contextlib.contextmanager
+def _bytecode_from_here(root: Path) -> Iterator[None]:
+    """What pip installs is compiled by this machine's Python, if it is the Pi's: emulated, that takes minutes."""
+    if not (root / f"usr/lib/python{sys.version_info[0]}.{sys.version_info[1]}").is_dir():
+        yield
+        return
+    with (root / "etc/pip.conf").open("a") as settings:
+        settings.write("[install]\nno-compile = no\n")  # a double negation: pip wants "no" for such an option
+    yield
+    compileall.compile_dir(root / VENV.lstrip("/"), quiet=1, workers=0, stripdir=str(root), prependdir="/")
 
 
 # The car

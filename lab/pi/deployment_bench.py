@@ -8,7 +8,6 @@ import contextlib
 import json
 import os
 import shutil
-import sys
 import tempfile
 import threading
 import time
@@ -235,8 +234,7 @@ class DeploymentBench:
             raise EmulationError("told to stop")
         folder = self.folder / (name or "laptop")
         folder.mkdir(exist_ok=True)
-        command = Path(sys.executable).with_name("rover")
-        given = {"rover_packed": str(folder / "packed"), "rover_command": str(command), **variables}
+        given = {"rover_packed": str(folder / "packed"), **variables}
         return playbooks.run(book, [self.network, *others], folder=folder, variables=given, timeout_s=PLAY_S)
 
     def deploy(self, artifact: Path | None = None, **more: Any) -> Play:

@@ -89,11 +89,12 @@ def run(
     """
     program = Path(sys.executable).with_name("ansible-playbook")
     if not program.exists():
-        raise EmulationError(f"no {program.name} beside {sys.executable}: pip install -e '.[dev]', or 'make pi-fast'")
-    listed = inventory(hosts)
-    (folder / "inventory.ini").write_text(listed)
+        remedy = "pip install -e '.[dev]', or 'make pi-fast'"
+        raise EmulationError(f"no {program.name} beside {sys.executable}", remedy=remedy)
+    (folder / "inventory.ini").write_text(inventory(hosts))
+    given = {"rover_command": str(program.with_name("rover")), **(variables or {})}
     command = [program, "-i", folder / "inventory.ini", REPOSITORY / "ansible" / f"{book}.yml"]
-    command += [*(["--check", "--diff"] if check else []), *options, "-e", json.dumps(dict(variables or {}))]
+    command += [*(["--check", "--diff"] if check else []), *options, "-e", json.dumps(given)]
     started = time.monotonic()
     with (folder / "output").open("w+b") as output:
         process = subprocess.Popen(
