@@ -39,6 +39,7 @@ from rover_lib.onboard.stage import sha256_of
 MODELS = Path("/var/lib/rover/models")
 POLICY, DIGEST, ORIGIN = "policy.pt", "policy.pt.sha256", "release.json"
 NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # the second whole copy of a release in use that was damaged is ...-2
+PART = re.compile(r"part-\d{4,}")
 PART_BYTES = 8 << 20  # a transfer that was cut goes on at most so far back
 SPARE_BYTES = 64 << 20  # is left free for logs
 HISTORY = 100
@@ -114,16 +115,17 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
 def pack(
     artifact: Path | str, folder: Path | str, expected: Expected = THIS_CAR, allow: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Cut an artifact into parts in an empty folder, with a release.json that says what they must make together.
+    """Cut an artifact into parts in a folder of their own, with a release.json that says what they make together.
 
-    Parts travel one by one, so that a transfer goes on where it was cut. Returns what release.json says: name (the
-    content hash), sha256, bytes, parts, mode, origin. Raises as inspect_artifact().
+    Parts travel one by one, so that a transfer goes on where it was cut. What an earlier pack() wrote there is
+    replaced. Returns what release.json says: name (the content hash), sha256, bytes, parts, mode, origin. Raises as
+    inspect_artifact(), and ReleaseError, with nothing touched, for a folder that holds anything else.
     """
     artifact, folder = Path(artifact), Path(folder)
     manifest = inspect_artifact(artifact, expected, allow)
-    folder.mkdir(parents=True, exist_ok=True)
-    for old in folder.iterdir():
+    for old in _packed_before(artifact, folder):
         old.unlink()
+    folder.mkdir(parents=True, exist_ok=True)
     count = 0
     with artifact.open("rb") as f:
         while part := f.read(PART_BYTES):
@@ -132,6 +134,27 @@ def pack(
     about = {**_about(artifact, manifest), "parts": count}
     (folder / ORIGIN).write_text(json.dumps(about, indent=1, sort_keys=True) + "\n")
     return about
+
+
+def _packed_before(artifact: Path, folder: Path) -> list[Path]:
+    """The files of an earlier pack(), release.json first. Raises ReleaseError if the folder holds anything else."""
+    if not folder.exists():
+        return []
+    remedy = "pack into a folder of its own"
+    if not folder.is_dir():
+        raise ReleaseError(f"{folder}: not a folder", remedy=remedy)
+    ours, others = [], []
+    for path in sorted(folder.iterdir(), key=lambda p: (p.name != ORIGIN, p.name)):
+        written_by_us = (path.name == ORIGIN or PART.fullmatch(path.name)) and path.is_file()
+        (ours if written_by_us and not path.samefile(artifact) else others).append(path)
+    if others:
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        raise ReleaseError(
+            f"{folder}: holds files that 'rover release pack' did not write",
+            found=f"{others[0].name}{more}",
+            remedy=remedy,
+        )
+    return ours
 
 
 def _about(artifact: Path, manifest: dict[str, Any]) -> dict[str, Any]:

@@ -268,6 +268,45 @@ def test_packing_again_changes_nothing(packed, two):
     assert content() == before
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize("foreign", ["notes.txt", "part-0000/inside", "part-one", ".hidden", "policy.pt"])
+def test_a_folder_that_holds_anything_else_is_refused_and_left_as_it_is(packed, two, foreign):
+    (packed / "part-0000").unlink()
+    (packed / foreign).parent.mkdir(exist_ok=True)
+    (packed / foreign).write_text("not ours")
+    before = contents(packed)
+    with pytest.raises(
+        ReleaseError, match=r"holds files that .* did not write, found .*; pack into a folder of its own"
+    ):
+        pack(two[1], packed)
+    assert contents(packed) == before
+
+
+@pytest.mark.parametrize("name", ["policy_static.pt", "part-0000", "release.json"])
+def test_the_artifact_in_the_folder_is_not_removed(two, tmp_path, name):
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    artifact = Path(shutil.copy(two[0], folder / name))
+    with pytest.raises(ReleaseError, match=f"did not write, found {name}; pack into"):
+        pack(artifact, folder)
+    assert contents(folder) == {name: two[0].read_bytes()}
+
+
+def test_a_file_in_place_of_the_folder_is_refused(two, tmp_path):
+    (tmp_path / "packed").write_text("not ours")
+    with pytest.raises(ReleaseError, match="packed: not a folder; pack into a folder of its own"):
+        pack(two[0], tmp_path / "packed")
+
+
+def test_packing_a_smaller_artifact_leaves_no_part_of_the_larger_one(packed, two, monkeypatch):
+    monkeypatch.setattr("rover_lib.onboard.release.PART_BYTES", 1 << 30)
+    pack(two[0], packed)
+    assert set(contents(packed)) == {"part-0000", "release.json"}
+
+
 def test_a_flipped_byte_on_the_way_is_found_and_the_same_transfer_repeated_heals(releases, packed, two):
     old, part = releases.current, packed / "part-0002"
     good = part.read_bytes()
