@@ -32,8 +32,14 @@ def program(name: str) -> str:
 
 
 def run(*command: object, cwd: Path = ROOT, tmp: Path | None = None) -> subprocess.CompletedProcess:
+    """A command with a bare environment, in which a program in tmp/bin comes first."""
     home = {"ANSIBLE_HOME": str(tmp), "ANSIBLE_LOCAL_TEMP": f"{tmp}/local"} if tmp else {}
-    env = {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin", "HOME": str(Path.home()), "LANG": "C.UTF-8", **home}
+    env = {
+        "PATH": f"{tmp}/bin:{Path(sys.executable).parent}:/usr/bin:/bin",
+        "HOME": str(Path.home()),
+        "LANG": "C.UTF-8",
+        **home,
+    }
     return subprocess.run(
         list(map(str, command)), cwd=cwd, capture_output=True, text=True, env={**env, "ANSIBLE_NOCOLOR": "1"}
     )
@@ -152,6 +158,26 @@ def test_an_artifact_that_is_not_there_or_not_fit_does_not_travel(tmp_path, arti
     found = play(tmp_path, [entry("pack")], rover_artifact=str(artifacts["fp32"]), rover_allow=["mode"], **rover)
     assert found.returncode == 0, found.stdout
     assert (tmp_path / "packed" / "release.json").exists()
+
+
+@pytest.mark.parametrize(
+    "text, asked_for, refused",
+    [
+        ("driving: steering +0.10", "refuse", True),
+        ("driving: steering +0.10", "stop", False),
+        ("disarmed: waiting for a human to arm it", "refuse", False),
+    ],
+)
+def test_whether_the_car_drives_is_asked_of_systemd_and_no_release_is_opened(tmp_path, text, asked_for, refused):
+    """There is no rover command here that could open one."""
+    systemctl = tmp_path / "bin" / "systemctl"
+    systemctl.parent.mkdir()
+    systemctl.write_text(f"#!/bin/sh\nprintf 'LoadState=loaded\\nActiveState=active\\nStatusText={text}\\n'\n")
+    systemctl.chmod(0o755)
+    nowhere = {"rover_home": str(tmp_path / "no rover"), "rover_models": str(tmp_path / "no models")}
+    done = play(tmp_path, [entry("not_driving")], rover_while_driving=asked_for, **nowhere)
+    assert done.returncode == (2 if refused else 0), done.stdout
+    assert ("localhost is driving: wait until it is disarmed" in " ".join(done.stdout.split())) == refused
 
 
 @pytest.mark.parametrize("name", ["episode_20251007_144013", ".episode_20251007_144013.part"])
