@@ -98,6 +98,7 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_jso
 
     Errors are shares of the recorded range and microseconds of servo pulse.
     """
+    from rover_lib.onboard.artifact import distinct_names
     from rover_lib.onboard.params import params
     from rover_lib.onboard.policy import load_policy
     from rover_lib.workshop import compare as c
@@ -107,7 +108,7 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_jso
     fp32 = load_policy(reference)
     recordings = load_recordings(episodes, fp32.chunk, p["sync_s"], terminal())
     held_out = split(recordings, p["held_out_share"], p["seed"]).held_out
-    others = {a.stem.removeprefix("policy_"): load_policy(a) for a in artifacts}
+    others = {name: load_policy(path) for name, path in distinct_names(artifacts, drop="policy_").items()}
     report = c.fidelity(fp32, others, held_out, recordings.action_range(), terminal())
     for warning in report.warnings():
         click.echo(f"rover: warning: {warning}", err=True)

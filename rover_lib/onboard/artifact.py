@@ -9,6 +9,7 @@ import io
 import json
 import re
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -140,6 +141,32 @@ def check_manifest(manifest: Any, where: str) -> None:
         raise ArtifactError(
             f"{where}: manifest parity tolerance {tolerance!r} does not cover its actions; quantize again"
         )
+
+
+def distinct_names(paths: Sequence[Path], drop: str = "") -> dict[str, Path]:
+    """Artifacts by the shortest name that tells them apart: the stem, with as many folders before it as that takes.
+
+    drop: a beginning of stems that says nothing, such as "policy_". Raises ArtifactError for a file given twice.
+    """
+    longest = max((len(path.absolute().parts) for path in paths), default=0)
+    names: dict[str, Path] = {}
+    for path in paths:
+        if any(path.resolve() == other.resolve() for other in names.values()):
+            raise ArtifactError(f"{path}: given twice", remedy="name each file once")
+        name = str(path)  # if two files of one folder differ only in what is not in the name
+        for folders in range(longest):
+            candidate = _name(path, folders, drop)
+            if [_name(other, folders, drop) for other in paths].count(candidate) == 1:
+                name = candidate
+                break
+        names[name] = path
+    return names
+
+
+def _name(path: Path, folders: int, drop: str) -> str:
+    """The stem of a path, with so many of its folders before it."""
+    parents = path.absolute().parts[1:-1]
+    return "/".join([*parents[max(0, len(parents) - folders) :], path.stem.removeprefix(drop)])
 
 
 def _open(path: Path | str) -> zipfile.ZipFile:

@@ -277,25 +277,25 @@ def benchmark(
 
     The first artifact's figures stand at the top level. Needs nothing but the artifact: this is what runs on the Pi.
     """
-    from rover_lib.onboard.artifact import content_hash, read_parity
+    from rover_lib.onboard.artifact import content_hash, distinct_names, read_parity
     from rover_lib.onboard.benchmark import benchmark as measure
     from rover_lib.onboard.benchmark import check_gates
     from rover_lib.onboard.params import params
     from rover_lib.onboard.policy import load_policy
     from rover_lib.onboard.stage import write_stage
 
-    policies = {a.stem: load_policy(a) for a in artifacts}
+    files = distinct_names(artifacts)
+    policies = {name: load_policy(path) for name, path in files.items()}
     vectors = read_parity(artifacts[0])
-    first = policies[artifacts[0].stem]
+    first = next(iter(policies.values()))
     frames = [
         {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
     ]  # stored as RGB; a camera gives BGR
     options = {"warmup": warmup, "iterations": iterations, "threads": threads, "duration_s": duration}
     metrics = measure(policies, frames, vectors["state"][0], **options, memory_alone=True)
     if output:
-        write_stage(
-            output, "benchmark", params=options, metrics=metrics, inputs={a.name: content_hash(a) for a in artifacts}
-        )
+        inputs = {f"{name}{path.suffix}": content_hash(path) for name, path in files.items()}
+        write_stage(output, "benchmark", params=options, metrics=metrics, inputs=inputs)
     if gates:
         metrics["gates"] = check_gates(metrics, params()["gates"]["original"])
     show(metrics, as_json)

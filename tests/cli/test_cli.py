@@ -1,6 +1,7 @@
 """The command line: help that helps, one sentence for bad input, nothing half-written."""
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -87,6 +88,27 @@ def test_benchmark_writes_its_stage(artifacts, tmp_path):
     assert set(keys.split()) <= set(metrics) and set(metrics["artifacts"]) == {"policy_static", "policy_fp32"}
 
 
+def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypatch):
+    monkeypatch.setattr("rover_lib.onboard.benchmark.peak_memory_alone_mb", lambda path, threads: None)  # for speed
+    files = []
+    for run, mode in (("a", "static"), ("b", "mixed")):
+        (tmp_path / run).mkdir()
+        files.append(shutil.copy(artifacts[mode], tmp_path / run / "policy_static.pt"))
+    out = tmp_path / "benchmark-here.json"
+    result = rover("benchmark", *files, "--iterations", 2, "--warmup", 0, "--threads", 1, "--output", out, "--json")
+    assert result.exit_code == 0, result.output
+    for metrics in (json.loads(result.output), json.loads(out.read_text())["metrics"]):
+        timed = metrics["artifacts"]
+        assert {name: v["mode"] for name, v in timed.items()} == {
+            "a/policy_static": "static",
+            "b/policy_static": "mixed",
+        }
+        assert metrics["main"] == "a/policy_static" and all(v["n"] == 2 for v in timed.values())
+    assert set(json.loads(out.read_text())["inputs"]) == {"a/policy_static.pt", "b/policy_static.pt"}
+    result = rover("benchmark", files[0], files[0])
+    assert result.exit_code == 1 and result.output.strip().endswith("given twice; name each file once")
+
+
 def test_a_damaged_checkpoint_leaves_no_artifact(tiny_file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     content = torch.load(tiny_file, weights_only=False)
@@ -119,6 +141,10 @@ def test_quantizes_and_compares_on_recordings(tiny_file, drives, tmp_path):
     found = json.loads(result.output)
     assert set(found) == {"static", "mixed"}
     assert len(found["static"]["steering_mae_per_step_pct"]) == 32
+    (tmp_path / "other").mkdir()
+    same_name = shutil.copy(tmp_path / "static.pt", tmp_path / "other" / "static.pt")
+    result = rover("compare", *files[:2], same_name, "--episodes", drives, "--json")
+    assert set(json.loads(result.output)) == {f"{tmp_path.name}/static", "other/static"}
     plain = rover("compare", *files, "--episodes", drives)
     assert "32 values, see --json" in plain.output and "steering_mae_us" in plain.output
 

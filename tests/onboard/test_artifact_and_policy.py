@@ -35,6 +35,30 @@ def rewritten(source: Path, target: Path, change: dict[str, object]) -> Path:
     return target
 
 
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [
+        (["runs/a/policy_static.pt"], ["static"]),
+        (["runs/a/policy_static.pt", "runs/b/policy_mixed.pt"], ["static", "mixed"]),
+        (["runs/a/policy_static.pt", "runs/b/policy_static.pt", "c.pt"], ["a/static", "b/static", "c"]),
+        (["x/same/p.pt", "y/same/p.pt"], ["x/same/p", "y/same/p"]),
+        (["/same/p.pt", "/y/same/p.pt"], ["/same/p.pt", "y/same/p"]),
+        (["a/p.pt", "a/p.bin"], ["a/p.pt", "a/p.bin"]),
+        (["a/policy_p.pt", "a/p.pt", "b/p.pt"], ["a/policy_p.pt", "a/p.pt", "b/p"]),
+    ],
+)
+def test_artifacts_go_by_the_shortest_names_that_tell_them_apart(given, names):
+    paths = [Path(g) for g in given]
+    assert artifact.distinct_names(paths, drop="policy_") == dict(zip(names, paths, strict=True))
+
+
+def test_an_artifact_that_is_given_twice_is_refused(tmp_path):
+    (tmp_path / "p.pt").touch()
+    (tmp_path / "link.pt").symlink_to("p.pt")
+    with pytest.raises(ArtifactError, match=r"link\.pt: given twice; name each file once"):
+        artifact.distinct_names([tmp_path / "p.pt", tmp_path / "link.pt"])
+
+
 def manifest_with(**values):
     return lambda raw: json.dumps({k: v for k, v in (json.loads(raw) | values).items() if v is not ...}).encode()
 
