@@ -7,6 +7,7 @@ Inside the zip, beside TorchScript's own records: `extra/manifest.json` (what it
 import hashlib
 import io
 import json
+import math
 import re
 import zipfile
 from collections.abc import Sequence
@@ -121,7 +122,7 @@ def check_integrity(path: Path | str) -> None:
 
 
 def check_manifest(manifest: Any, where: str) -> None:
-    """Raise ArtifactError, naming the key, for a manifest of another schema or with a value of another type."""
+    """Raise ArtifactError, naming the key, for a manifest of another schema or with a value that cannot be."""
     if not isinstance(manifest, dict):
         raise ArtifactError(f"{where}: its manifest is no JSON object but {type(manifest).__name__}; quantize again")
     if manifest.get("schema") != SCHEMA:
@@ -133,14 +134,29 @@ def check_manifest(manifest: Any, where: str) -> None:
         if not isinstance(manifest.get(key), kind):
             found = repr(manifest[key])[:60] if key in manifest else "nothing"
             raise ArtifactError(f"{where}: manifest key '{key}' is {found}, not what it should be; quantize again")
+    if not manifest["cameras"]:
+        raise ArtifactError(f"{where}: manifest has no cameras; quantize again")
     for camera in manifest["cameras"]:
         if not isinstance(camera, dict) or not {"name", "height", "width"} <= camera.keys():
             raise ArtifactError(f"{where}: manifest camera {camera!r} lacks name, height or width; quantize again")
+        if not isinstance(camera["name"], str) or not _is_count(camera["height"]) or not _is_count(camera["width"]):
+            raise ArtifactError(f"{where}: manifest camera {camera!r} is not a name and a size; quantize again")
+    if not _is_count(manifest["chunk"]):
+        raise ArtifactError(f"{where}: manifest chunk must be 1 or more, found {manifest['chunk']}; quantize again")
+    if not 0 < manifest["rate_hz"] < math.inf:
+        raise ArtifactError(f"{where}: manifest rate_hz must be above 0, found {manifest['rate_hz']}; quantize again")
+    for key in ("state_names", "action_names"):
+        if not manifest[key] or not all(isinstance(name, str) for name in manifest[key]):
+            raise ArtifactError(f"{where}: manifest {key} must be names, found {manifest[key]!r}; quantize again")
     tolerance = manifest["parity"].get("tolerance")
     if not isinstance(tolerance, dict) or set(tolerance) != set(manifest["action_names"]):
         raise ArtifactError(
             f"{where}: manifest parity tolerance {tolerance!r} does not cover its actions; quantize again"
         )
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and value >= 1
 
 
 def distinct_names(paths: Sequence[Path], drop: str = "") -> dict[str, Path]:

@@ -9,10 +9,10 @@ import json
 import math
 import os
 import platform
+import secrets
 import socket
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -29,16 +29,14 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """A temporary path beside `path`; renamed onto it when the block ends well, removed when it does not."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    fd, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
-    os.close(fd)
-    temporary = Path(name)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{path.suffix}")
+    # Not mkstemp, whose mode of 0600 would hide the file from the service's user: here the kernel applies the umask,
+    # which a process can ask for only by setting it, for all of its threads.
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
         yield temporary
         with temporary.open("rb") as f:
             os.fsync(f.fileno())  # a power cut after the rename must not leave an empty file
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)  # mkstemp's 0600 would hide the file from the service's user
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
