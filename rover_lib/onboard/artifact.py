@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # reading what an artifact says of itself needs neither
 
 SCHEMA = 1
 MANGLED = re.compile(rb"___torch_mangle_\d+")
-MANIFEST_KEYS = {
+MANIFEST_KEYS: dict[str, type | tuple[type, ...]] = {
     "schema": int,
     "mode": str,  # fp32, dynamic, static, mixed
     "scheme": str,  # float, symmetric, affine
@@ -56,7 +56,7 @@ def save_artifact(
 
     check_manifest(manifest, str(path))
     vectors = io.BytesIO()
-    np.savez_compressed(vectors, **parity)
+    np.savez_compressed(vectors, allow_pickle=False, **parity)
     extra = {
         "manifest.json": json.dumps(manifest, sort_keys=True, indent=1),
         "parity.npz": vectors.getvalue(),

@@ -1,8 +1,7 @@
 """Time policies on the machine that runs them: a distribution, the host's state, and the floor of a Pi 5
 beside it.
 
-    metrics = benchmark({"static": static, "fp32": fp32}, frames, state, warmup=10, iterations=100)
-    gates = check_gates(metrics, params["gates"]["original"])
+    metrics = benchmark({"static": static, "fp32": fp32}, frames, state, BenchmarkOptions(iterations=1000))
 
 All policies are timed interleaved in one run, one inference of each per round and another one first in every
 round: a machine that heats up or is shared slows all of them alike. What a host cannot tell (no thermal
@@ -16,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,39 +23,11 @@ import numpy as np
 import torch
 
 from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.floor import floor_ms
 from rover_lib.onboard.host import Host, throttled_means
 
-# Measured peaks of a Raspberry Pi 5, four cores at 2.4 GHz (public cpufp results), in 10**9 multiply-accumulates
-# per second: INT8 SDOT 614 GOPS, FP16 307 GFLOPS, FP32 153.5 GFLOPS, two operations to a multiply-accumulate.
-PI5_GMAC_PER_S = {"int8": 307.0, "fp16": 153.5, "fp32": 76.75}
-PRECISION = {"dynamic": "int8", "static": "int8", "mixed": "int8"}  # of an artifact's mode, at its best
-
+Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
-HIGHER_IS_BETTER = ("throughput_fps", "control_rate_hz")
-GATE_KEYS = {"memory_mb": "peak_memory_mb", "model_size_mb": "size_mb"}  # gates that go by another name here
-
-
-def floor_ms(gmac: float | Mapping[str, float] | None, mode: str) -> float | None:
-    """The least time that a Pi 5 needs for one inference, by arithmetic alone; None where `gmac` is not
-    known.
-
-    gmac: 10**9 multiply-accumulates of one inference, or a mapping from precision (int8, fp16, fp32) to its
-    share. mode: a precision, or an artifact's mode, for which a plain number counts as if all of it were in
-    INT8 (fp32: in FP32). That is a true floor for `mixed` and `dynamic` too, though one that they cannot
-    reach. Raises ParamsError for an unknown mode or a count that is no amount.
-    """
-    if gmac is None:
-        return None
-    shares = gmac if isinstance(gmac, Mapping) else {PRECISION.get(mode, mode): gmac}
-    total_s = 0.0
-    for precision, amount in shares.items():
-        if precision not in PI5_GMAC_PER_S:
-            known = sorted({*PI5_GMAC_PER_S, *PRECISION})
-            raise ParamsError(f"no Pi 5 peak is known for {precision!r}: choose one of {', '.join(known)}")
-        if isinstance(amount, bool) or not isinstance(amount, (int, float)) or not 0 <= amount < math.inf:
-            raise ParamsError(f"gmac must be a number from 0, found {amount!r}: count the model again")
-        total_s += amount / PI5_GMAC_PER_S[precision]
-    return total_s * 1000
 
 
 def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeout_s: float = 300) -> float | None:
@@ -113,117 +85,123 @@ def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
     return found
 
 
+def _silent(items: Iterable, **_: object) -> Iterable:
+    return items
+
+
+@dataclass(frozen=True)
+class BenchmarkOptions:
+    """How to time policies. Raises ParamsError for what makes no sense.
+
+    warmup: inferences of each policy that do not count. iterations: rounds; with duration_s, a soak, rounds until that
+    time is over, with a time series. threads: torch's, 0 for all cores, None as they are. rate_hz: at most this many
+    inferences per second, on absolute deadlines, as a drive makes them; None: as fast as it can. main: the policy whose
+    figures stand at the top level (None: the first). reference: the policy whose p50 the others are compared with.
+    memory_alone: measure each artifact's memory in a process of its own (seconds each).
+    """
+
+    warmup: int = 10
+    iterations: int = 100
+    threads: int | None = None
+    duration_s: float | None = None
+    rate_hz: float | None = None
+    main: str | None = None
+    reference: str | None = None
+    memory_alone: bool = False
+
+    def __post_init__(self) -> None:
+        if self.warmup < 0 or self.iterations < 1:
+            counts = f"{self.warmup} and {self.iterations}"
+            raise ParamsError("warmup must be from 0 and iterations from 1", found=counts)
+        for name, value in (("duration_s", self.duration_s), ("rate_hz", self.rate_hz)):
+            if value is not None and not 0 < value < math.inf:
+                raise ParamsError(f"{name} must be above 0", found=value)
+        if self.threads is not None and self.threads < 0:
+            raise ParamsError("threads must be from 0 (all cores)", found=self.threads)
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """Time as a benchmark sees it, all in seconds: what has passed, what the processor worked, and waiting."""
+
+    wall: Callable[[], float] = time.perf_counter
+    cpu: Callable[[], float] = time.process_time
+    sleep: Callable[[float], None] = time.sleep
+
+
+DEFAULTS = BenchmarkOptions()
+REAL_TIME = Clocks()
+
+
 def benchmark(
     policies: Mapping[str, Any],
     frames: Sequence[Any],
     state: np.ndarray,
+    options: BenchmarkOptions = DEFAULTS,
     *,
-    warmup: int = 10,
-    iterations: int = 100,
-    threads: int | None = None,
-    duration_s: float | None = None,
-    rate_hz: float | None = None,
-    main: str | None = None,
-    reference: str | None = None,
-    memory_alone: bool = False,
     host: Host | None = None,
-    clock: Callable[[], float] = time.perf_counter,
-    cpu_clock: Callable[[], float] = time.process_time,
-    sleep: Callable[[float], None] = time.sleep,
-    progress: Callable[..., Iterable] | None = None,
+    clocks: Clocks = REAL_TIME,
+    progress: Progress = _silent,
 ) -> dict[str, Any]:
-    """Time every policy's predict_chunk(frame, state), interleaved, and return the metrics of
-    benchmark-<host>.json.
+    """Time every policy's predict_chunk(frame, state), interleaved, and return the metrics of benchmark-<host>.json.
 
-    policies: name -> anything with predict_chunk; `.manifest` ("mode", "gmac") and `.path` are used where
-    there are any. frames: taken in turn. iterations: rounds; with duration_s, a soak, rounds until that time
-    is over, with a time series. threads: torch's threads, 0 for all cores, None as they are; restored
-    afterwards. rate_hz: at most this many inferences per second, on absolute deadlines, as a drive makes
-    them; None: as fast as it can. main: whose figures stand at the top level (the first if None). reference:
-    whose p50 the others are compared with. memory_alone: measure each artifact's memory in a process of its
-    own (seconds each). progress: called like tqdm.tqdm(iterable, desc=, total=), or None.
+    policies: name -> anything with predict_chunk; `.manifest` ("mode", "gmac") and `.path` are used where there are
+    any. frames: taken in turn. progress: called like tqdm.tqdm(iterable, desc=, total=).
 
-    At the top level cpu_pct is this process's time over the whole run, as a share of all cores it may use;
-    per artifact, of its own inferences. temperature_c is the highest and clock_mhz the lowest reading.
-    peak_memory_mb is the artifact's alone where measured, else None there and this process's at the top
-    level. Raises ParamsError for parameters that make no sense; what a policy raises goes through.
+    At the top level cpu_pct is this process's time over the whole run, as a share of all cores it may use; per
+    artifact, of its own inferences. temperature_c is the highest and clock_mhz the lowest reading. peak_memory_mb is
+    the artifact's alone where measured, else None there and this process's at the top level. Raises ParamsError without
+    policies, without frames, or if main or reference is no policy; what a policy raises goes through.
     """
     names = list(policies)
-    main = names[0] if main is None and names else main
+    if not names or not len(frames):
+        raise ParamsError("nothing to benchmark", found=f"{len(names)} policies and {len(frames)} frames")
+    main, reference = options.main or names[0], options.reference
     for name in (main, reference):
         if name is not None and name not in policies:
-            raise ParamsError(f"no policy {name!r} to benchmark, found {names}: name one of them")
-    if not names or not len(frames):
-        raise ParamsError(f"nothing to benchmark: {len(names)} policies, {len(frames)} frames")
-    if warmup < 0 or iterations < 1:
-        raise ParamsError(f"warmup must be from 0 and iterations from 1, found {warmup} and {iterations}")
-    for what, value in (("duration_s", duration_s), ("rate_hz", rate_hz)):
-        if value is not None and not 0 < value < math.inf:
-            raise ParamsError(f"{what} must be above 0, found {value}")
-    if threads is not None and threads < 0:
-        raise ParamsError(f"threads must be from 0 (all cores), found {threads}")
+            raise ParamsError(f"no policy {name!r} to benchmark", found=names, remedy="name one of them")
     host = host or Host()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads_before = torch.get_num_threads()
-    if threads is not None:
-        torch.set_num_threads(threads or cores)
+    if options.threads is not None:
+        torch.set_num_threads(options.threads or cores)
     try:
         for name in names:
-            for i in range(warmup):
+            for i in range(options.warmup):
                 policies[name].predict_chunk(frames[i % len(frames)], state)
-        run = _Run(policies, frames, state, host, clock, cpu_clock, sleep, rate_hz)
-        run.measure(iterations, duration_s, progress)
-        threads_used = torch.get_num_threads()
+        run = _Run(policies, frames, state, host, clocks)
+        run.measure(options, progress)
+        threads = torch.get_num_threads()
     finally:
         torch.set_num_threads(threads_before)
 
-    artifacts: dict[str, dict[str, Any]] = {}
-    for name, policy in policies.items():
-        manifest = getattr(policy, "manifest", None) or {}
-        path = getattr(policy, "path", None)
-        mode, gmac = manifest.get("mode"), manifest.get("gmac")
-        times_ms = run.latencies_ms[name]
-        artifacts[name] = {
-            **latency_metrics(times_ms),
-            "peak_memory_mb": peak_memory_alone_mb(path, threads=threads_used) if memory_alone and path else None,
-            "cpu_pct": _share_pct(run.cpu_s[name], sum(times_ms) / 1000, cores),
-            "floor_ms": floor_ms(gmac, mode) if mode else None,
-            "gmac": gmac,
-            "mode": mode,
-            "size_mb": Path(path).stat().st_size / 1e6 if path and Path(path).is_file() else None,
-        }
+    artifacts = {name: run.metrics_of(name, cores) for name in names}
+    for name, metrics in artifacts.items():
+        path = getattr(policies[name], "path", None)
+        if options.memory_alone and path:
+            metrics["peak_memory_mb"] = peak_memory_alone_mb(path, threads=threads)
         if reference is not None:
-            paired = np.asarray(run.latencies_ms[reference]) / np.maximum(times_ms, 1e-9)
-            p50_ms = artifacts[name]["latency_p50_ms"]
-            reference_ms = float(np.percentile(run.latencies_ms[reference], 50))
-            artifacts[name]["speedup"] = reference_ms / p50_ms if p50_ms > 0 else None
-            artifacts[name]["speedup_p5"], artifacts[name]["speedup_p95"] = np.percentile(paired, (5, 95)).tolist()
-    process_mb = host.process_peak_memory_mb()
-    throttled = run.readings[-1]["throttled"]
+            metrics |= run.speedup(name, reference)
     top = {k: v for k, v in artifacts[main].items() if not k.startswith("speedup")}
+    process_mb = host.process_peak_memory_mb()
+    if top["peak_memory_mb"] is None:
+        top["peak_memory_mb"] = process_mb
     return {
         **top,
-        "peak_memory_mb": process_mb if top["peak_memory_mb"] is None else top["peak_memory_mb"],
         "process_peak_memory_mb": process_mb,
         "cpu_pct": _share_pct(run.process_s, run.wall_s, cores),
-        "cpu_per_core_pct": run.per_core_pct,
-        "temperature_c": max(
-            (r["temperature_c"] for r in run.readings if r["temperature_c"] is not None), default=None
-        ),
-        "clock_mhz": min((r["clock_mhz"] for r in run.readings if r["clock_mhz"] is not None), default=None),
-        "throttled": throttled,
-        "throttled_means": throttled_means(throttled),
+        **run.host_metrics(),
         "main": main,
         "reference": reference,
-        "threads": threads_used,
+        "threads": threads,
         "cores": cores,
-        "warmup": warmup,
+        "warmup": options.warmup,
         "rounds": len(run.latencies_ms[main]),
         "wall_s": run.wall_s,
-        "rate_hz": rate_hz,
-        "missed_deadlines": run.missed if rate_hz else None,
+        "rate_hz": options.rate_hz,
+        "missed_deadlines": run.missed if options.rate_hz else None,
         "artifacts": artifacts,
-        "series": run.series if duration_s is not None else None,
+        "series": run.series if options.duration_s is not None else None,
     }
 
 
@@ -234,9 +212,11 @@ def _share_pct(cpu_s: float, wall_s: float, cores: int) -> float | None:
 class _Run:
     """The timed part of one benchmark."""
 
-    def __init__(self, policies, frames, state, host, clock, cpu_clock, sleep, rate_hz):
-        self.policies, self.frames, self.state, self.host = policies, frames, state, host
-        self.clock, self.cpu_clock, self.sleep, self.rate_hz = clock, cpu_clock, sleep, rate_hz
+    def __init__(
+        self, policies: Mapping[str, Any], frames: Sequence[Any], state: np.ndarray, host: Host, clocks: Clocks
+    ):
+        self.policies, self.frames, self.state = policies, frames, state
+        self.host, self.clocks = host, clocks
         self.latencies_ms: dict[str, list[float]] = {name: [] for name in policies}
         self.cpu_s = dict.fromkeys(policies, 0.0)
         self.readings: list[dict[str, Any]] = []
@@ -245,30 +225,31 @@ class _Run:
         self.wall_s = self.process_s = 0.0
         self.per_core_pct: list[float] | None = None
 
-    def measure(self, iterations: int, duration_s: float | None, progress: Callable[..., Iterable] | None) -> None:
+    def measure(self, options: BenchmarkOptions, progress: Progress) -> None:
         """Fill the lists: `iterations` rounds, or as many as begin within duration_s."""
-        rounds: Iterable[int] = range(iterations) if duration_s is None else itertools.count()
-        if progress:
-            text = "timing" if duration_s is None else f"soaking for {duration_s:g} s"
-            rounds = progress(rounds, desc=text, total=iterations if duration_s is None else None)
+        duration_s, rate_hz = options.duration_s, options.rate_hz
+        if duration_s is None:
+            rounds = progress(range(options.iterations), desc="timing", total=options.iterations)
+        else:
+            rounds = progress(itertools.count(), desc=f"soaking for {duration_s:g} s", total=None)
         # at most 300 points: enough to see a machine throttle, few enough to plot and to keep
         every_s = max(1.0, (duration_s or 0) / 300)
         names = list(self.policies)
         self.readings.append(self.host.reading())
         before = self.host.core_ticks()
-        cpu_start_s, start_s = self.cpu_clock(), self.clock()
+        cpu_start_s, start_s = self.clocks.cpu(), self.clocks.wall()
         due_s, tick_s, seen = start_s, start_s + every_s, dict.fromkeys(names, 0)
         for i in rounds:
-            if duration_s is not None and self.clock() - start_s >= duration_s and i > 0:
+            if duration_s is not None and self.clocks.wall() - start_s >= duration_s and i > 0:
                 break
             for k in range(len(names)):
-                if self.rate_hz:
-                    due_s = self._wait(due_s)
+                if rate_hz:
+                    due_s = self._wait(due_s, 1 / rate_hz)
                 self._time(names[(i + k) % len(names)], self.frames[i % len(self.frames)])
-            if duration_s is not None and (now_s := self.clock()) >= tick_s:
+            if duration_s is not None and (now_s := self.clocks.wall()) >= tick_s:
                 self._note(now_s - start_s, seen)
                 tick_s = now_s + every_s
-        self.wall_s, self.process_s = self.clock() - start_s, self.cpu_clock() - cpu_start_s
+        self.wall_s, self.process_s = self.clocks.wall() - start_s, self.clocks.cpu() - cpu_start_s
         after = self.host.core_ticks()
         if duration_s is not None and any(len(self.latencies_ms[n]) > seen[n] for n in names):
             self._note(self.wall_s, seen)
@@ -278,20 +259,60 @@ class _Run:
             spans = [(b1 - b0, a1 - a0) for (b0, a0), (b1, a1) in zip(before, after, strict=True)]
             self.per_core_pct = [100 * busy / total if total > 0 else 0.0 for busy, total in spans]
 
+    def metrics_of(self, name: str, cores: int) -> dict[str, Any]:
+        """What was measured of one policy, and what is known about it."""
+        policy, times_ms = self.policies[name], self.latencies_ms[name]
+        manifest = getattr(policy, "manifest", None) or {}
+        path = getattr(policy, "path", None)
+        mode, gmac = manifest.get("mode"), manifest.get("gmac")
+        return {
+            **latency_metrics(times_ms),
+            "peak_memory_mb": None,
+            "cpu_pct": _share_pct(self.cpu_s[name], sum(times_ms) / 1000, cores),
+            "floor_ms": floor_ms(gmac, mode) if mode else None,
+            "gmac": gmac,
+            "mode": mode,
+            "size_mb": Path(path).stat().st_size / 1e6 if path and Path(path).is_file() else None,
+        }
+
+    def speedup(self, name: str, reference: str) -> dict[str, float | None]:
+        """How many times as fast as the reference: by p50, and from 5 to 95 % of the rounds."""
+        times_ms, reference_ms = self.latencies_ms[name], self.latencies_ms[reference]
+        p50_ms, reference_p50_ms = (float(np.percentile(x, 50)) for x in (times_ms, reference_ms))
+        paired = np.asarray(reference_ms) / np.maximum(times_ms, 1e-9)
+        low, high = np.percentile(paired, (5, 95)).tolist()
+        return {
+            "speedup": reference_p50_ms / p50_ms if p50_ms > 0 else None,
+            "speedup_p5": low,
+            "speedup_p95": high,
+        }
+
+    def host_metrics(self) -> dict[str, Any]:
+        """The machine during the run: the highest temperature, the lowest clock, and the last throttled word."""
+        temperatures_c = [r["temperature_c"] for r in self.readings if r["temperature_c"] is not None]
+        clocks_mhz = [r["clock_mhz"] for r in self.readings if r["clock_mhz"] is not None]
+        throttled = self.readings[-1]["throttled"]
+        return {
+            "cpu_per_core_pct": self.per_core_pct,
+            "temperature_c": max(temperatures_c, default=None),
+            "clock_mhz": min(clocks_mhz, default=None),
+            "throttled": throttled,
+            "throttled_means": throttled_means(throttled),
+        }
+
     def _time(self, name: str, frame: Any) -> None:
         predict = self.policies[name].predict_chunk
-        cpu_start_s, start_s = self.cpu_clock(), self.clock()
+        cpu_start_s, start_s = self.clocks.cpu(), self.clocks.wall()
         predict(frame, self.state)
-        end_s, cpu_end_s = self.clock(), self.cpu_clock()
+        end_s, cpu_end_s = self.clocks.wall(), self.clocks.cpu()
         self.latencies_ms[name].append((end_s - start_s) * 1000)
         self.cpu_s[name] += cpu_end_s - cpu_start_s
 
-    def _wait(self, due_s: float) -> float:
+    def _wait(self, due_s: float, period_s: float) -> float:
         """Wait for a deadline and return the next one; one that is over is counted and not made up for."""
-        now_s = self.clock()
+        now_s = self.clocks.wall()
         if now_s < due_s:
-            self.sleep(due_s - now_s)
-        period_s = 1 / self.rate_hz
+            self.clocks.sleep(due_s - now_s)
         behind = math.floor((now_s - due_s) / period_s) if now_s > due_s else 0
         self.missed += behind
         return due_s + (behind + 1) * period_s
@@ -317,36 +338,3 @@ class _Run:
                     "n": len(recent),
                 }
         self.series.append(point)
-
-
-def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Hold measured figures against gates: one {gate, limit, found, passed} each; passed is None if not
-    measured.
-
-    A gate is a number or a [low, high] range that was promised. Doing better than promised passes: a latency
-    need only not be above its range, a rate not below it. A single number must be stayed under (rates:
-    reached). A text, such as throttled "0x0", must be equal. Raises ParamsError for a gate that is none of
-    these.
-    """
-    rows = []
-    for gate, limit in gates.items():
-        found = metrics.get(gate)
-        if found is None:
-            found = metrics.get(GATE_KEYS.get(gate, gate))
-        if isinstance(limit, str):
-            passed = None if found is None else found == limit
-            rows.append({"gate": gate, "limit": limit, "found": found, "passed": passed})
-            continue
-        is_range = isinstance(limit, (list, tuple)) and len(limit) == 2
-        ends = list(limit) if is_range else [limit]
-        numbers = [e for e in ends if isinstance(e, (int, float)) and not isinstance(e, bool) and math.isfinite(e)]
-        if len(numbers) != len(ends) or ends != sorted(ends):
-            raise ParamsError(f"gate {gate} must be a number, [low, high] or a text, found {limit!r}: see params.yml")
-        if found is None or isinstance(found, str) or math.isnan(found):
-            found, passed = None, None
-        elif gate in HIGHER_IS_BETTER:
-            passed = bool(found >= ends[0])
-        else:
-            passed = bool(found <= ends[1] if is_range else found < ends[0])
-        rows.append({"gate": gate, "limit": limit, "found": found, "passed": passed})
-    return rows

@@ -259,7 +259,7 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 @click.option("--warmup", type=click.IntRange(min=0), default=10, show_default=True)
 @click.option("--iterations", type=click.IntRange(min=1), default=100, show_default=True)
 @click.option("--threads", type=click.IntRange(min=0), default=0, show_default=True, help="0: all cores.")
-@click.option("--duration", type=float, help="Soak for so many seconds instead, with a time series.")
+@click.option("--duration", type=float, help="Soak for this many seconds instead, with a time series.")
 @click.option("--output", type=FILE, help="Write benchmark JSON there, for notebook 05.")
 @click.option("--gates", is_flag=True, help="Hold the first artifact against the original's gates in params.yml.")
 @AS_JSON
@@ -278,8 +278,9 @@ def benchmark(
     The first artifact's figures stand at the top level. Needs nothing but the artifact: this is what runs on the Pi.
     """
     from rover_lib.onboard.artifact import content_hash, distinct_names, read_parity
+    from rover_lib.onboard.benchmark import BenchmarkOptions
     from rover_lib.onboard.benchmark import benchmark as measure
-    from rover_lib.onboard.benchmark import check_gates
+    from rover_lib.onboard.gates import check_gates
     from rover_lib.onboard.params import params
     from rover_lib.onboard.policy import load_policy
     from rover_lib.onboard.stage import write_stage
@@ -291,8 +292,8 @@ def benchmark(
     frames = [
         {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
     ]  # stored as RGB; a camera gives BGR
-    options = {"warmup": warmup, "iterations": iterations, "threads": threads, "duration_s": duration}
-    metrics = measure(policies, frames, vectors["state"][0], **options, memory_alone=True)
+    options: dict[str, Any] = {"warmup": warmup, "iterations": iterations, "threads": threads, "duration_s": duration}
+    metrics = measure(policies, frames, vectors["state"][0], BenchmarkOptions(**options, memory_alone=True))
     if output:
         inputs = {f"{name}{path.suffix}": content_hash(path) for name, path in files.items()}
         write_stage(output, "benchmark", params=options, metrics=metrics, inputs=inputs)

@@ -143,11 +143,9 @@ def _packed_before(artifact: Path, folder: Path) -> list[Path]:
     remedy = "pack into a folder of its own"
     if not folder.is_dir():
         raise ReleaseError(f"{folder}: not a folder", remedy=remedy)
-    ours, others = [], []
-    for path in sorted(folder.iterdir(), key=lambda p: (p.name != ORIGIN, p.name)):
-        written_by_us = (path.name == ORIGIN or PART.fullmatch(path.name)) and path.is_file()
-        (ours if written_by_us and not path.samefile(artifact) else others).append(path)
-    if others:
+    files = sorted(folder.iterdir(), key=lambda p: (p.name != ORIGIN, p.name))
+    ours = [p for p in files if _is_packed(p) and not p.samefile(artifact)]
+    if others := [p for p in files if p not in ours]:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise ReleaseError(
             f"{folder}: holds files that 'rover release pack' did not write",
@@ -155,6 +153,10 @@ def _packed_before(artifact: Path, folder: Path) -> list[Path]:
             remedy=remedy,
         )
     return ours
+
+
+def _is_packed(path: Path) -> bool:
+    return path.is_file() and (path.name == ORIGIN or PART.fullmatch(path.name) is not None)
 
 
 def _about(artifact: Path, manifest: dict[str, Any]) -> dict[str, Any]:

@@ -374,7 +374,7 @@ def gates(found: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GATED
     """The gates of params.yml that a comparison can judge. found: `metrics`; limits: params.yml's `gates`.
 
     The error gates are for every action that the policy has and params.yml names, as `<action>_mae_pct`. Those of
-    speed are `onboard.benchmark.check_gates`.
+    speed are `onboard.gates.check_gates`.
     """
     fp32, judged = found["fp32"], found["modes"][mode]
     rows = [

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,14 +11,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rover_lib.onboard.benchmark import (
-    benchmark,
-    check_gates,
-    floor_ms,
-    latency_metrics,
-    peak_memory_alone_mb,
-)
+from rover_lib.onboard.benchmark import BenchmarkOptions, Clocks, benchmark, latency_metrics, peak_memory_alone_mb
 from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.floor import floor_ms
+from rover_lib.onboard.gates import check_gates
 
 FRAMES = [np.full((4, 4, 3), k, np.uint8) for k in range(3)]
 STATE = np.zeros(2, np.float32)
@@ -67,8 +64,11 @@ class Machine:
         return SimpleNamespace(predict_chunk=predict_chunk, **attributes)
 
     @property
-    def arguments(self):
-        return {"clock": self.clock, "cpu_clock": self.cpu_clock, "sleep": self.sleep}
+    def clocks(self):
+        return Clocks(self.clock, self.cpu_clock, self.sleep)
+
+    def benchmark(self, policies, host, **options):
+        return benchmark(policies, FRAMES, STATE, BenchmarkOptions(**options), host=host, clocks=self.clocks)
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ def test_latencies_are_in_order(times_ms):
 
 def test_interleaved_warmed_up_and_each_first_in_turn(machine, bare_host):
     policies = {n: machine.policy(n, [10]) for n in "abc"}
-    benchmark(policies, FRAMES, STATE, warmup=2, iterations=4, host=bare_host, **machine.arguments)
+    machine.benchmark(policies, bare_host, warmup=2, iterations=4)
     names = "".join(name for name, _ in machine.log)
     assert names == "aabbcc" + "abc" + "bca" + "cab" + "abc"
     assert [frame for _, frame in machine.log[6:]] == [0] * 3 + [1] * 3 + [2] * 3 + [0] * 3
@@ -148,9 +148,7 @@ def test_metrics(machine, bare_host, tmp_path):
     fp32 = machine.policy("fp32", [40], manifest={"mode": "fp32", "gmac": 15.02})
     lerobot = machine.policy("lerobot", [60])
     policies = {"static": static, "fp32": fp32, "lerobot": lerobot}
-    metrics = benchmark(
-        policies, FRAMES, STATE, warmup=2, iterations=10, reference="lerobot", host=bare_host, **machine.arguments
-    )
+    metrics = machine.benchmark(policies, bare_host, warmup=2, iterations=10, reference="lerobot")
     assert metrics["main"] == "static"
     for key, value in {
         "latency_p50_ms": 15,
@@ -182,15 +180,13 @@ def test_metrics(machine, bare_host, tmp_path):
 
 def test_another_main(machine, bare_host):
     policies = {"a": machine.policy("a", [10]), "b": machine.policy("b", [30])}
-    metrics = benchmark(policies, FRAMES, STATE, main="b", iterations=3, host=bare_host, **machine.arguments)
+    metrics = machine.benchmark(policies, bare_host, main="b", iterations=3)
     assert metrics["latency_p50_ms"] == pytest.approx(30)
     assert "speedup" not in metrics["artifacts"]["a"]
 
 
 def test_what_a_host_cannot_tell_is_none(machine, bare_host):
-    metrics = benchmark(
-        {"a": machine.policy("a", [10])}, FRAMES, STATE, iterations=2, host=bare_host, **machine.arguments
-    )
+    metrics = machine.benchmark({"a": machine.policy("a", [10])}, bare_host, iterations=2)
     for key in ("temperature_c", "clock_mhz", "throttled", "throttled_means", "cpu_per_core_pct", "floor_ms"):
         assert metrics[key] is None, key
     assert metrics["peak_memory_mb"] > 10  # of the process, from the system's accounts
@@ -198,9 +194,7 @@ def test_what_a_host_cannot_tell_is_none(machine, bare_host):
 
 
 def test_what_a_pi_tells(machine, pi_host):
-    metrics = benchmark(
-        {"a": machine.policy("a", [10])}, FRAMES, STATE, iterations=2, host=pi_host, **machine.arguments
-    )
+    metrics = machine.benchmark({"a": machine.policy("a", [10])}, pi_host, iterations=2)
     assert metrics["temperature_c"] == 61.35
     assert metrics["clock_mhz"] == 1500  # the slowest core
     assert metrics["throttled"] == "0x50000"
@@ -211,9 +205,7 @@ def test_what_a_pi_tells(machine, pi_host):
 
 def test_soak_has_a_time_series(machine, pi_host):
     policies = {"a": machine.policy("a", [100]), "b": machine.policy("b", [300])}
-    metrics = benchmark(
-        policies, FRAMES, STATE, warmup=1, iterations=1, duration_s=9.9, host=pi_host, **machine.arguments
-    )
+    metrics = machine.benchmark(policies, pi_host, warmup=1, iterations=1, duration_s=9.9)
     assert metrics["rounds"] == 25
     assert metrics["wall_s"] == pytest.approx(10)
     series = metrics["series"]
@@ -230,14 +222,14 @@ def test_soak_has_a_time_series(machine, pi_host):
 
 def test_a_long_soak_keeps_its_series_short(machine, bare_host):
     policy = {"a": machine.policy("a", [500])}
-    metrics = benchmark(policy, FRAMES, STATE, duration_s=3600, host=bare_host, **machine.arguments)
+    metrics = machine.benchmark(policy, bare_host, duration_s=3600)
     assert 280 <= len(metrics["series"]) <= 301
     assert metrics["rounds"] == 7200
 
 
 def test_a_rate_is_held_by_absolute_deadlines(machine, bare_host):
     policy = {"a": machine.policy("a", [10])}
-    metrics = benchmark(policy, FRAMES, STATE, warmup=0, iterations=30, rate_hz=10, host=bare_host, **machine.arguments)
+    metrics = machine.benchmark(policy, bare_host, warmup=0, iterations=30, rate_hz=10)
     assert metrics["wall_s"] == pytest.approx(29 * 0.1 + 0.01)
     assert machine.slept_s == pytest.approx([0.09] * 29)
     assert metrics["missed_deadlines"] == 0
@@ -246,7 +238,7 @@ def test_a_rate_is_held_by_absolute_deadlines(machine, bare_host):
 
 def test_missed_deadlines_are_counted_and_not_made_up_for(machine, bare_host):
     policy = {"a": machine.policy("a", [10, 10, 350, 10, 10])}
-    metrics = benchmark(policy, FRAMES, STATE, warmup=0, iterations=5, rate_hz=10, host=bare_host, **machine.arguments)
+    metrics = machine.benchmark(policy, bare_host, warmup=0, iterations=5, rate_hz=10)
     assert metrics["missed_deadlines"] == 2
     assert machine.log == [("a", k % 3) for k in range(5)]
     assert metrics["wall_s"] == pytest.approx(0.61)  # 0, 0.1, 0.2 to 0.55, at once, 0.6
@@ -260,9 +252,9 @@ def test_progress_is_called_like_tqdm(machine, bare_host):
         yield from iterable
 
     policy = {"a": machine.policy("a", [100])}
-    options = {"host": bare_host, "progress": progress, **machine.arguments}
-    benchmark(policy, FRAMES, STATE, iterations=3, **options)
-    benchmark(policy, FRAMES, STATE, duration_s=2, **options)
+    given = {"host": bare_host, "clocks": machine.clocks, "progress": progress}
+    benchmark(policy, FRAMES, STATE, BenchmarkOptions(iterations=3), **given)
+    benchmark(policy, FRAMES, STATE, BenchmarkOptions(duration_s=2), **given)
     assert seen == [("timing", 3), ("soaking for 2 s", None)]
 
 
@@ -270,17 +262,18 @@ def test_threads_are_set_and_restored(bare_host):
     before = torch.get_num_threads()
     seen = []
     policy = SimpleNamespace(predict_chunk=lambda frame, state: seen.append(torch.get_num_threads()))
-    metrics = benchmark({"a": policy}, FRAMES, STATE, warmup=0, iterations=1, threads=1, host=bare_host)
+    options = BenchmarkOptions(warmup=0, iterations=1, threads=1)
+    metrics = benchmark({"a": policy}, FRAMES, STATE, options, host=bare_host)
     assert seen == [1]
     assert metrics["threads"] == 1
-    metrics = benchmark({"a": policy}, FRAMES, STATE, warmup=0, iterations=1, threads=0, host=bare_host)
+    metrics = benchmark({"a": policy}, FRAMES, STATE, replace(options, threads=0), host=bare_host)
     assert metrics["threads"] == metrics["cores"]
 
     def fail(frame, state):
         raise PolicyError("no")
 
     with pytest.raises(PolicyError):
-        benchmark({"a": SimpleNamespace(predict_chunk=fail)}, FRAMES, STATE, threads=1, host=bare_host)
+        benchmark({"a": SimpleNamespace(predict_chunk=fail)}, FRAMES, STATE, options, host=bare_host)
     assert torch.get_num_threads() == before
 
 
@@ -300,9 +293,10 @@ def test_threads_are_set_and_restored(bare_host):
     ],
 )
 def test_parameters_that_make_no_sense(machine, bare_host, bad):
-    arguments = {"policies": {"a": machine.policy("a", [1])}, "frames": FRAMES, "state": STATE, "host": bare_host}
+    given = {"policies": {"a": machine.policy("a", [1])}, "frames": FRAMES, **bad}
+    policies, frames = given.pop("policies"), given.pop("frames")
     with pytest.raises(ParamsError):
-        benchmark(**{**arguments, **machine.arguments, **bad})
+        benchmark(policies, frames, STATE, BenchmarkOptions(**given), host=bare_host, clocks=machine.clocks)
     assert machine.log == []
 
 
@@ -311,7 +305,8 @@ def test_on_this_machine():
         return (torch.ones(200, 200) @ torch.ones(200, 200)).numpy()
 
     policies = {"a": SimpleNamespace(predict_chunk=predict_chunk), "b": SimpleNamespace(predict_chunk=predict_chunk)}
-    metrics = benchmark(policies, FRAMES, STATE, warmup=3, iterations=20, threads=1, reference="b")
+    options = BenchmarkOptions(warmup=3, iterations=20, threads=1, reference="b")
+    metrics = benchmark(policies, FRAMES, STATE, options)
     assert 0 < metrics["latency_p50_ms"] <= metrics["latency_p95_ms"] <= metrics["latency_max_ms"]
     assert metrics["cpu_pct"] > 0
     assert metrics["peak_memory_mb"] > 50

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rover_lib.onboard.benchmark import benchmark
+from rover_lib.onboard.benchmark import BenchmarkOptions, Clocks, benchmark
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import hosts, plots
 
@@ -51,10 +51,9 @@ def written(folder, name, latency_ms, *, hottest_c=None, soak_s=None, inputs=Non
     """benchmark-<name>.json, as `rover benchmark` leaves it."""
     machine = Machine(latency_ms, hottest_c)
     policy = SimpleNamespace(predict_chunk=machine.predict_chunk, manifest={"mode": "static", "gmac": 0.375})
-    times = {"clock": machine.clock, "cpu_clock": machine.clock, "host": machine}
-    metrics = benchmark(
-        {artifact: policy}, [np.zeros((2, 2, 3), np.uint8)], np.zeros(2), iterations=20, duration_s=soak_s, **times
-    )
+    options, clocks = BenchmarkOptions(iterations=20, duration_s=soak_s), Clocks(machine.clock, machine.clock)
+    frames = [np.zeros((2, 2, 3), np.uint8)]
+    metrics = benchmark({artifact: policy}, frames, np.zeros(2), options, host=machine, clocks=clocks)
     path = folder / f"benchmark-{name}.json"
     write_stage(path, "benchmark", params={}, metrics=metrics, inputs=inputs or {"policy.pt": "5a"})
     content = json.loads(path.read_text())

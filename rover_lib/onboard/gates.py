@@ -1,0 +1,46 @@
+"""Measured figures held against what was promised.
+
+rows = check_gates(metrics, params()["gates"]["original"])
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from rover_lib.onboard.errors import ParamsError
+
+HIGHER_IS_BETTER = ("throughput_fps", "control_rate_hz")
+GATE_KEYS = {"memory_mb": "peak_memory_mb", "model_size_mb": "size_mb"}  # gates that go by another name in a benchmark
+
+
+def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Hold measured figures against gates: one {gate, limit, found, passed} each; passed is None if not
+    measured.
+
+    A gate is a number or a [low, high] range that was promised. Doing better than promised passes: a latency
+    need only not be above its range, a rate not below it. A single number must be stayed under (rates:
+    reached). A text, such as throttled "0x0", must be equal. Raises ParamsError for a gate that is none of
+    these.
+    """
+    rows = []
+    for gate, limit in gates.items():
+        found = metrics.get(gate)
+        if found is None:
+            found = metrics.get(GATE_KEYS.get(gate, gate))
+        if isinstance(limit, str):
+            passed = None if found is None else found == limit
+            rows.append({"gate": gate, "limit": limit, "found": found, "passed": passed})
+            continue
+        is_range = isinstance(limit, (list, tuple)) and len(limit) == 2
+        ends = list(limit) if is_range else [limit]
+        numbers = [e for e in ends if isinstance(e, (int, float)) and not isinstance(e, bool) and math.isfinite(e)]
+        if len(numbers) != len(ends) or ends != sorted(ends):
+            raise ParamsError(f"gate {gate} must be a number, [low, high] or a text, found {limit!r}: see params.yml")
+        if found is None or isinstance(found, str) or math.isnan(found):
+            found, passed = None, None
+        elif gate in HIGHER_IS_BETTER:
+            passed = bool(found >= ends[0])
+        else:
+            passed = bool(found <= ends[1] if is_range else found < ends[0])
+        rows.append({"gate": gate, "limit": limit, "found": found, "passed": passed})
+    return rows
