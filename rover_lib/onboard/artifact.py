@@ -103,9 +103,9 @@ def read_parity(path: Path | str) -> "dict[str, np.ndarray]":
             content = np.load(io.BytesIO(z.read(_record(z, "parity.npz", path))), allow_pickle=False)
             vectors = {k: content[k] for k in content.files}
         except (ValueError, OSError, zipfile.BadZipFile) as e:
-            raise ArtifactError(f"{path}: its parity vectors are not readable ({e}); quantize again") from None
+            raise ArtifactError(f"{path}: its parity vectors are not readable ({e})", remedy="quantize again") from None
     if "state" not in vectors or "chunk" not in vectors or len(vectors["chunk"]) == 0:
-        raise ArtifactError(f"{path}: it has no parity vectors (found {sorted(vectors)}); quantize again")
+        raise ArtifactError(f"{path}: it has no parity vectors", found=sorted(vectors), remedy="quantize again")
     return vectors
 
 
@@ -116,42 +116,58 @@ def check_integrity(path: Path | str) -> None:
             damaged = z.testzip()
         # RuntimeError, its subclasses too: a damaged header may ask for a password, or for an unknown compression
         except (zipfile.BadZipFile, OSError, RuntimeError) as e:
-            raise ArtifactError(f"{path}: damaged ({e}); copy the file again") from None
+            raise ArtifactError(f"{path}: damaged ({e})", remedy="copy the file again") from None
     if damaged:
-        raise ArtifactError(f"{path}: damaged, the checksum of '{damaged}' does not match; copy the file again")
+        raise ArtifactError(
+            f"{path}: damaged, the checksum of '{damaged}' does not match", remedy="copy the file again"
+        )
 
 
 def check_manifest(manifest: Any, where: str) -> None:
     """Raise ArtifactError, naming the key, for a manifest of another schema or with a value that cannot be."""
     if not isinstance(manifest, dict):
-        raise ArtifactError(f"{where}: its manifest is no JSON object but {type(manifest).__name__}; quantize again")
+        raise ArtifactError(
+            f"{where}: its manifest is no JSON object", found=type(manifest).__name__, remedy="quantize again"
+        )
     if manifest.get("schema") != SCHEMA:
         raise ArtifactError(
-            f"{where}: manifest schema {manifest.get('schema')!r}, this rover_lib reads {SCHEMA}; "
-            "use the rover_lib that wrote it, or quantize again"
+            f"{where}: manifest schema {manifest.get('schema')!r}, this rover_lib reads {SCHEMA}",
+            remedy="use the rover_lib that wrote it, or quantize again",
         )
     for key, kind in MANIFEST_KEYS.items():
         if not isinstance(manifest.get(key), kind):
             found = repr(manifest[key])[:60] if key in manifest else "nothing"
-            raise ArtifactError(f"{where}: manifest key '{key}' is {found}, not what it should be; quantize again")
+            raise ArtifactError(
+                f"{where}: manifest key '{key}' is {found}, not what it should be", remedy="quantize again"
+            )
     if not manifest["cameras"]:
-        raise ArtifactError(f"{where}: manifest has no cameras; quantize again")
+        raise ArtifactError(f"{where}: manifest has no cameras", remedy="quantize again")
     for camera in manifest["cameras"]:
         if not isinstance(camera, dict) or not {"name", "height", "width"} <= camera.keys():
-            raise ArtifactError(f"{where}: manifest camera {camera!r} lacks name, height or width; quantize again")
+            raise ArtifactError(
+                f"{where}: manifest camera {camera!r} lacks name, height or width", remedy="quantize again"
+            )
         if not isinstance(camera["name"], str) or not _is_count(camera["height"]) or not _is_count(camera["width"]):
-            raise ArtifactError(f"{where}: manifest camera {camera!r} is not a name and a size; quantize again")
+            raise ArtifactError(
+                f"{where}: manifest camera {camera!r} is not a name and a size", remedy="quantize again"
+            )
     if not _is_count(manifest["chunk"]):
-        raise ArtifactError(f"{where}: manifest chunk must be 1 or more, found {manifest['chunk']}; quantize again")
+        raise ArtifactError(
+            f"{where}: manifest chunk must be 1 or more", found=manifest["chunk"], remedy="quantize again"
+        )
     if not 0 < manifest["rate_hz"] < math.inf:
-        raise ArtifactError(f"{where}: manifest rate_hz must be above 0, found {manifest['rate_hz']}; quantize again")
+        raise ArtifactError(
+            f"{where}: manifest rate_hz must be above 0", found=manifest["rate_hz"], remedy="quantize again"
+        )
     for key in ("state_names", "action_names"):
         if not manifest[key] or not all(isinstance(name, str) for name in manifest[key]):
-            raise ArtifactError(f"{where}: manifest {key} must be names, found {manifest[key]!r}; quantize again")
+            raise ArtifactError(
+                f"{where}: manifest {key} must be names", found=repr(manifest[key]), remedy="quantize again"
+            )
     tolerance = manifest["parity"].get("tolerance")
     if not isinstance(tolerance, dict) or set(tolerance) != set(manifest["action_names"]):
         raise ArtifactError(
-            f"{where}: manifest parity tolerance {tolerance!r} does not cover its actions; quantize again"
+            f"{where}: manifest parity tolerance {tolerance!r} does not cover its actions", remedy="quantize again"
         )
 
 
@@ -189,15 +205,17 @@ def _open(path: Path | str) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(path)
     except FileNotFoundError:
-        raise ArtifactError(f"{path}: not found; 'rover run' writes artifacts to runs/<name>/") from None
+        raise ArtifactError(f"{path}: not found", remedy="'rover run' writes artifacts to runs/<name>/") from None
     except (zipfile.BadZipFile, OSError) as e:
-        raise ArtifactError(f"{path}: not an artifact, or cut short ({e}); copy the file again") from None
+        raise ArtifactError(f"{path}: not an artifact, or cut short ({e})", remedy="copy the file again") from None
 
 
 def _record(z: zipfile.ZipFile, name: str, path: Path | str) -> str:
     found = [n for n in z.namelist() if n.endswith(f"/extra/{name}")]
     if len(found) != 1:
-        raise ArtifactError(f"{path}: no {name} in it; is it an artifact of this project? ('rover inspect' says what)")
+        raise ArtifactError(
+            f"{path}: no {name} in it", remedy="is it an artifact of this project? ('rover inspect' says what)"
+        )
     return found[0]
 
 
@@ -206,6 +224,6 @@ def _manifest_in(z: zipfile.ZipFile, path: Path | str) -> dict[str, Any]:
     try:
         manifest = json.loads(z.read(record))
     except (ValueError, zipfile.BadZipFile) as e:
-        raise ArtifactError(f"{path}: its manifest is not readable ({e}); copy the file again") from None
+        raise ArtifactError(f"{path}: its manifest is not readable ({e})", remedy="copy the file again") from None
     check_manifest(manifest, str(path))
     return manifest

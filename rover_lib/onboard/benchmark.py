@@ -61,7 +61,7 @@ def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeou
         raise PolicyError(f"{path}: no prediction within {timeout_s:g} s in a process of its own") from None
     if found.returncode:
         last = (found.stderr.strip().splitlines() or ["no message"])[-1]
-        raise PolicyError(f"{path}: does not run in a process of its own ({last}): load it here to see why")
+        raise PolicyError(f"{path}: does not run in a process of its own ({last})", remedy="load it here to see why")
     word = found.stdout.split()[-1]
     return None if word == "None" else float(word)
 

@@ -27,8 +27,8 @@ def floor_ms(gmac: float | Mapping[str, float] | None, mode: str) -> float | Non
     for precision, amount in shares.items():
         if precision not in PI5_GMAC_PER_S:
             known = sorted({*PI5_GMAC_PER_S, *PRECISION})
-            raise ParamsError(f"no Pi 5 peak is known for {precision!r}: choose one of {', '.join(known)}")
+            raise ParamsError(f"no Pi 5 peak is known for {precision!r}", remedy=f"choose one of {', '.join(known)}")
         if isinstance(amount, bool) or not isinstance(amount, (int, float)) or not 0 <= amount < math.inf:
-            raise ParamsError(f"gmac must be a number from 0, found {amount!r}: count the model again")
+            raise ParamsError("gmac must be a number from 0", found=repr(amount), remedy="count the model again")
         total_s += amount / PI5_GMAC_PER_S[precision]
     return total_s * 1000

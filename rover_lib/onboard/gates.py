@@ -35,7 +35,9 @@ def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[di
         ends = list(limit) if is_range else [limit]
         numbers = [e for e in ends if isinstance(e, (int, float)) and not isinstance(e, bool) and math.isfinite(e)]
         if len(numbers) != len(ends) or ends != sorted(ends):
-            raise ParamsError(f"gate {gate} must be a number, [low, high] or a text, found {limit!r}: see params.yml")
+            raise ParamsError(
+                f"gate {gate} must be a number, [low, high] or a text", found=repr(limit), remedy="see params.yml"
+            )
         if found is None or isinstance(found, str) or math.isnan(found):
             found, passed = None, None
         elif gate in HIGHER_IS_BETTER:

@@ -50,12 +50,12 @@ class Policy:
         frames = self._frames(frame_bgr)
         state = np.asarray(state, np.float32)
         if state.shape != (len(self.state_names),):
-            raise PolicyError(f"the state must have shape ({len(self.state_names)},), found {state.shape}")
+            raise PolicyError(f"the state must have shape ({len(self.state_names)},)", found=state.shape)
         if not np.isfinite(state).all():
-            raise PolicyError(f"the state is not finite: {state.tolist()}; send what was last commanded")
+            raise PolicyError("the state is not finite", found=state.tolist(), remedy="send what was last commanded")
         chunk = self.run(state, [prepare_frame(f, c["height"], c["width"]) for f, c in frames])
         if not np.isfinite(chunk).all():
-            raise PolicyError(f"{self.path}: the policy predicted NaN or Inf; stop the car and quantize again")
+            raise PolicyError(f"{self.path}: the policy predicted NaN or Inf", remedy="stop the car and quantize again")
         return chunk
 
     def _frames(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray]) -> list[tuple[np.ndarray, dict[str, Any]]]:
@@ -63,7 +63,7 @@ class Policy:
         if not isinstance(frame_bgr, Mapping):
             frame_bgr = {self.cameras[0]: frame_bgr}
         if set(frame_bgr) != set(self.cameras):
-            raise PolicyError(f"the policy looks through {list(self.cameras)}, found frames of {sorted(frame_bgr)}")
+            raise PolicyError(f"the policy looks through {list(self.cameras)}", found=f"frames of {sorted(frame_bgr)}")
         return [(frame_bgr[c["name"]], c) for c in cameras]
 
     def run(self, state: np.ndarray, frames_rgb: list[np.ndarray]) -> np.ndarray:
@@ -87,13 +87,14 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
     made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
     if made_with.split(".")[:2] != here.split(".")[:2]:
         raise ArtifactError(
-            f"{path}: made with torch {made_with}, here is {here}; install torch {made_with.split('+')[0]}"
+            f"{path}: made with torch {made_with}, here is {here}", remedy=f"install torch {made_with.split('+')[0]}"
         )
     engine = manifest["engine"]
     if engine not in torch.backends.quantized.supported_engines:
         raise ArtifactError(
             f"{path}: needs the quantization engine '{engine}', this torch has "
-            f"{list(torch.backends.quantized.supported_engines)}; install PyPI's build of torch"
+            f"{list(torch.backends.quantized.supported_engines)}",
+            remedy="install PyPI's build of torch",
         )
     torch.backends.quantized.engine = engine
     if threads:
@@ -102,7 +103,7 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
         module = torch.jit.load(str(path), map_location="cpu").eval()
     except RuntimeError as e:
         raise ArtifactError(
-            f"{path}: TorchScript cannot load it ({str(e).splitlines()[0][:200]}); quantize again"
+            f"{path}: TorchScript cannot load it ({str(e).splitlines()[0][:200]})", remedy="quantize again"
         ) from None
     policy = Policy(path, module, manifest)
     check_parity(policy)
@@ -122,10 +123,12 @@ def check_parity(policy: Policy) -> dict[str, float]:
         frames = [vectors[f"frame_{c}"] for c in policy.cameras]
         found = [policy.run(s, [f[i] for f in frames]) for i, s in enumerate(vectors["state"])]
     except (KeyError, IndexError, RuntimeError) as e:
-        raise ArtifactError(f"{policy.path}: its parity vectors do not run ({str(e)[:200]}); quantize again") from None
+        raise ArtifactError(
+            f"{policy.path}: its parity vectors do not run ({str(e)[:200]})", remedy="quantize again"
+        ) from None
     if vectors["chunk"].shape != (len(found), policy.chunk, len(policy.action_names)):
         raise ArtifactError(
-            f"{policy.path}: its parity vectors have another shape than its manifest says; quantize again"
+            f"{policy.path}: its parity vectors have another shape than its manifest says", remedy="quantize again"
         )
     difference = np.abs(np.stack(found) - vectors["chunk"]).max((0, 1))
     tolerance = policy.manifest["parity"]["tolerance"]
@@ -134,6 +137,7 @@ def check_parity(policy: Policy) -> dict[str, float]:
         if not d <= tolerance[name]:  # NaN is not within
             raise ArtifactError(
                 f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}, "
-                f"at most {tolerance[name]:.3g} is rounding; do not drive with it"
+                f"at most {tolerance[name]:.3g} is rounding",
+                remedy="do not drive with it",
             )
     return result

@@ -22,12 +22,14 @@ def prepare_frame(frame_bgr: np.ndarray, height: int, width: int) -> np.ndarray:
     """
     if not isinstance(frame_bgr, np.ndarray) or frame_bgr.ndim != 3 or frame_bgr.shape[2] != 3:
         found = getattr(frame_bgr, "shape", type(frame_bgr).__name__)
-        raise FrameError(f"a frame must be (height, width, 3) BGR, found {found}: is the camera delivering colour?")
+        raise FrameError(
+            "a frame must be (height, width, 3) BGR", found=found, remedy="is the camera delivering colour?"
+        )
     if frame_bgr.dtype != np.uint8:
-        raise FrameError(f"a frame must be uint8, found {frame_bgr.dtype}: pass the picture as OpenCV reads it")
+        raise FrameError("a frame must be uint8", found=frame_bgr.dtype, remedy="pass the picture as OpenCV reads it")
     h, w = frame_bgr.shape[:2]
     if h == 0 or w == 0:
-        raise FrameError(f"a frame of {w}x{h} pixels has no picture in it: check the camera")
+        raise FrameError(f"a frame of {w}x{h} pixels has no picture in it", remedy="check the camera")
     if (h, w) != (height, width):
         shrinks = height < h or width < w
         frame_bgr = cv2.resize(

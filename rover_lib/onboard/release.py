@@ -98,17 +98,17 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
     """
     allow = set(allow)
     if unknown := allow - set(MAY_DIFFER):
-        raise ReleaseError(f"only {', '.join(MAY_DIFFER)} can be allowed, found {', '.join(sorted(unknown))}")
+        raise ReleaseError(f"only {', '.join(MAY_DIFFER)} can be allowed", found=", ".join(sorted(unknown)))
     check_integrity(path)
     manifest = read_manifest(path)
     with zipfile.ZipFile(path) as z:
         code = b"".join(z.read(n) for n in z.namelist() if "/code/" in n and n.endswith(".py"))
     if (wanted := CODE_OF_MODE.get(manifest["mode"])) and wanted not in code:
-        raise ArtifactError(f"{path}: its manifest says {manifest['mode']}, its code is not; quantize again")
+        raise ArtifactError(f"{path}: its manifest says {manifest['mode']}, its code is not", remedy="quantize again")
     for kind, why in expected.refusals(manifest).items():
         if kind not in allow:
             remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
-            raise ReleaseError(f"{path}: {why}; {remedy}")
+            raise ReleaseError(f"{path}: {why}", remedy=remedy)
     return manifest
 
 
@@ -227,7 +227,9 @@ class Releases:
         if name == "current":
             return self.policy
         if not NAME.fullmatch(name):
-            raise ReleaseError(f"a release is named by 64 hexadecimal digits or 'current', found '{name}'; see status")
+            raise ReleaseError(
+                "a release is named by 64 hexadecimal digits or 'current'", found=f"'{name}'", remedy="see status"
+            )
         return self.releases / name / POLICY
 
     def wrong_with(self, name: str) -> str:
@@ -288,10 +290,10 @@ class Releases:
         """
         path = self.path_of(name)
         if not path.exists():
-            raise ReleaseError(f"{path}: not there; {'deploy one' if name == 'current' else 'stage it again'}")
+            raise ReleaseError(f"{path}: not there", remedy="deploy one" if name == "current" else "stage it again")
         real = path.parent.resolve().name
         if wrong := self.wrong_with(real):
-            raise ReleaseError(f"{path}: {wrong}; deploy it again")
+            raise ReleaseError(f"{path}: {wrong}", remedy="deploy it again")
         from rover_lib.onboard.policy import load_policy  # here, because it loads torch
 
         load_policy(path)
@@ -307,7 +309,9 @@ class Releases:
         source = Path(source)
         with _disk_trouble_in_a_sentence(), self._at_work():
             if not source.exists():
-                raise ReleaseError(f"{source}: not found; stage takes an artifact, or the folder that pack wrote")
+                raise ReleaseError(
+                    f"{source}: not found", remedy="stage takes an artifact, or the folder that pack wrote"
+                )
             about = self._packed(source) if source.is_dir() else None
             if about and (there := self._whole(about["name"])):
                 return Staged(there, False)
@@ -318,13 +322,18 @@ class Releases:
             parts = [source / f"part-{i:04d}" for i in range(about["parts"])] if about else [source]
             found, wanted = _join(parts, new / POLICY), sha256 or (about or {}).get("sha256")
             if wanted and found != wanted:
-                raise ReleaseError(f"{source}: arrived damaged (sha256 {found[:12]}, not {wanted[:12]}); send it again")
+                raise ReleaseError(
+                    f"{source}: arrived damaged (sha256 {found[:12]}, not {wanted[:12]})", remedy="send it again"
+                )
             try:
                 here = _about(new / POLICY, inspect_artifact(new / POLICY, self.expected, allow))
             except RoverError as e:
-                raise type(e)(str(e).replace(str(new / POLICY), str(source))) from None
+                what = e.what.replace(str(new / POLICY), str(source))
+                raise type(e)(what, found=e.found, remedy=e.remedy) from None
             if about and about["name"] != here["name"]:
-                raise ReleaseError(f"{source}: contains {here['name'][:12]}, not {about['name'][:12]}; pack it again")
+                raise ReleaseError(
+                    f"{source}: contains {here['name'][:12]}, not {about['name'][:12]}", remedy="pack it again"
+                )
             here["origin"] = about["origin"] if about else {**here["origin"], "file": str(source.absolute())}
             if there := self._whole(here["name"]):
                 return Staged(there, False)
@@ -344,7 +353,7 @@ class Releases:
         with _disk_trouble_in_a_sentence(), self._at_work():
             before = self.current
             if name == "current":
-                raise ReleaseError("'current' is in use already; name the release to switch to")
+                raise ReleaseError("'current' is in use already", remedy="name the release to switch to")
             self.path_of(name)
             self._check(name)
             if before == name:
@@ -377,7 +386,9 @@ class Releases:
                 self._point(name)
                 return name
             why = f" ({'; '.join(refused)})" if refused else ""
-            raise ReleaseError(f"there is no release to roll back to{why}; {self._in_use()}; deploy one instead")
+            raise ReleaseError(
+                f"there is no release to roll back to{why}; {self._in_use()}", remedy="deploy one instead"
+            )
 
     def prune(self, keep: int = 3) -> list[str]:
         """Remove all but the `keep` releases used last; never the one in use. Returns the names of those removed.
@@ -385,7 +396,7 @@ class Releases:
         One that was never in use counts as older than one that was, and one that is damaged is removed.
         """
         if keep < 1:
-            raise ReleaseError(f"at least 1 release is kept, found {keep}")
+            raise ReleaseError("at least 1 release is kept", found=keep)
         with _disk_trouble_in_a_sentence(), self._at_work():
             whole = [name for name in self._by_use() if not self.wrong_with(name)]
             gone = [name for name in self._by_use() if name not in whole[:keep] and name != self.current]
@@ -420,7 +431,7 @@ class Releases:
             except BlockingIOError:
                 if left:
                     time.sleep(LOCK_S)
-        raise ReleaseError(f"{self.models}: another deployment is at work; wait for it (status says at_work)")
+        raise ReleaseError(f"{self.models}: another deployment is at work", remedy="wait for it (status says at_work)")
 
     def _tidy(self) -> None:
         for left in (*self.releases.glob(".*"), *self.models.glob(".new-*")):
@@ -450,14 +461,16 @@ class Releases:
             return {**about, "bytes": int(about["bytes"]), "parts": int(about["parts"])}
         except (OSError, ValueError, KeyError, TypeError) as e:
             raise ReleaseError(
-                f"{folder / ORIGIN}: not what 'rover release pack' writes ({e}); send it again"
+                f"{folder / ORIGIN}: not what 'rover release pack' writes ({e})", remedy="send it again"
             ) from None
 
     def _make_sure_of_room(self, needed: int) -> None:
         free = shutil.disk_usage(self.models).free
         if free < needed + SPARE_BYTES:
             wanted_mb = (needed + SPARE_BYTES) / 1e6
-            raise ReleaseError(f"{self.models}: {free / 1e6:.0f} MB free, {wanted_mb:.0f} are needed; prune releases")
+            raise ReleaseError(
+                f"{self.models}: {free / 1e6:.0f} MB free, {wanted_mb:.0f} are needed", remedy="prune releases"
+            )
 
     def _whole(self, content: str) -> str | None:
         """A release of that content which is whole, the one in use first."""
@@ -558,10 +571,13 @@ def _disk_trouble_in_a_sentence() -> Iterator[None]:
         yield
     except OSError as e:
         if e.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise ReleaseError("the disk is full; what was in use still is; prune releases or old recordings") from e
+            raise ReleaseError(
+                "the disk is full; what was in use still is", remedy="prune releases or old recordings"
+            ) from e
         if e.errno in (errno.EROFS, errno.EIO):  # so a card ends
             raise ReleaseError(
-                f"the disk cannot be written ({e.strerror}); what was in use still is; look at dmesg, use another card"
+                f"the disk cannot be written ({e.strerror}); what was in use still is",
+                remedy="look at dmesg, use another card",
             ) from e
         raise
 
@@ -576,7 +592,7 @@ def _join(parts: list[Path], target: Path) -> str:
             try:
                 content = part.read_bytes()
             except FileNotFoundError:
-                raise ReleaseError(f"{part}: not arrived; send it again") from None
+                raise ReleaseError(f"{part}: not arrived", remedy="send it again") from None
             digest.update(content)
             _write_all(file, content)
         os.fsync(file)

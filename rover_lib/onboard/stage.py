@@ -118,10 +118,12 @@ def read_stage(path: Path | str, stage: str) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError:
-        raise RoverError(f"{path}: not found; run the notebook of stage '{stage}' first") from None
+        raise RoverError(f"{path}: not found", remedy=f"run the notebook of stage '{stage}' first") from None
     except (ValueError, OSError) as e:
-        raise RoverError(f"{path}: not readable as JSON ({e}); delete it and run its stage again") from None
+        raise RoverError(f"{path}: not readable as JSON ({e})", remedy="delete it and run its stage again") from None
     found = (content.get("schema"), content.get("stage")) if isinstance(content, dict) else type(content).__name__
     if found != (SCHEMA, stage):
-        raise RoverError(f"{path}: expected schema {SCHEMA} of stage '{stage}', found {found}; run the stage again")
+        raise RoverError(
+            f"{path}: expected schema {SCHEMA} of stage '{stage}'", found=found, remedy="run the stage again"
+        )
     return content

@@ -42,7 +42,7 @@ def rewritten(source: Path, target: Path, change: dict[str, object]) -> Path:
         (["runs/a/policy_static.pt", "runs/b/policy_mixed.pt"], ["static", "mixed"]),
         (["runs/a/policy_static.pt", "runs/b/policy_static.pt", "c.pt"], ["a/static", "b/static", "c"]),
         (["x/same/p.pt", "y/same/p.pt"], ["x/same/p", "y/same/p"]),
-        (["/same/p.pt", "/y/same/p.pt"], ["/same/p.pt", "y/same/p"]),
+        (["/same/p.pt", "/y/same/p.pt"], ["same/p", "y/same/p"]),
         (["a/p.pt", "a/p.bin"], ["a/p.pt", "a/p.bin"]),
         (["a/policy_p.pt", "a/p.pt", "b/p.pt"], ["a/policy_p.pt", "a/p.pt", "b/p"]),
     ],
