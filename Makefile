@@ -22,7 +22,8 @@ help:
 	@echo "                                            a policy of the real car's size, PEERS=1 adds other runtimes"
 	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino"
 	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
-	@echo "make notebooks                              put the demo's outputs, and runs/full's count, into the committed notebooks"
+	@echo "make notebooks                              put the demo's outputs, and runs/full's count, into the committed notebooks,"
+	@echo "                                            and the JSON behind them into results/"
 
 # uv installs the CUDA build of torch, gigabytes that its wheel insists on, in a minute where pip takes several.
 $(READY): pyproject.toml
@@ -90,8 +91,7 @@ lab: $(READY)
 	$(VENV)/bin/jupyter lab notebooks
 
 notebooks: demo
-	$(VENV)/bin/python -c "from rover_lib.workshop.run import NAMES, publish; publish('runs/demo', 'notebooks', (*NAMES, '07_drive'))"
-	test ! -f runs/full/06_arm.ipynb || $(VENV)/bin/python -c "from rover_lib.workshop.run import publish; publish('runs/full', 'notebooks', ('06_arm',))"
+	$(VENV)/bin/python -m rover_lib.workshop.publish
 
 clean:
 	rm -rf $(VENV) runs

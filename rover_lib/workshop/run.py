@@ -1,4 +1,4 @@
-"""Execute the five notebooks on a checkpoint and recordings, and put what they showed back into the repository.
+"""Execute the five notebooks on a checkpoint and recordings.
 
     folder = run("best_model.pth", "episodes", "mine")
 
@@ -6,7 +6,6 @@ A run is a folder: load.json, calibrate.json, quantize.json, compare.json, bench
 policy_<mode>.pt, figures/*.png and the executed notebooks. The notebooks know each other only through these files.
 """
 
-import io
 import json
 import logging
 import os
@@ -14,8 +13,6 @@ import re
 import shutil
 import socket
 import sys
-import tempfile
-from base64 import b64decode, b64encode
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,7 +21,6 @@ from typing import Any
 import nbformat
 from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
-from PIL import Image
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
@@ -39,15 +35,10 @@ KERNEL_ENVIRONMENT = {
     "PYTHONWARNINGS": "ignore:Currently,ignore:IProgress not found",
     "TORCH_CPP_LOG_LEVEL": "ERROR",
 }
-IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
-NOTEBOOK_LIMIT = 1_000_000  # bytes, of a committed notebook
 
 
 class NotebookError(RoverError):
     """A notebook that did not run to its end, or whose output must not be committed."""
-
-
-# --- running them -----------------------------------------------------------------------------------------------------
 
 
 class ThisPython(AsyncKernelManager):
@@ -250,70 +241,3 @@ def _sentence(error: Any) -> str:
 def _subclasses(kind: type[RoverError]) -> set[type[RoverError]]:
     direct: list[type[RoverError]] = kind.__subclasses__()
     return set(direct).union(*(_subclasses(c) for c in direct))
-
-
-# --- publishing what they showed --------------------------------------------------------------------------------------
-
-
-def publish(
-    run_dir: Path | str, notebooks_dir: Path | str = NOTEBOOKS, names: tuple[str, ...] | None = None
-) -> list[Path]:
-    """Put a run's outputs into the repository's notebooks: no counts, no papermill metadata, no paths of this machine.
-
-    names: of the notebooks, without .ipynb; the five of a run if None. Cells are matched by id, and their sources must
-    be the same. Large pictures get 256 colours. Raises NotebookError if a notebook was not run, has changed since,
-    still holds a path, or is larger than 1 MB; then nothing is written.
-    """
-    run_dir, notebooks_dir = Path(run_dir).resolve(), Path(notebooks_dir).resolve()
-    made = {}
-    for name in NAMES if names is None else names:
-        target, executed = notebooks_dir / f"{name}.ipynb", run_dir / f"{name}.ipynb"
-        if not executed.is_file():
-            raise NotebookError(f"{executed}: not there; execute the run first")
-        made[target] = _published(nbformat.read(target, as_version=4), nbformat.read(executed, as_version=4), name)
-        for folder in (run_dir, notebooks_dir.parent, Path.home(), Path(tempfile.gettempdir()), Path(sys.prefix)):
-            if len(str(folder)) > 1 and f"{folder}/" in made[target]:
-                raise NotebookError(f"{name}: an output shows a path below {folder}; print names, not paths")
-        if len(made[target]) > NOTEBOOK_LIMIT:
-            raise NotebookError(
-                f"{name}: {len(made[target]) / 1e6:.1f} MB with its outputs; draw less, 1 MB is the limit"
-            )
-    for target, text in made.items():
-        with atomic_path(target) as temporary:
-            temporary.write_text(text)
-    return list(made)
-
-
-def _published(source: Any, executed: Any, name: str) -> str:
-    outputs = {c.id: c for c in executed.cells if c.cell_type == "code"}
-    for cell in source.cells:
-        if cell.cell_type != "code":
-            continue
-        ran = outputs.get(cell.id)
-        if ran is None or ran.source != cell.source:
-            raise NotebookError(f"{name}: cell '{cell.id}' is not what was executed; execute the run again")
-        cell.outputs = [_plain_output(o) for o in ran.outputs if o.get("name") != "stderr"]
-        cell.execution_count = None
-    return nbformat.writes(source) + "\n"
-
-
-def _plain_output(output: Any) -> Any:
-    output = nbformat.from_dict(dict(output))
-    if "execution_count" in output:
-        output.execution_count = None
-    output.pop("transient", None)
-    if picture := output.get("data", {}).get("image/png"):
-        output.data = {"image/png": _smaller(picture)}  # without "<Figure size ...>"
-    if "metadata" in output:
-        output.metadata = {}
-    return output
-
-
-def _smaller(picture: str) -> str:
-    """A base64 PNG, with 256 colours if it is large and they make it smaller."""
-    raw = b64decode(picture)
-    if len(raw) > IMAGE_LIMIT:
-        buffer = io.BytesIO()
-        Image.open(io.BytesIO(raw)).convert("RGB").quantize(256).save(buffer, "PNG", optimize=True)
-        raw = min(raw, buffer.getvalue(), key=len)
-    return b64encode(raw).decode()

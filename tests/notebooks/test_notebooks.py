@@ -13,10 +13,11 @@ import pytest
 
 from lab.a76 import report
 from lab.params import lab_params
-from rover_lib.onboard.stage import write_stage
-from rover_lib.workshop import progress, session
+from rover_lib.onboard.stage import read_stage, write_stage
+from rover_lib.workshop import progress, publish, session
 from rover_lib.workshop import run as runs
-from rover_lib.workshop.run import AFTERWARDS, NAMES, NOTEBOOK_LIMIT, NOTEBOOKS, parameters_of
+from rover_lib.workshop.publish import NOTEBOOK_LIMIT, RESULTS_OF
+from rover_lib.workshop.run import AFTERWARDS, NAMES, NOTEBOOKS, parameters_of
 from rover_lib.world import latency
 
 PATHS = [NOTEBOOKS / f"{name}.ipynb" for name in NAMES + AFTERWARDS]
@@ -215,7 +216,8 @@ def written(folder, name, *cells):
 
 @pytest.fixture
 def one_notebook(monkeypatch, tmp_path):
-    monkeypatch.setattr(runs, "NAMES", ("01_load",))
+    for module in (runs, publish):
+        monkeypatch.setattr(module, "NAMES", ("01_load",))
     return tmp_path / "notebooks"
 
 
@@ -355,7 +357,7 @@ def test_publishing_takes_outputs_without_counts_and_noise(one_notebook, tmp_pat
     shown = nbformat.v4.new_output("execute_result", data={"text/plain": "1"}, execution_count=3)
     ran = ("work", "print(a)\na", [stream("1\n"), stream("noise", "stderr"), shown])
     written(tmp_path / "run", "01_load", ("parameters", "a = 1  # one"), ("injected", "a = 2"), ran)
-    (path,) = runs.publish(tmp_path / "run", one_notebook)
+    (path,) = publish.publish(tmp_path / "run", one_notebook)
     parameters, work = nbformat.read(path, as_version=4).cells
     assert parameters.source == "a = 1  # one"
     assert [o.output_type for o in work.outputs] == ["stream", "execute_result"]
@@ -366,7 +368,7 @@ def test_publishing_is_of_the_notebooks_that_are_named(one_notebook, tmp_path):
     for name in ("01_load", "06_arm"):
         written(one_notebook, name, ("work", "print(1)"))
         written(tmp_path / "run", name, ("work", "print(1)", [stream("1\n")]))
-    assert [p.stem for p in runs.publish(tmp_path / "run", one_notebook, ("06_arm",))] == ["06_arm"]
+    assert [p.stem for p in publish.publish(tmp_path / "run", one_notebook, ("06_arm",))] == ["06_arm"]
     assert not nbformat.read(one_notebook / "01_load.ipynb", as_version=4).cells[0].outputs
 
 
@@ -375,11 +377,37 @@ def test_publishing_refuses_paths_and_changed_cells(one_notebook, tmp_path):
     before = (one_notebook / "01_load.ipynb").read_text()
     written(tmp_path / "run", "01_load", ("work", "print(1)", [stream(f"{tmp_path}/run/x")]))
     with pytest.raises(runs.NotebookError, match="print names"):
-        runs.publish(tmp_path / "run", one_notebook)
+        publish.publish(tmp_path / "run", one_notebook)
     written(tmp_path / "run", "01_load", ("work", "print(2)", [stream("2")]))
     with pytest.raises(runs.NotebookError, match="not what was executed"):
-        runs.publish(tmp_path / "run", one_notebook)
+        publish.publish(tmp_path / "run", one_notebook)
     assert (one_notebook / "01_load.ipynb").read_text() == before
+
+
+def test_publishing_leaves_the_json_behind_the_outputs(one_notebook, tmp_path):
+    written(one_notebook, "01_load", ("work", "print(1)"))
+    written(tmp_path / "mine", "01_load", ("work", "print(1)", [stream("1\n")]))
+    inputs = {f"frame_{i:06d}.jpg": "0" * 64 for i in range(1000)}
+    given = {"checkpoint": tmp_path / "mine" / "best_model.pth"}
+    write_stage(tmp_path / "mine" / "load.json", "load", params=given, metrics={"samples": 3}, inputs=inputs)
+    (tmp_path / "mine" / "other.json").write_text("{}")
+    _, path = publish.publish(tmp_path / "mine", one_notebook, ("01_load",))
+    assert path == tmp_path / "results" / "mine" / "load.json"
+    assert [p.name for p in path.parent.iterdir()] == ["load.json"]
+    content = read_stage(path, "load")
+    assert content["params"] == {"checkpoint": "best_model.pth"} and content["metrics"] == {"samples": 3}
+    assert list(content["inputs"]) == ["1000 files"]
+    write_stage(tmp_path / "mine" / "load.json", "load", params={}, metrics={"note": f"see {tmp_path}/x"})
+    with pytest.raises(runs.NotebookError, match="shows a path of this machine"):
+        publish.publish(tmp_path / "mine", one_notebook, ("01_load",))
+    assert read_stage(path, "load") == content
+
+
+def test_committed_results_are_small_and_show_no_path():
+    assert set(RESULTS_OF) == {*NAMES, *AFTERWARDS}
+    texts = [p.read_text() for p in (NOTEBOOKS.parent / "results").rglob("*.json")]
+    assert not [t for t in texts if publish.ABSOLUTE.search(t)]
+    assert sum(len(t) for t in texts) < 1_000_000
 
 
 def test_what_was_opened_must_not_have_changed(tiny, tiny_file, tmp_path, monkeypatch):

@@ -321,6 +321,23 @@ def test_chooses_by_error(tiny, calibration):
     assert plain.float_blocks == () and len(steps) == 1
 
 
+def test_an_action_that_never_changes_takes_no_part_in_choosing(tiny, calibration):
+    chooser = Chooser(tiny, calibration, memory_samples(2, seed=8), {"steering": (-0.5, 0.5), "throttle": (0.06, 0.06)})
+    assert chooser.warnings == ["throttle never changes in these recordings: not judged"]
+    scheme, table = chooser.observer(Scheme(), ["minmax", "histogram"])
+    assert all(row["throttle_mae_pct"] is None and row["steering_mae_pct"] > 0 for row in table.values())
+    assert table[scheme.observer]["steering_mae_pct"] == min(row["steering_mae_pct"] for row in table.values())
+    blocks = {"backbone.stem": table["minmax"], "image_project": table["histogram"]}
+    mixed, steps = chooser.mixed(scheme, blocks, budget_pct=100, max_blocks=1)
+    assert mixed.float_blocks == () and len(steps) == 1 and steps[0]["throttle_mae_pct"] is None
+
+
+def test_where_no_action_changes_nothing_can_be_chosen(tiny, calibration):
+    still = {"steering": (0.0, 0.0), "throttle": (0.0, 0.0)}
+    with pytest.raises(QuantizeError, match=r"steering and throttle never change.*; record episodes in which"):
+        Chooser(tiny, calibration, memory_samples(1), still)
+
+
 finite = st.floats(-1e4, 1e4, allow_nan=False, width=32)
 
 

@@ -1,0 +1,166 @@
+"""Put what runs showed into the repository: outputs into its notebooks, and the JSON behind them into results/.
+
+    python -m rover_lib.workshop.publish       # what `make notebooks` does
+
+results/<run>/<stage>.json is what the run left, less paths of this machine and the hashes of every recorded frame. What
+quotes a number reads it there.
+"""
+
+import hashlib
+import io
+import json
+import re
+import sys
+import tempfile
+from base64 import b64decode, b64encode
+from pathlib import Path
+from typing import Any
+
+import nbformat
+from PIL import Image
+
+from rover_lib.onboard.stage import atomic_path
+from rover_lib.workshop.run import NAMES, NOTEBOOKS, NotebookError
+
+RESULTS_OF = {  # stages that a notebook leaves
+    "01_load": "load",
+    "02_calibrate": "calibrate",
+    "03_quantize": "quantize",
+    "04_compare": "compare",
+    "05_benchmark": "benchmark-*",
+    "06_arm": "arm",
+    "07_drive": "drive",
+}
+OF_LABORATORY = ("faults.json", "pi-fast.json", "pi.json")  # in runs/, where `make faults` and `make pi` leave them
+IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
+NOTEBOOK_LIMIT = 1_000_000  # bytes, of a committed notebook
+RESULT_LIMIT = 200_000  # bytes, of a committed JSON
+MANY_INPUTS = 40  # hashes of files; more of them are summed up in one
+ABSOLUTE = re.compile(r"/(?:home|root|tmp|Users|work|var|opt|mnt)/|[A-Z]:\\\\")
+
+
+def publish(
+    run_dir: Path | str, notebooks_dir: Path | str = NOTEBOOKS, names: tuple[str, ...] | None = None
+) -> list[Path]:
+    """Put a run's outputs into the repository's notebooks: no counts, no papermill metadata, no paths of this machine;
+    and the JSON behind them into results/<run>, beside the notebooks' folder.
+
+    names: of the notebooks, without .ipynb; the five of a run if None. Cells are matched by id, and their sources must
+    be the same. Large pictures get 256 colours. Returns the files written. Raises NotebookError if a notebook was not
+    run, has changed since, still holds a path, or is larger than 1 MB; then nothing is written.
+    """
+    run_dir, notebooks_dir = Path(run_dir).resolve(), Path(notebooks_dir).resolve()
+    texts: dict[Path, str] = {}
+    for name in NAMES if names is None else names:
+        target, executed = notebooks_dir / f"{name}.ipynb", run_dir / f"{name}.ipynb"
+        if not executed.is_file():
+            raise NotebookError(f"{executed}: not there", remedy="execute the run first")
+        text = _published(nbformat.read(target, as_version=4), nbformat.read(executed, as_version=4), name)
+        for folder in (run_dir, notebooks_dir.parent, Path.home(), Path(tempfile.gettempdir()), Path(sys.prefix)):
+            if len(str(folder)) > 1 and f"{folder}/" in text:
+                raise NotebookError(f"{name}: an output shows a path below {folder}", remedy="print names, not paths")
+        if len(text) > NOTEBOOK_LIMIT:
+            size = f"{len(text) / 1e6:.1f} MB with its outputs"
+            raise NotebookError(f"{name}: {size}", remedy="draw less, 1 MB is the limit")
+        texts[target] = text
+        for path in sorted(run_dir.glob(f"{RESULTS_OF[name]}.json")):
+            texts[notebooks_dir.parent / "results" / run_dir.name / path.name] = _result(path)
+    return _write(texts)
+
+
+def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEBOOKS) -> list[Path]:
+    """Publish the demo; of runs/full its count, and of the laboratory its reports, where they are there."""
+    runs_dir, notebooks_dir = Path(runs_dir), Path(notebooks_dir)
+    written = publish(runs_dir / "demo", notebooks_dir, (*NAMES, "07_drive"))
+    if (runs_dir / "full" / "06_arm.ipynb").is_file():
+        written += publish(runs_dir / "full", notebooks_dir, ("06_arm",))
+    reports = [runs_dir / name for name in OF_LABORATORY if (runs_dir / name).is_file()]
+    folder = notebooks_dir.resolve().parent / "results" / "lab"
+    return written + _write({folder / path.name: _result(path) for path in reports})
+
+
+def _write(texts: dict[Path, str]) -> list[Path]:
+    for target, text in texts.items():
+        with atomic_path(target) as temporary:
+            temporary.write_text(text)
+    return list(texts)
+
+
+# --- the JSON ---------------------------------------------------------------------------------------------------------
+
+
+def _result(path: Path) -> str:
+    """A stage's JSON as it is committed. Raises NotebookError if it still holds a path, or is large."""
+    content = json.loads(path.read_text())
+    if len(inputs := content.get("inputs", {})) > MANY_INPUTS:
+        content["inputs"] = _summed_up(inputs)
+    text = json.dumps(_names_only(content), indent=1) + "\n"
+    if (shown := ABSOLUTE.search(text)) is not None:
+        around = text[max(shown.start() - 40, 0) : shown.end() + 40]
+        raise NotebookError(f"{path.name}: shows a path of this machine", found=around, remedy="write names, not paths")
+    if len(text) > RESULT_LIMIT:
+        size = f"{len(text) / 1e3:.0f} kB"
+        raise NotebookError(
+            f"{path.name}: {size}, of at most {RESULT_LIMIT / 1e3:.0f}", remedy="leave out what is bulk"
+        )
+    return text
+
+
+def _summed_up(inputs: dict[str, str]) -> dict[str, str]:
+    """{file: sha256} of many files as one entry: their count, and a hash of all."""
+    lines = "".join(f"{sha256}  {name}\n" for name, sha256 in sorted(inputs.items()))
+    return {f"{len(inputs)} files": hashlib.sha256(lines.encode()).hexdigest()}
+
+
+def _names_only(value: Any) -> Any:
+    """The same value, with the last part of every absolute path in it."""
+    if isinstance(value, dict):
+        return {_names_only(k): _names_only(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_names_only(v) for v in value]
+    if isinstance(value, str) and Path(value).is_absolute():
+        return Path(value).name
+    return value
+
+
+# --- the notebooks ----------------------------------------------------------------------------------------------------
+
+
+def _published(source: Any, executed: Any, name: str) -> str:
+    outputs = {c.id: c for c in executed.cells if c.cell_type == "code"}
+    for cell in source.cells:
+        if cell.cell_type != "code":
+            continue
+        ran = outputs.get(cell.id)
+        if ran is None or ran.source != cell.source:
+            raise NotebookError(f"{name}: cell '{cell.id}' is not what was executed; execute the run again")
+        cell.outputs = [_plain_output(o) for o in ran.outputs if o.get("name") != "stderr"]
+        cell.execution_count = None
+    return nbformat.writes(source) + "\n"
+
+
+def _plain_output(output: Any) -> Any:
+    output = nbformat.from_dict(dict(output))
+    if "execution_count" in output:
+        output.execution_count = None
+    output.pop("transient", None)
+    if picture := output.get("data", {}).get("image/png"):
+        output.data = {"image/png": _smaller(picture)}  # without "<Figure size ...>"
+    if "metadata" in output:
+        output.metadata = {}
+    return output
+
+
+def _smaller(picture: str) -> str:
+    """A base64 PNG, with 256 colours if it is large and they make it smaller."""
+    raw = b64decode(picture)
+    if len(raw) > IMAGE_LIMIT:
+        buffer = io.BytesIO()
+        Image.open(io.BytesIO(raw)).convert("RGB").quantize(256).save(buffer, "PNG", optimize=True)
+        raw = min(raw, buffer.getvalue(), key=len)
+    return b64encode(raw).decode()
+
+
+if __name__ == "__main__":
+    for path in publish_all():
+        print(path.name)
