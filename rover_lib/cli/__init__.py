@@ -7,8 +7,29 @@ from rover_lib.cli import drive, prepare, world
 from rover_lib.onboard import cli as onboard
 from rover_lib.onboard.cli import Rover
 
+ROVERS = onboard.main.commands
+# By what a user does, as `rover --help` lists them; inspect, drive and log know more here than on the rover.
+SECTIONS = {
+    "Prepare a policy": (prepare.run, prepare.inspect, prepare.quantize, prepare.compare, ROVERS["benchmark"]),
+    "Try it without a car": (world.world,),
+    "Set up a rover": (prepare.wheelhouse, ROVERS["release"]),
+    "Drive": (ROVERS["doctor"], ROVERS["record"], drive.drive, ROVERS["arm-car"], drive.log),
+}
 
-@click.group("rover", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+
+class Workstation(Rover):
+    """The commands in sections."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        width = formatter.width - 6 - max(map(len, self.commands))
+        for title, commands in SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl([(str(c.name), c.get_short_help_str(width)) for c in commands])
+
+
+@click.group(
+    "rover", cls=Workstation, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+)
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
 @click.version_option(rover_lib.__version__)
 def main(debug: bool) -> None:
@@ -19,7 +40,6 @@ def main(debug: bool) -> None:
     """
 
 
-for command in onboard.main.commands.values():
-    main.add_command(command)
-for command in (*prepare.COMMANDS, *drive.COMMANDS, world.world):  # those of the same name know more than the rover's
-    main.add_command(command)
+for commands in SECTIONS.values():
+    for command in commands:
+        main.add_command(command)

@@ -49,6 +49,3 @@ def log(file: Path, output: Path | None, drive: int, as_json: bool) -> None:
         with atomic_path(output) as temporary:
             figure.savefig(temporary)
         click.echo(f"drawn: {output}", err=as_json)
-
-
-COMMANDS = (drive, log)

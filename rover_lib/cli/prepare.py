@@ -124,6 +124,3 @@ def wheelhouse(folder: Path, pythons: tuple[str, ...], only_rover: bool) -> None
     from rover_lib.workshop.wheelhouse import PYTHONS, make
 
     show(vars(make(folder, pythons=pythons or PYTHONS, only_rover=only_rover)), True)
-
-
-COMMANDS = (run, inspect, quantize, compare, wheelhouse)
