@@ -12,8 +12,8 @@ from rover_lib.onboard.cli import FILE, LOG_DRIVE, drive_options, run_drive, sum
 @click.command()
 @drive_options
 @click.option("--world", "in_world", is_flag=True, help="The balloon world instead of a car, in real time.")
-@click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="With --world: a plan takes so long.")
-@click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="With --world: its first.")
+@click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="With --world: of a plan, at least.")
+@click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
 @click.pass_context
 def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **options: Any) -> None:
     """Drive ARTIFACT: arms the car once camera, plan and Arduino are ready, and stops it whatever fails.

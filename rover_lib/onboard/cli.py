@@ -188,8 +188,8 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
 @click.option(
     "--hz", type=click.FloatRange(5, 50), default=30.0, show_default=True, help="Controls and frames a second."
 )
-@click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="End an episode after so many.")
-@click.option("--label", default="", help='What is done, say "hit red balloon".')
+@click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="Longest duration of an episode.")
+@click.option("--label", default="", help='What is done, such as "hit red balloon".')
 @click.option("--episodes", type=click.IntRange(min=1), default=1, show_default=True, help="One after another.")
 @click.pass_context
 def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -> None:
@@ -400,7 +400,7 @@ def prune(releases: Any, keep: int) -> None:
 @click.pass_obj
 def status(releases: Any, as_json: bool) -> None:
     """What is in use, whether it is whole, what else is there. Exit code 1 if what is in use is not whole."""
-    found = releases.status()
+    report = releases.status()
     if as_json:
         import socket
 
@@ -408,17 +408,17 @@ def status(releases: Any, as_json: bool) -> None:
         from rover_lib.onboard.service import ServiceError, state_of
 
         try:
-            found["service"] = state_of()
+            report["service"] = state_of()
         except ServiceError as e:
-            found["service"] = {"installed": False, "active": "unknown", "state": "", "text": str(e)}
+            report["service"] = {"installed": False, "active": "unknown", "state": "", "text": str(e)}
         log = next((p for p in (Path("/var/lib/rover-drive/flight.log"), default_log()) if p.exists()), None)
-        found |= {"rover": socket.gethostname(), **Host().reading(), "last_drive_s": log and log.stat().st_mtime}
-        return show(found, True)
-    for r in found["releases"]:
+        report |= {"rover": socket.gethostname(), **Host().reading(), "last_drive_s": log and log.stat().st_mtime}
+        return show(report, True)
+    for r in report["releases"]:
         mark = "*" if r["current"] else " "
         click.echo(f"{mark} {r['name'][:12]}  {r['mode']:<7} {r['megabytes']:6.1f} MB  {r['wrong'] or r['origin']}")
-    if not found["healthy"]:
-        raise RoverError(found["trouble"])
+    if not report["healthy"]:
+        raise RoverError(report["trouble"])
 
 
 @main.command()

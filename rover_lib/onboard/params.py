@@ -20,12 +20,12 @@ def params() -> dict[str, Any]:
 
     Raises ParamsError for a file that is no YAML mapping.
     """
-    found = read_params(DEFAULTS)
+    values = read_params(DEFAULTS)
     for place in PLACES:
         if place.is_file():
-            _set(found, read_params(place), str(place))
+            _set(values, read_params(place), str(place))
             break
-    return found
+    return values
 
 
 def read_params(path: Path | str) -> dict[str, Any]:

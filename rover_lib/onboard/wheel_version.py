@@ -17,6 +17,6 @@ def wheel_version() -> str:
     digest = hashlib.sha256()
     for path in sorted([PACKAGE, *files]):
         digest.update(f"{path.relative_to(PACKAGE.parent)}\0".encode() + path.read_bytes() + b"\0")
-    found = re.search(r'^__version__ = "(.+)"$', PACKAGE.read_text(), re.MULTILINE)
-    assert found, f"{PACKAGE} has no __version__"
-    return f"{found[1]}+{digest.hexdigest()[:12]}"
+    version = re.search(r'^__version__ = "(.+)"$', PACKAGE.read_text(), re.MULTILINE)
+    assert version, f"{PACKAGE} has no __version__"
+    return f"{version[1]}+{digest.hexdigest()[:12]}"

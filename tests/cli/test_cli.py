@@ -43,10 +43,10 @@ def test_help(command):
 
 
 def test_inspects_each_kind_of_file(artifacts, tiny_file):
-    found = json.loads(rover("inspect", artifacts["static"], "--json").output)
-    assert found["artifact"]["mode"] == "static" and len(found["artifact"]["content_hash"]) == 64
-    found = json.loads(rover("inspect", tiny_file, "--json").output)
-    assert found["checkpoint"]["format"] == "trainer"
+    content = json.loads(rover("inspect", artifacts["static"], "--json").output)
+    assert content["artifact"]["mode"] == "static" and len(content["artifact"]["content_hash"]) == 64
+    content = json.loads(rover("inspect", tiny_file, "--json").output)
+    assert content["checkpoint"]["format"] == "trainer"
     assert "parameters_acting" in rover("inspect", tiny_file).output
 
 
@@ -140,9 +140,9 @@ def test_quantizes_and_compares_on_recordings(tiny_file, drives, tmp_path):
     files = [tmp_path / f"{mode}.pt" for mode in ("fp32", "static", "mixed")]
     result = rover("compare", *files, "--episodes", drives, "--json")
     assert result.exit_code == 0, result.output
-    found = json.loads(result.output)
-    assert set(found) == {"static", "mixed"}
-    assert len(found["static"]["steering_mae_per_step_pct"]) == 32
+    content = json.loads(result.output)
+    assert set(content) == {"static", "mixed"}
+    assert len(content["static"]["steering_mae_per_step_pct"]) == 32
     (tmp_path / "other").mkdir()
     same_name = shutil.copy(tmp_path / "static.pt", tmp_path / "other" / "static.pt")
     result = rover("compare", *files[:2], same_name, "--episodes", drives, "--json")
@@ -152,8 +152,8 @@ def test_quantizes_and_compares_on_recordings(tiny_file, drives, tmp_path):
 
 
 def test_inspects_recordings_and_drives_a_trial(drives, artifacts):
-    found = json.loads(rover("inspect", drives, "--json").output)
-    assert found["recordings"]["episodes"] == 4
+    content = json.loads(rover("inspect", drives, "--json").output)
+    assert content["recordings"]["episodes"] == 4
     result = rover("world", "trial", artifacts["static"], "--worlds", 1, "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.output)["trials"] == 1

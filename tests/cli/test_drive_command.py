@@ -44,13 +44,13 @@ def world_drive(demo_run, tmp_path_factory):
 
 
 def test_a_drive_leaves_its_report(world_drive):
-    found = json.loads((world_drive[0] / "drive.json").read_text())
-    assert (found["ticks"], found["ended"]) == (60, "60 ticks")
+    report = json.loads((world_drive[0] / "drive.json").read_text())
+    assert (report["ticks"], report["ended"]) == (60, "60 ticks")
     assert {"missed", "jitter_p50_ms", "jitter_p99_ms", "jitter_max_ms", "plan_age_p95_ms", "hits", "trials"} <= set(
-        found
+        report
     )
-    assert 50 <= found["latency_p50_ms"] < 150
-    assert found["memory_mb"] > 50
+    assert 50 <= report["latency_p50_ms"] < 150
+    assert report["memory_mb"] > 50
 
 
 def test_a_drive_leaves_its_log(world_drive):
@@ -105,9 +105,9 @@ def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number):
             break
     time.sleep(0.5)
     process.send_signal(number)
-    _, said = process.communicate(timeout=20)
-    assert process.returncode == 0, said
-    assert f"{number.name}: stopping" in said
+    _, stderr = process.communicate(timeout=20)
+    assert process.returncode == 0, stderr
+    assert f"{number.name}: stopping" in stderr
     assert json.loads((tmp_path / "drive").read_text())["ended"] == "told to stop"
 
 
@@ -151,11 +151,11 @@ def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "code", "says"),
+    ("options", "code", "message"),
     [
         ([], 2, "give an ARTIFACT, or --replay"),
         (["policy.pt", "--replay", "episode"], 2, "give an ARTIFACT, or --replay"),
-        (["policy.pt", "--firmware"], 2, "belong to --world"),
+        (["policy.pt", "--latency-ms", "50"], 2, "belongs to --world"),
         (["policy.pt", "--hz", "5"], 2, "--hz"),
         (["policy.pt", "--throttle-limit", "1.5"], 2, "--throttle-limit"),
         (["policy.pt", "--port", "/dev/nothing"], 1, "/dev/nothing: cannot be opened"),
@@ -163,10 +163,10 @@ def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
         (["--replay", "nothing"], 1, "nothing"),
     ],
 )
-def test_what_cannot_begin(options, code, says, tmp_path):
+def test_what_cannot_begin(options, code, message, tmp_path):
     result = CliRunner().invoke(main, ["drive", *options, "--log", str(tmp_path / "flight.log")])
     assert result.exit_code == code
-    assert says in result.output
+    assert message in result.output
     assert "Traceback" not in result.output
 
 
