@@ -1,8 +1,8 @@
 """What quantization changed: the same frames through every artifact, differences in units that the car feels.
 
     report = fidelity(fp32, {"static": static}, split.held_out, recordings.action_range())
-    found = metrics(report, policies, trials, driven)
-    gates(found, params()["gates"])
+    compared = metrics(report, policies, trials, driven)
+    gates(compared, params()["gates"])
 
 Errors are absolute differences to the FP32 artifact, never to the recorded action: how well the policy
 imitates is another question, whose answer (`recorded_error`) is given beside it as a yardstick.
@@ -223,16 +223,16 @@ def us_per_unit(action: str) -> float:
 
 def artifacts(run_dir: Path | str) -> dict[str, Path]:
     """The artifacts of a run by mode, in the order of ARTIFACTS; those that are not there are left out."""
-    found = {mode: Path(run_dir) / f"policy_{mode}.pt" for mode in ARTIFACTS}
-    return {mode: path for mode, path in found.items() if path.is_file()}
+    paths = {mode: Path(run_dir) / f"policy_{mode}.pt" for mode in ARTIFACTS}
+    return {mode: path for mode, path in paths.items() if path.is_file()}
 
 
 def load_policies(run_dir: Path | str, threads: int | None = None) -> dict[str, Policy]:
     """Every artifact of a run, loaded and checked as on the Pi. ArtifactError for one that does not pass."""
-    found = {mode: load_policy(path, threads=threads) for mode, path in artifacts(run_dir).items()}
-    if "fp32" not in found:
-        raise PolicyError(f"{run_dir}: no policy_fp32.pt in it (found {sorted(found)}); run notebook 03")
-    return found
+    policies = {mode: load_policy(path, threads=threads) for mode, path in artifacts(run_dir).items()}
+    if "fp32" not in policies:
+        raise PolicyError(f"{run_dir}: no policy_fp32.pt in it", found=sorted(policies), remedy="run notebook 03")
+    return policies
 
 
 def hashes(run_dir: Path | str) -> dict[str, str]:
@@ -241,7 +241,7 @@ def hashes(run_dir: Path | str) -> dict[str, str]:
 
 
 def thinned(samples: Sequence[Any], at_most: int) -> tuple[Any, ...]:
-    """At most that many of the samples, evenly spaced, first and last among them."""
+    """At most `at_most` of the samples, evenly spaced, first and last among them."""
     if len(samples) <= at_most:
         return tuple(samples)
     return tuple(samples[i] for i in np.linspace(0, len(samples) - 1, at_most).round().astype(int))
@@ -269,15 +269,18 @@ def fidelity(
     """
     names = tuple(reference.action_names)
     if not samples:
-        raise PolicyError("there are no frames to compare on; record more, or hold out a larger share")
+        raise PolicyError("there are no frames to compare on", remedy="record more, or hold out a larger share")
     for mode, policy in others.items():
         if (tuple(policy.action_names), policy.chunk) != (names, reference.chunk):
             raise PolicyError(
                 f"{mode} plans {policy.chunk} steps of {list(policy.action_names)}, FP32 {reference.chunk} "
-                f"of {list(names)}; compare artifacts of one checkpoint"
+                f"of {list(names)}",
+                remedy="compare artifacts of one checkpoint",
             )
     if missing := [n for n in names if n not in action_range]:
-        raise PolicyError(f"no recorded range of action {missing} (found {sorted(action_range)}); use other recordings")
+        raise PolicyError(
+            f"no recorded range of action {missing}", found=sorted(action_range), remedy="use other recordings"
+        )
     expected: list[np.ndarray] = []
     planned: dict[str, list[np.ndarray]] = {mode: [] for mode in others}
     for sample in progress(samples, desc="comparing", total=len(samples)):
@@ -370,13 +373,13 @@ def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str,
     }
 
 
-def gates(found: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GATED) -> list[dict[str, Any]]:
-    """The gates of params.yml that a comparison can judge. found: `metrics`; limits: params.yml's `gates`.
+def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GATED) -> list[dict[str, Any]]:
+    """The gates of params.yml that a comparison can judge. compared: `metrics`; limits: params.yml's `gates`.
 
     The error gates are for every action that the policy has and params.yml names, as `<action>_mae_pct`. Those of
     speed are `onboard.gates.check_gates`.
     """
-    fp32, judged = found["fp32"], found["modes"][mode]
+    fp32, judged = compared["fp32"], compared["modes"][mode]
     rows = [
         gate(f"{mode} {key}", judged[key], "<=", limits[key])
         for key in judged

@@ -92,15 +92,19 @@ class Sample:
         try:
             data = self.frame_path.read_bytes()
         except OSError as e:
-            raise EpisodeError(f"{self.frame_path}: cannot be read ({e.strerror}): restore it or load again") from None
+            raise EpisodeError(
+                f"{self.frame_path}: cannot be read ({e.strerror})", remedy="restore it or load again"
+            ) from None
         if problem := _jpeg_problem(data[:2], data[-JPEG_TAIL:]):
-            raise EpisodeError(f"{self.frame_path}: {problem}: delete the picture or record the episode again")
+            raise EpisodeError(f"{self.frame_path}: {problem}", remedy="delete the picture or record the episode again")
         try:
             frame = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         except cv2.error:
             frame = None
         if frame is None:
-            raise EpisodeError(f"{self.frame_path}: does not decode as a JPEG: delete it or record the episode again")
+            raise EpisodeError(
+                f"{self.frame_path}: does not decode as a JPEG", remedy="delete it or record the episode again"
+            )
         return frame
 
 
@@ -144,7 +148,7 @@ class Recordings:
                 try:
                     found[_relative(path, self.root)] = sha256_of(path)
                 except OSError as e:
-                    raise EpisodeError(f"{path}: cannot be read any more ({e.strerror}): load again") from None
+                    raise EpisodeError(f"{path}: cannot be read any more ({e.strerror})", remedy="load again") from None
         return found
 
     def summary(self) -> dict[str, Any]:
@@ -227,7 +231,7 @@ def load_recordings(
     root = Path(root)
     root = root if root.name else root.resolve()  # "." has no name to give an episode
     if chunk < 1 or not sync_s > 0:
-        raise EpisodeError(f"chunk must be at least 1 and sync_s above 0, found {chunk} and {sync_s}")
+        raise EpisodeError("chunk must be at least 1 and sync_s above 0", found=f"{chunk} and {sync_s}")
     pwm = pwm or PwmCalibration()
     try:
         if any((root / name).exists() for name in DATA_FILES):
@@ -236,10 +240,12 @@ def load_recordings(
             folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and p.is_dir())
     except OSError as e:
         raise EpisodeError(
-            f"{root}: no folder of episodes ({e.strerror}): give the folder with episode_* in it"
+            f"{root}: no folder of episodes ({e.strerror})", remedy="give the folder with episode_* in it"
         ) from None
     if not folders:
-        raise EpisodeError(f"{root}: no episode folders in it: give the folder that holds episode_YYYYMMDD_HHMMSS")
+        raise EpisodeError(
+            f"{root}: no episode folders in it", remedy="give the folder that holds episode_YYYYMMDD_HHMMSS"
+        )
     faults = _Faults(root)
     read = (
         _load_episode(folder, chunk, sync_s, pwm, faults)
@@ -252,8 +258,8 @@ def load_recordings(
             kinds[fault.kind] = kinds.get(fault.kind, 0) + fault.count
         worst = ", ".join(f"{kind} {n} times" for kind, n in sorted(kinds.items(), key=lambda k: (-k[1], k[0]))[:6])
         raise EpisodeError(
-            f"{root}: no usable sample in {len(folders)} episode folder(s) ({worst or 'they are empty'}): "
-            "record again, or copy the whole folders, frames included"
+            f"{root}: no usable sample in {len(folders)} episode folder(s) ({worst or 'they are empty'})",
+            remedy="record again, or copy the whole folders, frames included",
         )
     return Recordings(root, episodes, faults.listed())
 
@@ -643,7 +649,7 @@ def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -
     a share outside (0, 1) or recordings too short to be parted.
     """
     if not 0 < held_out_share < 1:
-        raise EpisodeError(f"held_out_share must be between 0 and 1, found {held_out_share}")
+        raise EpisodeError("held_out_share must be between 0 and 1", found=held_out_share)
     episodes = recordings.episodes
     if len(episodes) < 3:
         return _split_by_time(episodes, held_out_share)
@@ -680,8 +686,8 @@ def _split_by_time(episodes: tuple[Episode, ...], held_out_share: float) -> Spli
     if not parts["held_out"]:
         lengths = ", ".join(f"{e.id}: {len(e.samples)}" for e in episodes)
         raise EpisodeError(
-            f"{len(episodes)} episode(s) are too short to be parted (samples: {lengths}): "
-            "record at least three episodes, or a longer one"
+            f"{len(episodes)} episode(s) are too short to be parted (samples: {lengths})",
+            remedy="record at least three episodes, or a longer one",
         )
     return Split(
         **{part: tuple(samples) for part, samples in parts.items()},
@@ -702,7 +708,9 @@ def choose_calibration(
     Raises EpisodeError for no samples or a count below 1.
     """
     if not samples or count < 1:
-        raise EpisodeError(f"cannot choose {count} of {len(samples)} samples for calibration: record more episodes")
+        raise EpisodeError(
+            f"cannot choose {count} of {len(samples)} samples for calibration", remedy="record more episodes"
+        )
     if len(samples) <= count:
         fewer = len(samples) < count
         note = f"asked for {count} calibration samples, found only {len(samples)}: all are used" if fewer else None

@@ -97,7 +97,7 @@ def _check(path: Path, content: Mapping[str, Any]) -> None:
     except (KeyError, TypeError, ValueError, AttributeError):
         usable = False
     if not usable:
-        raise RoverError(f"{path}: no figures of a benchmark in it; fetch it again")
+        raise RoverError(f"{path}: no figures of a benchmark in it", remedy="fetch it again")
 
 
 def _mode(name: str) -> str:
