@@ -46,7 +46,7 @@ LARGEST_SIDE_PX = 8192  # the largest picture of a Pi's cameras has 4608 pixels 
 MOST_ACTIONS = 1000  # and numbers in a state
 REPORTED = 1000  # entries of the trainer's config, in the report
 
-FEATURE_PX = 32  # a ResNet sees one feature per so many pixels a side
+FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
 SQUEEZED = 0.05  # of the aspect ratio: 432x240 for 640x360 is 0.013
 
 
@@ -765,13 +765,15 @@ def _checked(
     extra: dict[str, Any],
 ) -> Checkpoint:
     expected = expected_shapes(config)
-    found = {k: tuple(v.shape) for k, v in weights.items()}
+    shapes = {k: tuple(v.shape) for k, v in weights.items()}
     problems = []
-    if missing := sorted(expected.keys() - found.keys()):
+    if missing := sorted(expected.keys() - shapes.keys()):
         problems.append(f"missing: {listed(missing)}")
-    if unknown := sorted(found.keys() - expected.keys()):
+    if unknown := sorted(shapes.keys() - expected.keys()):
         problems.append(f"unknown: {listed(unknown)}")
-    if wrong := [f"{k} is {found[k]}, not {expected[k]}" for k in expected if k in found and found[k] != expected[k]]:
+    if wrong := [
+        f"{k} is {shapes[k]}, not {expected[k]}" for k in expected if k in shapes and shapes[k] != expected[k]
+    ]:
         problems.append(f"of another shape: {listed(wrong)}")
     if problems:
         raise CheckpointError(

@@ -141,15 +141,15 @@ class Recordings:
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file that the samples came from, by its path relative to `root`."""
-        found = {}
+        hashes = {}
         for episode in self.episodes:
             used = [p for name in DATA_FILES if (p := episode.path / name).is_file()]
             for path in used + [s.frame_path for s in episode.samples]:
                 try:
-                    found[_relative(path, self.root)] = sha256_of(path)
+                    hashes[_relative(path, self.root)] = sha256_of(path)
                 except OSError as e:
                     raise EpisodeError(f"{path}: cannot be read any more ({e.strerror})", remedy="load again") from None
-        return found
+        return hashes
 
     def summary(self) -> dict[str, Any]:
         """Counts, ranges and faults as plain JSON types, for load.json."""
@@ -185,15 +185,15 @@ class _Faults:
     """Counts faults by file and kind, and keeps the first one's words."""
 
     root: Path
-    found: dict[tuple[str, str], list] = field(default_factory=dict)
+    counted: dict[tuple[str, str], list] = field(default_factory=dict)
 
     def add(self, path: Path, kind: str, note: str, count: int = 1) -> None:
         if count:
-            entry = self.found.setdefault((_relative(path, self.root), kind), [0, note])
+            entry = self.counted.setdefault((_relative(path, self.root), kind), [0, note])
             entry[0] += count
 
     def listed(self) -> tuple[Fault, ...]:
-        return tuple(Fault(file, kind, count, note) for (file, kind), (count, note) in sorted(self.found.items()))
+        return tuple(Fault(file, kind, count, note) for (file, kind), (count, note) in sorted(self.counted.items()))
 
 
 @dataclass(frozen=True)

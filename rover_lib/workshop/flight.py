@@ -152,7 +152,7 @@ def _temperature(ax: Axes, machine: Mapping[str, Any], summary: Mapping[str, Any
         ax.plot(t_s, celsius, color=RED, lw=1.4, label=label)
         ax.set_ylim(np.nanmin(celsius) - 2, np.nanmax(celsius) + 2)
     else:
-        ax.text(0.5, 0.5, "this machine told no temperature", transform=ax.transAxes, ha="center", va="center",
+        ax.text(0.5, 0.5, "this machine has no temperature sensor", transform=ax.transAxes, ha="center", va="center",
                 fontsize=9)  # fmt: skip
         ax.set_yticks([])
     bits = np.array([int(v or "0", 16) & NOW_BITS for v in machine["throttled"]], int)

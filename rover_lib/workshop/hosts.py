@@ -2,7 +2,7 @@
 
 benchmarks = read_benchmarks("runs/demo", "runs/rovers")
 print(benchmarks.table())
-plots.latency(benchmarks.found)
+plots.latency(benchmarks.by_host)
 """
 
 import socket
@@ -21,22 +21,22 @@ NO_SOAK = "none of the rovers was soaked; -e rover_soak_minutes=30 shows tempera
 
 @dataclass(frozen=True)
 class Benchmarks:
-    """found: contents of benchmark-<host>.json by host, this machine first. unusable: a sentence for each other file.
+    """by_host: contents of benchmark-<host>.json by host, this machine first. unusable: a sentence for each other file.
 
     Artifacts go by their mode; one of a rover that is not the run's, byte for byte, is called "static, another".
     """
 
-    found: dict[str, dict[str, Any]]
+    by_host: dict[str, dict[str, Any]]
     unusable: list[str]
 
     def soaks(self) -> dict[str, dict[str, Any]]:
         """Those with a time series."""
-        return {host: b for host, b in self.found.items() if b["metrics"].get("series")}
+        return {host: b for host, b in self.by_host.items() if b["metrics"].get("series")}
 
     def table(self) -> str:
         """A line for each host and artifact, a dash where a host has no sensor; below what there is to say about it."""
         rows = [("host", "artifact", "p50", "p95", "p99 ms", "n", "C, most", "MHz, least", "throttled")]
-        for host, b in self.found.items():
+        for host, b in self.by_host.items():
             m = b["metrics"]
             state = (_shown(m.get("temperature_c"), 1), _shown(m.get("clock_mhz"), 0), m.get("throttled") or "-")
             for name, v in m["artifacts"].items():
@@ -46,7 +46,7 @@ class Benchmarks:
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         sides = "<<" + ">" * len(widths)
         lines = ["  ".join(f"{c:{s}{w}}" for c, s, w in zip(row, sides, widths, strict=False)).rstrip() for row in rows]
-        rovers = self.found.keys() - {THIS}
+        rovers = self.by_host.keys() - {THIS}
         if not rovers:
             lines.append(NO_ROVER)
         elif not rovers & self.soaks().keys():
@@ -63,7 +63,8 @@ def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
     A rover is called what the inventory calls it, which is in the file's name; of two with one name the fetched one
     counts. A file that cannot be used is left out, and named.
     """
-    found, unusable = {}, []
+    by_host: dict[str, dict[str, Any]] = {}
+    unusable: list[str] = []
     for folder in (Path(run_dir), Path(fetched)):
         for path in sorted(folder.glob("benchmark-*.json")):
             try:
@@ -73,10 +74,10 @@ def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
                 unusable.append(str(error).replace(str(path), path.name))
                 continue
             here = folder == Path(run_dir) and content["env"]["host"] == socket.gethostname()
-            found[THIS if here else path.stem.removeprefix("benchmark-")] = content
-    ours = {sha: _mode(file) for file, sha in found.get(THIS, {"inputs": {}})["inputs"].items()}
-    found = {host: content if host == THIS else _named(content, ours) for host, content in found.items()}
-    return Benchmarks({h: found[h] for h in sorted(found, key=lambda h: (h != THIS, h))}, unusable)
+            by_host[THIS if here else path.stem.removeprefix("benchmark-")] = content
+    ours = {sha: _mode(file) for file, sha in by_host.get(THIS, {"inputs": {}})["inputs"].items()}
+    by_host = {host: content if host == THIS else _named(content, ours) for host, content in by_host.items()}
+    return Benchmarks({h: by_host[h] for h in sorted(by_host, key=lambda h: (h != THIS, h))}, unusable)
 
 
 def _check(path: Path, content: Mapping[str, Any]) -> None:
@@ -88,10 +89,10 @@ def _check(path: Path, content: Mapping[str, Any]) -> None:
         needed = [v[key] for v in timed for key in ("latency_p50_ms", "latency_p95_ms", "n")]
         needed += [v["latency_p99_ms"] for v in metrics["artifacts"].values()]
         needed += [env["cores"], *(p["t_s"] for p in series)]
-        told = [p.get(key) for p in (metrics, *series) for key in ("temperature_c", "clock_mhz")]
+        readings = [p.get(key) for p in (metrics, *series) for key in ("temperature_c", "clock_mhz")]
         for p in (metrics, *series):
             int(p.get("throttled") or "0x0", 16)
-        numbers = needed + [n for n in told if n is not None]
+        numbers = needed + [n for n in readings if n is not None]
         usable = metrics["main"] in metrics["artifacts"] and all(type(n) in (int, float) for n in numbers)
         usable &= all(isinstance(v, str) for v in (env["host"], env["machine"], *content["inputs"].values()))
     except (KeyError, TypeError, ValueError, AttributeError):

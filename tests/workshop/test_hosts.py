@@ -73,9 +73,9 @@ def folders(tmp_path):
 
 def test_this_machine_alone_is_a_sentence(folders):
     benchmarks = hosts.read_benchmarks(*folders)
-    assert list(benchmarks.found) == [hosts.THIS] and not benchmarks.soaks() and not benchmarks.unusable
-    head, row, said = benchmarks.table().splitlines()
-    assert head.split()[:3] == ["host", "artifact", "p50"] and said == hosts.NO_ROVER
+    assert list(benchmarks.by_host) == [hosts.THIS] and not benchmarks.soaks() and not benchmarks.unusable
+    head, row, note = benchmarks.table().splitlines()
+    assert head.split()[:3] == ["host", "artifact", "p50"] and note == hosts.NO_ROVER
     assert row.split() == ["this", "machine", "static", "8.0", "8.0", "8.0", "20", "-", "-", "-"]
     assert socket.gethostname() not in benchmarks.table().split()
 
@@ -85,14 +85,14 @@ def test_rovers_are_called_what_the_inventory_calls_them(folders):
     for name in ("rover2", "rover1"):
         written(folders[1], name, 60.0, host="raspberrypi")
     benchmarks = hosts.read_benchmarks(*folders)
-    assert list(benchmarks.found) == [hosts.THIS, "rover1", "rover2"]
+    assert list(benchmarks.by_host) == [hosts.THIS, "rover1", "rover2"]
     assert benchmarks.table().endswith(hosts.NO_SOAK)
 
 
 def test_an_artifact_goes_by_its_mode_and_another_one_is_called_that(folders):
     written(folders[1], "rover1", 60.0)
     written(folders[1], "rover2", 60.0, soak_s=20, inputs={"policy.pt": "0f"})
-    found = hosts.read_benchmarks(*folders).found
+    found = hosts.read_benchmarks(*folders).by_host
     assert list(found["rover1"]["metrics"]["artifacts"]) == ["static"]
     metrics = found["rover2"]["metrics"]
     assert list(metrics["artifacts"]) == ["static, another"] == list(metrics["series"][3]["artifacts"])
@@ -127,7 +127,7 @@ def test_a_damaged_or_foreign_file_is_counted_and_named(folders, spoil, words):
     bad = written(folders[1], "rover2", 60.0)
     bad.write_bytes(spoil(json.loads(bad.read_text())).encode("latin-1"))
     benchmarks = hosts.read_benchmarks(*folders)
-    assert list(benchmarks.found) == [hosts.THIS, "rover1"]
+    assert list(benchmarks.by_host) == [hosts.THIS, "rover1"]
     *_, count, sentence = benchmarks.table().splitlines()
     assert count == "1 file is left out:" and sentence.startswith("benchmark-rover2.json: ") and words in sentence
     assert str(folders[1]) not in benchmarks.table()  # a published notebook holds no path
@@ -146,7 +146,7 @@ def drawn(figure):
 
 def test_every_host_has_a_panel(folders):
     written(folders[1], "rover1", 60.0)
-    figure = plots.latency(hosts.read_benchmarks(*folders).found)
+    figure = plots.latency(hosts.read_benchmarks(*folders).by_host)
     assert [ax.get_title().partition(" (")[0] for ax in figure.axes] == [hosts.THIS, "rover1"]
     assert [label.get_text() for label in figure.axes[1].get_yticklabels()] == ["static"]
 

@@ -34,8 +34,8 @@ def latency(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
     fig, axes = new_figure(len(benchmarks), height_in=height_in, height_ratios=counts, sharex=True)
     floors = False
     for ax, (host, stage) in zip(axes[:, 0], benchmarks.items(), strict=True):
-        found = stage["metrics"]["artifacts"]
-        for y, (name, v) in enumerate(found.items()):
+        artifacts = stage["metrics"]["artifacts"]
+        for y, (name, v) in enumerate(artifacts.items()):
             mode = name.partition(",")[0]
             p50, p95, p99 = (v[f"latency_{p}_ms"] for p in ("p50", "p95", "p99"))
             ax.barh(y, p50, 0.62, color=COLOURS.get(mode, GREY), alpha=0.85)
@@ -47,10 +47,10 @@ def latency(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
                 floors = True
             text = f"{p50:.1f} / {p95:.1f} / {p99:.1f} ms"
             ax.annotate(text, (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=9)
-        ax.set_yticks(range(len(found)), [NAMES.get(n, n) for n in found])
-        ax.set_ylim(len(found) - 0.5, -0.5)
+        ax.set_yticks(range(len(artifacts)), [NAMES.get(n, n) for n in artifacts])
+        ax.set_ylim(len(artifacts) - 0.5, -0.5)
         ax.set_xlim(0, None)
-        env, n = stage["env"], next(iter(found.values()))["n"]
+        env, n = stage["env"], next(iter(artifacts.values()))["n"]
         ax.set_title(f"{host} ({env['machine']}, {env['cores']} cores), n = {n}, bar: p50", fontsize=11)
     axes[-1, 0].set_xlabel("latency of one inference, one plan of actions (ms)")
     axes[0, 0].text(1.01, 1.02, "p50 / p95 / p99", transform=axes[0, 0].transAxes, fontsize=9)
@@ -69,17 +69,17 @@ HOST_COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY, BLACK)
 def soak(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
     """What a soak did to a host, over time: latency, temperature, clock, and when the firmware held it back.
 
-    benchmarks: contents of benchmark-<host>.json with a series, by host. What no host can tell has no panel.
+    benchmarks: contents of benchmark-<host>.json with a series, by host. What no host has a sensor for has no panel.
     """
     hosts = dict(zip(benchmarks, itertools.cycle(HOST_COLOURS), strict=False))
     series = {host: b["metrics"]["series"] for host, b in benchmarks.items()}
 
-    def told(key: str) -> bool:
+    def has(key: str) -> bool:
         return any(p.get(key) is not None for points in series.values() for p in points)
 
-    held = told("throttled")
+    held = has("throttled")
     readings = [r for r in (("temperature_c", "temperature\n(°C)"), ("clock_mhz", "clock of the\nslowest core (MHz)"))
-                if told(r[0])]  # fmt: skip
+                if has(r[0])]  # fmt: skip
     heights = [2.0] + [1.4] * len(readings) + [0.25 + 0.22 * len(hosts)] * held
     fig, axes = new_figure(len(heights), height_in=1.2 + sum(heights), height_ratios=heights, sharex=True)
     first, last = axes[0, 0], axes[-1, 0]

@@ -24,15 +24,15 @@ from rover_lib.workshop.plots.style import (
 
 def sizes(metrics: Mapping[str, Any]) -> Figure:
     """Artifact files, weights with weights. metrics: of compare.json."""
-    found = {"fp32": metrics["fp32"]["size_mb"]} | {m: v["size_mb"] for m, v in metrics["modes"].items()}
-    fig, axes = new_figure(1, height_in=1.0 + 0.34 * len(found))
-    ax, y = axes[0, 0], range(len(found))
-    ax.barh(y, list(found.values()), color=[COLOURS.get(m, GREY) for m in found])
-    for at, size_mb in enumerate(found.values()):
-        text = f"{size_mb:.1f} MB" + (f", {found['fp32'] / size_mb:.1f}x smaller" if at else "")
+    sizes_mb = {"fp32": metrics["fp32"]["size_mb"]} | {m: v["size_mb"] for m, v in metrics["modes"].items()}
+    fig, axes = new_figure(1, height_in=1.0 + 0.34 * len(sizes_mb))
+    ax, y = axes[0, 0], range(len(sizes_mb))
+    ax.barh(y, list(sizes_mb.values()), color=[COLOURS.get(m, GREY) for m in sizes_mb])
+    for at, size_mb in enumerate(sizes_mb.values()):
+        text = f"{size_mb:.1f} MB" + (f", {sizes_mb['fp32'] / size_mb:.1f}x smaller" if at else "")
         ax.annotate(text, (size_mb, at), (4, 0), textcoords="offset points", va="center", fontsize=9)
     ax.margins(x=0.25)
-    ax.set_yticks(y, [NAMES.get(m, m) for m in found])
+    ax.set_yticks(y, [NAMES.get(m, m) for m in sizes_mb])
     ax.invert_yaxis()
     ax.set_xlabel("artifact file (MB, 10^6 bytes)")
     return fig
@@ -66,15 +66,15 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure:
 
 def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0) -> Figure:
     """The frames on which a mode differs most from FP32: the picture and both plans, with the recording's own."""
-    found = report.worst(mode, count)
+    frames = report.worst(mode, count)
     names = report.action_names
-    fig, axes = new_figure(max(len(found), 1), 1 + len(names), height_in=0.9 + 1.9 * max(len(found), 1))
-    if not found:
+    fig, axes = new_figure(max(len(frames), 1), 1 + len(names), height_in=0.9 + 1.9 * max(len(frames), 1))
+    if not frames:
         for ax in axes[0]:
             note(ax, "not judged")
         return fig
     times_s = np.arange(report.reference.shape[1]) / rate_hz
-    for row, worst in zip(axes, found, strict=True):
+    for row, worst in zip(axes, frames, strict=True):
         row[0].imshow(worst.sample.frame_bgr()[..., ::-1])
         row[0].axis("off")
         row[0].set_title(f"{worst.action} {worst.error_pct:.2f} % off", fontsize=10)

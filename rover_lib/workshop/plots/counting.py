@@ -89,15 +89,15 @@ def counted(metrics: Mapping[str, Any]) -> Figure:
 
 def counted_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
     """What the instructions do. groups: {artifact or peer: {group: 10**9 instructions}}, groups in one order."""
-    totals = {name: sum(found.values()) for name, found in groups.items()}
-    near = {name: found for name, found in groups.items() if totals[name] < NEAR * min(totals.values())}
+    totals = {name: sum(by_group.values()) for name, by_group in groups.items()}
+    near = {name: by_group for name, by_group in groups.items() if totals[name] < NEAR * min(totals.values())}
     panels = [groups, near] if 1 < len(near) < len(groups) else [groups]
     rows = [len(shown) for shown in panels]
     fig, axes = new_figure(len(panels), height_in=1.3 + 0.5 * len(panels) + 0.36 * sum(rows), height_ratios=rows)
     for ax, shown in zip(axes[:, 0], panels, strict=True):
         y, left = np.arange(len(shown)), np.zeros(len(shown))
         for colour, group in zip(GROUP_COLOURS, next(iter(shown.values())), strict=True):
-            width = np.array([found[group] for found in shown.values()])
+            width = np.array([by_group[group] for by_group in shown.values()])
             ax.barh(y, width, left=left, color=colour, label=group)
             left += width
         bar_values(ax, y, left, "{:.3g}")
@@ -150,14 +150,14 @@ def computed_times(metrics: Mapping[str, Any]) -> Figure:
     return fig
 
 
-def instruction_counts(found: Mapping[str, Any] | None = None) -> Figure:
+def instruction_counts(metrics: Mapping[str, Any] | None = None) -> Figure:
     """Why symmetric: instructions of one inference, by what ran.
 
-    found: metrics of the run's arm.json; if None, the full policy's, as recorded in COUNTED.
+    metrics: those of the run's arm.json; if None, the full policy's, as recorded in COUNTED.
     """
     rows, title = list(COUNTED), "full policy at 360x640, recorded, not of this run"
-    if found is not None:
-        counted = whole_size(found)
+    if metrics is not None:
+        counted = whole_size(metrics)
         rows = [(NAMES.get(n, n), m["instructions_g"], m["simd_g"]) for n, m in counted.items()]
         floor_g, gmac = (next(iter(counted.values()))[key] for key in ("floor_g", "gmac"))
         rows.append(("dot-product instructions alone", floor_g, floor_g))

@@ -49,13 +49,13 @@ def throttle_over_age(rows: Sequence[Mapping[str, Any]], settings: Settings, chu
 def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Balloons hit, with Wilson's 95 % interval, against how long an inference takes. rows: of drive.json."""
     sets = [(title, _late(rows, pushed=pushed)) for title, pushed in (("left alone", False), ("pushed", True))]
-    sets = [(title, found) for title, found in sets if found]
-    counts = [len({r["latency_ms"] for r in found}) for _, found in sets]
+    sets = [(title, drives) for title, drives in sets if drives]
+    counts = [len({r["latency_ms"] for r in drives}) for _, drives in sets]
     fig, axes = new_figure(1, len(sets), height_in=3.8, sharey=True, width_ratios=[c + 1 for c in counts])
-    for ax, (title, found) in zip(axes[0], sets, strict=True):
-        places = {ms: x for x, ms in enumerate(sorted({r["latency_ms"] for r in found}))}
+    for ax, (title, drives) in zip(axes[0], sets, strict=True):
+        places = {ms: x for x, ms in enumerate(sorted({r["latency_ms"] for r in drives}))}
         for compensate, (label, colour, marker, side) in HOW.items():
-            shown = [r for r in found if r["compensate"] == compensate]
+            shown = [r for r in drives if r["compensate"] == compensate]
             x = [places[r["latency_ms"]] + 0.1 * side for r in shown]
             share = np.array([100 * r["hits"] / r["trials"] for r in shown])
             ends = 100 * np.array([[r["hits_wilson_low"], r["hits_wilson_high"]] for r in shown]).reshape(-1, 2).T
@@ -65,9 +65,9 @@ def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 ax.annotate(f"{r['hits']}", (at, y), (9 * side, 0), textcoords="offset points", color=colour,
                             ha="left" if side > 0 else "right", va="center", fontsize=8)  # fmt: skip
         for ms, place in places.items():
-            if stopped := max(r["stopped"] for r in found if r["latency_ms"] == ms):
+            if stopped := max(r["stopped"] for r in drives if r["latency_ms"] == ms):
                 ax.annotate(f"{stopped} stopped:\nplan too old", (place, 30), ha="center", fontsize=9, color=RED)
-        pushes = max(r["pushes"] for r in found)
+        pushes = max(r["pushes"] for r in drives)
         ax.set_title(f"{title} {pushes} times on its way" if pushes else title, fontsize=11)
         ax.set_xticks(list(places.values()), [f"{ms:g}" for ms in places])
         ax.set(xlabel="an inference takes (ms)", xlim=(-0.6, len(places) - 0.4), ylim=(-4, 104))
@@ -81,12 +81,12 @@ def beside_the_path(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
     rows: of drive.json; latencies at which cars were stopped are left out.
     """
-    found = [r for r in _late(rows) if not r["stopped"]]
-    places = {ms: x for x, ms in enumerate(sorted({r["latency_ms"] for r in found}))}
+    drives = [r for r in _late(rows) if not r["stopped"]]
+    places = {ms: x for x, ms in enumerate(sorted({r["latency_ms"] for r in drives}))}
     fig, axes = new_figure(1, height_in=3.0)
     ax = axes[0, 0]
     for compensate, (label, colour, _, side) in HOW.items():
-        shown = [r for r in found if r["compensate"] == compensate]
+        shown = [r for r in drives if r["compensate"] == compensate]
         x = [places[r["latency_ms"]] + 0.19 * side for r in shown]
         middle, most = (np.array([r[f"aside_p{q}_cm"] for r in shown]) for q in (50, 90))
         ax.bar(x, middle, 0.36, color=colour, alpha=0.85, label=label)
