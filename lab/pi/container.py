@@ -142,9 +142,9 @@ class Container:
                 if s.recv(4) == b"SSH-":
                     break
             if time.monotonic() > started + BOOT_S:
-                said = self._console()
+                last = self._console()
                 self.cut_power()
-                raise EmulationError(f"{self.name} has no sshd after {BOOT_S:g} s, its console's last: {said}")
+                raise EmulationError(f"{self.name} has no sshd after {BOOT_S:g} s, its console's last: {last}")
             time.sleep(0.2)
         self._leader = self._find_leader(process.pid)
         return time.monotonic() - started

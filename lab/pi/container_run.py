@@ -26,7 +26,7 @@ runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
     faults         [{fault, model_after, healthy, healed_by_rerun, ...}], see deployment_faults.py
     fleet          {cases: [{broken, results, models, healthy, ...}], good}, see fleet.py
     gates          [{gate, wanted, found, holds}], the limits from lab/params.yml
-What is not as it should be is a sentence in `wrong`. Beside it, pi-fast.log has all that the playbooks said.
+What is not as it should be is a sentence in `wrong`. Beside it, pi-fast.log has all that the playbooks printed.
 """
 
 import compileall
@@ -204,14 +204,14 @@ class _Run:
         return path
 
     def play(self, book: str, pi: Container, name: str = "", *, check: bool = False, **variables: Any) -> Play:
-        """Runs one, which has to work. Raises EmulationError with the end of what it said if not."""
+        """Runs one, which has to work. Raises EmulationError with the end of its output if not."""
         with self.report.step(name or book) as row:
             done = playbooks.run(book, [pi], folder=self.folder, check=check, variables={**self.variables, **variables})
             self.log.write(f"===== {name or book}\n{done.output}\n")
             self.log.flush()
             row |= {**done.row(), "seconds": row.get("seconds")}
             if not done.ok:
-                raise EmulationError(f"{book}.yml failed, and said at its end: {done.end}")
+                raise EmulationError(f"{book}.yml failed, its output ends: {done.end}")
         return done
 
     def flight(self, pi: Container) -> None:

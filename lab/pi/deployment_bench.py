@@ -124,7 +124,7 @@ class Line(NamedTuple):
 
 
 def line_of(output: str, name: str) -> Line:
-    """A rover's line in what status.yml said. Raises EmulationError if it has none."""
+    """A rover's line in what status.yml printed. Raises EmulationError if it has none."""
     lines = [line.strip().strip('",') for line in output.splitlines() if line.strip().startswith('"')]
     for i, line in enumerate(lines):
         words = line.split()
@@ -162,6 +162,7 @@ class DeploymentBench:
 
     before = target = ""
     disk_then = Disk()
+    disk_is_small = False
 
     def __init__(
         self,
@@ -177,7 +178,7 @@ class DeploymentBench:
         self.network = Network(pi)
         self.undo = contextlib.ExitStack()
         self.seconds: dict[str, float] = {}
-        self.said: list[str] = []
+        self.outputs: list[str] = []
         self.packed = {mode: pack(path, self.folder / "packed", allow=allow) for mode, path in self.artifacts.items()}
 
     def __enter__(self) -> "DeploymentBench":
@@ -222,7 +223,7 @@ class DeploymentBench:
         """Of a row: a model that is not in use is to be deployed. fresh: only the one in use is on the rover."""
         self.before = self._mode_of(self.releases.current or "", "")
         self.target = next(mode for mode in self.artifacts if mode != self.before)
-        self.seconds, self.said = {}, []
+        self.seconds, self.outputs, self.disk_is_small = {}, [], False
         if fresh:
             for release in (self.state / "models" / "releases").iterdir():
                 if release.name != self.releases.current:
@@ -238,39 +239,37 @@ class DeploymentBench:
         return playbooks.run(book, [self.network, *others], folder=folder, variables=given, timeout_s=PLAY_S)
 
     def deploy(self, artifact: Path | None = None, **more: Any) -> Play:
-        """Runs deploy.yml with an artifact, or with the one to be deployed; what it said is noted."""
+        """Runs deploy.yml with an artifact, or with the one to be deployed; what it printed is noted."""
         artifact = artifact or self.artifacts[self.target]
         play = self.play("deploy", rover_artifact=str(artifact), rover_allow=self.allow, **more)
-        self.said.append(play.output)
+        self.outputs.append(play.output)
         return play
 
     def deploy_until(self, moment: Callable[[Disk], bool], strike: Callable[[], object], **more: Any) -> Play:
         """Runs deploy.yml, and strikes once at the moment. Raises Missed if it never came."""
-        struck: list[BaseException | None] = []
         over = threading.Event()
 
-        def watch() -> None:
-            while not over.is_set():
-                with contextlib.suppress(OSError, EmulationError):
-                    if moment(self.disk):
-                        try:
-                            strike()
-                        except Exception as error:
-                            return struck.append(error)
-                        return struck.append(None)
-                time.sleep(LOOK_S)
+        def reached() -> bool:
+            try:
+                return moment(self.disk)
+            except (OSError, EmulationError):  # it changes while it is read
+                return False
 
-        watcher = threading.Thread(target=watch, name=f"watcher of {self.pi.name}")
-        watcher.start()
-        try:
-            play = self.deploy(**more)
-        finally:
-            over.set()
-            watcher.join()
-        if not struck:
+        def watch() -> bool:
+            while not reached():
+                if over.wait(LOOK_S):
+                    return False
+            strike()
+            return True
+
+        with ThreadPoolExecutor(1) as pool:
+            struck = pool.submit(watch)
+            try:
+                play = self.deploy(**more)
+            finally:
+                over.set()
+        if not struck.result():
             raise Missed(f"{self.pi.name}: the moment did not come, or passed unseen; deploy.yml: {play.end[-600:]}")
-        if struck[0]:
-            raise struck[0]
         return play
 
     def cut_power(self, moment: Callable[[Disk], bool]) -> None:
@@ -306,11 +305,10 @@ class DeploymentBench:
         self.stop.wait(INTO_CHECK_S)
 
     def rover(self, *command: object) -> str:
-        """Runs `rover` on the rover, by hand; what it said is noted."""
+        """Runs `rover` on the rover, by hand; what it printed is noted."""
         done = self.pi.inside(ROVER, *command, check=False, timeout_s=CHECK_S)
-        said = done.stdout + done.stderr
-        self.said.append(said)
-        return said
+        self.outputs.append(done.stdout + done.stderr)
+        return self.outputs[-1]
 
     def small_disk(self, free: int) -> None:
         """Models and what arrives are now on a file system with so many bytes free, until the row is over."""
@@ -322,10 +320,13 @@ class DeploymentBench:
             f" cp -a /{STATE}/. /mnt/small; mount --bind /mnt/small /{STATE}; umount /mnt/small",
         )
         self.undo.callback(self.pi.inside, "umount", "--lazy", f"/{STATE}", check=False)
+        self.disk_is_small = True
 
-    def make_room(self) -> None:
-        self.pi.inside("mount", "-o", "remount,size=1g", f"/{STATE}")
-        (self.state / "ballast").unlink(missing_ok=True)
+    def heal(self) -> None:
+        """What a human does about the cause before deploying again: makes room on a small disk."""
+        if self.disk_is_small:
+            self.pi.inside("mount", "-o", "remount,size=1g", f"/{STATE}")
+            (self.state / "ballast").unlink(missing_ok=True)
 
     def make_read_only(self) -> None:
         """As a card does when it comes to its end; until the row is over."""

@@ -54,18 +54,17 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class DeploymentFault:
-    """A row. inject: makes a deployment meet it. says: what must be said of it, a regular expression. how: it is made.
+    """A row. inject: makes a deployment meet it. message: a regular expression of what is printed about it.
 
-    heal: what a human does about the cause before deploying again. fresh: the model to be deployed is not on the rover
-    yet, so that it travels; otherwise it is there from before, which is quicker.
+    how: it is made. fresh: the model to be deployed is not on the rover yet, so that it travels; otherwise it is there
+    from before, which is quicker.
     """
 
     name: str
     inject: Callable[[DeploymentBench], object]
-    says: str
+    message: str
     how: str
     fresh: bool = False
-    heal: Callable[[DeploymentBench], object] = lambda bench: None
 
 
 # How they are made
@@ -145,18 +144,19 @@ def _name_another(bench: DeploymentBench) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text()), "name": other[::-1]}))
 
 
-def _refused(says: str, **changes: Any) -> Callable[[DeploymentBench], None]:
+def _refused(message: str, **changes: Any) -> Callable[[DeploymentBench], None]:
     """An artifact with another manifest: by the laptop, before anything travels; and by the rover, brought by hand."""
 
     def inject(bench: DeploymentBench) -> None:
         bad = changed_artifact(bench.artifacts[bench.target], bench.folder / "changed.pt", **changes)
         if bench.deploy(bad).ok:
-            raise EmulationError(f"{bench.pi.name}: an artifact was deployed of which is true: {says}")
+            raise EmulationError(f"{bench.pi.name}: an artifact was deployed of which is true: {message}")
         there = bench.state / "by-hand.pt"
         shutil.copy(bad, there)
         bench.undo.callback(there.unlink, missing_ok=True)
-        if not re.search(says, bench.rover("release", "stage", f"/{STATE}/by-hand.pt")):
-            raise EmulationError(f"{bench.pi.name}: the rover did not refuse it by '{says}'", found=bench.said[-1])
+        if not re.search(message, bench.rover("release", "stage", f"/{STATE}/by-hand.pt")):
+            what = f"{bench.pi.name}: the rover did not refuse it by '{message}'"
+            raise EmulationError(what, found=bench.outputs[-1])
 
     return inject
 
@@ -200,7 +200,7 @@ def _tamper_in_use(bench: DeploymentBench) -> dict[str, Any]:
 
 def _roll_back(bench: DeploymentBench) -> None:
     play = bench.play("rollback")
-    bench.said.append(play.output)
+    bench.outputs.append(play.output)
     if play.ok:
         raise EmulationError(f"{bench.pi.name}: rolled back to nothing")
 
@@ -227,16 +227,19 @@ def _nobody_there(bench: DeploymentBench) -> dict[str, Any]:
 
 LOST = "UNREACHABLE!|does not answer any more"  # when ssh ends
 FULL = "No space left on device"
+IN_CHECK = "a second into its parity vectors"
 OTHER_TORCH, A_LIE = r"made with torch 9\.9\.9, rovers have", "its manifest says dynamic, its code is not"
 
 
 def _power_cut(
-    when: str, moment: Callable[[Disk], bool], how: str, *, in_check: bool = False, fresh: bool = True
+    when: str, moment: Callable[[Disk], bool], how: str = IN_CHECK, *, fresh: bool = True
 ) -> DeploymentFault:
     def cut(bench: DeploymentBench) -> None:
         bench.cut_power(moment)
 
-    return DeploymentFault(f"power cut {when}", _strike(moment, cut, in_check=in_check), LOST, how, fresh)
+    in_check = how == IN_CHECK
+    inject = _strike(moment, cut, in_check=in_check)
+    return DeploymentFault(f"power cut {when}", inject, LOST, how, fresh=fresh and not in_check)
 
 
 FAULTS = [
@@ -248,42 +251,22 @@ FAULTS = [
         "before the release has its name", Disk.written, "once all its bytes are written, while they are looked at"
     ),
     _power_cut("after fsync and rename", Disk.named, "once its folder has its name"),
-    _power_cut(
-        "in the health check before the switch",
-        Disk.named,
-        "a second into its parity vectors",
-        in_check=True,
-        fresh=False,
-    ),
+    _power_cut("in the health check before the switch", Disk.named),
     _power_cut("right after the switch", Disk.just_switched, "once current points to it", fresh=False),
-    _power_cut(
-        "in the health check after the switch",
-        Disk.just_switched,
-        "a second into its parity vectors",
-        in_check=True,
-        fresh=False,
-    ),
+    _power_cut("in the health check after the switch", Disk.just_switched),
     _power_cut(
         "between switch and restart",
         lambda disk: disk.remembered,
         "once it was proven again; a power cut ends a service too, which then loads what current points to",
         fresh=False,
     ),
-    DeploymentFault(
-        "disk full in the transfer",
-        _no_room_to_arrive,
-        FULL,
-        f"{ROOM >> 20} MB are free",
-        fresh=True,
-        heal=DeploymentBench.make_room,
-    ),
+    DeploymentFault("disk full in the transfer", _no_room_to_arrive, FULL, f"{ROOM >> 20} MB are free", fresh=True),
     DeploymentFault(
         "too little room for a release",
         _no_room_to_stage,
         r"\d+ MB free, \d+ are needed; prune releases",
         "it can arrive, but the release does not fit beside it",
         fresh=True,
-        heal=DeploymentBench.make_room,
     ),
     DeploymentFault(
         "disk full while the release is written",
@@ -291,7 +274,6 @@ FAULTS = [
         "the disk is full; what was in use still is",
         "something else takes all that is free, once there was room enough",
         fresh=True,
-        heal=DeploymentBench.make_room,
     ),
     DeploymentFault(
         "a byte flipped on the way",
@@ -435,7 +417,7 @@ def break_deployments(
                 with telling:
                     rows[fault.name] = row
                     done(row)
-                    say(_told(row))
+                    say(_line(row))
 
         in_parallel(work, benches)
     return [rows[fault.name] for fault in FAULTS if fault.name in rows]
@@ -493,10 +475,10 @@ def _after(fault: DeploymentFault, bench: DeploymentBench) -> dict[str, Any]:
         with bench.timed("boot"):
             bench.pi.boot()
     bench.network.mend()
-    said = " ".join(" ".join(bench.said).replace("\\n", " ").split())
-    match = re.search(fault.says, said)
+    output = " ".join(" ".join(bench.outputs).replace("\\n", " ").split())
+    match = re.search(fault.message, output)
     if not match:
-        raise Missed(f"{bench.pi.name}: nobody said '{fault.says}', but: {said[-800:]}")
+        raise Missed(f"{bench.pi.name}: nobody reported '{fault.message}', but: {output[-800:]}")
     with bench.timed("health"):
         healthy = bench.healthy()
     with bench.timed("status"):
@@ -510,9 +492,9 @@ def _after(fault: DeploymentFault, bench: DeploymentBench) -> dict[str, Any]:
         "status": shown,
         "status_true": not untrue,
         **({"status_lies": untrue} if untrue else {}),
-        "said": said[max(0, match.start() - 60) : match.end() + 100],
+        "said": output[max(0, match.start() - 60) : match.end() + 100],
     }
-    fault.heal(bench)
+    bench.heal()
     with bench.timed("rerun"):
         again = bench.deploy()
     model, whole = bench.mode_in_use()
@@ -533,7 +515,7 @@ def _restore(bench: DeploymentBench) -> None:
     bench.deploy()
 
 
-def _told(row: Mapping[str, Any]) -> str:
+def _line(row: Mapping[str, Any]) -> str:
     if row.get("error"):
         return f"{row['fault']}: {row['error']}"
     good = row["healthy"] and row["status_true"] and row["healed_by_rerun"]

@@ -79,6 +79,6 @@ def wanted_of(broken: str, before: Mapping[str, str], new: str) -> dict[str, tup
 
 
 def results_of(output: str) -> dict[str, str]:
-    """What deploy.yml's report says of each rover."""
+    """The result that deploy.yml's report has for each rover."""
     report = output.partition("TASK [Show what came of each]")[2].partition("TASK [")[0]
-    return {name: json.loads(f'"{said}"') for name, said in re.findall(r'"msg": "([\w.-]+): (.*)"', report)}
+    return {name: json.loads(f'"{result}"') for name, result in re.findall(r'"msg": "([\w.-]+): (.*)"', report)}

@@ -349,8 +349,8 @@ class Machine:
     def _check(self) -> None:
         if self._process.poll() is not None:
             self._errors.seek(0)
-            said = last_words(self._errors.read().decode(errors="replace"))
-            raise MachineError(f"QEMU has ended (exit code {self._process.returncode}): {said}")
+            last = last_words(self._errors.read().decode(errors="replace"))
+            raise MachineError(f"QEMU has ended (exit code {self._process.returncode}): {last}")
 
     # -- ssh
 
@@ -384,8 +384,8 @@ class Machine:
         except subprocess.TimeoutExpired:
             raise MachineError(f"'{command}' took more than {timeout_s:g} s in the emulated machine") from None
         if check and done.returncode:
-            said = last_words(done.stderr or done.stdout)
-            raise MachineError(f"'{command}' failed in the emulated machine ({done.returncode}): {said}")
+            last = last_words(done.stderr or done.stdout)
+            raise MachineError(f"'{command}' failed in the emulated machine ({done.returncode}): {last}")
         return done.stdout + done.stderr
 
     # -- USB

@@ -73,7 +73,7 @@ def run_machine(
     """All of it; what was found, which is written to `output` even where a step fails.
 
     artifact: to deploy. recordings: episodes, whose frames the camera shows. fresh: provision anew, even if a card that
-    was provisioned with just this role and these wheels is in the cache. say: told each step. Raises RoverError where
+    was provisioned with just this role and these wheels is in the cache. say: output each step. Raises RoverError where
     it cannot be begun. The machine's console and Ansible's words are beside `output` afterwards if anything failed.
     """
     output, artifact, recordings = Path(output), Path(artifact), Path(recordings)
@@ -263,27 +263,27 @@ class _Run:
 
     def service(self) -> dict[str, str]:
         """What systemd knows of it."""
-        told = self.pi.ssh(f"systemctl show --property=ActiveState,SubState,Result,NRestarts,StatusText {UNIT}")
-        return dict(line.partition("=")[::2] for line in told.splitlines() if "=" in line)
+        output = self.pi.ssh(f"systemctl show --property=ActiveState,SubState,Result,NRestarts,StatusText {UNIT}")
+        return dict(line.partition("=")[::2] for line in output.splitlines() if "=" in line)
 
     def journal(self) -> list[str]:
         """What the service said last."""
-        told = self.sudo(f"journalctl --unit={UNIT} --output=cat --no-pager --lines=60")
+        output = self.sudo(f"journalctl --unit={UNIT} --output=cat --no-pager --lines=60")
         return [
             line
-            for line in told.splitlines()
+            for line in output.splitlines()
             if "unplugged" in line or "plugged in" in line or "no such camera" in line
         ][-4:]
 
     def doctor(self) -> dict[str, Any]:
         """`rover doctor` on the rover: whether the car would drive, and each check."""
-        told = self.pi.ssh(
+        output = self.pi.ssh(
             f"sudo rover doctor {MODEL} --camera {CAMERA} --port {PORT} --json", check=False, timeout_s=900
         )
         try:
-            found = json.loads(told[told.index("{") : told.rindex("}") + 1])
+            found = json.loads(output[output.index("{") : output.rindex("}") + 1])
         except ValueError:
-            raise MachineRunError(f"rover doctor gave no JSON: {' '.join(told.split())[-400:]}") from None
+            raise MachineRunError(f"rover doctor gave no JSON: {' '.join(output.split())[-400:]}") from None
         if not found["drives"]:
             failed = [f"{c['name']}: {c['found']}" for c in found["checks"] if c["verdict"] == "fail"]
             self.wrong(f"rover doctor: {'; '.join(failed)}")
@@ -293,10 +293,10 @@ class _Run:
 
     def machine(self) -> dict[str, Any]:
         """What it says that it is."""
-        told = self.pi.ssh(
+        output = self.pi.ssh(
             "uname -rm; nproc; grep -m1 ^Features /proc/cpuinfo; head -1 /proc/meminfo; cat /etc/debian_version"
         )
-        kernel, cores, features, memory, debian = told.splitlines()[:5]
+        kernel, cores, features, memory, debian = output.splitlines()[:5]
         if "asimddp" not in features:
             self.wrong(f"the machine has no SDOT, which INT8 policies use: {features}")
         return {

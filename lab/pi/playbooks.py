@@ -63,7 +63,7 @@ class Play:
 
     @property
     def end(self) -> str:
-        """The last that it said before the recap: the failed task, if one failed."""
+        """The end of its output before the recap: the failed task, if one failed."""
         return self.output.partition("PLAY RECAP")[0].strip()[-3000:]
 
     def row(self) -> dict[str, Any]:

@@ -152,8 +152,8 @@ def sandbox(pi: Container) -> dict[str, Any]:
         (pi.root / PROBE.lstrip("/")).unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             open_folder.rmdir()
-    told = pi.inside("systemd-analyze", "security", "--no-pager", UNIT, check=False).stdout
-    exposure = re.search(r"Overall exposure level for \S+: ([\d.]+)", told)
+    analysis = pi.inside("systemd-analyze", "security", "--no-pager", UNIT, check=False).stdout
+    exposure = re.search(r"Overall exposure level for \S+: ([\d.]+)", analysis)
     wanted = f"write {STATE}/probe"
     probes = [
         {"probe": n, "refused": n != wanted, "inside": inside["found"][n], "outside": outside["found"][n]}
@@ -192,10 +192,10 @@ def _probe(pi: Container, name: str, unit: str) -> dict[str, Any]:
     try:
         pi.inside("systemctl", "daemon-reload")
         started = pi.inside("systemctl", "start", name, check=False)
-        said = pi.inside("journalctl", f"--unit={name}", "--output=cat", "--no-pager").stdout
-        found = [line for line in said.splitlines() if line.startswith("PROBED ")]
+        journal = pi.inside("journalctl", f"--unit={name}", "--output=cat", "--no-pager").stdout
+        found = [line for line in journal.splitlines() if line.startswith("PROBED ")]
         if not found:
-            raise EmulationError(f"{name} could not look: {started.stderr} {said[-800:]}")
+            raise EmulationError(f"{name} could not look: {started.stderr} {journal[-800:]}")
         return json.loads(found[-1].removeprefix("PROBED "))
     finally:
         (pi.root / "etc/systemd/system" / name).unlink()
@@ -256,16 +256,15 @@ def start_limit(pi: Container) -> dict[str, Any]:
         told = show(pi, "ActiveState", "NRestarts", "Result", "StatusText")
     finally:
         away.rename(camera)
-    cursor = pi.inside("journalctl", f"--unit={UNIT}", "--output=cat", "--no-pager", f"--since=-{took_s + 15:.0f}s")
-    said = cursor.stdout
+    journal = pi.inside("journalctl", f"--unit={UNIT}", "--output=cat", "--no-pager", f"--since=-{took_s + 15:.0f}s")
     pi.inside("systemctl", "reset-failed", UNIT, check=False)
     return {
-        "tries": len(re.findall(rf"^Starting {re.escape(UNIT)}", said, re.M)),
+        "tries": len(re.findall(rf"^Starting {re.escape(UNIT)}", journal.stdout, re.M)),
         "ended": ended,
         "seconds": round(took_s, 1),
         "state": told["ActiveState"],
         "result": told["Result"],
-        "said": next((line for line in said.splitlines() if line.startswith("rover: ")), ""),
+        "said": next((line for line in journal.stdout.splitlines() if line.startswith("rover: ")), ""),
     }
 
 

@@ -156,7 +156,7 @@ class _Plugged:
 
     def __init__(self, connection: socket.socket, camera: UsbCamera):
         self._connection, self._camera = connection, camera
-        self._header = self._said = FIRST_HEADER  # of what is sent, and of what comes
+        self._header_out = self._header_in = FIRST_HEADER  # of what is sent, and of what comes
         self._received = bytearray()
         self._waiting: deque[tuple[int, int]] = deque()  # (id, bytes wanted) of the driver's bulk requests
         self._payload = b""  # what is left of a frame
@@ -167,7 +167,7 @@ class _Plugged:
     def serve(self) -> None:
         version = b"rover".ljust(64, b"\0")
         self._send(HELLO, 0, version + _words(CAPABILITIES))
-        self._header = HEADER
+        self._header_out = HEADER
         while not self._camera._closing.is_set():
             wait_s = min(0.1, max(0.0, self._due_s - time.monotonic())) if self._waiting and self._whole else 0.1
             if select.select([self._connection], [], [], wait_s)[0]:
@@ -179,18 +179,18 @@ class _Plugged:
             self._give()
 
     def _take(self) -> None:
-        while len(self._received) >= self._said.size:
-            kind, length, number = self._said.unpack_from(self._received)
-            end = self._said.size + length
+        while len(self._received) >= self._header_in.size:
+            kind, length, number = self._header_in.unpack_from(self._received)
+            end = self._header_in.size + length
             if len(self._received) < end:
                 return
-            body = bytes(self._received[self._said.size : end])
+            body = bytes(self._received[self._header_in.size : end])
             del self._received[:end]
             self._answer(kind, number, body)
 
     def _answer(self, kind: int, number: int, body: bytes) -> None:
         if kind == HELLO:
-            self._said = HEADER
+            self._header_in = HEADER
             self._introduce()
         elif kind in (SET_CONFIGURATION, GET_CONFIGURATION):
             self._send(CONFIGURATION, number, bytes([OK, 1]))
@@ -199,10 +199,9 @@ class _Plugged:
         elif kind == CONTROL:
             endpoint, request, request_type, _, value, index, length = CONTROL_HEADER.unpack_from(body)
             status, data = control_answer(request_type, request, value, index, length)
-            said = CONTROL_HEADER.pack(endpoint, request, request_type, status, value, index, len(data) or length)
-            if request_type & 0x80:
-                said = CONTROL_HEADER.pack(endpoint, request, request_type, status, value, index, len(data))
-            self._send(CONTROL, number, said + data)
+            count = len(data) if request_type & 0x80 else len(data) or length
+            head = CONTROL_HEADER.pack(endpoint, request, request_type, status, value, index, count)
+            self._send(CONTROL, number, head + data)
         elif kind == BULK:
             endpoint, _, low, _, high = BULK_HEADER.unpack_from(body)
             if endpoint == ENDPOINT:
@@ -253,4 +252,4 @@ class _Plugged:
             self._send(BULK, number, header + data)
 
     def _send(self, kind: int, number: int, body: bytes) -> None:
-        self._connection.sendall(self._header.pack(kind, len(body), number) + body)
+        self._connection.sendall(self._header_out.pack(kind, len(body), number) + body)
