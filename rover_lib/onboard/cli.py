@@ -115,14 +115,14 @@ DRIVE_OPTIONS = (
     click.option("--hz", type=click.FloatRange(10, 100), default=30.0, show_default=True, help="Commands a second."),
     click.option("--dry-run", is_flag=True, help="No Arduino, no motor: logs what would be sent."),
     click.option("--record", type=FILE, help="Write the drive as an episode into this folder."),
-    click.option("--record-mb", type=click.FloatRange(min=1), help="All in that folder take at most so much."),
-    click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="End after so many."),
-    click.option("--ticks", type=click.IntRange(min=1), help="End after so many commands."),
+    click.option("--record-mb", type=click.FloatRange(min=1), help="Most megabytes of that folder."),
+    click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="Longest duration of the drive."),
+    click.option("--ticks", type=click.IntRange(min=1), help="End after this number of commands."),
     click.option("--throttle-limit", type=click.FloatRange(0, 1), help="[default: params.yml; with --replay: none]"),
     click.option(
         "--blend-ticks", type=click.IntRange(min=0), help="Of a fresh plan taking over [default: params.yml]."
     ),
-    click.option("--ensemble", type=float, help="LeRobot's temporal ensembling with this coefficient, say 0.01."),
+    click.option("--ensemble", type=float, help="LeRobot's temporal ensembling with this coefficient, such as 0.01."),
     click.option("--threads", type=click.IntRange(min=1), help="The policy's [default: all cores but one]."),
     click.option(
         "--log", "log_file", type=FILE, help="Flight log [default: rover/flight.log in the user's state folder]."
