@@ -19,7 +19,7 @@ def main(debug: bool) -> None:
 
 @main.command()
 @drive_options
-@click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="A plan takes so long.")
+@click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="Time that a plan takes, at least.")
 @click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
 @click.pass_context
 def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> None:

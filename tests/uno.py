@@ -96,7 +96,7 @@ def status_of(body: str) -> SimpleNamespace:
 
 
 class Uno:
-    """The board, stepped. `events`: all that was measured, in the order of its end; `lines`: all that it said."""
+    """The board, stepped. `events`: all that was measured, in the order of its end; `lines`: all that it sent."""
 
     def __init__(self):
         self._c = _library()
@@ -134,9 +134,9 @@ class Uno:
         while n := self._c.uno_read(self._uno, text, len(text)):
             self._rest += text.raw[:n]
         *whole, self._rest = self._rest.split(b"\n")
-        for said in filter(None, whole):
-            body = body_of(said)
-            assert body is not None or any(e.kind == RESET for e in new), f"the firmware said {said!r}"
+        for text_line in filter(None, whole):
+            body = body_of(text_line)
+            assert body is not None or any(e.kind == RESET for e in new), f"the firmware sent {text_line!r}"
             if body:
                 self.lines.append(body)
                 if body.startswith("<H "):
@@ -174,7 +174,7 @@ class Uno:
     @property
     def status(self) -> SimpleNamespace:
         """The newest status."""
-        return status_of(next(said for said in reversed(self.lines) if said.startswith("<S ")))
+        return status_of(next(body for body in reversed(self.lines) if body.startswith("<S ")))
 
     def drive(self, steering_us: int, throttle_us: int, ms: float, every_ms: float = 33) -> list[SimpleNamespace]:
         """Commands at a rate, for a time."""

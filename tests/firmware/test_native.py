@@ -130,12 +130,12 @@ def native() -> ctypes.CDLL:
 
 def read(data: bytes) -> list[Command]:
     """The commands that the firmware finds in bytes."""
-    reader, found = Reader(), []
+    reader, commands = Reader(), []
     for byte in data:
         command = Command()
         if native().reader_take(reader, byte, 0, command) == 1:
-            found.append(command)
-    return found
+            commands.append(command)
+    return commands
 
 
 NUMBER = st.integers(0, 2**32 - 1)
@@ -153,10 +153,10 @@ def test_crc_is_zlibs(data):
 @given(st.sampled_from("AND"), NUMBER, NUMBER, NUMBER, NUMBER)
 def test_what_the_host_sends_is_what_the_firmware_reads(kind, boot, sequence, steering_us, throttle_us):
     values = (boot, sequence, steering_us, throttle_us) if kind == "D" else (boot, sequence)
-    (found,) = read(servo_link.frame(f">{kind} " + " ".join(map(str, values))))
-    assert found.kind.decode() == kind
-    assert (found.boot, found.sequence) == (boot, sequence)
-    assert (found.steering_us, found.throttle_us) == ((steering_us, throttle_us) if kind == "D" else (0, 0))
+    (command,) = read(servo_link.frame(f">{kind} " + " ".join(map(str, values))))
+    assert command.kind.decode() == kind
+    assert (command.boot, command.sequence) == (boot, sequence)
+    assert (command.steering_us, command.throttle_us) == ((steering_us, throttle_us) if kind == "D" else (0, 0))
 
 
 @given(st.binary(max_size=300))
@@ -204,21 +204,21 @@ def test_what_the_firmware_says_is_what_the_host_reads(fields, received, uptime_
     length = native().vehicle_status(vehicle, uptime_ms, line)
     assert 0 < length <= 127  # it fits, however large its numbers are
     text = ctypes.string_at(ctypes.addressof(line), length)
-    said = servo_link.parse(text[:-1], 12.5)
+    parsed = servo_link.parse(text[:-1], 12.5)
     assert text.endswith(b"\n")
-    assert (said.host_s, said.uptime_ms, said.state.value) == (12.5, uptime_ms, fields["state"])
-    assert {k: getattr(said, k) for k in fields if k != "state"} == {k: v for k, v in fields.items() if k != "state"}
+    assert (parsed.host_s, parsed.uptime_ms, parsed.state.value) == (12.5, uptime_ms, fields["state"])
+    assert {k: getattr(parsed, k) for k in fields if k != "state"} == {k: v for k, v in fields.items() if k != "state"}
     pulses = [(p, t) if present else (None, None) for present, p, t in received]
-    assert (said.receiver_steering_us, said.receiver_steering_period_us) == pulses[0]
-    assert (said.receiver_throttle_us, said.receiver_throttle_period_us) == pulses[1]
+    assert (parsed.receiver_steering_us, parsed.receiver_steering_period_us) == pulses[0]
+    assert (parsed.receiver_throttle_us, parsed.receiver_throttle_period_us) == pulses[1]
 
 
 @given(st.integers(0, 65535), NUMBER, st.sampled_from("pebw-"))
 def test_hello_is_what_the_host_reads(boot, sequence, cause):
     line = Line()
     length = native().vehicle_hello(Vehicle(boot=boot, sequence=sequence), cause.encode(), line)
-    said = servo_link.parse(ctypes.string_at(ctypes.addressof(line), length - 1), 0)
-    assert said == servo_link.Hello(1, "1.0.0", boot, sequence, servo_link.RESETS[cause])
+    parsed = servo_link.parse(ctypes.string_at(ctypes.addressof(line), length - 1), 0)
+    assert parsed == servo_link.Hello(1, "1.0.0", boot, sequence, servo_link.RESETS[cause])
 
 
 def test_both_sides_have_the_same_limits():

@@ -106,8 +106,8 @@ def test_ages_of_plans_are_those_of_the_planner(seconds, first, pattern):
 def test_the_newest_frame_is_looked_at_as_soon_as_a_plan_is_ready():
     policy = Foresees()
     drive = drive_late(policy, CURVE, Condition(0.15, SETTINGS))
-    looks = [round(30 * captured.captured_s) for captured, _ in drive.plans]
-    assert looks[:7] == [0, 4, 9, 13, 18, 22, 27]  # every 4.5 ticks; every other time that frame is half a tick old
+    looked_at = [round(30 * captured.captured_s) for captured, _ in drive.plans]
+    assert looked_at[:7] == [0, 4, 9, 13, 18, 22, 27]  # every 4.5 ticks; every other time that frame is half a tick old
     latencies = [30 * plan.latency_s for plan, _ in drive.plans[:4]]
     assert latencies == pytest.approx([4.5, 5, 4.5, 5])
 
@@ -259,7 +259,7 @@ def rows(hits_at):
 
 
 @pytest.mark.parametrize(
-    ("hits_at", "found", "passed"),
+    ("hits_at", "lost", "passed"),
     [
         ({0: 40, 150: 38}, 2, True),
         ({0: 40, 150: 37}, 3, False),
@@ -267,9 +267,9 @@ def rows(hits_at):
         ({0: 40, 30: 40}, None, None),
     ],
 )
-def test_the_gate_is_of_compensated_drives_that_nobody_pushes(hits_at, found, passed):
+def test_the_gate_is_of_compensated_drives_that_nobody_pushes(hits_at, lost, passed):
     (row,) = gates(rows(hits_at), 2)
-    assert (row["found"], row["passed"], row["limit"]) == (found, passed, 2)
+    assert (row["found"], row["passed"], row["limit"]) == (lost, passed, 2)
 
 
 def test_the_command_measures_again_and_prints_a_table(run_dir, monkeypatch):

@@ -24,7 +24,7 @@ class Raw:
             if body := body_of(self.port.readline()[:-1]):
                 return body
 
-    def say(self, text):
+    def send(self, text):
         """What the status says after it."""
         self.port.reset_input_buffer()
         self.port.write(text)
@@ -49,16 +49,16 @@ def opened():
 @needs.real_time
 def test_the_stand_in_ignores_what_the_firmware_ignores():
     with opened() as raw:
-        assert raw.say(raw.command("D", 1500, 200)).result == "i"
+        assert raw.send(raw.command("D", 1500, 200)).result == "i"
         arming = raw.command("A")
-        assert raw.say(arming).state == "A"
+        assert raw.send(arming).state == "A"
         old = raw.command("D", 1500, 200)
-        status = raw.say(old)
+        status = raw.send(old)
         assert (status.result, status.steering_us, status.throttle_us) == ("k", 1500, 200)
-        status = raw.say(old)
+        status = raw.send(old)
         assert (status.result, status.old) == ("o", 1)
         raw.boot += 1
-        assert raw.say(raw.command("D", 1900, 600)).old == 2
+        assert raw.send(raw.command("D", 1900, 600)).old == 2
         raw.boot -= 1
         for bad in (
             b">D 1 2 3\n",
@@ -67,29 +67,29 @@ def test_the_stand_in_ignores_what_the_firmware_ignores():
             line(">D 1 99"),
             b">" + b"x" * 80 + b"\n",
         ):
-            raw.say(raw.command("D", 1500, 200))
-            assert raw.say(bad).throttle_us in (200, 120)
-        status = raw.say(b"")
+            raw.send(raw.command("D", 1500, 200))
+            assert raw.send(bad).throttle_us in (200, 120)
+        status = raw.send(b"")
         assert status.bad == 5
         for pulses in ((899, 200), (2013, 200), (1500, 119), (1500, 712)):
-            raw.say(raw.command("A"))
-            assert raw.say(raw.command("D", *pulses)).result == "r"
-        raw.say(raw.command("A"))
-        status = raw.say(raw.command("N"))
+            raw.send(raw.command("A"))
+            assert raw.send(raw.command("D", *pulses)).result == "r"
+        raw.send(raw.command("A"))
+        status = raw.send(raw.command("N"))
         assert (status.state, status.reason, status.throttle_us) == ("S", "n", 120)
         time.sleep(0.2)
-        assert raw.say(arming).state == "S"  # replayed
+        assert raw.send(arming).state == "S"  # replayed
 
 
 @needs.real_time
 def test_an_out_of_range_command_is_no_sign_of_life():
     with opened() as raw:
-        raw.say(raw.command("A"))
+        raw.send(raw.command("A"))
         end = time.monotonic() + 0.25
         while time.monotonic() < end:
             raw.port.write(raw.command("D", 1500, 900))
             time.sleep(0.02)
-        assert raw.say(b"").reason == "t"
+        assert raw.send(b"").reason == "t"
 
 
 def test_unplugging_the_stand_in():

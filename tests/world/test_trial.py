@@ -55,12 +55,12 @@ def test_wilson_interval_refuses_what_is_no_count(hits, trials):
         wilson_interval(hits, trials)
 
 
-def test_a_blind_policy_misses_and_one_that_looks_hits():
+def test_a_blind_policy_misses_and_one_that_sees_hits():
     blind = run_trials(Constant(0.0, 0.05), worlds=10)
-    looks = run_trials(SeesRed(), worlds=10, replan_every=2)
+    seeing = run_trials(SeesRed(), worlds=10, replan_every=2)
     assert blind.hits <= 3
-    assert looks.hits >= 7
-    assert looks.wilson == wilson_interval(looks.hits, 10)
+    assert seeing.hits >= 7
+    assert seeing.wilson == wilson_interval(seeing.hits, 10)
 
 
 def test_a_report_tells_of_every_world():

@@ -145,6 +145,7 @@ def test_a_negative_seed_is_refused():
         World(-1)
 
 
+@pytest.mark.release
 def test_rendering_is_quick():
     world = World(4)
     times = []

@@ -57,9 +57,9 @@ def arm(board):
 def on_pins(events, steering_us, throttle_us, after_us=0, within_us=EDGE_US):
     """Whether there are pulses of both pins, and all are these."""
     for pin, wanted in (("steering", steering_us), ("throttle", throttle_us)):
-        found = widths(events, pin, after_us)
-        assert found, f"no {pin} pulses"
-        assert all(abs(us - wanted) <= within_us for us in found), f"{pin}: {sorted(found)} us, wanted {wanted}"
+        measured = widths(events, pin, after_us)
+        assert measured, f"no {pin} pulses"
+        assert all(abs(us - wanted) <= within_us for us in measured), f"{pin}: {sorted(measured)} us, wanted {wanted}"
 
 
 def is_neutral(events, after_us=0):
@@ -442,7 +442,7 @@ def test_lines_of_another_start_never_move_a_pin(armed):
     armed.run_ms(150)
     assert armed.boot == boot + 1
     assert armed.lines[-1].startswith("<S")
-    assert any(said == f"<H 1 1.0.0 {armed.boot} 0 e" for said in armed.lines)
+    assert any(body == f"<H 1 1.0.0 {armed.boot} 0 e" for body in armed.lines)
     for text in old:
         armed.send(text)
     events = armed.run_ms(60)
@@ -476,8 +476,8 @@ def test_every_command_of_100_hz_is_acknowledged(armed):
         armed.command("D", 1300 + n, 200 + n)
         sent[armed.sequence] = (1300 + n, 200 + n)
         armed.run_ms(ANSWER_MS)
-    said = [uno.status_of(s) for s in armed.lines[before:]]
-    acknowledged = {s.sequence: (s.steering_us, s.throttle_us) for s in said if s.result == "k"}
+    statuses = [uno.status_of(s) for s in armed.lines[before:]]
+    acknowledged = {s.sequence: (s.steering_us, s.throttle_us) for s in statuses if s.result == "k"}
     assert {k: v for k, v in acknowledged.items() if k in sent} == sent
     assert armed.status.lost == armed.status.bad == 0
     load = sum(len(s) + 10 for s in armed.lines[before:]) / (armed.now_us - bytes_before) * 1e6 / 11520
@@ -540,7 +540,7 @@ def test_a_hung_loop_is_reset_by_the_watchdog(armed):
     assert later
     assert max(later) <= 124 + ARDUINO_STEP_US
     on_pins(events, *REST, after_us=resets[0] + 60_000, within_us=STEP_US)
-    assert any(said == f"<H 1 1.0.0 {armed.boot} 0 w" for said in armed.lines)
+    assert any(body == f"<H 1 1.0.0 {armed.boot} 0 w" for body in armed.lines)
     assert (armed.status.state, armed.status.reason) == ("M", "r")
     arm(armed)
 
@@ -606,7 +606,7 @@ def test_no_other_interrupt_disturbs_the_steering_by_more_than_a_step(board):
     rng = random.Random(5)
     board.transmitter(*REST)
     board.run_ms(150)
-    found = []
+    errors = []
     for _ in range(800):
         steering_us, throttle_us = rng.uniform(1010, 1940), 4 * rng.randrange(30, 170)
         board.transmitter(steering_us, throttle_us)
@@ -614,5 +614,5 @@ def test_no_other_interrupt_disturbs_the_steering_by_more_than_a_step(board):
             board.send(line(">Q"))
             board.run_ms(rng.uniform(9, 12))
         assert board.status.receiver_throttle_us == throttle_us
-        found.append(board.status.receiver_steering_us - steering_us)
-    assert max(map(abs, found)) <= STEP_US
+        errors.append(board.status.receiver_steering_us - steering_us)
+    assert max(map(abs, errors)) <= STEP_US

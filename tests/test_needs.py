@@ -1,0 +1,43 @@
+"""The tests' own way with a busy machine: a test in real time is repeated while it is late, and never skipped."""
+
+import time
+
+import needs
+import pytest
+
+
+def test_a_test_is_repeated_while_the_machine_is_late():
+    attempts = []
+
+    @needs.real_time
+    def late_twice():
+        attempts.append(1)
+        if len(attempts) < 3:
+            needs.keep_sending(lambda: time.sleep(0.2), seconds=1)
+
+    late_twice()
+    assert len(attempts) == 3
+
+
+def test_it_fails_in_the_end_and_says_why():
+    attempts = []
+
+    @needs.real_time
+    def always_late():
+        attempts.append(1)
+        needs.keep_sending(lambda: time.sleep(0.2), seconds=1)
+
+    with pytest.raises(needs.Late) as failure:
+        always_late()
+    assert len(attempts) == needs.ATTEMPTS
+    assert "this machine was too busy in 5 attempts" in failure.value.__notes__[0]
+
+
+def test_a_heartbeat_knows_that_nobody_had_a_turn():
+    with needs.Heartbeat() as heartbeat:
+        time.sleep(0.1)
+        begin = time.monotonic()
+        sum(range(20_000_000))  # in C: it does not give the interpreter back
+        took = time.monotonic() - begin
+        time.sleep(0.1)
+    assert heartbeat.late_s > 0.5 * took

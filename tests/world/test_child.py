@@ -1,0 +1,47 @@
+"""A process beside this one: talked to, ended, and its last words in the errors. Cars and Arduinos prove the rest."""
+
+import signal
+import sys
+
+import pytest
+from needs import ended
+
+from rover_lib.onboard.errors import WorldError
+from rover_lib.world.child import Child
+
+ECHO = "import sys\nfor line in sys.stdin: print(line.upper(), end='', flush=True)"
+
+
+def start(program, **options):
+    return Child("the program", sys.executable, "-c", program, error=WorldError, **options)
+
+
+def test_a_child_that_talks_ends_with_its_input():
+    child = start(ECHO, talks=True)
+    child.send_line("hello")
+    assert child.read(20) == b"HELLO\n"
+    assert child.read() == b""
+    child.check()
+    child.close()
+    assert child.process.returncode == 0
+    with pytest.raises(WorldError, match="the program was closed; make a new one"):
+        child.send_line("hello")
+
+
+def test_its_last_words_are_in_the_error():
+    child = start("import sys; sys.stderr.write('one\\ntwo\\n'); sys.exit(7)", talks=True)
+    with pytest.raises(WorldError, match=r"has ended \(exit status 7\): one \| two; start a new one"):
+        child.read(20)
+    assert child.errors() == ["one", "two"]
+    child.close()
+
+
+def test_one_that_was_stopped_is_ended_too():
+    child = start("import time; print('here', file=__import__('sys').stderr, flush=True); time.sleep(60)")
+    while not child.errors():
+        child.check()
+    child.process.send_signal(signal.SIGSTOP)
+    child.close()
+    assert child.process.returncode == -signal.SIGTERM
+    assert ended(child.pid)
+    child.close()
