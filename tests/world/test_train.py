@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -51,11 +53,20 @@ CONFIG_KEYS = {
 }
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_frames():
+    """The recipes' three phases, on a handful of frames."""
+    recipes = {kind: replace(r, batch=4, transformer_batch=8, samples=24) for kind, r in RECIPES.items()}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train_module, "RECIPES", recipes)
+        yield
+
+
 @pytest.fixture(scope="module")
 def trained(recorded, tmp_path_factory):
     """A checkpoint of a few steps on the processor."""
     out = tmp_path_factory.mktemp("trained") / "best_model.pth"
-    return train(recorded, out, size="small", steps=5, device="cpu")
+    return train(recorded, out, size="small", steps=3, device="cpu")
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +135,7 @@ def test_training_is_deterministic(recorded, trained, tmp_path, monkeypatch):
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "another"))
     torch.rand(3)  # the state of the global generator must not matter, nor change
     before = torch.get_rng_state()
-    again = torch.load(train(recorded, tmp_path / "again.pth", steps=5, device="cpu"), weights_only=False)
+    again = torch.load(train(recorded, tmp_path / "again.pth", steps=3, device="cpu"), weights_only=False)
     assert torch.equal(torch.get_rng_state(), before)
     first = torch.load(trained, weights_only=False)
     assert all(torch.equal(v, first["model_state_dict"][k]) for k, v in again["model_state_dict"].items())
@@ -132,7 +143,7 @@ def test_training_is_deterministic(recorded, trained, tmp_path, monkeypatch):
 
 
 def test_another_seed_gives_other_weights(recorded, checkpoint, tmp_path):
-    other = torch.load(train(recorded, tmp_path / "other.pth", seed=1, steps=5, device="cpu"), weights_only=False)
+    other = torch.load(train(recorded, tmp_path / "other.pth", seed=1, steps=3, device="cpu"), weights_only=False)
     name = "model.action_head.weight"
     assert not torch.equal(other["model_state_dict"][name], checkpoint["model_state_dict"][name])
 
@@ -144,9 +155,9 @@ def test_a_checkpoint_that_was_made_is_taken_from_the_cache(recorded, trained, m
     monkeypatch.setattr(train_module, "_train", never)
     before = trained.read_bytes()
     trained.unlink()
-    assert train(recorded, trained, steps=5, device="cpu").read_bytes() == before
+    assert train(recorded, trained, steps=3, device="cpu").read_bytes() == before
     with pytest.raises(AssertionError, match="trained again"):
-        train(recorded, trained.with_name("more.pth"), steps=6, device="cpu")
+        train(recorded, trained.with_name("more.pth"), steps=4, device="cpu")
     assert [p.name for p in trained.parent.iterdir()] == [trained.name]
 
 
