@@ -26,16 +26,17 @@ def fuzz(program, lines, seed):
     return subprocess.run([program, str(lines), str(seed)], capture_output=True, text=True, timeout=120)
 
 
-def test_a_million_random_and_mutated_lines():
+@pytest.mark.parametrize("count", [100_000, pytest.param(1_000_000, marks=pytest.mark.release)])
+def test_random_and_mutated_lines(count):
     """Never an unsafe pulse, no stuck state, no access out of bounds: tests/firmware/fuzz.c says what is unsafe."""
     program = uno.compiled("fuzz", *SANITIZE, FUZZ, SOURCES / "protocol.c", SOURCES / "vehicle.c")
-    done = fuzz(program, 1_000_000, 1)
+    done = fuzz(program, count, 1)
     assert done.returncode == 0, done.stderr
     lines, commands, driven, *kinds = map(int, re.findall(r"\d+", done.stdout))
-    assert lines >= 1_000_000
-    assert commands > 400_000
-    assert driven > 100_000
-    assert min(kinds) > 100_000
+    assert lines >= count
+    assert commands > 0.4 * count
+    assert driven > 0.1 * count
+    assert min(kinds) > 0.1 * count
 
 
 @pytest.mark.parametrize(
@@ -54,6 +55,7 @@ def test_a_million_random_and_mutated_lines():
         ("overflow", "protocol.c", "reader->length == HOST_LINE_MAX", "reader->length == HOST_LINE_MAX + 40"),
     ],
 )  # fmt: skip
+@pytest.mark.slow
 def test_the_fuzz_finds_planted_faults(tmp_path, name, file, good, bad):
     text = (SOURCES / file).read_text()
     assert text.count(good) == 1, f"{good!r} is no longer in {file}"

@@ -159,6 +159,7 @@ def test_pushes_push():
     assert beside_path(late(0.0, pushes=3), late(0.0)) > 0.01
 
 
+@pytest.mark.slow
 def test_reports_are_of_the_seeds_and_do_not_depend_on_threads():
     conditions = [Condition(0.0, SETTINGS), Condition(0.15, SETTINGS, pushes=2), Condition(0.6, SETTINGS)]
     told = []
@@ -222,6 +223,7 @@ def run_dir(tmp_path, monkeypatch):
 HOW = {"worlds": 2, "latencies_ms": [0, 150, 600], "pushes": 2, "pushed_latencies_ms": [150], "shown_ms": 150}
 
 
+@pytest.mark.slow
 def test_a_run_is_measured_once_for_each_policy_and_question(run_dir):
     first = latency.measured(run_dir.path, **HOW)
     assert run_dir.loaded and read_stage(run_dir.path / "drive.json", "drive") == first
@@ -272,6 +274,7 @@ def test_the_gate_is_of_compensated_drives_that_nobody_pushes(hits_at, lost, pas
     assert (row["found"], row["passed"], row["limit"]) == (lost, passed, 2)
 
 
+@pytest.mark.slow
 def test_the_command_measures_again_and_prints_a_table(run_dir, monkeypatch):
     (run_dir.path / "drive.json").write_text("of another version")
 

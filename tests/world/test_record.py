@@ -9,6 +9,8 @@ from rover_lib.workshop.episodes import load_recordings
 from rover_lib.world import record
 from rover_lib.world.record import record_episodes
 
+pytestmark = pytest.mark.slow
+
 # facts of the user's format, as found in a real recording
 EPISODE_KEYS = {
     "episode_id",

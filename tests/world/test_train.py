@@ -12,6 +12,8 @@ from rover_lib.world.train import RECIPES, SIZES, build_policy, make_checkpoint,
 from rover_lib.world.trial import run_trials
 from rover_lib.world.world import World
 
+pytestmark = pytest.mark.slow
+
 # the keys of the user's best_model.pth
 CHECKPOINT_KEYS = [
     "epoch",

@@ -55,6 +55,7 @@ def test_wilson_interval_refuses_what_is_no_count(hits, trials):
         wilson_interval(hits, trials)
 
 
+@pytest.mark.slow
 def test_a_blind_policy_misses_and_one_that_sees_hits():
     blind = run_trials(Constant(0.0, 0.05), worlds=10)
     seeing = run_trials(SeesRed(), worlds=10, replan_every=2)
@@ -129,6 +130,7 @@ def test_progress_is_told():
     assert told == [("driving", 2)]
 
 
+@pytest.mark.slow
 def test_several_at_once_drive_as_one_by_one():
     policies = {"left": Constant(-0.2, 0.05), "right": Constant(0.2, 0.05), "straight": Constant(0.0, 0.05)}
     together = run_trials_of(policies, 3)

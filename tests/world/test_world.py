@@ -61,6 +61,7 @@ def test_the_balloon_is_red_where_it_should_be():
 
 
 @pytest.mark.parametrize("shoves", [0, 2])
+@pytest.mark.slow
 def test_the_expert_hits_almost_always(shoves):
     worlds = [World(50_000 + seed, shoves) for seed in range(60)]
     for world in worlds:
@@ -69,6 +70,7 @@ def test_the_expert_hits_almost_always(shoves):
     assert all(1.5 < w.state.time_s <= TIMEOUT_S for w in worlds)
 
 
+@pytest.mark.slow
 def test_the_experts_actions_vary_within_the_recordings_range():
     worlds = [World(seed, shoves=2) for seed in range(40)]
     actions = np.concatenate([drive(w) for w in worlds])
