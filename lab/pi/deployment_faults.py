@@ -391,23 +391,18 @@ def break_deployments(
     layers: Sequence[Path],
     artifacts: Mapping[str, Path],
     *,
-    only: str = "",
-    workers: int = WORKERS,
     done: Callable[[dict[str, Any]], object] = lambda row: None,
     say: Say = lambda text: None,
 ) -> list[dict[str, Any]]:
-    """Every fault whose name contains `only`, each on one of so many rovers; their rows, in the order of FAULTS.
+    """Every fault, each on one of a few rovers; their rows, in the order of FAULTS.
 
     layers: of a Container that was provisioned, and is off. A rover with another model gets the first of the artifacts.
-    done: gets each row once it is there, one at a time.
-    Raises EmulationError if no row can be made at all.
+    done: gets each row once it is there, one at a time. Raises EmulationError if no row can be made at all.
     """
-    waiting = [fault for fault in FAULTS if only in fault.name]
-    if not waiting:
-        raise EmulationError(f"no fault has '{only}' in its name; there are: {', '.join(f.name for f in FAULTS)}")
+    waiting = list(FAULTS)
     rows: dict[str, dict[str, Any]] = {}
     telling = threading.Lock()
-    with rovers([f"breaks{i + 1}" for i in range(min(workers, len(waiting)))], layers, artifacts) as benches:
+    with rovers([f"breaks{i + 1}" for i in range(WORKERS)], layers, artifacts) as benches:
 
         def work(bench: DeploymentBench) -> None:
             give_first_model([bench])

@@ -78,7 +78,6 @@ def run(
     folder: Path,
     check: bool = False,
     variables: Mapping[str, Any] | None = None,
-    options: Sequence[str] = (),
     timeout_s: float = 3600,
 ) -> Play:
     """Runs ansible/<book>.yml on hosts, in this order.
@@ -94,7 +93,7 @@ def run(
     (folder / "inventory.ini").write_text(inventory(hosts))
     given = {"rover_command": str(program.with_name("rover")), **(variables or {})}
     command = [program, "-i", folder / "inventory.ini", REPOSITORY / "ansible" / f"{book}.yml"]
-    command += [*(["--check", "--diff"] if check else []), *options, "-e", json.dumps(given)]
+    command += [*(["--check", "--diff"] if check else []), "-e", json.dumps(given)]
     started = time.monotonic()
     with (folder / "output").open("w+b") as output:
         process = subprocess.Popen(

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from lab.params import lab_params
-from lab.pi import container_run, deployment_faults
+from lab.pi import container_run
 from lab.pi.deployment_bench import DeploymentBench, Disk, Line, line_of
 from lab.pi.deployment_faults import FAULTS, wrong_rows
 from lab.pi.emulation import EmulationError
@@ -136,8 +136,3 @@ def test_a_row_may_begin_with_no_release_but_the_one_in_use(tmp_path):
     bench.begin(fresh=True)
     assert [p.name for p in (models / "releases").iterdir()] == names[:1]
     assert (bench.before, bench.target) == ("static", "mixed")
-
-
-def test_a_fault_that_is_not_there_is_told():
-    with pytest.raises(EmulationError, match="no fault has 'earthquake' in its name; there are: power cut"):
-        deployment_faults.break_deployments([Path("/nowhere")], {}, only="earthquake")
