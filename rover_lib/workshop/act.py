@@ -356,7 +356,7 @@ class Attention(Pointwise):
 
 
 class Memory(Pointwise):
-    """What the encoder found, (1, T, D), as all decoder layers' cross-attentions take it: keys' and values' input."""
+    """The encoder's output, (1, T, D), as all decoder layers' cross-attentions take it: keys' and values' input."""
 
     def __init__(self, as_conv: bool):
         super().__init__(as_conv)
@@ -520,8 +520,8 @@ class ACT(nn.Module):
 
     def forward(self, state: Tensor, *frames: Tensor) -> Tensor:
         tokens = [self.latent, self.state_project(self.state_norm(state))[:, None]]
-        for i, look in enumerate(self.image_input):  # by index: FX cannot iterate over frames while it traces
-            x = self.image_project(self.backbone(look(frames[i])))  # (1, D, h, w)
+        for i, image_input in enumerate(self.image_input):  # by index: FX cannot iterate over frames while it traces
+            x = self.image_project(self.backbone(image_input(frames[i])))  # (1, D, h, w)
             tokens.append(x.flatten(2).transpose(1, 2))  # (1, h * w, D)
         x = torch.cat(tokens, 1)
         for layer in self.encoder:

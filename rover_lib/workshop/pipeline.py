@@ -146,7 +146,7 @@ def write_calibrate(
 
 
 def write_quantize(run_dir: Path | str, checkpoint: Checkpoint, metrics: dict[str, Any]) -> None:
-    """quantize.json. metrics: `modes` from `export_policies`, and what choosing found."""
+    """quantize.json. metrics: `modes` from `export_policies`, and the tables of choosing."""
     inputs = {"calibration.pt": sha256_of(Path(run_dir) / "calibration.pt"), "checkpoint": checkpoint.sha256}
     given = params()["quantization"]
     write_stage(Path(run_dir) / "quantize.json", "quantize", params=given, metrics=metrics, inputs=inputs)

@@ -133,7 +133,8 @@ def _published(source: Any, executed: Any, name: str) -> str:
             continue
         ran = outputs.get(cell.id)
         if ran is None or ran.source != cell.source:
-            raise NotebookError(f"{name}: cell '{cell.id}' is not what was executed; execute the run again")
+            what = f"{name}: cell '{cell.id}' is not what was executed"
+            raise NotebookError(what, remedy="execute the run again")
         cell.outputs = [_plain_output(o) for o in ran.outputs if o.get("name") != "stderr"]
         cell.execution_count = None
     return nbformat.writes(source) + "\n"

@@ -179,7 +179,8 @@ def _layer_row(name: str, m: Int8Layer) -> dict[str, Any]:
     }
     for key in ("weight_scale_min", "out_scale"):
         if row[key] is not None and not 0 < row[key] < float("inf"):
-            raise QuantizeError(f"{name}: {key} is {row[key]}; its calibration range is no range")
+            what = f"{name}: its calibration range is no range, {key} is {row[key]}"
+            raise QuantizeError(what, remedy="check the recordings, and calibrate again")
     return row
 
 

@@ -50,6 +50,6 @@ def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:
         )
     if again.parts.episodes != stage["metrics"]["split"]:
         raise RoverError(
-            f"{again.recordings.root}: has other episodes than notebook 01 found", remedy="run notebook 01 again"
+            f"{again.recordings.root}: has other episodes than notebook 01 loaded", remedy="run notebook 01 again"
         )
     return again

@@ -10,9 +10,8 @@ from types import SimpleNamespace
 import nbformat
 import numpy as np
 import pytest
+from executed import printed
 
-from lab.a76 import report
-from lab.params import lab_params
 from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop import progress, publish, session
 from rover_lib.workshop import run as runs
@@ -66,12 +65,12 @@ def test_cells_call_check_and_show(notebook):
         assert imports or len(lines) <= MOST_LINES, f"{cell.id} has {len(lines)} lines"
 
 
-def test_every_notebook_writes_a_figure_and_what_it_found(notebook, path):
+def test_every_notebook_writes_a_figure_and_its_results(notebook, path):
     text = "\n".join(c.source for c in code(notebook))
     assert "plots.save(" in text
     assert bool(re.search(r"write_(stage|load|calibrate|quantize)\(", text)) == (
         path.stem in NAMES
-    )  # afterwards the library writes what is found
+    )  # afterwards the library writes the results
 
 
 def test_committed_outputs_are_clean(notebook, path):
@@ -90,66 +89,6 @@ def test_all_know_the_run_folder():
     assert {"checkpoint", "episodes"} <= parameters_of(PATHS[0])
 
 
-# --- the notebook of counted instructions ---
-
-
-def counted(fewer: float, **changed):
-    """What arm.json says of an artifact, as far as the notebook reads it."""
-    kernels = {"xnn_qs8_qc8w_gemm_minmax_fp32_ukernel_4x16c4__asm_aarch64_neondot_ld128": 1.2 * fewer, "other": 0.2}
-    found = {
-        "instructions_g": 1.2 * fewer + 0.2,
-        "simd_g": 1.0 * fewer,
-        "floor_g": 0.94 * fewer,
-        "gmac": 15.02 * fewer,
-        "image_height": 360,
-        "image_width": 640,
-        "tenth_g": 1.2 * fewer + 0.2,
-        "instructions_by_kernel": kernels,
-        "sdot_by_kernel": {next(iter(kernels)): 0.9 * fewer},
-        "peak_memory_mb": 300,
-        "peak_memory_loading_mb": 300,
-        "frames_on_the_core": 50,
-        "reference": "policy_fp32",
-        "computed_pi5_ms": dict(zip(("low", "high"), report.predicted_ms(fewer, 1.2 * fewer + 0.2), strict=True)),
-    }
-    errors = {f"{where}{action}_mae_pct": 0.1 for where in ("", "workstation_") for action in ("steering", "throttle")}
-    return found | errors | changed
-
-
-def shown(path):
-    cells = nbformat.read(path, as_version=4).cells
-    return "".join(o.text for c in cells if c.cell_type == "code" for o in c.outputs if o.output_type == "stream")
-
-
-def test_counts_are_drawn(tmp_path):
-    small = {key: value for key, value in counted(0.3, image_height=180, image_width=320).items() if "mae" not in key}
-    small |= {"reference": None, "tenth_g": None}
-    artifacts = {"policy_fp32": counted(4), "policy_static": counted(1), "policy_static_180x320": small}
-    peer = {key: value for key, value in counted(1.1).items() if key != "sdot_by_kernel"}
-    metrics = {
-        "label": report.LABEL,
-        "artifacts": artifacts,
-        "peers": {"another runtime": peer},
-        "note": "cannot drive",
-    }
-    metrics["backbone_bits"] = {"frames": 4, "values": 123456, "differing": 0}
-    metrics["gates"] = report.gates(metrics, lab_params()["arm"]["gates"])
-    write_stage(tmp_path / "arm.json", "arm", params={}, metrics=metrics)
-    text = shown(runs.execute("06_arm", tmp_path))
-    assert report.LABEL in text and "cannot drive" in text and "0 of 123,456 INT8 values" in text
-    assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {
-        f"06_{figure}" for figure in ("counted", "by_kernel", "by_size", "computed_times", "gates")
-    }
-
-
-def test_nothing_counted_is_a_sentence(tmp_path):
-    (tmp_path / "mine").mkdir()
-    assert "make arm NAME=mine counts" in shown(runs.execute("06_arm", tmp_path / "mine"))
-    assert {p.name for p in (tmp_path / "mine").iterdir()} == {"06_arm.ipynb"}
-    with pytest.raises(runs.NotebookError, match="not found"):
-        runs.execute("06_arm", tmp_path / "nothing")
-
-
 # --- late plans ---
 
 
@@ -164,9 +103,9 @@ def test_drives_are_drawn(tmp_path, monkeypatch):
     with zipfile.ZipFile(tmp_path / "policy_static.pt", "w") as z:
         z.writestr("archive/code/policy.py", "only this process knows it")
     chosen = {"worlds": 2, "latencies_ms": [0, 150, 600], "pushes": 2, "pushed_latencies_ms": [150], "shown_ms": 150}
-    found = latency.measured(tmp_path, **chosen)
-    text = shown(runs.execute("07_drive", tmp_path, **chosen))
-    assert latency.table(found) in text and "ensembling, 0.01" in text
+    measured = latency.measured(tmp_path, **chosen)
+    text = printed(runs.execute("07_drive", tmp_path, **chosen))
+    assert latency.table(measured) in text and "ensembling, 0.01" in text
     assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {
         f"07_{figure}" for figure in ("age", "hits", "path", "above", "gates")
     }
@@ -194,7 +133,7 @@ def test_rovers_are_drawn(tmp_path):
         (tmp_path / folder).mkdir()
         write_stage(tmp_path / folder / "benchmark-rover1.json", "benchmark", params={}, metrics=metrics)
     (tmp_path / "rovers" / "benchmark-rover2.json").write_text("{")
-    text = shown(runs.execute("05_benchmark", tmp_path / "demo", notebooks=tmp_path / "notebooks"))
+    text = printed(runs.execute("05_benchmark", tmp_path / "demo", notebooks=tmp_path / "notebooks"))
     assert re.search(r"rover1 +static, another +60.0 ", text) and "1 file is left out:\nbenchmark-rover2.json: " in text
     assert {p.stem for p in (tmp_path / "demo" / "figures").glob("*.png")} == {"05_latency", "05_soak"}
 
@@ -225,7 +164,7 @@ def test_a_run_fills_parameters_and_leaves_the_executed_notebook(one_notebook, t
     written(
         one_notebook,
         "01_load",
-        ("parameters", 'run_dir = "."  # here\nworlds = 1  # so many'),
+        ("parameters", 'run_dir = "."  # here\nworlds = 1  # count'),
         ("work", "import pathlib, sys\npathlib.Path(run_dir, 'made').write_text(f'{worlds} {sys.executable}')"),
     )
     folder = runs.run("ck", "episodes", "mine", runs_dir=tmp_path / "runs", notebooks=one_notebook, worlds=7)

@@ -85,10 +85,10 @@ def test_equals_lerobot(name, for_int8, tmp_path):
         batch = {k: torch.from_numpy(normalise(f, mean))[None] for k, f in frames.items()}
         with torch.inference_mode():
             expected = policy.predict_action_chunk(batch | {"observation.state": torch.from_numpy(state)[None]})
-            found = model(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames.values()))
-        assert found.shape == expected.shape
+            ours = model(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames.values()))
+        assert ours.shape == expected.shape
         assert expected.std() > 1e-3  # a constant answer would prove nothing
-        assert (found - expected).abs().max() < 1e-5
+        assert (ours - expected).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY"])
@@ -108,8 +108,8 @@ def test_lerobots_processors_end_up_inside(mode, tmp_path):
     raw = {key: torch.from_numpy(frame).permute(2, 0, 1).float() / 255, "observation.state": torch.from_numpy(state)}
     with torch.inference_mode():
         expected = outer(policy.predict_action_chunk(inner(raw))[0])
-        found = ACT(checkpoint.config, checkpoint.weights)(torch.from_numpy(state)[None], torch.from_numpy(frame))[0]
-    assert (found - expected).abs().max() < 1e-5
+        ours = ACT(checkpoint.config, checkpoint.weights)(torch.from_numpy(state)[None], torch.from_numpy(frame))[0]
+    assert (ours - expected).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -133,9 +133,9 @@ def test_columns_are_the_pixels_where_the_border_can_be_a_colour(mean, std, colu
     for size in ((36, 64), (35, 61), (7, 8)):
         frame = torch.randint(0, 256, (*size, 3), dtype=torch.uint8)
         expected = conv(Pixels(norm)(frame))
-        found = column_conv(conv, norm)(Columns(norm, *size)(frame))
-        assert found.shape == expected.shape
-        gap = (found - expected).abs()
+        ours = column_conv(conv, norm)(Columns(norm, *size)(frame))
+        assert ours.shape == expected.shape
+        gap = (ours - expected).abs()
         assert gap[..., 2:-2, 2:-2].numel() == 0 or gap[..., 2:-2, 2:-2].max() < 1e-5
         assert gap.max() < 0.5 / 255 / min(std) * conv.weight.abs().sum((1, 2, 3)).max() + 1e-5
 
@@ -146,10 +146,10 @@ def test_quantized_columns_are_the_float_ones_exactly(dtype):
     frame = torch.arange(35 * 61 * 3).remainder(256).to(torch.uint8).reshape(35, 61, 3)
     expected = columns(frame)
     columns.dtype = dtype
-    found = columns(frame)
-    assert found.dtype == dtype
-    assert found.is_contiguous(memory_format=torch.channels_last)
-    assert (found.dequantize() - expected).abs().max() < 1e-6
+    ours = columns(frame)
+    assert ours.dtype == dtype
+    assert ours.is_contiguous(memory_format=torch.channels_last)
+    assert (ours.dequantize() - expected).abs().max() < 1e-6
 
 
 def test_cameras_that_are_normalised_differently_keep_the_float_stem():

@@ -173,8 +173,8 @@ def test_the_backbone_alone_gives_the_policys_tokens(tiny, calibration):
     x = inputs(tiny, 1)[0]
     quantized.module(*x)
     hook.remove()
-    found = backbone(*x)
-    assert found.dtype == torch.int8 and torch.equal(found, seen[0]) and found.unique().numel() > 10
+    tokens = backbone(*x)
+    assert tokens.dtype == torch.int8 and torch.equal(tokens, seen[0]) and tokens.unique().numel() > 10
     assert not any(n.startswith("encoder") for n, _ in backbone.named_modules())
     for mode in ({"mode": "dynamic"}, {"mode": "mixed", "float_blocks": ("image_project",)}):
         with pytest.raises(QuantizeError, match="no INT8 backbone"):

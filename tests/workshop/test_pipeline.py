@@ -1,0 +1,49 @@
+"""The pipeline once: what the command line makes is what a run makes."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+from policies import memory_samples
+
+from rover_lib.onboard.artifact import content_hash, read_manifest
+from rover_lib.onboard.params import params
+from rover_lib.workshop.observe import calibrate
+from rover_lib.workshop.pipeline import Recipe, export_policies, make_artifact
+from rover_lib.workshop.quantize import quantize
+from rover_lib.workshop.session import Opened
+
+
+@pytest.fixture
+def loaded(tiny):
+    parts = SimpleNamespace(calibration=tuple(memory_samples(4)), choosing=tuple(memory_samples(3, seed=1)))
+    return Opened(tiny, None, parts)
+
+
+def test_the_recipe_is_what_params_yml_says():
+    p = params()
+    recipe = Recipe.of(p)
+    assert (recipe.samples, recipe.seed) == (p["calibration"]["samples"], p["calibration"]["seed"])
+    assert (recipe.scheme.kind, recipe.scheme.smooth) == (p["quantization"]["scheme"], p["quantization"]["smooth"])
+    assert (recipe.parity.tolerance, recipe.parity.vectors) == (p["parity"]["fp32"], p["parity"]["vectors"])
+    assert Recipe.of(p, samples=7).samples == 7
+
+
+def test_one_artifact_is_the_one_of_a_run(loaded, tiny, tmp_path):
+    recipe = Recipe.of(params())
+    digest, warnings = make_artifact(loaded, tmp_path / "one.pt", recipe)
+    assert warnings[0].startswith(f"asked for {recipe.samples} calibration samples")
+    chosen, _ = recipe.choose(loaded.parts.calibration)
+    calibration = calibrate(tiny, chosen, smooth=recipe.scheme.smooth)
+    policies = {"static": quantize(tiny, recipe.scheme, calibration)}
+    modes = export_policies(tmp_path, tiny, policies, calibration, loaded.parts.choosing, recipe.parity)
+    assert modes["static"]["content_hash"] == digest == content_hash(tmp_path / "policy_static.pt")
+    assert modes["static"]["scheme"]["mode"] == "static" and modes["static"]["int8_modules"] > 0
+
+
+def test_fp32_needs_no_calibration(loaded, tmp_path):
+    recipe = replace(Recipe.of(params()), samples=2)
+    digest, warnings = make_artifact(loaded, tmp_path / "fp32.pt", recipe, fp32=True)
+    manifest = read_manifest(tmp_path / "fp32.pt")
+    assert (manifest["mode"], manifest["calibration"], warnings) == ("fp32", None, [])
+    assert digest == content_hash(tmp_path / "fp32.pt")
