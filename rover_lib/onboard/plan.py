@@ -20,6 +20,7 @@ from rover_lib.onboard.errors import ParamsError, PolicyError
 STEERING, THROTTLE = 0, 1
 ROUNDING = 1e-6  # of times, in steps
 LIMITS = np.array([[-1.0, 0.0], [1.0, 1.0]])  # lowest and highest [steering, throttle]
+IN_FORCE_S = 0.15  # of a command: after that the Arduino stops a car that hears no other
 OVERSHOOT = 0.25  # a learned action may be a little beyond an end, as a transmitter is: it is clipped
 
 
@@ -204,10 +205,11 @@ class Commanded:
         """(2,) float32 [steering, throttle]: the policy's state for a frame captured then; neutral at the start.
 
         In training a frame's state is the action of the frame before it, which is the control nearest to that frame
-        in time (episodes.py). So it is the command nearest to one step before the capture, if it is within one.
+        in time (episodes.py). So it is the command nearest to one step before the capture, if that was in force then:
+        not more than a step later, and not so old that the Arduino had stopped the car.
         """
         before_s = captured_s - 1 / rate_hz
         nearest = min(tuple(self._sent), key=lambda c: abs(c[0] - before_s), default=None)
-        if nearest is None or nearest[0] - before_s > 1 / rate_hz:
+        if nearest is None or not -1 / rate_hz <= before_s - nearest[0] <= IN_FORCE_S:
             return np.zeros(2, np.float32)
         return np.array(nearest[1:], np.float32)

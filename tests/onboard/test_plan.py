@@ -182,6 +182,15 @@ def test_the_state_is_what_was_commanded_a_step_before():
     assert commanded.state(0.0, RATE).tolist() == [0.0, 0.0]  # before the first command: neutral
 
 
+def test_a_command_that_is_no_longer_in_force_is_no_state():
+    """The Arduino stops a car 150 ms after its last command: what was commanded before is not what the car does."""
+    commanded = Commanded()
+    commanded.add(1.0, 0.5, 0.3)
+    assert commanded.state(1.0 + STEP + 0.149, RATE).tolist() == pytest.approx([0.5, 0.3])  # a loop of 10 Hz, say
+    assert commanded.state(1.0 + STEP + 0.151, RATE).tolist() == [0.0, 0.0]
+    assert commanded.state(60.0, RATE).tolist() == [0.0, 0.0]
+
+
 def test_settings_of_params():
     settings = Settings.of(params()["drive"])
     assert settings.fade_s < settings.stop_s <= 32 / RATE
