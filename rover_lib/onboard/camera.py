@@ -13,7 +13,7 @@ import stat
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from itertools import takewhile
 from operator import itemgetter
@@ -31,6 +31,7 @@ JPEG_MOST = 8_000_000  # bytes; a stream without an end for so long is none
 PICTURES = (".jpg", ".jpeg", ".png")
 
 Read = tuple[np.ndarray, float | None]  # a picture, and when it was captured if the camera says so
+Reader = Generator[Read, None, None]
 
 
 class CameraError(RoverError):
@@ -94,8 +95,8 @@ class Camera:
         try:
             if self.wait(0, FIRST_FRAME_S) is None:
                 raise CameraError(
-                    f"{self.source}: no frame within {FIRST_FRAME_S:g} s; is it a camera, and does no other program "
-                    "use it? ('rover doctor' looks at all of them)"
+                    f"{self.source}: no frame within {FIRST_FRAME_S:g} s",
+                    remedy="is it a camera, and does no other program use it? ('rover doctor' looks at all of them)",
                 )
         except BaseException:
             self.close()
@@ -139,7 +140,7 @@ class Camera:
                 return None
             return (frame.number - 1) / (frame.captured_s - self._first_s)
 
-    def _read(self, reader: Iterator[Read]) -> None:
+    def _read(self, reader: Reader) -> None:
         before, repeats, number = None, 0, 0
         try:
             with contextlib.closing(reader):
@@ -148,14 +149,14 @@ class Camera:
                         return
                     now = self._clock()
                     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-                        raise CameraError(f"{self.source}: a frame must be (h, w, 3) uint8, found {image.shape}")
+                        raise CameraError(f"{self.source}: a frame must be (h, w, 3) uint8", found=image.shape)
                     if self._frame and image.shape != self._frame.image.shape:
                         (h, w), (h0, w0) = image.shape[:2], self._frame.image.shape[:2]
                         raise CameraError(
-                            f"{self.source}: the picture changed from {w0}x{h0} to {w}x{h}; is another program using "
-                            "the camera?"
+                            f"{self.source}: the picture changed from {w0}x{h0} to {w}x{h}",
+                            remedy="is another program using the camera?",
                         )
-                    seen = zlib.crc32(image)
+                    seen = zlib.crc32(image.data)
                     repeats = repeats + 1 if seen == before else 0
                     before, number = seen, number + 1
                     # A camera's own time counts if it is of this clock; some drivers give none, or of another.
@@ -166,24 +167,28 @@ class Camera:
                         self._frame = frame
                         self._first_s = self._first_s or frame.captured_s
                         self._changed.notify_all()
-                raise CameraError(f"{self.source}: it ended after {number} frames; is the camera unplugged?")
+                raise CameraError(f"{self.source}: it ended after {number} frames", remedy="is the camera unplugged?")
         except CameraError as error:
             failure = error
         except Exception as error:  # whatever a driver does, the car must learn of it
-            failure = CameraError(f"{self.source}: reading failed ({type(error).__name__}: {error}); check the camera")
+            failure = CameraError(
+                f"{self.source}: reading failed ({type(error).__name__}: {error})", remedy="check the camera"
+            )
         with self._changed:
             self._failure = failure
             self._changed.notify_all()
 
 
-def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Iterator[Read]:
+def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:
     if source.isdigit():
         source = f"/dev/video{source}"
     path = Path(source)
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        raise CameraError(f"{source}: no such camera ({error.strerror}); 'rover doctor' lists those that are") from None
+        raise CameraError(
+            f"{source}: no such camera ({error.strerror})", remedy="'rover doctor' lists those that are"
+        ) from None
     if stat.S_ISCHR(mode):
         return _v4l2(source, size, rate_hz)
     if stat.S_ISFIFO(mode):
@@ -195,11 +200,13 @@ def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threadi
     return _video(path, rate_hz, closing)
 
 
-def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Iterator[Read]:
+def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
     device = cv2.VideoCapture(source, cv2.CAP_V4L2)
     try:
         if not device.isOpened():
-            raise CameraError(f"{source}: cannot be opened; is the user in group video, and does nobody else use it?")
+            raise CameraError(
+                f"{source}: cannot be opened", remedy="is the user in group video, and does nobody else use it?"
+            )
         device.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))  # raw pictures do not fit USB 2 at 30 Hz
         device.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
         device.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
@@ -208,17 +215,19 @@ def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Iterator[Read]:
         while True:
             ok, image = device.read()
             if not ok:
-                raise CameraError(f"{source}: gives no more frames; is the camera unplugged?")
+                raise CameraError(f"{source}: gives no more frames", remedy="is the camera unplugged?")
             yield image, device.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the driver's time of the buffer, monotonic
     finally:
         device.release()
 
 
-def _video(path: Path, rate_hz: float, closing: threading.Event) -> Iterator[Read]:
+def _video(path: Path, rate_hz: float, closing: threading.Event) -> Reader:
     device = cv2.VideoCapture(str(path))
     try:
         if not device.isOpened():
-            raise CameraError(f"{path}: no video that OpenCV can read; give /dev/videoN, a video, a folder or a FIFO")
+            raise CameraError(
+                f"{path}: no video that OpenCV can read", remedy="give /dev/videoN, a video, a folder or a FIFO"
+            )
         own_hz = device.get(cv2.CAP_PROP_FPS)
         images = map(itemgetter(1), takewhile(itemgetter(0), iter(device.read, None)))
         yield from _paced(images, own_hz if 1 <= own_hz <= 240 else rate_hz, closing)
@@ -226,16 +235,18 @@ def _video(path: Path, rate_hz: float, closing: threading.Event) -> Iterator[Rea
         device.release()
 
 
-def _folder(path: Path, rate_hz: float, closing: threading.Event) -> Iterator[Read]:
+def _folder(path: Path, rate_hz: float, closing: threading.Event) -> Reader:
     folder = path / "frames" if (path / "frames").is_dir() else path
     files = sorted(f for f in folder.iterdir() if f.suffix.lower() in PICTURES)
     if not files:
-        raise CameraError(f"{folder}: no pictures in it ({', '.join(PICTURES)}); give /dev/videoN or another folder")
+        raise CameraError(
+            f"{folder}: no pictures in it ({', '.join(PICTURES)})", remedy="give /dev/videoN or another folder"
+        )
     pictures = (cv2.imread(str(f), cv2.IMREAD_COLOR) for f in files)
     return _paced((p for p in pictures if p is not None), rate_hz, closing)
 
 
-def _paced(images: Iterator[np.ndarray], rate_hz: float, closing: threading.Event) -> Iterator[Read]:
+def _paced(images: Iterator[np.ndarray], rate_hz: float, closing: threading.Event) -> Reader:
     """Pictures that are all there, at a camera's rate."""
     start = time.monotonic()
     for i, image in enumerate(images):
@@ -244,7 +255,7 @@ def _paced(images: Iterator[np.ndarray], rate_hz: float, closing: threading.Even
         yield image, None
 
 
-def _fifo(path: Path, closing: threading.Event) -> Iterator[Read]:
+def _fifo(path: Path, closing: threading.Event) -> Reader:
     """JPEGs from a FIFO, the last of those that are there; its end is the end of the camera."""
     for image in _decoded(_split(_pieces(path, closing), newest=True)):
         yield image, None
@@ -288,7 +299,9 @@ def _split(pieces: Iterator[bytes], newest: bool = False) -> Iterator[bytes]:
         if last is not None:
             yield last
         if len(pending) > JPEG_MOST:
-            raise CameraError(f"no JPEG in {JPEG_MOST / 1e6:g} MB of the stream; write JPEGs one after another")
+            raise CameraError(
+                f"no JPEG in {JPEG_MOST / 1e6:g} MB of the stream", remedy="write JPEGs one after another"
+            )
 
 
 def _decoded(jpegs: Iterator[bytes]) -> Iterator[np.ndarray]:

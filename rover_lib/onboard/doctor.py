@@ -40,7 +40,8 @@ MEMORY_MB = 700  # the real policy has 436 resident while predicting, the loop's
 RECORDINGS_MB = 1000  # a quarter of an hour at 30 Hz
 EARLIEST_S = 1_735_689_600  # 2025: a Pi without a network starts in its past
 
-# Of linux/videodev2.h
+# Of linux/videodev2.h. Three questions to the kernel: linuxpy, which asks them too, would be one more package to pin
+# and hash on every rover, and v4l2-ctl one more to install.
 VIDIOC_QUERYCAP, CAPABILITY = 0x80685600, struct.Struct("<16s32s32sIII12x")
 VIDIOC_ENUM_FMT, FORMAT = 0xC0405602, struct.Struct("<III32sI16x")
 VIDIOC_ENUM_FRAMESIZES, FRAME_SIZE = 0xC02C564A, struct.Struct("<III6I8x")
@@ -109,10 +110,14 @@ def examine(
         try:
             yield from check()
         except RoverError as error:
-            found, _, remedy = str(error).rpartition("; ")
-            yield Check(name, "fail", found or remedy, remedy if found else "")
+            yield Check(name, "fail", _found(error), error.remedy)
         except Exception as error:
             yield Check(name, "fail", f"could not be checked: {type(error).__name__}: {error}", "report this, please")
+
+
+def _found(error: RoverError) -> str:
+    """An error without its remedy, which a check has apart."""
+    return error.what if error.found is None else f"{error.what}, found {error.found}"
 
 
 def access(name: str, device: Path, group: str) -> Iterator[Check]:
@@ -126,7 +131,8 @@ def access(name: str, device: Path, group: str) -> Iterator[Check]:
             group = grp.getgrgid(device.stat().st_gid).gr_name
         except KeyError:
             group = str(device.stat().st_gid)
-        what, verdict = f"{user} may not use {device}, which belongs to group {group}", "fail"
+        what = f"{user} may not use {device}, which belongs to group {group}"
+        verdict: Verdict = "fail"
     else:
         if os.geteuid() == 0 or group in _groups():
             yield Check(name, "ok", f"{user} is in it" if os.geteuid() else f"{user} needs no group")
@@ -250,9 +256,8 @@ def camera_rate(
             while (left := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, left)):
                 last = frame
     except RoverError as error:
-        found, _, remedy = str(error).rpartition("; ")
         used = f"; used by {', '.join(users)}" if users else ""
-        yield Check("camera", "fail", f"{found}{used}", f"end {users[0]}" if users else remedy)
+        yield Check("camera", "fail", f"{_found(error)}{used}", f"end {users[0]}" if users else error.remedy)
         return
     number = last.number - first.number
     measured_hz = number / (last.captured_s - first.captured_s) if number and last.captured_s > first.captured_s else 0
@@ -300,8 +305,8 @@ def arduino(
         yield Check("Arduino", "fail", f"{port}: used by {', '.join(users)}", f"end {users[0]}")
         return
     with ServoLink(port, boot_s=boot_s) as link:
-        hello = link.hello
-        yield Check("Arduino", "ok", f"{port}: firmware {hello.firmware}, protocol {PROTOCOL_VERSION}")
+        firmware = link.hello.firmware if link.hello else "unknown"
+        yield Check("Arduino", "ok", f"{port}: firmware {firmware}, protocol {PROTOCOL_VERSION}")
         times_ms = [link.round_trip_s() * 1000 for _ in range(ROUND_TRIPS)]
         median_ms, most_ms = statistics.median(times_ms), max(times_ms)
         found = f"round trip {median_ms:.1f} ms median, {most_ms:.1f} ms at most of {ROUND_TRIPS}"
@@ -318,6 +323,7 @@ def arduino(
 
 def _transmitter(link: ServoLink) -> Check:
     end, silent = time.monotonic() + SIGNAL_S, ["steering", "throttle"]
+    pulses: dict[str, int | None] = {}
     while time.monotonic() < end and silent:
         if telemetry := link.latest():
             pulses = {"steering": telemetry.receiver_steering_us, "throttle": telemetry.receiver_throttle_us}
@@ -329,7 +335,8 @@ def _transmitter(link: ServoLink) -> Check:
             "transmitter", "fail", found, "switch it on, then look at the receiver's wires (firmware/README.md)"
         )
     found = f"steering {pulses['steering']} us, throttle {pulses['throttle']} us"
-    if abs(pulses["throttle"] - link.calibration.throttle.pulse_us(0.0)) > REST_US:
+    throttle_us = pulses["throttle"]
+    if throttle_us is not None and abs(throttle_us - link.calibration.throttle.pulse_us(0.0)) > REST_US:
         return Check("transmitter", "warning", f"{found}: arming will be refused", "let go of the throttle stick")
     return Check("transmitter", "ok", found)
 

@@ -1,4 +1,8 @@
-"""What the machine says about itself: temperature, clock, throttling, memory. What it cannot tell is None, not 0."""
+"""What the machine says about itself: temperature, clock, throttling, memory. What it cannot tell is None, not 0.
+
+Read from /proc and /sys: psutil would be a compiled package to pin and hash on every rover, and knows neither a
+process's peak memory on Linux nor what a Raspberry Pi's firmware throttles.
+"""
 
 import os
 import resource

@@ -111,7 +111,7 @@ class Planner:
             return
         plan = self.wait(FRESH_S, after=number)
         if not plan or plan.number == number:
-            raise PolicyError(f"no fresh plan within {FRESH_S:g} s; is this machine too busy?")
+            raise PolicyError(f"no fresh plan within {FRESH_S:g} s", remedy="is this machine too busy?")
 
     @property
     def asking_s(self) -> float:
@@ -214,24 +214,34 @@ class PolicyProcess:
 
         Raises PolicyError with what the policy raised, or if its process has ended.
         """
-        frame = np.ascontiguousarray(frame_bgr)
+        pipe, frame = self._open_pipe(), np.ascontiguousarray(frame_bgr)
         try:
-            self._pipe.send_bytes(_REQUEST.pack(*frame.shape[:2], *map(float, state)))
-            self._pipe.send_bytes(frame.data.cast("B"))
+            pipe.send_bytes(_REQUEST.pack(*frame.shape[:2], *map(float, state)))
+            pipe.send_bytes(frame.data.cast("B"))
         except (OSError, ValueError) as error:
             raise self._ended() from error
         answer = self._answer(None)
         return np.frombuffer(answer, np.float32).reshape(-1, 2)
 
+    def _open_pipe(self) -> Connection:
+        if self._pipe is None:
+            raise PolicyError(
+                f"{self.artifact}: its process was not started", remedy="use it as `with PolicyProcess(...) as policy:`"
+            )
+        return self._pipe
+
     def _answer(self, timeout_s: float | None) -> bytes:
+        pipe = self._open_pipe()
         end = None if timeout_s is None else time.monotonic() + timeout_s
         try:
-            while not self._pipe.poll(POLL_S):
+            while not pipe.poll(POLL_S):
                 if self._closing.is_set():
                     raise PolicyError(f"{self.artifact}: the policy was closed")
                 if end and time.monotonic() > end:
-                    raise PolicyError(f"{self.artifact}: not loaded within {timeout_s:g} s; is the memory full?")
-            answer = self._pipe.recv_bytes()
+                    raise PolicyError(
+                        f"{self.artifact}: not loaded within {timeout_s:g} s", remedy="is the memory full?"
+                    )
+            answer = pipe.recv_bytes()
         except (EOFError, OSError) as error:
             raise self._ended() from error
         if answer[:1] == b"!":
@@ -239,11 +249,12 @@ class PolicyProcess:
         return answer[1:]
 
     def _ended(self) -> PolicyError:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(END_S)
-        code = self._process.returncode
+        code = None
+        if self._process:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                code = self._process.wait(END_S)
         how = signal.Signals(-code).name if code and code < 0 else f"exit code {code}"
-        return PolicyError(f"{self.artifact}: the policy's process ended ({how}); is there enough memory?")
+        return PolicyError(f"{self.artifact}: the policy's process ended ({how})", remedy="is there enough memory?")
 
 
 def late(predict: Predict, latency_s: float) -> Predict:
@@ -273,8 +284,8 @@ def serve(pipe: Connection, artifact: str, threads: int) -> None:
             names = list(policy.state_names), list(policy.action_names)
             if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
                 raise PolicyError(
-                    f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}; this car "
-                    "has one camera, steering and throttle"
+                    f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}",
+                    remedy="this car has one camera, steering and throttle",
                 )
         except RoverError as error:
             return pipe.send_bytes(b"!" + str(error).encode())

@@ -144,7 +144,7 @@ def drive(
         report.ended = sentence_of(error)
         log.event(report.ended, level=logging.ERROR)
         if isinstance(error, RoverError) and not isinstance(error, (DriveFault, TakenOver)) and loop.armed:
-            raise DriveFault(report.ended) from error
+            raise DriveFault(error.what, found=error.found, remedy=error.remedy) from error
         raise
     else:
         stopped = loop.neutral()

@@ -75,7 +75,9 @@ class PolicyPilot:
         end = time.monotonic() + FIRST_PLAN_S
         while self._planner.wait(0.1) is None and not stop.is_set():
             if time.monotonic() > end:
-                raise PolicyError(f"no plan within {FIRST_PLAN_S:g} s; does 'rover benchmark' run on this artifact?")
+                raise PolicyError(
+                    f"no plan within {FIRST_PLAN_S:g} s", remedy="does 'rover benchmark' run on this artifact?"
+                )
 
     def order(self, now_s: float) -> Order | None:
         frame = self._camera.latest()
@@ -130,7 +132,9 @@ class PolicyPilot:
             return
         self._black_s = captured_s if self._black_s is None else self._black_s
         if captured_s - self._black_s >= (self._settings.black_frames - 1.5) * period_s:
-            raise DriveFault(f"the camera's picture is black (mean {mean:.1f} of 255); is there a cap on the lens?")
+            raise DriveFault(
+                f"the camera's picture is black (mean {mean:.1f} of 255)", remedy="is there a cap on the lens?"
+            )
 
 
 class ReplayPilot:

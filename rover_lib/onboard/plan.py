@@ -47,7 +47,7 @@ class Settings:
     def __post_init__(self):
         def must(holds: bool, what: str) -> None:
             if not holds:
-                raise ParamsError(f"drive: {what}; look at the section 'drive' of params.yml")
+                raise ParamsError(f"drive: {what}", remedy="look at the section 'drive' of params.yml")
 
         for name in ("fade_s", "stop_s", "throttle_limit", "black_level"):
             value = getattr(self, name)
@@ -68,7 +68,7 @@ class Settings:
         """From a mapping such as params.yml's; overrides that are not None win. ParamsError for unknown names."""
         known = {f.name for f in fields(cls)}
         if unknown := sorted(set(section) - known):
-            raise ParamsError(f"drive: unknown {unknown}, known are {sorted(known)}; look at params.yml")
+            raise ParamsError(f"drive: unknown {unknown}, known are {sorted(known)}", remedy="look at params.yml")
         return cls(**{**section, **{k: v for k, v in overrides.items() if v is not None}})
 
 
@@ -89,13 +89,16 @@ class Plan:
     def __post_init__(self):
         actions = np.asarray(self.actions, float)
         if actions.ndim != 2 or actions.shape[1] != 2 or len(actions) == 0:
-            raise PolicyError(f"a plan must be (chunk, 2) actions, found {actions.shape}; is it a policy of this car?")
+            raise PolicyError(
+                "a plan must be (chunk, 2) actions", found=actions.shape, remedy="is it a policy of this car?"
+            )
         if not np.isfinite(actions).all():
-            raise PolicyError(f"plan {self.number} is not finite; stop the car and quantize again")
+            raise PolicyError(f"plan {self.number} is not finite", remedy="stop the car and quantize again")
         if (actions < LIMITS[0] - OVERSHOOT).any() or (actions > LIMITS[1] + OVERSHOOT).any():
             raise PolicyError(
                 f"plan {self.number} has actions from {actions.min(0).round(3).tolist()} to "
-                f"{actions.max(0).round(3).tolist()}, outside the range of a servo; stop the car"
+                f"{actions.max(0).round(3).tolist()}, outside the range of a servo",
+                remedy="stop the car",
             )
         object.__setattr__(self, "actions", np.clip(actions, *LIMITS))
 
@@ -179,11 +182,12 @@ class Follower:
         return self._meant(now_s) + self._offset * max(0.0, left)
 
     def _meant(self, now_s: float) -> np.ndarray:
+        newest = self._plans[-1]
         if self.settings.ensemble is None:
-            return self.plan.at(self._step(self.plan, now_s))
+            return newest.at(self._step(newest, now_s))
         # As LeRobot's ACTTemporalEnsembler: exp(-coefficient * i), i = 0 is the oldest plan that reaches until now.
         steps = [(p, self._step(p, now_s)) for p in self._plans]
-        reach = [p.at(step) for p, step in steps if step < len(p.actions) - 1 + ROUNDING] or [self.plan.at(math.inf)]
+        reach = [p.at(step) for p, step in steps if step < len(p.actions) - 1 + ROUNDING] or [newest.at(math.inf)]
         weights = np.exp(-self.settings.ensemble * np.arange(len(reach)))
         return np.average(reach, axis=0, weights=weights)
 

@@ -17,13 +17,15 @@ NEUTRAL = (0.0, 0.0)  # (steering, throttle): straight and stopped
 def _finite(value: object, what: str) -> float:
     """`value` as a float. Raises PwmError for None, strings, booleans, NaN and infinities."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise PwmError(f"{what} must be a number, found {type(value).__name__} {value!r}: send neutral instead")
+        raise PwmError(
+            f"{what} must be a number", found=f"{type(value).__name__} {value!r}", remedy="send neutral instead"
+        )
     try:
         found = float(value)
     except OverflowError:
         found = math.inf
     if not math.isfinite(found):
-        raise PwmError(f"{what} must be finite, found {found}: send neutral and look at what computed it")
+        raise PwmError(f"{what} must be finite", found=found, remedy="send neutral and look at what computed it")
     return found
 
 
@@ -48,11 +50,14 @@ class Channel:
         if self.period_us <= 0 or self.span_pct <= 0 or not self.low <= 0 <= self.high or self.low == self.high:
             raise PwmError(
                 f"{self.name}: period {self.period_us} us, span {self.span_pct} %, range "
-                f"{self.low} to {self.high} is no servo channel: period and span must be above 0"
+                f"{self.low} to {self.high} is no servo channel",
+                remedy="period and span must be above 0",
             )
         ends = self.neutral_pct + self.span_pct * self.low, self.neutral_pct + self.span_pct * self.high
         if ends[0] <= 0 or ends[1] >= 100:
-            raise PwmError(f"{self.name}: its ends are {ends[0]:.2f} % and {ends[1]:.2f} % of a period: must be inside")
+            raise PwmError(
+                f"{self.name}: its ends must be inside a period", found=f"{ends[0]:.2f} % and {ends[1]:.2f} % of it"
+            )
 
     @property
     def us_per_unit(self) -> float:
@@ -69,7 +74,9 @@ class Channel:
         action = _finite(action, self.name)
         if not self.low <= action <= self.high:
             raise PwmError(
-                f"{self.name} must be in [{self.low:g}, {self.high:g}], found {action:g}: clip the plan first"
+                f"{self.name} must be in [{self.low:g}, {self.high:g}]",
+                found=f"{action:g}",
+                remedy="clip the plan first",
             )
         return round((self.neutral_pct + self.span_pct * action) / 100 * self.period_us)
 
@@ -128,7 +135,9 @@ class PwmCalibration:
     def channel(self, action_name: str) -> Channel:
         """The channel of "steering" or "throttle". Raises PwmError for other names."""
         if action_name not in ("steering", "throttle"):
-            raise PwmError(f"no servo channel for action {action_name!r}: this rover has steering and throttle")
+            raise PwmError(
+                f"no servo channel for action {action_name!r}", remedy="this rover has steering and throttle"
+            )
         return getattr(self, action_name)
 
     def pulses(self, steering: float, throttle: float) -> Pulses:

@@ -156,14 +156,15 @@ class Recorder:
         needed = SPARE_BYTES + rows
         if self._most_bytes is not None and self._most_bytes - rows - self._writer.picture_bytes < LEAST_BYTES:
             raise EpisodeError(
-                f"{self.folder.parent}: no room is left of what episodes may take here: fetch them with "
-                "ansible/drive.yml, or delete some"
+                f"{self.folder.parent}: no room is left of what episodes may take here",
+                remedy="fetch them with ansible/drive.yml, or delete some",
             )
         disk = os.statvfs(self.folder.parent)
         if (free := disk.f_bavail * disk.f_frsize) < needed:
             raise EpisodeError(
                 f"{self.folder.parent}: the disk is as good as full ({free / 1e6:.1f} MB free, {needed / 1e6:.1f} are "
-                "kept in reserve): make room, or name a folder on another one"
+                "kept in reserve)",
+                remedy="make room, or name a folder on another one",
             )
 
     def _run(self) -> None:
@@ -197,7 +198,9 @@ class Recorder:
             now = self._clock()
             if frame is None:
                 if now - last_s > SILENT_S:
-                    raise EpisodeError(f"{self._camera.source}: no frame for {SILENT_S:g} s: is the camera plugged in?")
+                    raise EpisodeError(
+                        f"{self._camera.source}: no frame for {SILENT_S:g} s", remedy="is the camera plugged in?"
+                    )
                 continue
             seen, last_s = frame.number, now
             if frame.captured_s - captured_s < self._frame_s:
@@ -299,7 +302,9 @@ def record(
             try:
                 said = link.latest()
                 if now - heard_s > SILENT_S:
-                    raise EpisodeError(f"{link.port}: no status for {SILENT_S:g} s: is the Arduino plugged in?")
+                    raise EpisodeError(
+                        f"{link.port}: no status for {SILENT_S:g} s", remedy="is the Arduino plugged in?"
+                    )
             except RoverError as error:
                 recorder.close(str(error))
                 break

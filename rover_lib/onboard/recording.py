@@ -96,7 +96,7 @@ class EpisodeWriter:
         self.controls = self.frames = self.picture_bytes = 0
         self._extra: dict[str, None] = {}  # names of further columns, in order
         self._first_s, self._last_s = math.inf, -math.inf
-        self._temporary: Path | None = None
+        self._temporary: Path | None = None  # while it is open
         self._rows: dict[str, FileIO] = {}
 
     def __enter__(self) -> "EpisodeWriter":
@@ -120,8 +120,8 @@ class EpisodeWriter:
                 temporary.mkdir()
             except FileExistsError:
                 raise EpisodeExists(
-                    f"{self.folder}: is being recorded, or was when its program was killed: name another folder, or "
-                    f"delete {temporary.name}"
+                    f"{self.folder}: is being recorded, or was when its program was killed",
+                    remedy=f"name another folder, or delete {temporary.name}",
                 ) from None
             self._temporary = temporary
             (temporary / "frames").mkdir()
@@ -162,7 +162,9 @@ class EpisodeWriter:
                 row[flag] = action is not None
         if extra:
             if taken := extra.keys() & {*CONTROL_FIELDS, *FLAG_FIELDS}:
-                raise EpisodeError(f"{self.folder.name}: {min(taken)} is no further column: give it another name")
+                raise EpisodeError(
+                    f"{self.folder.name}: {min(taken)} is no further column", remedy="give it another name"
+                )
             row |= plain(extra)
             self._extra |= dict.fromkeys(extra)
         self._append("control", row, row["system_timestamp"])
@@ -170,23 +172,27 @@ class EpisodeWriter:
 
     def frame(self, t_s: float, frame_bgr: np.ndarray) -> None:
         """Add one picture: (height, width, 3) uint8 BGR of that resolution, at system time `t_s`."""
-        self._must_be_open()
+        temporary = self._must_be_open()
         t_s = self._time(t_s)
         if self.resolution is None and isinstance(frame_bgr, np.ndarray) and frame_bgr.ndim == 3:
             self.resolution = frame_bgr.shape[1], frame_bgr.shape[0]
         shape = (self.resolution[1], self.resolution[0], 3) if self.resolution else ("height", "width", 3)
         if not isinstance(frame_bgr, np.ndarray) or frame_bgr.shape != shape or frame_bgr.dtype != np.uint8:
             found = f"{getattr(frame_bgr, 'dtype', type(frame_bgr).__name__)} {getattr(frame_bgr, 'shape', '')}"
-            raise EpisodeError(f"{self.folder.name}: frames must be uint8 {shape}, found {found}: check the camera")
+            raise EpisodeError(
+                f"{self.folder.name}: frames must be uint8 {shape}", found=found, remedy="check the camera"
+            )
         number = self.frames + 1
         relative = f"frames/frame_{number:06d}.jpg"
         ok, jpeg = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         if not ok:
-            raise EpisodeError(f"{self.folder.name}: frame {number} could not be written as JPEG: check the camera")
-        picture = self._temporary / relative
+            raise EpisodeError(
+                f"{self.folder.name}: frame {number} could not be written as JPEG", remedy="check the camera"
+            )
+        picture = temporary / relative
         try:
             with self._disk():
-                picture.write_bytes(jpeg)
+                picture.write_bytes(jpeg.data)
         except EpisodeError:
             with contextlib.suppress(OSError):  # a part of it is no picture, and the episode may go on without
                 picture.unlink()
@@ -197,11 +203,11 @@ class EpisodeWriter:
     def finish(self) -> Path:
         """Makes the folder appear and returns it; leaves nothing where that fails, and says why."""
         try:
-            self._must_be_open()
+            temporary = self._must_be_open()
             with self._disk():
-                self._write()
+                self._write(temporary)
                 self._refuse_existing()  # rename would replace an empty folder without a word
-                self._temporary.rename(self.folder)
+                temporary.rename(self.folder)
             return self.folder
         finally:
             self.discard()
@@ -219,7 +225,9 @@ class EpisodeWriter:
         try:
             line = json.dumps(row, allow_nan=False).encode() + b"\n"
         except (TypeError, ValueError) as e:
-            raise EpisodeError(f"{self.folder.name}: a column cannot be written ({e}): give numbers or text") from None
+            raise EpisodeError(
+                f"{self.folder.name}: a column cannot be written ({e})", remedy="give numbers or text"
+            ) from None
         with self._disk():
             file = self._rows[kind]
             if (written := file.write(line)) < len(line):
@@ -233,16 +241,18 @@ class EpisodeWriter:
             yield
         except OSError as e:
             raise EpisodeError(
-                f"{self.folder}: cannot be written ({e.strerror or e}): make room, or name another folder"
+                f"{self.folder}: cannot be written ({e.strerror or e})", remedy="make room, or name another folder"
             ) from e
 
-    def _must_be_open(self) -> None:
+    def _must_be_open(self) -> Path:
+        """The hidden folder."""
         if self._temporary is None:
-            raise EpisodeError(f"{self.folder.name}: not open: use it as `with EpisodeWriter(...) as writer:`")
+            raise EpisodeError(f"{self.folder.name}: not open", remedy="use it as `with EpisodeWriter(...) as writer:`")
+        return self._temporary
 
     def _whole(self, name: str, value: object) -> int:
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-            raise EpisodeError(f"{self.folder.name}: {name} must be a whole number from 0, found {value!r}")
+            raise EpisodeError(f"{self.folder.name}: {name} must be a whole number from 0", found=f"{value!r}")
         return int(value)
 
     def _time(self, t_s: float) -> float:
@@ -251,19 +261,23 @@ class EpisodeWriter:
         except (TypeError, ValueError, OverflowError):
             found = math.nan
         if not math.isfinite(found):
-            raise EpisodeError(f"{self.folder.name}: a time must be finite seconds, found {t_s!r}: check the clock")
+            raise EpisodeError(
+                f"{self.folder.name}: a time must be finite seconds", found=f"{t_s!r}", remedy="check the clock"
+            )
         return found
 
     def _refuse_existing(self) -> None:
         if os.path.lexists(self.folder):
-            raise EpisodeExists(f"{self.folder}: exists already: name another folder, or move this one away first")
+            raise EpisodeExists(
+                f"{self.folder}: exists already", remedy="name another folder, or move this one away first"
+            )
 
-    def _write(self) -> None:
+    def _write(self, temporary: Path) -> None:
         """The three files, in the hidden folder."""
         if not self.controls or not self.frames:
             raise EpisodeError(
-                f"{self.folder.name}: {self.controls} controls and {self.frames} frames are no "
-                "episode: check that the camera and the Arduino deliver"
+                f"{self.folder.name}: {self.controls} controls and {self.frames} frames are no episode",
+                remedy="check that the camera and the Arduino deliver",
             )
         for file in self._rows.values():
             file.close()
@@ -278,7 +292,7 @@ class EpisodeWriter:
             "duration": duration_s,
             "metadata": {
                 "camera_fps": self.fps,
-                "camera_resolution": list(self.resolution),
+                "camera_resolution": list(self.resolution or ()),
                 "arduino_port": self.arduino_port,
                 "total_control_samples": self.controls,
                 "total_frames": self.frames,
@@ -291,31 +305,32 @@ class EpisodeWriter:
             "control": (*CONTROL_FIELDS, *(FLAG_FIELDS if self.flags else ()), *self._extra),
             "frame": FRAME_FIELDS,
         }
-        with (self._temporary / "episode_data.json").open("w") as f:
+        with (temporary / "episode_data.json").open("w") as f:
             # As json.dumps(episode, indent=2) would, but a row at a time: a long drive does not fit in memory.
             f.write(json.dumps(head, indent=2, allow_nan=False).removesuffix("\n}"))
             for kind in columns:
                 f.write(f',\n  "{kind}_samples": [')
-                for i, row in enumerate(self._read_rows(kind, columns[kind])):
+                for i, row in enumerate(_read_rows(temporary, kind, columns[kind])):
                     fields = json.dumps(row, separators=(",\n      ", ": "))[1:-1]
                     f.write(f"{',' if i else ''}\n    {{\n      {fields}\n    }}")
                 f.write("\n  ]")
             f.write("\n}")
             _to_disk(f)
         for kind in columns:
-            with (self._temporary / f"{kind}_data.csv").open("w", newline="") as f:
+            with (temporary / f"{kind}_data.csv").open("w", newline="") as f:
                 table = csv.DictWriter(f, columns[kind])  # ends lines with CR LF, as the user's recorder did
                 table.writeheader()
-                table.writerows(self._read_rows(kind, columns[kind]))
+                table.writerows(_read_rows(temporary, kind, columns[kind]))
                 _to_disk(f)
         for kind in columns:
-            (self._temporary / f"{kind}.rows").unlink()
+            (temporary / f"{kind}.rows").unlink()
 
-    def _read_rows(self, kind: str, columns: tuple[str, ...]) -> Iterator[dict[str, Any]]:
-        with (self._temporary / f"{kind}.rows").open() as f:
-            for line in f:
-                row = json.loads(line)
-                yield {name: row.get(name) for name in columns}
+
+def _read_rows(folder: Path, kind: str, columns: tuple[str, ...]) -> Iterator[dict[str, Any]]:
+    with (folder / f"{kind}.rows").open() as f:
+        for line in f:
+            row = json.loads(line)
+            yield {name: row.get(name) for name in columns}
 
 
 def _to_disk(file: IO[str]) -> None:
@@ -396,8 +411,8 @@ def read_controls(folder: Path | str, pwm: PwmCalibration | None = None) -> Cont
         steering_us, throttle_us = np.array([pulses[i] for i in keep], np.int64).T
         return Controls(times_s - times_s[0], steering_us, throttle_us, len(rows) - len(keep))
     raise EpisodeError(
-        f"{folder}: no control with both pulses measured in control_data.csv or episode_data.json: give the folder "
-        "of one episode, recorded with the transmitter on"
+        f"{folder}: no control with both pulses measured in control_data.csv or episode_data.json",
+        remedy="give the folder of one episode, recorded with the transmitter on",
     )
 
 

@@ -148,9 +148,11 @@ def state_of(unit: str = UNIT) -> dict[str, Any]:
             ["systemctl", "show", f"--property={','.join(names)}", unit], capture_output=True, text=True, timeout=30
         )
     except (OSError, subprocess.SubprocessError) as error:
-        raise ServiceError(f"systemctl cannot be asked about {unit} ({error}); is this a rover?") from None
+        raise ServiceError(f"systemctl cannot be asked about {unit} ({error})", remedy="is this a rover?") from None
     if found.returncode:
-        raise ServiceError(f"systemctl does not know about {unit}: {' '.join(found.stderr.split())}; is this a rover?")
+        raise ServiceError(
+            f"systemctl does not know about {unit}: {' '.join(found.stderr.split())}", remedy="is this a rover?"
+        )
     told = dict(line.partition("=")[::2] for line in found.stdout.splitlines())
     text = told.get("StatusText", "")
     return {
@@ -171,12 +173,12 @@ def arm_car(unit: str = UNIT, *, timeout_s: float = ARMED_S) -> str:
     if found["active"] != "active" or found["state"] != DISARMED:
         says = found["text"] or "it says nothing"
         remedy = "it drives already" if found["state"] == DRIVING else f"sudo systemctl start {unit}"
-        raise ServiceError(f"{unit} is {found['active']}, not waiting to be armed ({says}); {remedy}")
+        raise ServiceError(f"{unit} is {found['active']}, not waiting to be armed ({says})", remedy=remedy)
     sent = subprocess.run(
         ["systemctl", "kill", "--kill-whom=main", f"--signal={ARM.name}", unit], capture_output=True, text=True
     )
     if sent.returncode:
-        raise ServiceError(f"{unit} cannot be told to arm ({sent.stderr.strip()}); use sudo")
+        raise ServiceError(f"{unit} cannot be told to arm ({sent.stderr.strip()})", remedy="use sudo")
     end = time.monotonic() + timeout_s
     while time.monotonic() < end:
         time.sleep(CHECK_S)
@@ -184,5 +186,7 @@ def arm_car(unit: str = UNIT, *, timeout_s: float = ARMED_S) -> str:
         if now["active"] != "active" or now["state"] == DRIVING or now["text"] != found["text"]:
             break
     if now["active"] != "active" or now["state"] != DRIVING:
-        raise ServiceError(f"{unit} did not arm: {now['text'] or now['active']}; 'rover doctor' says what it needs")
+        raise ServiceError(
+            f"{unit} did not arm: {now['text'] or now['active']}", remedy="'rover doctor' says what it needs"
+        )
     return now["text"]

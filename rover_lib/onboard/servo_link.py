@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from numbers import Integral
+from typing import Any
 
 import serial
 
@@ -160,10 +161,8 @@ def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
     if not (found := _STATUS.fullmatch(text)):
         return None
     boot, uptime, sequence, result, state, reason, *numbers = found.groups()
-    return Telemetry(
-        host_s, int(boot), int(uptime), int(sequence), result, State(state), reason,
-        *(None if n is None else int(n) for n in numbers),
-    )  # fmt: skip
+    values: list[Any] = [None if n is None else int(n) for n in numbers]  # the pattern says which may be None
+    return Telemetry(host_s, int(boot), int(uptime), int(sequence), result, State(state), reason, *values)
 
 
 class ServoLink:
@@ -221,18 +220,23 @@ class ServoLink:
         it speaks another protocol.
         """
         if self._serial:
-            raise LinkError(f"{self.port}: the link is open already; close it first")
+            raise LinkError(f"{self.port}: the link is open already", remedy="close it first")
         try:
             self._serial = serial.Serial(self.port, BAUD, timeout=READ_TIMEOUT_S, exclusive=True)
             self._serial.reset_input_buffer()  # what it said before this reset
         except (*PORT_ERRORS, ValueError) as error:
             self._release()
-            raise LinkError(f"{self.port}: cannot be opened ({error}); is the Arduino plugged in, is the user in group "
-                            "dialout, and does no other program have the port?") from error  # fmt: skip
+            raise LinkError(
+                f"{self.port}: cannot be opened ({error})",
+                remedy="is the Arduino plugged in, is the user in group dialout, and does no other program have the "
+                "port?",
+            ) from error
         self._closing.clear()
         with self._heard:
             self._hello = self._telemetry = self._failure = None
-        self._reader = threading.Thread(target=self._read, name=f"servo link {self.port}", daemon=True)
+        self._reader = threading.Thread(
+            target=self._read, args=(self._serial,), name=f"servo link {self.port}", daemon=True
+        )
         self._reader.start()
         try:
             return self._wait_for_hello()
@@ -254,8 +258,8 @@ class ServoLink:
             now = self._clock()
             if now - opened > self.boot_s:
                 raise LinkError(
-                    f"{self.port}: no hello from an Arduino within {self.boot_s:g} s; is it the rover's, and is the "
-                    f"firmware on it (make flash PORT={self.port})?"
+                    f"{self.port}: no hello from an Arduino within {self.boot_s:g} s",
+                    remedy=f"is it the rover's, and is the firmware on it (make flash PORT={self.port})?",
                 )
             # It was not reset by opening its port if it goes on talking; a boot loader must not be talked to.
             due = SILENT_S if running and running.host_s - opened > SILENT_S / 2 else self.boot_s / 2
@@ -265,7 +269,8 @@ class ServoLink:
         if hello.protocol != PROTOCOL_VERSION:
             raise LinkError(
                 f"{self.port}: the Arduino speaks protocol {hello.protocol} (firmware {hello.firmware}), this program "
-                f"{PROTOCOL_VERSION}; put the matching firmware on it: make flash PORT={self.port}"
+                f"{PROTOCOL_VERSION}",
+                remedy=f"put the matching firmware on it: make flash PORT={self.port}",
             )
         return hello
 
@@ -307,7 +312,9 @@ class ServoLink:
                 continue  # it has just started, and nothing can have come yet
             if telemetry.result in "st":
                 remedy = "switch the transmitter on" if telemetry.result == "s" else "let go of the throttle stick"
-                raise LinkError(f"{self.port}: arming was {RESULTS[telemetry.result]}; {remedy} and try again")
+                raise LinkError(
+                    f"{self.port}: arming was {RESULTS[telemetry.result]}", remedy=f"{remedy} and try again"
+                )
         raise LinkError(f"{self.port}: no answer to arming within {ANSWER_S:g} s; {self._last_words()}")
 
     def neutral(self) -> Telemetry:
@@ -348,7 +355,9 @@ class ServoLink:
             low, high = channel.pulse_us(channel.low), channel.pulse_us(channel.high)
             if isinstance(value, bool) or not isinstance(value, Integral) or not low <= value <= high:
                 raise LinkError(
-                    f"{channel.name} pulse must be whole microseconds from {low} to {high}, found {value!r}: not sent"
+                    f"{channel.name} pulse must be whole microseconds from {low} to {high}",
+                    found=repr(value),
+                    remedy="it was not sent",
                 )
         return self._send(">D", int(steering_us), int(throttle_us))
 
@@ -364,7 +373,7 @@ class ServoLink:
                 raise self._failure
             telemetry = self._telemetry
         if telemetry and (age := self._clock() - telemetry.host_s) > STALE_S:
-            raise LinkError(f"{self.port}: the Arduino said nothing for {age:.1f} s; is it still plugged in?")
+            raise LinkError(f"{self.port}: the Arduino said nothing for {age:.1f} s", remedy="is it still plugged in?")
         return telemetry
 
     def round_trip_s(self) -> float:
@@ -378,7 +387,7 @@ class ServoLink:
             if self._failure:
                 raise self._failure
             if self._hellos == before:
-                raise LinkError(f"{self.port}: no answer within {ANSWER_S:g} s; is it still plugged in?")
+                raise LinkError(f"{self.port}: no answer within {ANSWER_S:g} s", remedy="is it still plugged in?")
             return self._clock() - start
 
     @property
@@ -419,24 +428,24 @@ class ServoLink:
                 with contextlib.suppress(*PORT_ERRORS):
                     port.reset_output_buffer()
         except PORT_ERRORS as error:
-            raise self._fail(f"{self.port}: writing failed ({error}); is it still plugged in?") from error
+            raise self._fail(f"{self.port}: writing failed ({error})") from error
         raise LinkError(f"{self.port}: the port took no data, its buffer is full; the Arduino stops by itself")
 
-    def _fail(self, sentence: str) -> LinkError:
+    def _fail(self, what: str) -> LinkError:
         with self._heard:
-            self._failure = self._failure or LinkError(sentence)
+            self._failure = self._failure or LinkError(what, remedy="is it still plugged in?")
             self._heard.notify_all()
             return self._failure
 
-    def _read(self) -> None:
+    def _read(self, port: serial.Serial) -> None:
         """The reader thread: drains the port as fast as it fills."""
-        port, pending, skipping = self._serial, b"", False
+        pending, skipping = b"", False
         while not self._closing.is_set():
             try:
                 data = port.read(max(1, port.in_waiting))
             except PORT_ERRORS as error:
                 if not self._closing.is_set():
-                    self._fail(f"{self.port}: reading failed ({error}); is it still plugged in?")
+                    self._fail(f"{self.port}: reading failed ({error})")
                 return
             now = self._clock()
             *lines, pending = (pending + data).split(b"\n")

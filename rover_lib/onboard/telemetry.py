@@ -148,8 +148,9 @@ class FlightLog:
     ):
         if max_bytes < MIN_BYTES or keep < 0 or not 0 < flush_s <= 1:
             raise ParamsError(
-                f"a flight log needs max_bytes from {MIN_BYTES}, keep from 0 and flush_s in (0, 1], found {max_bytes}, "
-                f"{keep} and {flush_s}; see params.yml"
+                f"a flight log needs max_bytes from {MIN_BYTES}, keep from 0 and flush_s in (0, 1]",
+                found=f"{max_bytes}, {keep} and {flush_s}",
+                remedy="see params.yml",
             )
         self.path = Path(path) if path is not None else None
         self.start_s = clock()
@@ -469,7 +470,9 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     try:
         files = [p.read_bytes() for p in (*_older(path), path)]
     except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror}); name a file that rover drive wrote") from error
+        raise LogError(
+            f"{path}: cannot be read ({error.strerror})", remedy="name a file that rover drive wrote"
+        ) from error
     drives: list[_Drive] = []
     damaged = 0
     for line in (line for data in files for line in data.split(b"\n") if line):
@@ -477,25 +480,30 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
         if row is None:
             damaged += 1
             continue
-        is_tick, is_header = isinstance(row, list), isinstance(row, dict) and row["kind"] == "header"
-        if is_header and (not drives or drives[-1].begins(row)):
-            drives.append(_Drive(row))
-        elif not drives or (is_tick and not drives[-1].goes_on(row[0])):
+        if isinstance(row, dict) and row["kind"] == "header":
+            if not drives or drives[-1].begins(row):
+                drives.append(_Drive(row))
+            continue
+        if not drives or (isinstance(row, list) and not drives[-1].goes_on(row[0])):
             drives.append(_Drive({}))  # its header was damaged
-        if is_tick:
+        if isinstance(row, list):
             drives[-1].ticks.append(row)
         elif isinstance(row, Event):
             drives[-1].events.append(row)
         elif row["kind"] == "machine":
             drives[-1].machine.append(row)
     if not drives:
-        raise LogError(f"{path}: no line of a flight log in it, {damaged} of something else; name a file that rover "
-                       "drive wrote")  # fmt: skip
+        raise LogError(
+            f"{path}: no line of a flight log in it, {damaged} of something else",
+            remedy="name a file that rover drive wrote",
+        )
     if not -len(drives) <= drive < len(drives):
-        raise LogError(f"{path}: no drive {drive}, it has {len(drives)}; choose from 0 to {len(drives) - 1}, or -1")
+        raise LogError(
+            f"{path}: no drive {drive}, it has {len(drives)}", remedy=f"choose from 0 to {len(drives) - 1}, or -1"
+        )
     chosen = drives[drive]
     if chosen.header.get("schema", SCHEMA) != SCHEMA:
-        raise LogError(f"{path}: of version {chosen.header['schema']}, this program reads {SCHEMA}; update it")
+        raise LogError(f"{path}: of version {chosen.header['schema']}, this program reads {SCHEMA}", remedy="update it")
     columns = zip(*chosen.ticks, strict=True) if chosen.ticks else [()] * len(Tick._fields)
     return Flight(
         path=path,
@@ -614,7 +622,7 @@ class StatusLine:
             text = self._callback()
         except Exception as error:
             text = f"no status: {type(error).__name__}: {error}"
-        if self._terminal:
+        if self._terminal and self._fd is not None:
             with contextlib.suppress(OSError):
                 text = text[: (os.get_terminal_size(self._fd).columns or 80) - 1]
         return self._clear + text
