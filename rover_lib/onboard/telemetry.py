@@ -176,9 +176,7 @@ class FlightLog:
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
         # Of the writing thread alone:
-        self._file: int | None = None
-        self._size = self._header_end = self._part = self._written = 0
-        self._unwritten = b""  # of a batch that the disk did not take
+        self._written = 0  # number of the last tick
         self._failed_since: float | None = None
         self._retry_s = self._machine_s = 0.0
         self._vcgencmd = False
@@ -187,7 +185,10 @@ class FlightLog:
     def __enter__(self) -> "FlightLog":
         self._threads = [threading.Thread(target=self._run_speaker, name="flight log events", daemon=True)]
         if self.path:
-            self._threads.append(threading.Thread(target=self._run_writer, name="flight log", daemon=True))
+            file = _LogFile(self.path, self._header, self._max_bytes, self._keep)
+            self._threads.append(
+                threading.Thread(target=self._run_writer, args=(file,), name="flight log", daemon=True)
+            )
         for thread in self._threads:
             thread.start()
         return self
@@ -220,7 +221,11 @@ class FlightLog:
         self._say_now.set()
 
     def _run_speaker(self) -> None:
-        """The thread that talks to logging."""
+        """The thread that talks to logging.
+
+        Not logging's QueueListener: its stop() waits for ever for a stream that is stuck, and would hold up a drive's
+        end.
+        """
         while True:
             self._say_now.wait()
             self._say_now.clear()
@@ -232,40 +237,39 @@ class FlightLog:
             if closing:
                 return
 
-    def _run_writer(self) -> None:
+    def _run_writer(self, file: "_LogFile") -> None:
         """The thread that writes."""
         self._vcgencmd = shutil.which(self._host.vcgencmd) is not None  # a program that is not there is not started
         while True:
             closing = self._closing.wait(self._flush_s)
             try:
                 if closing or time.monotonic() >= self._retry_s:
-                    self._write_all()
+                    self._write_all(file)
             except Exception as error:
                 self._fail(error)
+                file.close()
             if closing:
-                self._release()
+                file.close()
                 return
 
-    def _write_all(self) -> None:
+    def _write_all(self, file: "_LogFile") -> None:
         """Empty the queues into the file and sync it. OSError if the disk does not take it."""
-        if self._file is None:
-            self._open()
+        file.open()
         if self._failed_since is not None:
             failed_s = round(time.monotonic() - self._failed_since, 1)
             self.event("the flight log is written again", level=logging.WARNING, failed_s=failed_s)
             self._failed_since = None
-        if self._unwritten:
-            self._write(self._unwritten)
+        file.write(file.unwritten)
         if time.monotonic() >= self._machine_s:
             self._machine_s = time.monotonic() + MACHINE_S
-            self._write(self._machine_line())
+            file.write(self._machine_line())
         for queue, line in ((self._ticks, self._tick_lines), (self._events, _event_line)):
             left = len(queue)  # what comes in meanwhile is the next turn's
             while left > 0:
                 rows = [queue.popleft() for _ in range(min(left, BATCH_LINES))]
                 left -= len(rows)
-                self._write(b"".join(self._lines(rows, line)))
-        os.fsync(self._file)
+                file.write(b"".join(self._lines(rows, line)))
+        file.sync()
 
     def _lines(self, rows: Iterable[Any], line: Callable[[Any], bytes]) -> Iterable[bytes]:
         for row in rows:
@@ -293,30 +297,54 @@ class FlightLog:
         row["throttled"] = self._host.throttled() if self._vcgencmd else None
         return _sealed(row)
 
-    def _write(self, data: bytes) -> None:
-        self._unwritten = data
-        if self._size + len(data) > self._max_bytes and self._size > self._header_end:
-            self._release()
+    def _fail(self, error: Exception) -> None:
+        self.failures += 1
+        self.last_error = f"{type(error).__name__}: {error}"
+        self._retry_s = time.monotonic() + RETRY_S
+        if self._failed_since is None:
+            self._failed_since = time.monotonic()
+            text = f"{self.path}: the flight log cannot be written ({self.last_error}); driving goes on without"
+            self._say(logging.WARNING, text)
+
+
+class _LogFile:
+    """The file of a flight log, and its older parts. OSError comes where the disk does not take what is written."""
+
+    def __init__(self, path: Path, header: dict[str, Any], max_bytes: int, keep: int):
+        self._path, self._header, self._max_bytes, self._keep = path, header, max_bytes, keep
+        self._fd: int | None = None
+        self._size = self._header_end = self._part = 0
+        self.unwritten = b""  # of a batch that the disk did not take
+
+    def write(self, lines: bytes) -> None:
+        """Append whole lines; what was not taken is in `unwritten` afterwards."""
+        self.unwritten = lines
+        if not lines:
+            return
+        if self._size + len(lines) > self._max_bytes and self._size > self._header_end:
+            self.close()
             self._shift()
-            self._open()
-        done = os.write(self._file, data)
+        done = os.write(self.open(), lines)
         self._size += done
         # From the start of a line that was cut: whatever file is next has it whole, and none has it twice.
-        self._unwritten = b"" if done == len(data) else data[data.rfind(b"\n", 0, done) + 1 :]
-        if self._unwritten:
+        self.unwritten = b"" if done == len(lines) else lines[lines.rfind(b"\n", 0, done) + 1 :]
+        if self.unwritten:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def _open(self) -> None:
-        path = self.path
+    def open(self) -> int:
+        """The open file, with a header if it is a new part."""
+        if self._fd is not None:
+            return self._fd
+        path = self._path
         path.parent.mkdir(parents=True, exist_ok=True)
         header = _sealed(self._header | {"part": self._part + 1})
         if path.is_file() and path.stat().st_size + len(header) > self._max_bytes:
             self._shift()
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
-        self._size = os.fstat(self._file).st_size
-        if self._size and os.pread(self._file, 1, self._size - 1) != b"\n":
+        fd = self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
+        self._size = os.fstat(fd).st_size
+        if self._size and os.pread(fd, 1, self._size - 1) != b"\n":
             header = b"\n" + header  # ends what a power cut, or a full disk, left of a line
-        if os.write(self._file, header) != len(header):
+        if os.write(fd, header) != len(header):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._size += len(header)
         self._header_end = len(header)
@@ -326,34 +354,29 @@ class FlightLog:
             os.fsync(folder)  # the name of a new file is to survive a power cut too
         finally:
             os.close(folder)
+        return fd
+
+    def sync(self) -> None:
+        """Until what was written is on the disk."""
+        os.fsync(self.open())
+
+    def close(self) -> None:
+        fd, self._fd = self._fd, None
+        if fd is not None:
+            with contextlib.suppress(OSError):
+                os.close(fd)
 
     def _shift(self) -> None:
         """Make room for a new file."""
-        for old in _older(self.path):
+        for old in _older(self._path):
             if int(old.suffix[1:]) >= self._keep:
                 old.unlink()
             else:
-                old.replace(_numbered(self.path, int(old.suffix[1:]) + 1))
+                old.replace(_numbered(self._path, int(old.suffix[1:]) + 1))
         if self._keep:
-            self.path.replace(_numbered(self.path, 1))
+            self._path.replace(_numbered(self._path, 1))
         else:
-            self.path.unlink()
-
-    def _fail(self, error: Exception) -> None:
-        self.failures += 1
-        self.last_error = f"{type(error).__name__}: {error}"
-        self._retry_s = time.monotonic() + RETRY_S
-        if self._failed_since is None:
-            self._failed_since = time.monotonic()
-            text = f"{self.path}: the flight log cannot be written ({self.last_error}); driving goes on without"
-            self._say(logging.WARNING, text)
-        self._release()
-
-    def _release(self) -> None:
-        file, self._file = self._file, None
-        if file is not None:
-            with contextlib.suppress(OSError):
-                os.close(file)
+            self._path.unlink()
 
 
 def _numbered(path: Path, number: int) -> Path:
