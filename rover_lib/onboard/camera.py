@@ -27,7 +27,7 @@ from rover_lib.onboard.errors import RoverError
 FIRST_FRAME_S = 5.0
 CLOSE_S = 1.0
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"  # FF D9 is not in the data of a JPEG: there FF is followed by 00
-JPEG_MOST = 8_000_000  # bytes; a stream without an end for so long is none
+JPEG_MOST = 8_000_000  # bytes; a stream without an end of a picture in so much is none
 PICTURES = (".jpg", ".jpeg", ".png")
 
 Read = tuple[np.ndarray, float | None]  # a picture, and when it was captured if the camera says so
@@ -43,7 +43,7 @@ class Frame:
     """One picture. Nobody writes into it.
 
     image: (h, w, 3) uint8 BGR. captured_s: time.monotonic() (or the camera's clock) at which it was captured, or
-    arrived where the camera does not say. number: 1, 2, ... of this camera. repeats: so many frames before it were the
+    arrived where the camera does not say. number: 1, 2, ... of this camera. repeats: how many frames before it were the
     same, byte for byte. mean: of its pixels, 0 to 255.
     """
 
@@ -128,7 +128,7 @@ class Camera:
 
     @property
     def frames(self) -> int:
-        """So many came until now."""
+        """Count of those that came until now."""
         return self._frame.number if self._frame else 0
 
     @property

@@ -202,7 +202,7 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -
 
     fault = None
     for report in record_episodes(
-        folder=out_dir, rate_hz=hz, status=sys.stderr, say=lambda text: click.echo(text, err=True), **options
+        folder=out_dir, rate_hz=hz, status=sys.stderr, notify=lambda text: click.echo(text, err=True), **options
     ):
         click.echo(str(report))
         fault = report.fault

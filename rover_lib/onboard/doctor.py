@@ -50,7 +50,7 @@ BUFFER_CAPTURE, BUFFER_CAPTURE_PLANES = 1, 9
 DISCRETE = 1
 BIG_ENDIAN = 1 << 31  # of a format's four characters
 MOST_SIZES = 64  # asked for
-MOST_FORMATS = 8  # said; the kernel's test driver has 66
+MOST_FORMATS = 8  # of a check's line; the kernel's test driver has 66
 
 Verdict = Literal["ok", "warning", "fail"]
 Ioctl = Callable[[int, int, bytearray], int]

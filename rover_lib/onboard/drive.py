@@ -20,7 +20,7 @@ from typing import Any, Protocol
 from rover_lib.onboard.camera import Camera
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.host import default_log
-from rover_lib.onboard.inference import Planner, PolicyProcess, late
+from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
 from rover_lib.onboard.loop import Hooks, Report, Until, Warnings, drive
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import PolicyPilot, ReplayPilot
@@ -119,7 +119,7 @@ def drive_car(
             raise ParamsError("a drive needs an artifact or a replay")
         camera = stack.enter_context(Camera(options.camera))
         policy = stack.enter_context(PolicyProcess(options.artifact, threads=options.threads))
-        predict = late(policy.predict, options.latency_ms / 1e3) if options.latency_ms else policy.predict
+        predict = delayed(policy.predict, options.latency_ms / 1e3) if options.latency_ms else policy.predict
         commanded = Commanded()
         planner = stack.enter_context(Planner(camera, predict, commanded, policy.rate_hz, rest_s=REST_S))
         pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz)

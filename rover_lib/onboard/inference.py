@@ -115,7 +115,7 @@ class Planner:
 
     @property
     def asking_s(self) -> float:
-        """So long the policy has been asked without an answer; 0 while it is not."""
+        """How long the policy has been computing its answer; 0 while it is not."""
         asked = self._asked_s
         return 0.0 if asked is None else self._clock() - asked
 
@@ -257,17 +257,17 @@ class PolicyProcess:
         return PolicyError(f"{self.artifact}: the policy's process ended ({how})", remedy="is there enough memory?")
 
 
-def late(predict: Predict, latency_s: float) -> Predict:
-    """predict, but an answer takes at least so long."""
+def delayed(predict: Predict, latency_s: float) -> Predict:
+    """predict, but an answer takes at least latency_s."""
 
-    def predict_late(frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
+    def predict_delayed(frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
         end = time.monotonic() + latency_s
         try:
             return predict(frame_bgr, state)
         finally:
             time.sleep(max(0.0, end - time.monotonic()))
 
-    return predict_late
+    return predict_delayed
 
 
 def serve(pipe: Connection, artifact: str, threads: int) -> None:

@@ -19,8 +19,8 @@ FIRST_PLAN_S = 10.0
 MOVING = 0.004  # throttle above which a car moves, and no two pictures are the same
 LATE_FRAME_S = 0.2  # six frames of a camera
 SLACK_S = 0.002  # a control of this much later is of the same tick: recordings have the ticks' rate, or close to it
-HOLE_S = 0.3  # a recording without a measured pulse for so long does not go on driving
-LAST_S = 0.1  # a replay's last pulses are held for so long
+HOLE_S = 0.3  # a gap between measured pulses after which a replay stops the car
+LAST_S = 0.1  # how long a replay's last pulses are held
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,9 @@ class PolicyPilot:
             yield f"the policy took {asking_s:.2f} s or more, for the plan before {plan.latency_s:.2f} s"
 
     def _watch(self, captured_s: float, repeats: int, mean: float, now_s: float) -> None:
-        many, period_s = self._settings.frozen_frames, 1 / self._camera.wanted_hz
+        limit, period_s = self._settings.frozen_frames, 1 / self._camera.wanted_hz
         moving_s = now_s - self._moving_s if self._moving_s is not None else 0.0
-        if many and repeats + 1 >= many and moving_s > repeats * period_s:
+        if limit and repeats + 1 >= limit and moving_s > repeats * period_s:
             raise DriveFault(f"the camera is frozen: {repeats + 1} frames were the same while the car was driving")
         if mean >= self._settings.black_level or not self._settings.black_frames:
             self._black_s = None

@@ -31,7 +31,7 @@ class Settings:
     blend_ticks: ticks over which a fresh plan takes over, 0: at once. fade_s, stop_s: ages of a plan from which the
     throttle fades, and at which the car is stopped. compensate: whether the time since the frame is made up for.
     ensemble: LeRobot's coefficient of temporal ensembling, None: off. throttle_limit: of the throttle, in [0, 1].
-    frozen_frames, black_frames: so many in a row are a fault of the camera; black_level: mean of a black one.
+    frozen_frames, black_frames: how many in a row are a fault of the camera; black_level: mean of a black one.
     """
 
     fade_s: float = 0.5

@@ -2,7 +2,7 @@
 
 A recorder of its own thread takes frames and writes everything to disk; whoever drives only hands over controls. All
 times are of the monotonic clock, mapped to the system's once, at the start: a clock that NTP sets meanwhile changes
-nothing. What fails here never stops a drive: it is said once, and what was recorded until then is kept.
+nothing. What fails here never stops a drive: it is logged once, and what was recorded until then is kept.
 """
 
 import contextlib
@@ -40,7 +40,7 @@ class Recorder:
 
     folder: in which the episode appears on close(), as episode_YYYYMMDD_HHMMSS of the start in local time (a second
     later if that is taken). label: what was done. rate_hz: frames a second at most. source, arduino_port: who drove and
-    through what, for the metadata. most_bytes: the episode may take so many, see room_for(); None: what the disk has.
+    through what, for the metadata. most_bytes: limit of the episode, see room_for(); None: what the disk has.
     Raises EpisodeError if there is no room to record; later faults are in `failure`.
     """
 
@@ -138,12 +138,12 @@ class Recorder:
 
     @property
     def controls(self) -> int:
-        """So many were written."""
+        """Count of those written."""
         return self._writer.controls
 
     @property
     def frames(self) -> int:
-        """So many were written."""
+        """Count of those written."""
         return self._writer.frames
 
     def _fail(self, sentence: str) -> None:
@@ -285,7 +285,7 @@ def record(
         recorder = stack.enter_context(
             Recorder(folder, camera, label=label, rate_hz=rate_hz, arduino_port=link.port, source="human", clock=clock)
         )
-        start = heard_s = recorder.start_s  # what was said before is not of this episode
+        start = heard_s = recorder.start_s  # a status from before is not of this episode
         if status:
             line = stack.enter_context(
                 StatusLine(
@@ -300,7 +300,7 @@ def record(
             if max_seconds is not None and now - start >= max_seconds:
                 break
             try:
-                said = link.latest()
+                telemetry = link.latest()
                 if now - heard_s > SILENT_S:
                     raise EpisodeError(
                         f"{link.port}: no status for {SILENT_S:g} s", remedy="is the Arduino plugged in?"
@@ -308,11 +308,11 @@ def record(
             except RoverError as error:
                 recorder.close(str(error))
                 break
-            if said is not None and said.host_s > heard_s:
-                heard_s = said.host_s
-                steering, throttle = said.receiver_steering_us, said.receiver_throttle_us
-                periods = said.receiver_steering_period_us, said.receiver_throttle_period_us
-                recorder.control(heard_s, said.uptime_ms, steering, throttle, *periods)
+            if telemetry is not None and telemetry.host_s > heard_s:
+                heard_s = telemetry.host_s
+                steering, throttle = telemetry.receiver_steering_us, telemetry.receiver_throttle_us
+                periods = telemetry.receiver_steering_period_us, telemetry.receiver_throttle_period_us
+                recorder.control(heard_s, telemetry.uptime_ms, steering, throttle, *periods)
                 lost[0] += steering is None
                 lost[1] += throttle is None
             tick = max(tick + 1, int((now - start) * rate_hz))
@@ -330,10 +330,10 @@ def record_episodes(
     *,
     rate_hz: float = 30.0,
     episodes: int = 1,
-    say: Callable[[str], None] = _log.info,
+    notify: Callable[[str], None] = _log.info,
     **options: Any,
 ) -> Iterator[RecordReport]:
-    """Opens camera and Arduino and records so many episodes; for the main thread, because signals end them.
+    """Opens camera and Arduino and records one episode after another; for the main thread: signals end them.
 
     options: of record(), for each.
     SIGINT ends an episode; a second one, or one in the pause before the next episode, ends it all, and so do SIGTERM,
@@ -349,10 +349,10 @@ def record_episodes(
     with Camera(camera, rate_hz=rate_hz) as frames, ServoLink(port) as link, signals(on_signal):
         for i in range(episodes):
             if i:
-                say(f"episode {i + 1} of {episodes} begins in {PAUSE_S:g} s; Ctrl-C now is the end of it all")
+                notify(f"episode {i + 1} of {episodes} begins in {PAUSE_S:g} s; Ctrl-C now is the end of it all")
                 if stop.wait(PAUSE_S):
                     return
-            say("recording; Ctrl-C ends the episode")
+            notify("recording; Ctrl-C ends the episode")
             report = record(frames, link, folder, rate_hz=rate_hz, stop=stop, **options)
             yield report
             if report.fault or leave.is_set():

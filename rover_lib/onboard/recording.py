@@ -82,7 +82,6 @@ class EpisodeWriter:
         end_time_s: float | None = None,
         arduino_port: str = "",
         jpeg_quality: int = 95,
-        pwm: PwmCalibration | None = None,
         flags: bool = False,
     ):
         self.folder = Path(folder)
@@ -90,7 +89,7 @@ class EpisodeWriter:
         self.resolution = resolution and (int(resolution[0]), int(resolution[1]))
         self.start_time_s, self.end_time_s = start_time_s, end_time_s
         self.arduino_port, self.jpeg_quality = arduino_port, jpeg_quality
-        self.pwm = pwm or PwmCalibration()
+        self.pwm = PwmCalibration()
         self.flags = flags
         self.metadata: dict[str, Any] = {}  # what else is to be noted of this episode
         self.controls = self.frames = self.picture_bytes = 0
@@ -382,8 +381,8 @@ def arrived_late(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[
 @dataclass(frozen=True, eq=False)
 class Controls:
     """What a transmitter sent. times_s: (n,) float64 seconds from the first, which never go back. steering_us,
-    throttle_us: (n,) int64 microseconds, as measured. A hole in the recording is a long step in time. left_out: so many
-    controls were not usable, mostly because no pulse was measured.
+    throttle_us: (n,) int64 microseconds, as measured. A hole in the recording is a long step in time. left_out: count
+    of controls that were not usable, mostly because no pulse was measured.
     """
 
     times_s: np.ndarray

@@ -58,8 +58,8 @@ class Service:
     nothing is told to anybody, and all else is the same.
     """
 
-    def __init__(self, report: "Report", stop: threading.Event, say: Callable[[str], None] = lambda text: None):
-        self._report, self._stop, self._say = report, stop, say
+    def __init__(self, report: "Report", stop: threading.Event, notify: Callable[[str], None] = lambda text: None):
+        self._report, self._stop, self._notify = report, stop, notify
         # One that never waits: systemd may be busy, and the loop must not be.
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self._systemd = WatchDog(sock=self._socket)
@@ -103,7 +103,7 @@ class Service:
             try:
                 telemetry = arm()
             except RoverError as error:  # what is broken, and not only in the way, the next check finds
-                self._say(f"not armed: {error}")
+                self._notify(f"not armed: {error}")
                 self._tell(f"{DISARMED}: {error}")
                 continue
             self._state = DRIVING

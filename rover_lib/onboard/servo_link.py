@@ -223,7 +223,7 @@ class ServoLink:
             raise LinkError(f"{self.port}: the link is open already", remedy="close it first")
         try:
             self._serial = serial.Serial(self.port, BAUD, timeout=READ_TIMEOUT_S, exclusive=True)
-            self._serial.reset_input_buffer()  # what it said before this reset
+            self._serial.reset_input_buffer()  # what came before this reset
         except (*PORT_ERRORS, ValueError) as error:
             self._release()
             raise LinkError(
@@ -458,23 +458,23 @@ class ServoLink:
                 self.garbled += 1
 
     def _hear(self, line: bytes, now: float) -> None:
-        said = parse(line, now)
-        if said is None:
+        message = parse(line, now)
+        if message is None:
             self.garbled += bool(line)
             return
-        if isinstance(said, Hello):
+        if isinstance(message, Hello):
             with self._sending:
-                if self._hello and said.boot != self._boot:
+                if self._hello and message.boot != self._boot:
                     self.resets += 1
-                if not self._hello or said.boot != self._boot:
-                    self._boot, self._sequence = said.boot, said.sequence
-        elif self._hello and said.boot != self._boot and now - self._asked > HELLO_EVERY_S:
+                if not self._hello or message.boot != self._boot:
+                    self._boot, self._sequence = message.boot, message.sequence
+        elif self._hello and message.boot != self._boot and now - self._asked > HELLO_EVERY_S:
             self._asked = now  # it was reset, and that hello was lost
             with contextlib.suppress(LinkError):
                 self._write(frame(">Q"))
         with self._heard:
-            if isinstance(said, Hello):
-                self._hello, self._hellos = said, self._hellos + 1
+            if isinstance(message, Hello):
+                self._hello, self._hellos = message, self._hellos + 1
             else:
-                self._telemetry = said
+                self._telemetry = message
             self._heard.notify_all()

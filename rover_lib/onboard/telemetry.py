@@ -63,7 +63,7 @@ class Tick(NamedTuple):
     """One control tick. None says "not known" or "none yet"."""
 
     t_s: float  # since FlightLog.start_s, by the same clock
-    late_ms: float  # the command went out so long after its deadline
+    late_ms: float  # how long after its deadline the command went out
     state: str  # who drives: M, A, S as the Arduino says, "" not known
     reason: str  # why, a key of servo_link.REASONS
     steering: float  # commanded, [-1, 1]
@@ -130,8 +130,8 @@ class FlightLog:
     path: the file; None only passes events on to logging. Drives that are there already are kept: a new one is
     appended. header: what the drive was started with; the figure looks for hz, fade_s and stop_s in it. max_bytes: a
     file that would grow beyond is renamed to path.1, path.1 to path.2 and so on, and only `keep` such older files
-    stay. flush_s: the file is synced to the disk so often. Raises ParamsError for limits that make no sense, at once;
-    afterwards nothing: a disk that is full or gone is said once, counted in `failures`, and tried again every second.
+    stay. flush_s: pause between two syncs to the disk. Raises ParamsError for limits that make no sense, at once;
+    afterwards nothing: a disk that is full or gone is logged once, counted in `failures`, and tried again every second.
     Ticks come from one thread; events from any.
     """
 
@@ -170,9 +170,9 @@ class FlightLog:
         self._ticked = 0
         self._ticks: deque[tuple[int, Tick]] = deque(maxlen=QUEUE_TICKS if self.path else 0)
         self._events: deque[Event] = deque(maxlen=QUEUE_EVENTS if self.path else 0)
-        self._sayings: deque[tuple[int, Event | str]] = deque(maxlen=QUEUE_EVENTS)
-        self._say_now = threading.Event()
-        self._spoken = False  # nothing more will be said
+        self._messages: deque[tuple[int, Event | str]] = deque(maxlen=QUEUE_EVENTS)
+        self._messages_wait = threading.Event()
+        self._last_messages = False  # no more will come
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
         # Of the writing thread alone:
@@ -180,10 +180,10 @@ class FlightLog:
         self._failed_since: float | None = None
         self._retry_s = self._machine_s = 0.0
         self._vcgencmd = False
-        self._bad_row_said = False
+        self._bad_row_logged = False
 
     def __enter__(self) -> "FlightLog":
-        self._threads = [threading.Thread(target=self._run_speaker, name="flight log events", daemon=True)]
+        self._threads = [threading.Thread(target=self._run_messages, name="flight log events", daemon=True)]
         if self.path:
             file = _LogFile(self.path, self._header, self._max_bytes, self._keep)
             self._threads.append(
@@ -205,33 +205,33 @@ class FlightLog:
         """Note that something happened, with what belongs to it, in the file and in `logging`. As harmless as tick."""
         event = Event(self._clock() - self.start_s, text, fields)
         self._events.append(event)
-        self._say(level, event)
+        self._pass_on(level, event)
 
     def close(self) -> None:
         """Write what is left. Waits 2 s at most: a disk or a terminal that is stuck is left behind."""
         end = time.monotonic() + CLOSE_S
         self._closing.set()
-        for thread in reversed(self._threads):  # the speaker last: the writer may have something to say
-            self._spoken = thread is self._threads[0]
-            self._say_now.set()
+        for thread in reversed(self._threads):  # the one of the messages last: the writer may have some
+            self._last_messages = thread is self._threads[0]
+            self._messages_wait.set()
             thread.join(max(0.0, end - time.monotonic()))
 
-    def _say(self, level: int, event: Event | str) -> None:
-        self._sayings.append((level, event))
-        self._say_now.set()
+    def _pass_on(self, level: int, event: Event | str) -> None:
+        self._messages.append((level, event))
+        self._messages_wait.set()
 
-    def _run_speaker(self) -> None:
-        """The thread that talks to logging.
+    def _run_messages(self) -> None:
+        """The thread that passes messages on to logging.
 
         Not logging's QueueListener: its stop() waits for ever for a stream that is stuck, and would hold up a drive's
         end.
         """
         while True:
-            self._say_now.wait()
-            self._say_now.clear()
-            closing = self._spoken
-            while self._sayings:
-                level, event = self._sayings.popleft()
+            self._messages_wait.wait()
+            self._messages_wait.clear()
+            closing = self._last_messages
+            while self._messages:
+                level, event = self._messages.popleft()
                 with contextlib.suppress(Exception):  # a handler that fails must not end this thread
                     _log.log(level, "%s", event)
             if closing:
@@ -278,9 +278,9 @@ class FlightLog:
             except Exception as error:
                 self.failures += 1
                 self.last_error = f"{type(error).__name__}: {error}"
-                if not self._bad_row_said:
-                    self._bad_row_said = True
-                    self._say(logging.WARNING, f"a row is not in the flight log: {self.last_error}")
+                if not self._bad_row_logged:
+                    self._bad_row_logged = True
+                    self._pass_on(logging.WARNING, f"a row is not in the flight log: {self.last_error}")
 
     def _tick_lines(self, row: tuple[int, Tick]) -> bytes:
         number, tick = row
@@ -304,7 +304,7 @@ class FlightLog:
         if self._failed_since is None:
             self._failed_since = time.monotonic()
             text = f"{self.path}: the flight log cannot be written ({self.last_error}); driving goes on without"
-            self._say(logging.WARNING, text)
+            self._pass_on(logging.WARNING, text)
 
 
 class _LogFile:

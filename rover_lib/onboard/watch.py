@@ -20,14 +20,14 @@ from rover_lib.onboard.loop import Report
 from rover_lib.onboard.servo_link import LinkError, ServoLink, Telemetry
 from rover_lib.onboard.telemetry import FlightLog
 
-SWITCH_S = 0.0005  # other threads give the interpreter back to the loop after at most so long, not Python's 5 ms
+SWITCH_S = 0.0005  # at the latest, other threads give the interpreter back to the loop; not Python's 5 ms
 PRIORITY = 2  # of real time: above what stands in for a car in the balloon world
 HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before
 LATE_COMMAND_MS = 5.0
 OFTEN = 5  # commands of a second that were sent again
 IDLE = 0.05  # of the processors' time; with less, somebody waits
 STOLEN = 0.03  # of the same
-SAY_AGAIN = 3  # looks after which what goes on is said again
+REPEAT_AFTER = 3  # seconds after which a warning that still holds is repeated
 CLOCK_SET_S = 1.0
 SETTLED_S = 60.0  # memory is watched for growth from here on
 TAIL_BYTES = 1 << 16
@@ -44,13 +44,13 @@ def boosted_priority(log: FlightLog) -> Iterator[None]:
     """
     gc.collect()
     gc.freeze()  # what is here now need not be looked through again while driving
-    before, said = sys.getswitchinterval(), "the loop runs at real-time priority"
+    before, granted = sys.getswitchinterval(), "the loop runs at real-time priority"
     sys.setswitchinterval(SWITCH_S)
     try:
         schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, PRIORITY)
     except (OSError, AttributeError):  # AttributeError: no Linux
-        said = "the loop runs at ordinary priority: this user may not ask for real time"
-    log.event(said)
+        granted = "the loop runs at ordinary priority: this user may not ask for real time"
+    log.event(granted)
     try:
         yield
     finally:
@@ -99,7 +99,7 @@ def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
     process that was stopped as a whole has its time to go on.
     """
 
-    def look() -> None:
+    def watch() -> None:
         ticks, turns = 0, 0
         while not done.wait(HUNG_S / 6):
             turns = turns + 1 if ticks == report.ticks and not report.ended else 0
@@ -111,7 +111,7 @@ def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
                 os._exit(3)
 
     done = threading.Event()
-    threading.Thread(target=look, name="hung?", daemon=True).start()
+    threading.Thread(target=watch, name="hung?", daemon=True).start()
     try:
         yield
     finally:
@@ -153,7 +153,7 @@ class HealthWatch:
         self._ticks = 0
         self._counted: tuple[int, ...] | None = None
         self._spent = _processors()
-        self._busy = 0  # looks in a row that found the machine so
+        self._busy = 0  # seconds in a row in which the machine was
         self._clock_s = time.time() - time.monotonic()
 
     def __call__(self) -> Iterator[str]:
@@ -167,7 +167,7 @@ class HealthWatch:
         self._spent = spent
         if spent and before and spent[1] > before[1]:
             idle, _, stolen = ((now - then) / (spent[1] - before[1]) for now, then in zip(spent, before, strict=True))
-            if idle < IDLE and self._busy % SAY_AGAIN == 0:
+            if idle < IDLE and self._busy % REPEAT_AFTER == 0:
                 yield f"this machine is busy: its processors were idle for {idle:.0%} of the time"
             self._busy = self._busy + 1 if idle < IDLE else 0
             if stolen > STOLEN:
@@ -199,22 +199,22 @@ def _processors() -> tuple[int, int, int] | None:
 
 
 def artifact_changes(path: Path | str) -> Callable[[], Iterable[str]]:
-    """For drive's `watch`: says once when the file that was loaded is another one, or gone."""
+    """A source of warnings: says once when the file that was loaded is another one, or gone."""
 
-    def look() -> tuple[int, ...] | None:
+    def signature() -> tuple[int, ...] | None:
         try:
             s = os.stat(path)  # noqa: PTH116  # its fields are what is compared
         except OSError:
             return None
         return s.st_ino, s.st_size, s.st_mtime_ns
 
-    last = look()
+    last = signature()
 
     def watch() -> Iterator[str]:
         nonlocal last
-        if (found := look()) != last:
-            last = found
-            yield f"{path}: {'changed' if found else 'gone'} on disk; the policy that was loaded goes on driving"
+        if (now := signature()) != last:
+            last = now
+            yield f"{path}: {'changed' if now else 'gone'} on disk; the policy that was loaded goes on driving"
 
     return watch
 

@@ -12,7 +12,7 @@ import pytest
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.camera import CameraError, Frame
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.onboard.inference import Planner, PolicyProcess, late
+from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
 from rover_lib.onboard.plan import Commanded
 
 FRAME = np.random.default_rng(0).integers(0, 256, (36, 64, 3), np.uint8)
@@ -149,7 +149,7 @@ def test_how_long_it_has_been_asked():
 
 def test_late_is_late():
     start = time.monotonic()
-    assert late(lambda frame, state: CHUNK, 0.05)(FRAME, None) is CHUNK
+    assert delayed(lambda frame, state: CHUNK, 0.05)(FRAME, None) is CHUNK
     assert time.monotonic() - start >= 0.05
 
 
