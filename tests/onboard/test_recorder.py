@@ -298,7 +298,7 @@ def test_episodes_take_no_more_than_they_may(tmp_path, monkeypatch):
         time.sleep(0.03)
     until(lambda: recorder.failure)
     folder = recorder.close()
-    assert "no room is left of what episodes may take here: fetch them" in recorder.failure
+    assert "no room is left of what episodes may take here; fetch them" in recorder.failure
     taken = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
     assert 1_500_000 < taken < 4_000_000 and recorder.frames < 20
     assert content_of(folder)["metadata"]["fault"] == recorder.failure

@@ -224,6 +224,12 @@ def test_whatever_ends_it_neutral_is_the_first_that_follows(link, clock, what, r
     assert report.ended.startswith(str(what) if raised is DriveFault else type(what).__name__)
 
 
+def test_a_fault_keeps_its_remedy(link, clock):
+    with pytest.raises(DriveFault) as fault:
+        go(Always({2: CameraError("cam: it ended", found="3 frames", remedy="is it unplugged?")}), link, clock)
+    assert (fault.value.what, fault.value.found, fault.value.remedy) == ("cam: it ended", "3 frames", "is it unplugged?")
+
+
 def test_a_human_says_when(link, clock):
     """All is ready by then; nothing was sent before."""
 
