@@ -220,7 +220,7 @@ def test_a_camera_that_somebody_else_has(tmp_path):
     source.touch()
 
     def refuse(source, rate_hz):
-        raise CameraError(f"{source}: cannot be opened; do something")
+        raise CameraError(f"{source}: cannot be opened", remedy="do something")
 
     check = only(doctor.camera_rate(source, proc_root=tmp_path, open_camera=refuse))
     assert (check.verdict, check.found, check.remedy) == ("fail", f"{source}: cannot be opened", "do something")
