@@ -144,36 +144,36 @@ def state_of(unit: str = UNIT) -> dict[str, Any]:
     """
     names = ("LoadState", "ActiveState", "StatusText", "ActiveEnterTimestamp", "NRestarts", "Result", "UnitFileState")
     try:
-        found = subprocess.run(
+        result = subprocess.run(
             ["systemctl", "show", f"--property={','.join(names)}", unit], capture_output=True, text=True, timeout=30
         )
     except (OSError, subprocess.SubprocessError) as error:
         raise ServiceError(f"systemctl cannot be asked about {unit} ({error})", remedy="is this a rover?") from None
-    if found.returncode:
+    if result.returncode:
         raise ServiceError(
-            f"systemctl does not know about {unit}: {' '.join(found.stderr.split())}", remedy="is this a rover?"
+            f"systemctl does not know about {unit}: {' '.join(result.stderr.split())}", remedy="is this a rover?"
         )
-    told = dict(line.partition("=")[::2] for line in found.stdout.splitlines())
-    text = told.get("StatusText", "")
+    properties = dict(line.partition("=")[::2] for line in result.stdout.splitlines())
+    text = properties.get("StatusText", "")
     return {
-        "installed": told.get("LoadState") == "loaded",
-        "active": told.get("ActiveState", "unknown"),
+        "installed": properties.get("LoadState") == "loaded",
+        "active": properties.get("ActiveState", "unknown"),
         "state": next((s for s in STATES if text.startswith(s)), ""),
         "text": text,
-        "since": told.get("ActiveEnterTimestamp", ""),
-        "restarts": int(told.get("NRestarts") or 0),
-        "result": told.get("Result", ""),
-        "at_boot": told.get("UnitFileState") == "enabled",
+        "since": properties.get("ActiveEnterTimestamp", ""),
+        "restarts": int(properties.get("NRestarts") or 0),
+        "result": properties.get("Result", ""),
+        "at_boot": properties.get("UnitFileState") == "enabled",
     }
 
 
 def arm_car(unit: str = UNIT, *, timeout_s: float = ARMED_S) -> str:
     """Arm the car whose service waits for it; what the service says then. Raises ServiceError if it does not drive."""
-    found = state_of(unit)
-    if found["active"] != "active" or found["state"] != DISARMED:
-        says = found["text"] or "it says nothing"
-        remedy = "it drives already" if found["state"] == DRIVING else f"sudo systemctl start {unit}"
-        raise ServiceError(f"{unit} is {found['active']}, not waiting to be armed ({says})", remedy=remedy)
+    before = state_of(unit)
+    if before["active"] != "active" or before["state"] != DISARMED:
+        text = before["text"] or "it says nothing"
+        remedy = "it drives already" if before["state"] == DRIVING else f"sudo systemctl start {unit}"
+        raise ServiceError(f"{unit} is {before['active']}, not waiting to be armed ({text})", remedy=remedy)
     sent = subprocess.run(
         ["systemctl", "kill", "--kill-whom=main", f"--signal={ARM.name}", unit], capture_output=True, text=True
     )
@@ -183,7 +183,7 @@ def arm_car(unit: str = UNIT, *, timeout_s: float = ARMED_S) -> str:
     while time.monotonic() < end:
         time.sleep(CHECK_S)
         now = state_of(unit)
-        if now["active"] != "active" or now["state"] == DRIVING or now["text"] != found["text"]:
+        if now["active"] != "active" or now["state"] == DRIVING or now["text"] != before["text"]:
             break
     if now["active"] != "active" or now["state"] != DRIVING:
         raise ServiceError(
