@@ -136,9 +136,9 @@ def check_manifest(manifest: Any, where: str) -> None:
         )
     for key, kind in MANIFEST_KEYS.items():
         if not isinstance(manifest.get(key), kind):
-            found = repr(manifest[key])[:60] if key in manifest else "nothing"
+            value = repr(manifest[key])[:60] if key in manifest else "nothing"
             raise ArtifactError(
-                f"{where}: manifest key '{key}' is {found}, not what it should be", remedy="quantize again"
+                f"{where}: manifest key '{key}' is {value}, not what it should be", remedy="quantize again"
             )
     if not manifest["cameras"]:
         raise ArtifactError(f"{where}: manifest has no cameras", remedy="quantize again")
@@ -196,7 +196,7 @@ def distinct_names(paths: Sequence[Path], drop: str = "") -> dict[str, Path]:
 
 
 def _name(path: Path, folders: int, drop: str) -> str:
-    """The stem of a path, with so many of its folders before it."""
+    """The stem of a path after this number of its folders."""
     parents = path.absolute().parts[1:-1]
     return "/".join([*parents[max(0, len(parents) - folders) :], path.stem.removeprefix(drop)])
 
@@ -211,12 +211,12 @@ def _open(path: Path | str) -> zipfile.ZipFile:
 
 
 def _record(z: zipfile.ZipFile, name: str, path: Path | str) -> str:
-    found = [n for n in z.namelist() if n.endswith(f"/extra/{name}")]
-    if len(found) != 1:
+    records = [n for n in z.namelist() if n.endswith(f"/extra/{name}")]
+    if len(records) != 1:
         raise ArtifactError(
             f"{path}: no {name} in it", remedy="is it an artifact of this project? ('rover inspect' says what)"
         )
-    return found[0]
+    return records[0]
 
 
 def _manifest_in(z: zipfile.ZipFile, path: Path | str) -> dict[str, Any]:

@@ -50,7 +50,7 @@ def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeou
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     try:
-        found = subprocess.run(
+        done = subprocess.run(
             [sys.executable, "-c", code, str(path), str(threads or 0)],
             capture_output=True,
             text=True,
@@ -59,10 +59,10 @@ def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeou
         )
     except subprocess.TimeoutExpired:
         raise PolicyError(f"{path}: no prediction within {timeout_s:g} s in a process of its own") from None
-    if found.returncode:
-        last = (found.stderr.strip().splitlines() or ["no message"])[-1]
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise PolicyError(f"{path}: does not run in a process of its own ({last})", remedy="load it here to see why")
-    word = found.stdout.split()[-1]
+    word = done.stdout.split()[-1]
     return None if word == "None" else float(word)
 
 
@@ -73,16 +73,16 @@ def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
     rate at which 95 % of the inferences end within their period (1000 / p95).
     """
     x = np.asarray(latencies_ms, float)
-    found: dict[str, float | int] = {
+    metrics: dict[str, float | int] = {
         f"latency_{name}_ms": float(np.percentile(x, q)) for name, q in PERCENTILES.items()
     }
-    found["latency_mean_ms"] = float(x.mean())
-    found["latency_max_ms"] = float(x.max())
-    found["n"] = len(x)
-    found["throughput_fps"] = float(1000 / x.mean()) if x.mean() > 0 else math.inf
-    p95_ms = found["latency_p95_ms"]
-    found["control_rate_hz"] = 1000 / p95_ms if p95_ms > 0 else math.inf
-    return found
+    metrics["latency_mean_ms"] = float(x.mean())
+    metrics["latency_max_ms"] = float(x.max())
+    metrics["n"] = len(x)
+    metrics["throughput_fps"] = float(1000 / x.mean()) if x.mean() > 0 else math.inf
+    p95_ms = metrics["latency_p95_ms"]
+    metrics["control_rate_hz"] = 1000 / p95_ms if p95_ms > 0 else math.inf
+    return metrics
 
 
 def _silent(items: Iterable, **_: object) -> Iterable:

@@ -336,7 +336,10 @@ def release(ctx: click.Context, models: Path, chunk: int, camera: str, aspect: f
 
 
 ALLOW = click.option(
-    "--allow", multiple=True, type=click.Choice(["mode", "chunk", "camera"]), help="Take one that differs in this."
+    "--allow",
+    multiple=True,
+    type=click.Choice(["mode", "chunk", "camera"]),
+    help="Accept an artifact that differs in this.",
 )
 
 
@@ -354,7 +357,7 @@ def pack(releases: Any, artifact: Path, folder: Path, allow: tuple[str, ...]) ->
 
 @release.command()
 @click.argument("source", type=FILE)
-@click.option("--sha256", help="What the artifact's must be.")
+@click.option("--sha256", help="The SHA-256 that the artifact must have.")
 @ALLOW
 @click.pass_obj
 def stage(releases: Any, source: Path, sha256: str | None, allow: tuple[str, ...]) -> None:
@@ -391,8 +394,8 @@ def rollback(releases: Any) -> None:
 @click.pass_obj
 def prune(releases: Any, keep: int) -> None:
     """Remove all but the releases used last; never the one in use."""
-    gone = releases.prune(keep)
-    show({"removed": gone, "changed": bool(gone)}, True)
+    removed = releases.prune(keep)
+    show({"removed": removed, "changed": bool(removed)}, True)
 
 
 @release.command()

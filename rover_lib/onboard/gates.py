@@ -24,12 +24,12 @@ def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[di
     """
     rows = []
     for gate, limit in gates.items():
-        found = metrics.get(gate)
-        if found is None:
-            found = metrics.get(GATE_KEYS.get(gate, gate))
+        value = metrics.get(gate)
+        if value is None:
+            value = metrics.get(GATE_KEYS.get(gate, gate))
         if isinstance(limit, str):
-            passed = None if found is None else found == limit
-            rows.append({"gate": gate, "limit": limit, "found": found, "passed": passed})
+            passed = None if value is None else value == limit
+            rows.append({"gate": gate, "limit": limit, "found": value, "passed": passed})
             continue
         is_range = isinstance(limit, (list, tuple)) and len(limit) == 2
         ends = list(limit) if is_range else [limit]
@@ -38,11 +38,11 @@ def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[di
             raise ParamsError(
                 f"gate {gate} must be a number, [low, high] or a text", found=repr(limit), remedy="see params.yml"
             )
-        if found is None or isinstance(found, str) or math.isnan(found):
-            found, passed = None, None
+        if value is None or isinstance(value, str) or math.isnan(value):
+            value, passed = None, None
         elif gate in HIGHER_IS_BETTER:
-            passed = bool(found >= ends[0])
+            passed = bool(value >= ends[0])
         else:
-            passed = bool(found <= ends[1] if is_range else found < ends[0])
-        rows.append({"gate": gate, "limit": limit, "found": found, "passed": passed})
+            passed = bool(value <= ends[1] if is_range else value < ends[0])
+        rows.append({"gate": gate, "limit": limit, "found": value, "passed": passed})
     return rows

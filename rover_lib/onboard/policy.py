@@ -121,16 +121,16 @@ def check_parity(policy: Policy) -> dict[str, float]:
     vectors = read_parity(policy.path)
     try:
         frames = [vectors[f"frame_{c}"] for c in policy.cameras]
-        found = [policy.run(s, [f[i] for f in frames]) for i, s in enumerate(vectors["state"])]
+        chunks = [policy.run(s, [f[i] for f in frames]) for i, s in enumerate(vectors["state"])]
     except (KeyError, IndexError, RuntimeError) as e:
         raise ArtifactError(
             f"{policy.path}: its parity vectors do not run ({str(e)[:200]})", remedy="quantize again"
         ) from None
-    if vectors["chunk"].shape != (len(found), policy.chunk, len(policy.action_names)):
+    if vectors["chunk"].shape != (len(chunks), policy.chunk, len(policy.action_names)):
         raise ArtifactError(
             f"{policy.path}: its parity vectors have another shape than its manifest says", remedy="quantize again"
         )
-    difference = np.abs(np.stack(found) - vectors["chunk"]).max((0, 1))
+    difference = np.abs(np.stack(chunks) - vectors["chunk"]).max((0, 1))
     tolerance = policy.manifest["parity"]["tolerance"]
     result = {name: float(d) for name, d in zip(policy.action_names, difference, strict=True)}
     for name, d in result.items():

@@ -40,8 +40,8 @@ MODELS = Path("/var/lib/rover/models")
 POLICY, DIGEST, ORIGIN = "policy.pt", "policy.pt.sha256", "release.json"
 NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # the second whole copy of a release in use that was damaged is ...-2
 PART = re.compile(r"part-\d{4,}")
-PART_BYTES = 8 << 20  # a transfer that was cut goes on at most so far back
-SPARE_BYTES = 64 << 20  # is left free for logs
+PART_BYTES = 8 << 20  # what a transfer that was cut off sends again at most
+SPARE_BYTES = 64 << 20  # left free for logs
 HISTORY = 100
 LOCK_TRIES, LOCK_S = 5, 0.05
 SANDBOX = "rover-check@{}.service"
@@ -68,23 +68,23 @@ class Expected:
 
     def refusals(self, manifest: dict[str, Any]) -> dict[str, str]:
         """Why not to take an artifact, by kind: "mode", "chunk", "camera", "torch", "engine", "actions"."""
-        found = {}
+        refusals = {}
         if manifest["mode"] not in self.modes:
-            found["mode"] = f"its mode is {manifest['mode']}, which is several times slower than {self.modes[0]}"
+            refusals["mode"] = f"its mode is {manifest['mode']}, which is several times slower than {self.modes[0]}"
         if manifest["chunk"] != self.chunk:
-            found["chunk"] = f"it plans {manifest['chunk']} actions, this rover takes {self.chunk}"
+            refusals["chunk"] = f"it plans {manifest['chunk']} actions, this rover takes {self.chunk}"
         cameras = ", ".join(f"{c['name']} {c['width']}x{c['height']}" for c in manifest["cameras"])
         shapes = [(c["name"], round(c["width"] / c["height"], 1)) for c in manifest["cameras"]]
         if shapes != [(self.camera, round(self.aspect, 1))]:
-            found["camera"] = f"it looks through {cameras}, this rover has {self.camera} at {self.aspect:.2f} to 1"
+            refusals["camera"] = f"it looks through {cameras}, this rover has {self.camera} at {self.aspect:.2f} to 1"
         made_with, here = str(manifest["versions"].get("torch", "?")), version("torch")
         if made_with.split(".")[:2] != here.split(".")[:2]:
-            found["torch"] = f"it was made with torch {made_with}, rovers have {here}"
+            refusals["torch"] = f"it was made with torch {made_with}, rovers have {here}"
         if manifest["engine"] != ENGINE:
-            found["engine"] = f"it needs the quantization engine '{manifest['engine']}', a Pi has '{ENGINE}'"
+            refusals["engine"] = f"it needs the quantization engine '{manifest['engine']}', a Pi has '{ENGINE}'"
         if manifest["action_names"] != ["steering", "throttle"] or manifest["state_names"] != ["steering", "throttle"]:
-            found["actions"] = f"it gives {manifest['action_names']}, this car has steering and throttle"
-        return found
+            refusals["actions"] = f"it gives {manifest['action_names']}, this car has steering and throttle"
+        return refusals
 
 
 THIS_CAR = Expected()
@@ -205,7 +205,7 @@ class Releases:
         self.expected = expected
         self._check = check or self.verify
 
-    # What there is
+    # Questions
 
     @property
     def current(self) -> str | None:
@@ -241,16 +241,16 @@ class Releases:
             json.loads((folder / ORIGIN).read_text())
             if (folder / DIGEST).read_text().split()[:1] != [sha256_of(folder / POLICY)]:
                 return f"{POLICY} is not what {DIGEST} says"
-            found = content_hash(folder / POLICY)
+            content = content_hash(folder / POLICY)
         except Exception as e:  # whatever hinders reading it is what is wrong with it
             return f"not readable ({type(e).__name__}: {e})"
-        if found != named[1]:
-            return f"tampered with: its content is {found[:12]}, not what its folder is named after"
+        if content != named[1]:
+            return f"tampered with: its content is {content[:12]}, not what its folder is named after"
         return ""
 
     def all(self) -> list[Release]:
         """Every release, the one in use first, then those used last, then those never used."""
-        current, found = self.current, []
+        current, releases = self.current, []
         for name in self._by_use():
             try:
                 about = json.loads((self.releases / name / ORIGIN).read_text())
@@ -258,28 +258,29 @@ class Releases:
                 megabytes = (self.releases / name / POLICY).stat().st_size / 1e6
             except (OSError, ValueError, KeyError, TypeError):
                 mode, origin, megabytes = "?", "?", 0.0
-            found.append(Release(name, name == current, mode, origin, round(megabytes, 1), self.wrong_with(name)))
-        return found
+            releases.append(Release(name, name == current, mode, origin, round(megabytes, 1), self.wrong_with(name)))
+        return releases
 
     def status(self) -> dict[str, Any]:
         """What is: current, healthy (its bytes), since, releases, disk_free_mb, at_work (a command holds the lock)."""
         releases = self.all()
-        mine = next((r for r in releases if r.current), None)
+        in_use = next((r for r in releases if r.current), None)
+        wrong = {r.name: r.wrong for r in releases}  # each is read and hashed once
         if self.current is None:
             trouble = "no model: deploy one"
-        elif mine is None:
+        elif in_use is None:
             trouble = f"current points to {self.current}, which is no release: deploy or roll back"
         else:
-            trouble = mine.wrong
+            trouble = in_use.wrong
         return {
             "current": self.current,
-            "mode": mine.mode if mine else None,
+            "mode": in_use.mode if in_use else None,
             "since": self._since(),
             "healthy": not trouble,
             "trouble": trouble,
-            "can_roll_back_to": next((n for n in self._before() if not self.wrong_with(n)), None),
+            "can_roll_back_to": next((n for n in self._used_before() if wrong.get(n) == ""), None),
             "releases": [asdict(r) for r in releases],
-            "disk_free_mb": round(shutil.disk_usage(self._there()).free / 1e6),
+            "disk_free_mb": round(shutil.disk_usage(self._nearest_folder()).free / 1e6),
             "at_work": self._locked_by_another(),
         }
 
@@ -298,7 +299,7 @@ class Releases:
 
         load_policy(path)
 
-    # What changes something
+    # Changes
 
     def stage(self, source: Path | str, *, sha256: str | None = None, allow: Iterable[str] = ()) -> Staged:
         """Make a release of an artifact, or of the folder that pack() wrote; what is in use stays in use.
@@ -307,23 +308,23 @@ class Releases:
         that is not whole is replaced, the one in use by a second copy beside it. Raises ReleaseError, ArtifactError.
         """
         source = Path(source)
-        with _disk_trouble_in_a_sentence(), self._at_work():
+        with _disk_errors_explained(), self._exclusively():
             if not source.exists():
                 raise ReleaseError(
                     f"{source}: not found", remedy="stage takes an artifact, or the folder that pack wrote"
                 )
             about = self._packed(source) if source.is_dir() else None
-            if about and (there := self._whole(about["name"])):
-                return Staged(there, False)
-            self._make_sure_of_room(about["bytes"] if about else source.stat().st_size)
+            if about and (existing := self._intact(about["name"])):
+                return Staged(existing, False)
+            self._check_free_space(about["bytes"] if about else source.stat().st_size)
             new = self.releases / ".new"
             new.mkdir()
             new.chmod(0o755)  # whatever the umask: the service's user reads it
             parts = [source / f"part-{i:04d}" for i in range(about["parts"])] if about else [source]
-            found, wanted = _join(parts, new / POLICY), sha256 or (about or {}).get("sha256")
-            if wanted and found != wanted:
+            arrived, wanted = _join(parts, new / POLICY), sha256 or (about or {}).get("sha256")
+            if wanted and arrived != wanted:
                 raise ReleaseError(
-                    f"{source}: arrived damaged (sha256 {found[:12]}, not {wanted[:12]})", remedy="send it again"
+                    f"{source}: arrived damaged (sha256 {arrived[:12]}, not {wanted[:12]})", remedy="send it again"
                 )
             try:
                 here = _about(new / POLICY, inspect_artifact(new / POLICY, self.expected, allow))
@@ -335,12 +336,12 @@ class Releases:
                     f"{source}: contains {here['name'][:12]}, not {about['name'][:12]}", remedy="pack it again"
                 )
             here["origin"] = about["origin"] if about else {**here["origin"], "file": str(source.absolute())}
-            if there := self._whole(here["name"]):
-                return Staged(there, False)
-            _write(new / DIGEST, f"{found}  {POLICY}\n")
+            if existing := self._intact(here["name"]):
+                return Staged(existing, False)
+            _write(new / DIGEST, f"{arrived}  {POLICY}\n")
             _write(new / ORIGIN, json.dumps(here, indent=1, sort_keys=True) + "\n")
             _sync(new)
-            name = self._free(here["name"])
+            name = self._new_name(here["name"])
             new.rename(self.releases / name)
             _sync(self.releases)
             return Staged(name, True)
@@ -350,7 +351,7 @@ class Releases:
 
         Returns whether anything changed. Raises ReleaseError, with what is in use now.
         """
-        with _disk_trouble_in_a_sentence(), self._at_work():
+        with _disk_errors_explained(), self._exclusively():
             before = self.current
             if name == "current":
                 raise ReleaseError("'current' is in use already", remedy="name the release to switch to")
@@ -358,23 +359,23 @@ class Releases:
             self._check(name)
             if before == name:
                 return False
-            self._point(name)
+            self._point_current_at(name)
             try:
                 self._check("current")
             except BaseException as error:
-                self._point(before)
+                self._point_current_at(before)
                 now = f"{before[:12]} is in use again" if before else "no model is in use, as before"
                 if isinstance(error, RoverError):
                     raise ReleaseError(f"{name[:12]} failed after the switch, {now}: {error}") from error
                 raise
-            self._remember([*self._history(), name])
+            self._write_history([*self._history(), name])
             return True
 
     def rollback(self) -> str:
         """Use the release before the one in use, the newest that can be proven. Returns its name."""
-        with _disk_trouble_in_a_sentence(), self._at_work():
+        with _disk_errors_explained(), self._exclusively():
             refused = []
-            for name in self._before():
+            for name in self._used_before():
                 try:
                     self._check(name)
                 except RoverError as error:
@@ -382,8 +383,8 @@ class Releases:
                     continue
                 history = self._history()
                 # Before the switch: cut here, the next rollback begins where this one did.
-                self._remember(history[: len(history) - history[::-1].index(name)])
-                self._point(name)
+                self._write_history(history[: len(history) - history[::-1].index(name)])
+                self._point_current_at(name)
                 return name
             why = f" ({'; '.join(refused)})" if refused else ""
             raise ReleaseError(
@@ -397,19 +398,19 @@ class Releases:
         """
         if keep < 1:
             raise ReleaseError("at least 1 release is kept", found=keep)
-        with _disk_trouble_in_a_sentence(), self._at_work():
+        with _disk_errors_explained(), self._exclusively():
             whole = [name for name in self._by_use() if not self.wrong_with(name)]
-            gone = [name for name in self._by_use() if name not in whole[:keep] and name != self.current]
-            for name in gone:
+            removed = [name for name in self._by_use() if name not in whole[:keep] and name != self.current]
+            for name in removed:
                 self._remove(self.releases / name)
-            if gone:
-                self._remember([name for name in self._history() if name not in gone])
-            return gone
+            if removed:
+                self._write_history([name for name in self._history() if name not in removed])
+            return removed
 
     # How
 
     @contextlib.contextmanager
-    def _at_work(self) -> Iterator[None]:
+    def _exclusively(self) -> Iterator[None]:
         """Holds the lock, and removes what an interrupted command left."""
         self.releases.mkdir(parents=True, exist_ok=True)
         file = os.open(self.models / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
@@ -438,7 +439,7 @@ class Releases:
             shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
         history = self._history()
         if (current := self.current) in self._by_use() and history[-1:] != [current]:
-            self._remember([*history, current])  # a switch was cut before it was written down
+            self._write_history([*history, current])  # a switch was cut before it was written down
 
     def _locked_by_another(self) -> bool:
         try:
@@ -464,7 +465,7 @@ class Releases:
                 f"{folder / ORIGIN}: not what 'rover release pack' writes ({e})", remedy="send it again"
             ) from None
 
-    def _make_sure_of_room(self, needed: int) -> None:
+    def _check_free_space(self, needed: int) -> None:
         free = shutil.disk_usage(self.models).free
         if free < needed + SPARE_BYTES:
             wanted_mb = (needed + SPARE_BYTES) / 1e6
@@ -472,11 +473,11 @@ class Releases:
                 f"{self.models}: {free / 1e6:.0f} MB free, {wanted_mb:.0f} are needed", remedy="prune releases"
             )
 
-    def _whole(self, content: str) -> str | None:
+    def _intact(self, content: str) -> str | None:
         """A release of that content which is whole, the one in use first."""
         return next((n for n in self._by_use() if n.startswith(content) and not self.wrong_with(n)), None)
 
-    def _free(self, content: str) -> str:
+    def _new_name(self, content: str) -> str:
         """A name for a new release of that content; what has it and is not in use goes."""
         name, number = content, 1
         while (self.releases / name).exists():
@@ -487,7 +488,7 @@ class Releases:
             name = f"{content}-{number}"
         return name
 
-    def _is_there(self, name: str) -> bool:
+    def _exists(self, name: str) -> bool:
         return (self.releases / name / POLICY).exists()
 
     def _in_use(self) -> str:
@@ -500,11 +501,12 @@ class Releases:
         except (OSError, ValueError, OverflowError):
             return None
 
-    def _there(self) -> Path:
+    def _nearest_folder(self) -> Path:
+        """The models' folder, or what of its path is there already."""
         return next(p for p in (self.models, *self.models.absolute().parents) if p.exists())
 
-    def _point(self, name: str | None) -> None:
-        """`current` at a release, atomically and lastingly; at none if None."""
+    def _point_current_at(self, name: str | None) -> None:
+        """Switch `current` to a release, atomically and synced; remove it for None."""
         if name is None:
             self.current_link.unlink()
         else:
@@ -520,10 +522,10 @@ class Releases:
         except (OSError, ValueError, TypeError):
             return []
 
-    def _remember(self, names: list[str]) -> None:
-        """Writes the history, if there is room: a full disk must not keep a rover from going back, or from pruning.
+    def _write_history(self, names: list[str]) -> None:
+        """Write the history, if there is room: a full disk must not keep a rover from going back, or from pruning.
 
-        What is missing in it then, the next command adds.
+        The next command adds what is then missing.
         """
         new = self.models / ".new-history"
         with contextlib.suppress(OSError):
@@ -531,12 +533,12 @@ class Releases:
             new.replace(self.models / "history.json")
             _sync(self.models)
 
-    def _before(self) -> list[str]:
+    def _used_before(self) -> list[str]:
         """What was in use before the release that is, newest first, each once, and still there."""
         history, current = self._history(), self.current
         if current in history:
             history = history[: len(history) - history[::-1].index(current)]
-        return [n for n in dict.fromkeys(reversed(history)) if n != current and self._is_there(n)]
+        return [n for n in dict.fromkeys(reversed(history)) if n != current and self._exists(n)]
 
     def _by_use(self) -> list[str]:
         names = sorted(p.name for p in self.releases.glob("*") if NAME.fullmatch(p.name))
@@ -544,7 +546,7 @@ class Releases:
         return [n for n in used if n in names] + [n for n in names if n not in used]
 
     def _remove(self, folder: Path) -> None:
-        """A folder of releases/, which is gone at once or there."""
+        """Remove a folder of releases/; a power cut leaves all of it or nothing."""
         away = self.releases / f".gone-{folder.name}"
         folder.rename(away)
         _sync(self.releases)
@@ -554,19 +556,23 @@ class Releases:
 def sandboxed(name: str) -> None:
     """A check: `rover release verify NAME` in the service's sandbox, as the unit that provision.yml installed."""
     unit = SANDBOX.format(name)
-    found = subprocess.run(["systemctl", "start", unit], capture_output=True, text=True)
-    if found.returncode:
-        said = subprocess.run(
+    started = subprocess.run(["systemctl", "start", unit], capture_output=True, text=True)
+    if started.returncode:
+        journal = subprocess.run(
             ["journalctl", "--unit", unit, "--output=cat", "--grep=^rover: ", "--lines=1"],
             capture_output=True,
             text=True,
         )
-        why = said.stdout.strip().removeprefix("rover: ") or found.stderr.strip() or f"exit code {found.returncode}"
+        why = (
+            journal.stdout.strip().removeprefix("rover: ")
+            or started.stderr.strip()
+            or f"exit code {started.returncode}"
+        )
         raise ReleaseError(f"{unit}: {why}")
 
 
 @contextlib.contextmanager
-def _disk_trouble_in_a_sentence() -> Iterator[None]:
+def _disk_errors_explained() -> Iterator[None]:
     try:
         yield
     except OSError as e:

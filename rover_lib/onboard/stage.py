@@ -51,14 +51,14 @@ def sha256_of(path: Path | str) -> str:
 def environment() -> dict[str, Any]:
     """Where a figure comes from: host, machine, processor, torch, engine, commit (None outside a checkout)."""
     try:
-        found = subprocess.run(
+        git = subprocess.run(
             ["git", "rev-parse", "--short", "HEAD"],
             cwd=Path(__file__).parent,
             capture_output=True,
             text=True,
             timeout=5,
         )
-        commit = found.stdout.strip() or None
+        commit = git.stdout.strip() or None
     except (OSError, subprocess.SubprocessError):
         commit = None
     torch = sys.modules.get("torch")  # what did not load it is not about it
