@@ -18,6 +18,14 @@ SIZE = {"size": "small", "drives": 5, "samples": 6, "sizes": ((54, 96),), "curve
 
 
 @pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """A cache of this module's own: what it makes is made here, and is not left in the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROVER_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
 def run_dir(cache, tmp_path_factory):
     return full_run(tmp_path_factory.mktemp("runs") / "full", steps=5, **SIZE)
 
