@@ -13,6 +13,7 @@ from typing import Any
 from lab.pi.deployment_bench import DeploymentBench, give_first_model, in_parallel, rovers
 
 Say = Callable[[str], None]
+REPORT = "Show each result"  # the task of deploy.yml
 NAMES = ("canary", "second", "third")
 ONE_BY_ONE = [1, 1, 1]  # batches
 
@@ -80,5 +81,5 @@ def wanted_of(broken: str, before: Mapping[str, str], new: str) -> dict[str, tup
 
 def results_of(output: str) -> dict[str, str]:
     """The result that deploy.yml's report has for each rover."""
-    report = output.partition("TASK [Show what came of each]")[2].partition("TASK [")[0]
+    report = output.partition(f"TASK [{REPORT}]")[2].partition("TASK [")[0]
     return {name: json.loads(f'"{result}"') for name, result in re.findall(r'"msg": "([\w.-]+): (.*)"', report)}

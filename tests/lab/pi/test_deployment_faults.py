@@ -11,7 +11,9 @@ from lab.pi import container_run
 from lab.pi.deployment_bench import DeploymentBench, Disk, Line, line_of
 from lab.pi.deployment_faults import FAULTS, wrong_rows
 from lab.pi.emulation import EmulationError
+from lab.pi.fleet import REPORT as REPORT_TASK
 from lab.pi.fleet import results_of, wanted_of
+from lab.pi.playbooks import REPOSITORY
 
 ABOUT = {"name": "a" * 64, "sha256": "b" * 64, "bytes": 100, "parts": 2}
 GOOD = {"healthy": True, "status_true": True, "healed_by_rerun": True}
@@ -84,7 +86,7 @@ def test_a_rover_is_found_in_the_table():
 
 
 REPORT = """
-TASK [Show what came of each] ****
+TASK [Show each result] ****
 ok: [canary] => {
     "msg": "canary: deployed"
 }
@@ -98,6 +100,7 @@ TASK [Fail if any rover failed] ****
 
 
 def test_the_report_is_read_by_rover():
+    assert f"- name: {REPORT_TASK}\n" in (REPOSITORY / "ansible" / "deploy.yml").read_text()
     assert results_of(REPORT) == {"canary": "deployed", "second": 'failed: [Errno 30] "Read-only"'}
 
 
