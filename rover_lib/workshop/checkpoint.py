@@ -6,7 +6,6 @@ hold or by what no policy reaches.
 """
 
 import json
-import math
 import re
 import stat
 import warnings
@@ -423,9 +422,9 @@ class Normaliser:
                 if state := step.get("state_file"):
                     self.stats = self._read_statistics(folder, state)
         texts = isinstance(self.modes, dict) and all(isinstance(v, str) for v in self.modes.values())
-        if not texts or not isinstance(self.eps, (int, float)) or not math.isfinite(self.eps):
+        if not texts or not isinstance(self.eps, (int, float)) or not 0 <= self.eps <= 1:
             raise CheckpointError(
-                f"{self.where}: a norm_map of texts and a number eps are expected",
+                f"{self.where}: a norm_map of texts and an eps from 0 to 1 are expected",
                 found=f"{shown(self.modes)} and {shown(self.eps)}",
                 remedy="copy the folder again",
             )

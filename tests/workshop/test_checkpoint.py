@@ -104,14 +104,25 @@ def test_refuses_to_run_code(tiny_policy, tmp_path, monkeypatch):
         (lambda c: c["config"].update(n_heads=7), "7 heads"),
         (lambda c: c["config"].update(n_obs_steps=2), "n_obs_steps"),
         (lambda c: c["config"].update(vision_encoder="vit"), "'vit'"),
+        (lambda c: c["model_state_dict"].pop("model.action_head.bias"), "action_head.bias"),
+        (lambda c: c["model_state_dict"].update({"other.extra": torch.zeros(1)}), "other.extra"),
+        (lambda c: c["model_state_dict"].update({"model.action_head.bias": 3}), "action_head.bias"),
+    ],
+)
+def test_refuses_what_makes_no_policy(change, says, tmp_path):
+    content = small()
+    change(content)
+    assert says in refused(write(content, tmp_path / "bad.pth"))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
         (lambda c: c["config"].update(hidden_size=128), "of another shape"),
         (lambda c: c["config"].update(n_decoder_layers=3), "missing: decoder.layers.2"),
         (lambda c: c["config"].update(n_decoder_layers=1), "unknown: decoder.layers.1"),
         (lambda c: c["config"].update(chunk_size=16), "decoder_pos_embed"),
-        (lambda c: c["model_state_dict"].pop("model.action_head.bias"), "action_head.bias"),
         (lambda c: c["model_state_dict"].update({"model.extra": torch.zeros(1)}), "unknown: extra"),
-        (lambda c: c["model_state_dict"].update({"other.extra": torch.zeros(1)}), "other.extra"),
-        (lambda c: c["model_state_dict"].update({"model.action_head.bias": 3}), "action_head.bias"),
         (lambda c: c["model_state_dict"].update({BIAS: torch.full((64,), np.nan)}), "NaN or Inf in decoder.norm.bias"),
         (lambda c: c["model_state_dict"].update({BIAS: torch.full((64,), np.inf)}), "NaN or Inf"),
         # finite, but not as the float32 that drives
@@ -142,14 +153,6 @@ def test_refuses_damaged_files(tiny_file, tmp_path):
     assert "list" in refused(path)
 
 
-@pytest.fixture
-def folder(tiny_policy, tmp_path):
-    from test_act import image_stats, saved
-
-    saved(tiny_policy, tmp_path, image_stats(tiny_policy))
-    return tmp_path
-
-
 def edit(path, change):
     content = json.loads(path.read_text())
     change(content)
@@ -171,30 +174,30 @@ def edit(path, change):
         (lambda c: c.update(dim_model=None), "dim_model"),
     ],
 )
-def test_refuses_other_lerobot_policies(folder, change, says):
-    edit(folder / "config.json", change)
-    assert says in refused(folder)
+def test_refuses_other_lerobot_policies(copied, change, says):
+    edit(copied / "config.json", change)
+    assert says in refused(copied)
 
 
-def test_refuses_processors_that_it_does_not_know(folder):
-    edit(folder / "policy_preprocessor.json", lambda c: c["steps"].append({"registry_name": "magic", "config": {}}))
+def test_refuses_processors_that_it_does_not_know(copied):
+    edit(copied / "policy_preprocessor.json", lambda c: c["steps"].append({"registry_name": "magic", "config": {}}))
     with pytest.raises(CheckpointError, match="magic"):
-        load_checkpoint(folder)
-    edit(folder / "policy_preprocessor.json", lambda c: c["steps"][0]["config"].update(rename_map={"a": "b"}))
+        load_checkpoint(copied)
+    edit(copied / "policy_preprocessor.json", lambda c: c["steps"][0]["config"].update(rename_map={"a": "b"}))
     with pytest.raises(CheckpointError, match="renames"):
-        load_checkpoint(folder)
+        load_checkpoint(copied)
 
 
-def test_refuses_damaged_folders(folder):
-    (folder / "model.safetensors").write_bytes(b"short")
+def test_refuses_damaged_folders(copied):
+    (copied / "model.safetensors").write_bytes(b"short")
     with pytest.raises(CheckpointError, match="safetensors"):
-        load_checkpoint(folder)
-    (folder / "model.safetensors").unlink()
+        load_checkpoint(copied)
+    (copied / "model.safetensors").unlink()
     with pytest.raises(CheckpointError, match="not found"):
-        load_checkpoint(folder)
-    (folder / "config.json").write_text("{")
+        load_checkpoint(copied)
+    (copied / "config.json").write_text("{")
     with pytest.raises(CheckpointError, match="JSON"):
-        load_checkpoint(folder)
+        load_checkpoint(copied)
 
 
 @pytest.mark.parametrize("size", [(54, 96), (75, 131), (144, 256)])
@@ -524,8 +527,8 @@ def test_a_header_that_lies_is_refused(copied, content, says):
     assert says in str(refused_quickly(copied))
 
 
-def test_features_that_the_weights_do_not_have_are_refused(folder):
-    edit(folder / "config.json", lambda c: c["input_features"]["observation.state"].update(shape=[3]))
+def test_features_that_the_weights_do_not_have_are_refused(copied):
+    edit(copied / "config.json", lambda c: c["input_features"]["observation.state"].update(shape=[3]))
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
-        (folder / name).unlink()
-    assert "'observation.state' has shape [3], the weights are for 2" in refused(folder)
+        (copied / name).unlink()
+    assert "'observation.state' has shape [3], the weights are for 2" in refused(copied)

@@ -627,19 +627,25 @@ def test_wild_bytes_as_json(wild_folder, data):
     check_sane(wild_folder.parent)
 
 
+@pytest.fixture(scope="module")
+def csv_folder(tmp_path_factory):
+    """A recording without its JSON, and what its tables hold."""
+    folder = record(tmp_path_factory.mktemp("csv"), frames=2)
+    (folder / "episode_data.json").unlink()
+    return folder, {name: (folder / name).read_bytes() for name in ("control_data.csv", "frame_data.csv")}
+
+
 @QUICK
 @given(
     controls=st.lists(st.lists(st.one_of(st.text(max_size=6), st.floats().map(str), st.integers().map(str)))),
     frames=st.lists(st.lists(st.one_of(st.text(max_size=6), st.floats().map(str), GOOD["image_path"]))),
     tail=st.binary(max_size=20),
 )
-def test_wild_csv(tmp_path_factory, controls, frames, tail):
-    folder = record(tmp_path_factory.mktemp("csv"), frames=2)
-    (folder / "episode_data.json").unlink()
+def test_wild_csv(csv_folder, controls, frames, tail):
+    folder, tables = csv_folder
     for name, rows in (("control_data.csv", controls), ("frame_data.csv", frames)):
         text = "\n".join(",".join(row) for row in rows)
-        with (folder / name).open("ab") as f:
-            f.write(text.encode(errors="replace") + tail)
+        (folder / name).write_bytes(tables[name] + text.encode(errors="replace") + tail)
     check_sane(folder.parent)
 
 
@@ -756,7 +762,7 @@ def test_nothing_to_choose(many):
 def test_sixty_episodes_load_in_seconds(tmp_path):
     first = record(tmp_path, "episode_20260101_000000", frames=120)
     for k in range(1, 60):
-        shutil.copytree(first, tmp_path / f"episode_20260101_{k:06d}")
+        shutil.copytree(first, tmp_path / f"episode_20260101_{k:06d}", copy_function=os.link)
     start_s = time.process_time()  # not the wall clock: other tests may run beside this one
     recordings = load_recordings(tmp_path)
     elapsed_s = time.process_time() - start_s
