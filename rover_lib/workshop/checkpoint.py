@@ -444,9 +444,9 @@ class Normaliser:
         return [{**s, "config": s.get("config") or {}} for s in steps]
 
     def _read_statistics(self, folder: Path, name: Any) -> dict[str, Tensor]:
-        if not isinstance(name, str) or Path(name).name != name:
+        if not isinstance(name, str) or Path(name).name != name or not name.isprintable():
             raise CheckpointError(
-                f"{self.where}: its state file {shown(name)} lies outside the folder",
+                f"{self.where}: its state file {shown(name)} is no file of the folder",
                 remedy="copy the whole folder again",
             )
         return _read_safetensors(folder / name, STATISTICS_BYTES)
