@@ -99,25 +99,25 @@ def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any
     multiply-accumulates. Errors are divided by this machine's, and the worse of the actions is judged.
     """
     rows = []
-    for stem, found in metrics["artifacts"].items():
+    for stem, artifact in metrics["artifacts"].items():
         known = limits["policies"].get(stem, {})
-        if known and abs(found["gmac"] / known["gmac"] - 1) < SAME_POLICY:
-            rows += [gate(f"{stem} {key}", found[key], "<=", known[key]) for key in known if key != "gmac"]
-        if not re.fullmatch(rf"{STATIC}(_\d+x\d+)?", stem) or found.get("reference") is None:
+        if known and abs(artifact["gmac"] / known["gmac"] - 1) < SAME_POLICY:
+            rows += [gate(f"{stem} {key}", artifact[key], "<=", known[key]) for key in known if key != "gmac"]
+        if not re.fullmatch(rf"{STATIC}(_\d+x\d+)?", stem) or artifact.get("reference") is None:
             continue
         times = []
-        for key, here in found.items():
+        for key, here in artifact.items():
             if key.startswith("workstation_") and here is not None:
-                times.append(found[key.removeprefix("workstation_")] / here if here else float("inf"))
-        off_pct = 100 * abs(found["tenth_g"] / found["instructions_g"] - 1)
+                times.append(artifact[key.removeprefix("workstation_")] / here if here else float("inf"))
+        off_pct = 100 * abs(artifact["tenth_g"] / artifact["instructions_g"] - 1)
         rows += [
             gate(f"{stem} error, x workstation's", worst(times), "<=", limits["x_workstation_error"]),
-            gate(f"{stem} frames judged on the core", found["frames_on_the_core"], ">=", limits["frames"]),
+            gate(f"{stem} frames judged on the core", artifact["frames_on_the_core"], ">=", limits["frames"]),
             gate(f"{stem} tenth off the third, %", off_pct, "<=", limits["tenth_pct"]),
-            gate(f"{stem} peak_memory_mb", found["peak_memory_mb"], "<=", limits["peak_memory_mb"]),
+            gate(f"{stem} peak_memory_mb", artifact["peak_memory_mb"], "<=", limits["peak_memory_mb"]),
             gate(
                 f"{stem} peak_memory_loading_mb",
-                found["peak_memory_loading_mb"],
+                artifact["peak_memory_loading_mb"],
                 "<=",
                 limits["peak_memory_loading_mb"],
             ),
@@ -129,14 +129,14 @@ def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any
     return rows
 
 
-def group_kernels(found: dict[str, Any]) -> dict[str, float]:
+def group_kernels(counts: dict[str, Any]) -> dict[str, float]:
     """An artifact's or a peer's instructions by what they do, 10**9 each, in a fixed order; the sum is instructions_g.
 
-    found: with instructions_by_kernel and, to part a product's SDOT from what feeds it, sdot_by_kernel.
+    counts: of arm.json, with instructions_by_kernel and, to part a product's SDOT from what feeds it, sdot_by_kernel.
     """
     groups = dict.fromkeys((INT8_SDOT, *(name for name, _ in GROUPS), REST), 0.0)
-    sdot = found.get("sdot_by_kernel", {})
-    for kernel, instructions_g in found["instructions_by_kernel"].items():
+    sdot = counts.get("sdot_by_kernel", {})
+    for kernel, instructions_g in counts["instructions_by_kernel"].items():
         group = next((name for name, pattern in GROUPS if re.search(pattern, kernel)), REST)
         products_g = sdot.get(kernel, 0.0) if group == INT8_OTHER else 0.0
         groups[INT8_SDOT] += products_g

@@ -114,8 +114,8 @@ def test_functions_are_named_by_address(tmp_path):
 def test_kernels_are_summed_and_the_rest_is_other():
     rows = [(1, 10, 5, 2, 1), (2, 1, 5, 0, 0), (3, 100, 1, 1, 0), (4, 1, 1, 0, 0)]
     names = {1: "_Z3fooi", 2: "_Z3fooi", 3: "bar", 4: "baz"}
-    found = by_kernel(np.array(rows, BLOCK), names, at_most=2)
-    assert found == {"bar": (100, 100, 0), "foo": (55, 20, 10), "other": (1, 0, 0)}
+    kernels = by_kernel(np.array(rows, BLOCK), names, at_most=2)
+    assert kernels == {"bar": (100, 100, 0), "foo": (55, 20, 10), "other": (1, 0, 0)}
 
 
 @pytest.fixture(scope="module")
@@ -218,9 +218,9 @@ def test_bits_that_differ_are_found(core, tiny_run, again, monkeypatch):
         torch.backends.quantized.engine = q.ENGINE
         with np.load(folder / "inputs.npz") as seen, torch.inference_mode():
             frame = torch.from_numpy(seen["frame_0000"])
-            found = torch.jit.load(folder / "backbone.pt")(torch.from_numpy(seen["state"]), frame).numpy()
-        found[0, 0, 0, 0] += 1
-        np.save(folder / "backbone.npy", found)
+            flipped_bits = torch.jit.load(folder / "backbone.pt")(torch.from_numpy(seen["state"]), frame).numpy()
+        flipped_bits[0, 0, 0, 0] += 1
+        np.save(folder / "backbone.npy", flipped_bits)
 
     monkeypatch.setattr(counting, "emulate_script", flipped)
     bits = counting.backbone_bits(tiny_run, core, again.checkpoint, memory_samples(1))
@@ -251,8 +251,12 @@ def test_a_slow_fp32_is_held_against_this_machines(report, tiny_run, again, coun
     monkeypatch.setattr(counting, "_count_all", fewer)
     monkeypatch.setattr(counting, "backbone_bits", lambda *args: report["metrics"]["backbone_bits"])
     monkeypatch.setattr(counting, "SLOW_GMAC", 0.0)
-    found = count_run(tmp_path, frames=12)["metrics"]["artifacts"]
-    fp32, static, before = found["policy_fp32"], found["policy_static"], report["metrics"]["artifacts"]["policy_static"]
+    artifacts = count_run(tmp_path, frames=12)["metrics"]["artifacts"]
+    fp32, static, before = (
+        artifacts["policy_fp32"],
+        artifacts["policy_static"],
+        report["metrics"]["artifacts"]["policy_static"],
+    )
     assert (fp32["frames_on_the_core"], fp32["tenth_g"]) == (STEADY, None)
     assert 0 < static["reference_max_difference"] < 1e-4
     same = ("instructions_g", "tenth_g", "frames_on_the_core", "steering_mae_pct", "throttle_mae_pct")
@@ -284,8 +288,8 @@ def test_a_loaded_policy_is_warm(report):
 
 def test_counts_stay_within_their_budget(report):
     for stem, budget_m in BUDGETS_M.items():
-        found_m = report["metrics"]["artifacts"][stem]["instructions_g"] * 1e3
-        assert found_m == pytest.approx(budget_m, rel=0.02), f"{stem}: set BUDGETS_M if it is meant"
+        counted_m = report["metrics"]["artifacts"][stem]["instructions_g"] * 1e3
+        assert counted_m == pytest.approx(budget_m, rel=0.02), f"{stem}: set BUDGETS_M if it is meant"
 
 
 def test_what_the_guest_refuses_is_said_in_its_words(core, tiny_run, tmp_path):

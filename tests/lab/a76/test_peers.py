@@ -53,12 +53,12 @@ class FileSample:
 
 
 def file_samples(folder: Path, count: int, seed: int) -> tuple[FileSample, ...]:
-    found = []
+    samples = []
     for i, sample in enumerate(memory_samples(count, seed=seed)):
         path = folder / f"{seed}_{i:03d}.png"
         cv2.imwrite(str(path), sample.frame_bgr())
-        found.append(FileSample(sample.state, path))
-    return tuple(found)
+        samples.append(FileSample(sample.state, path))
+    return tuple(samples)
 
 
 @pytest.fixture(scope="module")
@@ -98,12 +98,12 @@ def test_a_peer_is_judged_by_its_distance_from_fp32(tiny_run):
     manifest = read_manifest(tiny_run.folder / "policy_fp32.pt")
     reference = np.random.default_rng(0).uniform(0.01, 0.09, (6, 32, 2)).astype(np.float32)
     off = reference + np.float32([0.02, -0.001])
-    found = peers.peer_metrics(counted(off), manifest, reference, RANGES)
-    assert found["steering_mae_pct"] == pytest.approx(2, rel=1e-4)  # of a range of 1
-    assert found["throttle_mae_pct"] == pytest.approx(1, rel=1e-4)  # of a range of 0.1
-    assert found["instructions_g"] == 0.003
-    assert found["x_floor"] == pytest.approx(0.003 / (manifest["gmac"] / 16))
-    assert (found["first_g"], found["peak_memory_mb"], found["threads"]) == (5e-9, 70.0, 1)
+    metrics = peers.peer_metrics(counted(off), manifest, reference, RANGES)
+    assert metrics["steering_mae_pct"] == pytest.approx(2, rel=1e-4)  # of a range of 1
+    assert metrics["throttle_mae_pct"] == pytest.approx(1, rel=1e-4)  # of a range of 0.1
+    assert metrics["instructions_g"] == 0.003
+    assert metrics["x_floor"] == pytest.approx(0.003 / (manifest["gmac"] / 16))
+    assert (metrics["first_g"], metrics["peak_memory_mb"], metrics["threads"]) == (5e-9, 70.0, 1)
     beyond = peers.peer_metrics(counted(np.full_like(off, [1.5, -0.2])), manifest, np.full_like(off, [1, 0]), RANGES)
     assert beyond["steering_mae_pct"] == beyond["throttle_mae_pct"] == 0, "no pulse can say more"
     for wrong in (off[:, :16], np.where(off > 0.08, np.nan, off)):
@@ -132,9 +132,9 @@ def test_their_float_policy_is_ours(tiny, tiny_file, monkeypatch):
     model, example = float_policy(str(tiny_file))
     assert [x.shape for x in example] == [x.shape for x in observation]
     with torch.inference_mode():
-        found = model(*map(torch.from_numpy, observation))
+        given = model(*map(torch.from_numpy, observation))
         expected = ACT(tiny.config, tiny.weights)(torch.from_numpy(sample.state[None]), torch.from_numpy(frame))
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(given, expected, rtol=0, atol=1e-6)
 
 
 @pytest.fixture
@@ -253,11 +253,11 @@ def without_engines(tiny_run, monkeypatch):
 
 def test_peers_join_what_was_counted(without_engines, tiny_run):
     before = arm_json(tiny_run.folder)
-    found = peers.count_peers(tiny_run.folder, frames=6)
-    assert read_stage(tiny_run.folder / "arm.json", "arm") == found
-    assert {k: v for k, v in found["metrics"].items() if k != "peers"} == before["metrics"]
-    assert (found["params"], before["inputs"].items() <= found["inputs"].items()) == (before["params"], True)
-    rows = found["metrics"]["peers"]
+    content = peers.count_peers(tiny_run.folder, frames=6)
+    assert read_stage(tiny_run.folder / "arm.json", "arm") == content
+    assert {k: v for k, v in content["metrics"].items() if k != "peers"} == before["metrics"]
+    assert (content["params"], before["inputs"].items() <= content["inputs"].items()) == (before["params"], True)
+    rows = content["metrics"]["peers"]
     assert set(rows) == {"torch_fp32", "torch_affine", "onnxruntime", "executorch"}
     assert rows["torch_fp32"]["artifact"] == "policy_fp32"
     assert rows["torch_fp32"]["instructions_g"] == 0.2
@@ -268,7 +268,7 @@ def test_peers_join_what_was_counted(without_engines, tiny_run):
     assert rows["executorch"]["file_mb"] == 1.5
     assert rows["executorch"]["made_with"] == {"tool": "1"}
     assert read_manifest(tiny_run.folder / "peers" / "policy_static_affine.pt")["scheme"] == "affine"
-    assert peers.count_peers(tiny_run.folder, frames=6)["metrics"] == found["metrics"], "again, over itself"
+    assert peers.count_peers(tiny_run.folder, frames=6)["metrics"] == content["metrics"], "again, over itself"
 
 
 def test_an_affine_artifact_of_the_run_is_not_counted_twice(without_engines, tiny_run, monkeypatch):

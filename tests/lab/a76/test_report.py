@@ -50,21 +50,21 @@ KERNELS = {
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_a_kernel_has_one_group(kernel):
     instructions_g, sdot_g, group = KERNELS[kernel]
-    found = report.group_kernels(
+    groups = report.group_kernels(
         {"instructions_by_kernel": {kernel: instructions_g}, "sdot_by_kernel": {kernel: sdot_g}}
     )
-    assert {name: g for name, g in found.items() if g} == pytest.approx(
+    assert {name: g for name, g in groups.items() if g} == pytest.approx(
         {group: instructions_g - sdot_g} | ({report.INT8_SDOT: sdot_g} if sdot_g else {})
     )
 
 
 def test_groups_sum_to_the_whole_in_one_order():
     kernels = {name: row[0] for name, row in KERNELS.items()}
-    found = report.group_kernels({"instructions_by_kernel": kernels})  # a peer without SDOT by kernel
-    assert sum(found.values()) == pytest.approx(sum(kernels.values()))
-    first, *_, last = found
-    assert (first, last) == (report.INT8_SDOT, report.REST) and found[first] == 0
-    assert list(found) == list(report.group_kernels({"instructions_by_kernel": {}}))
+    groups = report.group_kernels({"instructions_by_kernel": kernels})  # a peer without SDOT by kernel
+    assert sum(groups.values()) == pytest.approx(sum(kernels.values()))
+    first, *_, last = groups
+    assert (first, last) == (report.INT8_SDOT, report.REST) and groups[first] == 0
+    assert list(groups) == list(report.group_kernels({"instructions_by_kernel": {}}))
 
 
 def test_the_computed_time_is_a_range():
@@ -76,7 +76,7 @@ def test_the_computed_time_is_a_range():
 
 
 def artifact(**changed):
-    found = {
+    numbers = {
         "gmac": 15.02,
         "instructions_g": 1.4,
         "simd_g": 1.05,
@@ -90,7 +90,7 @@ def artifact(**changed):
         "workstation_steering_mae_pct": 0.1,
         "workstation_throttle_mae_pct": 0.2,
     }
-    return found | changed
+    return numbers | changed
 
 
 def gates(bits=0, **artifacts):
@@ -99,9 +99,9 @@ def gates(bits=0, **artifacts):
 
 
 def test_gates_of_the_cars_policy_hold():
-    found = gates(policy_static=artifact(), policy_fp32=artifact(instructions_g=6), policy_dynamic=artifact())
-    assert len(found) == 8 and all(found.values())
-    assert all(name.startswith("policy_static ") for name in found)
+    passed_by_gate = gates(policy_static=artifact(), policy_fp32=artifact(instructions_g=6), policy_dynamic=artifact())
+    assert len(passed_by_gate) == 8 and all(passed_by_gate.values())
+    assert all(name.startswith("policy_static ") for name in passed_by_gate)
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,8 @@ def test_gates_of_the_cars_policy_hold():
     ],
 )
 def test_each_gate_can_fail(changed, failing):
-    found = gates(policy_static=artifact(**changed))
-    assert [name for name, passed in found.items() if not passed] == [f"policy_static {failing}"]
+    passed_by_gate = gates(policy_static=artifact(**changed))
+    assert [name for name, passed in passed_by_gate.items() if not passed] == [f"policy_static {failing}"]
 
 
 def test_a_flipped_bit_fails():
@@ -130,8 +130,8 @@ def test_a_flipped_bit_fails():
 
 def test_gates_without_an_artifact_are_left_out():
     only_counted = artifact(gmac=9.0, tenth_g=None, reference=None)
-    found = gates(policy_static=artifact(gmac=0.4), policy_static_240x432=only_counted)
-    assert not [name for name in found if "instructions" in name or "240x432" in name]
+    passed_by_gate = gates(policy_static=artifact(gmac=0.4), policy_static_240x432=only_counted)
+    assert not [name for name in passed_by_gate if "instructions" in name or "240x432" in name]
     small = artifact(
         gmac=lab_params()["arm"]["gates"]["policies"]["policy_static_180x320"]["gmac"], instructions_g=0.45
     )
@@ -151,8 +151,8 @@ def test_the_command_counts_then_draws_then_says_what_it_found(tmp_path, monkeyp
 
     def count_run(run_dir, **options):
         called.append(("count", options["frames"]))
-        found = artifact(x_floor=1.5, first_g=1.4, load_instructions_g=9.0, instructions_g=1.47, tenth_g=1.47)
-        metrics = {"artifacts": {"policy_static": found}, "note": "this policy does not drive"}
+        counted = artifact(x_floor=1.5, first_g=1.4, load_instructions_g=9.0, instructions_g=1.47, tenth_g=1.47)
+        metrics = {"artifacts": {"policy_static": counted}, "note": "this policy does not drive"}
         metrics["gates"] = report.gates(metrics, lab_params()["arm"]["gates"])
         write_stage(path, "arm", params={}, metrics=metrics)
 

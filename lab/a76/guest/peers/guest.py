@@ -1,24 +1,21 @@
 """Runs inside the emulated Pi: another engine on its own form of the policy, one thread, no torch in the process.
 
-    predict.py ARTIFACT OBSERVATIONS FOLDER COUNTED ENGINE HEIGHT WIDTH
+    guest.py ARTIFACT OBSERVATIONS FOLDER COUNTED ENGINE HEIGHT WIDTH
 
 ENGINE is onnxruntime (ARTIFACT an .onnx) or executorch (a .pte); both take `state` (1, S) float32 and `frame`
-(1, 3, HEIGHT, WIDTH) float32 (see planes.py) and give (1, chunk, A) float32. OBSERVATIONS, the marks and what is left
-in FOLDER are those of ../predict.py: a BGR frame of the camera goes in, actions come out, and all between counts.
+(1, 3, HEIGHT, WIDTH) float32 (see planes.py) and give (1, chunk, A) float32. The rest is as in ../inferences.py: a BGR
+frame of the camera goes in, actions come out, and all between is counted.
 """
 
 import ctypes
-import json
-import platform
 import sys
 import types
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
-import cv2
 import numpy as np
-from mark import mark
+from inferences import leave, loaded, predict_all
 from planes import planes
 
 import rover_lib
@@ -29,16 +26,16 @@ package.__path__ = [str(Path(rover_lib.__file__).parent / "onboard")]
 sys.modules[package.__name__] = package
 from rover_lib.onboard.preprocess import prepare_frame  # noqa: E402
 
-Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # state (1, S), planes -> (chunk, A), all float32
+Run = Callable[[np.ndarray, np.ndarray], np.ndarray]  # state (1, S), planes -> (chunk, A), all float32
 
 
 def ticks() -> dict[str, int]:
     """Processor time that each thread of the process has used, in the kernel's ticks."""
-    found = {}
+    used = {}
     for task in Path("/proc/self/task").iterdir():
         fields = (task / "stat").read_text().rpartition(")")[2].split()
-        found[task.name] = int(fields[11]) + int(fields[12])
-    return found
+        used[task.name] = int(fields[11]) + int(fields[12])
+    return used
 
 
 def worked(before: dict[str, int], after: dict[str, int]) -> int:
@@ -47,7 +44,7 @@ def worked(before: dict[str, int], after: dict[str, int]) -> int:
     return sum(u > 0.05 * sum(used) for u in used)
 
 
-def onnxruntime(artifact: str) -> Predict:
+def onnxruntime(artifact: str) -> Run:
     import onnxruntime as ort
 
     options = ort.SessionOptions()
@@ -56,7 +53,7 @@ def onnxruntime(artifact: str) -> Predict:
     return lambda state, frame: session.run(None, {"state": state, "frame": frame})[0][0]
 
 
-def executorch(artifact: str) -> Predict:
+def executorch(artifact: str) -> Run:
     import executorch  # for its place only: the runtime is C++ (see executorch.cpp)
 
     library = ctypes.CDLL(str(Path(next(iter(executorch.__path__))).parent / "policy.so"))
@@ -83,28 +80,14 @@ def executorch(artifact: str) -> Predict:
 
 
 def main(artifact: str, observations: str, folder: str, counted: str, engine: str, height: str, width: str) -> None:
-    print("load", flush=True)
-    mark(True, 0)
-    predict = {"onnxruntime": onnxruntime, "executorch": executorch}[engine](artifact)
-    mark(False, 0)
-    chunks, before = [], ticks()
-    with np.load(observations) as seen:
-        states = seen["state"]
-        for i in range(max(len(states), int(counted))):
-            state, frame = states[i % len(states)][None], seen[f"frame_{i % len(states):04d}"]
-            print("predict", flush=True)
-            if i < int(counted):
-                mark(True, i + 1)
-            chunks.append(predict(state, planes(prepare_frame(frame, int(height), int(width)))))
-            if i < int(counted):
-                mark(False, i + 1)
-    threads, out = worked(before, ticks()), Path(folder)
-    np.save(out / "chunks.npy", np.stack(chunks[: len(states)]))
-    versions = {"python": platform.python_version(), engine: version(engine), "numpy": np.__version__}
-    versions |= {"cv2": cv2.__version__, "machine": platform.machine(), "libc": " ".join(platform.libc_ver())}
-    (out / "versions.json").write_text(json.dumps(versions | {"threads": threads}))
-    (out / "maps").write_text(Path("/proc/self/maps").read_text())
-    print("done", flush=True)
+    run = loaded(lambda: {"onnxruntime": onnxruntime, "executorch": executorch}[engine](artifact))
+    before, size = ticks(), (int(height), int(width))
+
+    def predict(frame: np.ndarray, state: np.ndarray) -> np.ndarray:
+        return run(state[None], planes(prepare_frame(frame, *size)))
+
+    predict_all(predict, observations, folder, int(counted))
+    leave(folder, worked(before, ticks()), **{engine: version(engine)})
 
 
 if __name__ == "__main__":
