@@ -3,6 +3,7 @@
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -136,6 +137,18 @@ def test_gates_without_an_artifact_are_left_out():
         gmac=lab_params()["arm"]["gates"]["policies"]["policy_static_180x320"]["gmac"], instructions_g=0.45
     )
     assert gates(policy_static_180x320=small)["policy_static_180x320 instructions_g"] is False
+
+
+def test_an_action_that_never_changes_is_not_judged():
+    chunks = np.random.default_rng(0).uniform(0, 0.1, (2, 4, 5, 2)).astype(np.float32)
+    ranges = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.0)}
+    errors = counting.errors_pct(*chunks, ("steering", "throttle"), ranges)
+    assert errors["throttle_mae_pct"] is None
+    assert errors["steering_mae_pct"] == pytest.approx(100 * np.abs(chunks[1] - chunks[0])[..., 0].mean(), rel=1e-4)
+    still = artifact(throttle_mae_pct=None, workstation_throttle_mae_pct=None)
+    assert gates(policy_static=still)["policy_static error, x workstation's"] is True
+    neither = still | {"steering_mae_pct": None, "workstation_steering_mae_pct": None}
+    assert gates(policy_static=neither)["policy_static error, x workstation's"] is None, "not measured, no failure"
 
 
 def test_an_image_size_is_judged_by_fp32_of_its_own():
