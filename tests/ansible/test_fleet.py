@@ -39,7 +39,10 @@ exit $code
 """
 
 # Nobody else may, and a playbook that gives its files to another is not the one that rovers get.
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="needs root: the playbooks give files to root")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(os.geteuid() != 0, reason="needs root: the playbooks give files to root"),
+]
 
 
 class Fleet:
