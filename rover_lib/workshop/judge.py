@@ -29,3 +29,8 @@ def constant_actions(action_range: Mapping[str, Range]) -> list[str]:
 def not_judged(action_range: Mapping[str, Range]) -> list[str]:
     """A warning for each action that never changes in the recordings."""
     return [f"{name} never changes in these recordings: not judged" for name in constant_actions(action_range)]
+
+
+def shown_pct(value: float | None) -> str:
+    """A share of the recorded range as people read it."""
+    return "not judged" if value is None else f"{value:6.2f} %"

@@ -1,6 +1,6 @@
 """Errors as shares of the recorded range, and actions that were never moved."""
 
-from rover_lib.workshop.judge import constant_actions, not_judged, pct_of_range, worst
+from rover_lib.workshop.judge import constant_actions, not_judged, pct_of_range, shown_pct, worst
 
 RANGES = {"steering": (-0.5, 0.5), "throttle": (0.06, 0.06)}
 
@@ -18,3 +18,7 @@ def test_an_action_that_never_changes_is_not_judged():
 def test_what_is_not_judged_is_never_the_worst():
     assert worst({"steering": 0.3, "throttle": None}) == worst([0.1, None, 0.3]) == 0.3
     assert worst({"throttle": None}) is None
+
+
+def test_what_is_not_judged_is_said_so():
+    assert shown_pct(0.114) == "  0.11 %" and shown_pct(None) == "not judged"
