@@ -419,7 +419,7 @@ def break_deployments(
 
 
 def wrong_rows(rows: Sequence[Mapping[str, Any]], at_least: int) -> list[str]:
-    """What is not as it must be, in sentences. at_least: so many rows must be there."""
+    """What is not as it must be, in sentences. at_least: how many rows there must be."""
     found = [f"{r['fault']}: {r['error']}" for r in rows if r.get("error")]
     for key, what in (
         ("healthy", "the rover has no model that passes its parity vectors"),

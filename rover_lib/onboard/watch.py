@@ -35,29 +35,41 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 @contextlib.contextmanager
-def boosted_priority(log: FlightLog) -> Iterator[None]:
-    """Inside, this process goes before all that is not as urgent, if its user may ask for that.
+def real_time(priority: int) -> Iterator[bool]:
+    """Inside, all threads of this process have a real-time priority; gives whether this user may ask for that.
 
-    All its threads, which sleep most of the time: one that was made to wait while it holds the interpreter would keep
-    the loop waiting too. With four busy processes on two cores the loop's lateness at p99 was 0.7 ms so, 4 to 9 with
-    the loop's thread alone at that priority, and 14 to 19 without (measured on an x86-64 workstation).
+    All of them, because one that waits for its turn while it holds the interpreter keeps the others waiting too.
     """
     gc.collect()
-    gc.freeze()  # what is here now need not be looked through again while driving
-    before, granted = sys.getswitchinterval(), "the loop runs at real-time priority"
+    gc.freeze()  # what is here now need not be looked through again meanwhile
+    before, granted = sys.getswitchinterval(), True
     sys.setswitchinterval(SWITCH_S)
     try:
-        schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, PRIORITY)
+        schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, priority)
     except (OSError, AttributeError):  # AttributeError: no Linux
-        granted = "the loop runs at ordinary priority: this user may not ask for real time"
-    log.event(granted)
+        granted = False
     try:
-        yield
+        yield granted
     finally:
         with contextlib.suppress(OSError, AttributeError):
             schedule(os.SCHED_OTHER, 0)
         sys.setswitchinterval(before)
         gc.unfreeze()
+
+
+@contextlib.contextmanager
+def boosted_priority(log: FlightLog) -> Iterator[None]:
+    """Inside, this process goes before all that is not as urgent, if its user may ask for that.
+
+    With four busy processes on two cores the loop's lateness at p99 was 0.7 ms so, 4 to 9 with the loop's thread alone
+    at that priority, and 14 to 19 without (measured on an x86-64 workstation).
+    """
+    with real_time(PRIORITY) as granted:
+        if granted:
+            log.event("the loop runs at real-time priority")
+        else:
+            log.event("the loop runs at ordinary priority: this user may not ask for real time")
+        yield
 
 
 def schedule(policy: int, priority: int) -> None:

@@ -461,7 +461,7 @@ def copied(small_folder, tmp_path):
         ('{"a": 1' + "0" * 5000 + "}", "not readable as JSON"),
         ("\ud800", "not readable as JSON"),
     ],
-    ids=["deep", "unended", "many entries", "list", "huge number", "no text"],
+    ids=["deep", "cut short", "many entries", "list", "huge number", "no text"],
 )
 def test_json_that_is_too_deep_or_too_large_is_refused(copied, file, text, says):
     (copied / file).write_bytes(text.encode(errors="surrogatepass"))
