@@ -4,9 +4,13 @@ VENV := .venv
 ROVER := $(VENV)/bin/rover
 LAB := $(VENV)/bin/python -m lab
 READY := $(VENV)/.ready
+# A file of tests, or a notebook, to each core; more processes than four would want more memory than they save time.
+PYTEST := $(VENV)/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 NAME ?= mine
+# In a container there may be nobody but root, and what is loaded here was made here; see onboard/confine.py.
+export ROVER_AS_ROOT := 1
 
-.PHONY: help demo run test test-fast check-release coverage lint lab arm faults pi-fast pi firmware flash notebooks clean
+.PHONY: help demo run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks clean
 
 help:
 	@echo "make demo                                   record, train, quantize, compare, benchmark and drive in the balloon world"
@@ -21,6 +25,7 @@ help:
 	@echo "make arm NAME=demo [PEERS=1]                count a run's instructions on an emulated Cortex-A76; NAME=full makes"
 	@echo "                                            a policy of the real car's size, PEERS=1 adds other runtimes"
 	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino"
+	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count, into the committed notebooks,"
 	@echo "                                            and the JSON behind them into results/"
@@ -50,15 +55,16 @@ lint: $(READY)
 
 # The demo is the tests' whole run; it is made once, and tests/test_demo.py holds it to the gates of params.yml.
 test: lint demo
-	$(VENV)/bin/pytest
+	$(PYTEST)
 
 test-fast: $(READY)
-	$(VENV)/bin/pytest -m 'not slow and not emulated and not release' tests
+	$(PYTEST) -m 'not slow and not emulated and not release' tests
 
 # Real time, whole fleets and whole machines: for a quiet machine, before something is given to others.
 check-release: lint demo
 	$(VENV)/bin/pytest -m release tests
-	$(MAKE) faults pi-fast pi
+	$(VENV)/bin/pytest notebooks
+	$(MAKE) faults random pi-fast pi
 
 coverage: demo
 	$(VENV)/bin/pytest --cov=rover_lib --cov=lab --cov-report=term
@@ -70,6 +76,9 @@ arm: $(READY)
 
 faults: $(READY)
 	$(LAB) faults runs/faults.json
+
+random: $(READY)
+	$(LAB) random runs/random.json
 
 # The demo's artifacts are deployed.
 pi-fast: $(READY)

@@ -1,30 +1,55 @@
 """What many tests share: one tiny policy, its calibration and its artifacts, and the demo's run."""
 
+import os
 from pathlib import Path
 
 import pytest
-import torch
 from hypothesis import settings
-from policies import TINY, lerobot_policy, memory_samples, trainer_content
 
+# LeRobot takes ten seconds to import, and `policies` needs it: here inside of the fixtures that have a policy.
+
+# In a container there may be nobody but root.
+os.environ.setdefault("ROVER_AS_ROOT", "1")
 # How long an example takes is the machine's affair: another program's turn is no failure.
 settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")
 
 
+def pytest_collection_modifyitems(items):
+    """What drives by the demo's policy starts processes that import torch: none of it is quick."""
+    for item in items:
+        if "demo_run" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread():
     """Tests are small: threads would only wait for each other."""
+    import torch
+
     torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
 def tiny_policy():
+    from policies import TINY, lerobot_policy
+
     return lerobot_policy(**TINY)
 
 
 @pytest.fixture(scope="session")
+def full_policy():
+    """Of the user's size: 84 million parameters."""
+    from policies import FULL, lerobot_policy
+
+    return lerobot_policy(**FULL)
+
+
+@pytest.fixture(scope="session")
 def tiny_file(tiny_policy, tmp_path_factory) -> Path:
+    import torch
+    from policies import trainer_content
+
     path = tmp_path_factory.mktemp("checkpoint") / "best_model.pth"
     torch.save(trainer_content(tiny_policy), path)
     return path
@@ -39,6 +64,8 @@ def tiny(tiny_file):
 
 @pytest.fixture(scope="session")
 def calibration(tiny):
+    from policies import memory_samples
+
     from rover_lib.workshop.observe import calibrate
 
     return calibrate(tiny, memory_samples(12))
@@ -47,6 +74,8 @@ def calibration(tiny):
 @pytest.fixture(scope="session")
 def artifacts(tiny, calibration, tmp_path_factory) -> dict[str, Path]:
     """One artifact per mode of the tiny policy."""
+    from policies import memory_samples
+
     from rover_lib.workshop.act import ACT
     from rover_lib.workshop.export import export
     from rover_lib.workshop.quantize import quantize

@@ -6,6 +6,7 @@ Debian packages cannot come with pip; .ci/run installs them, so that none of the
 import contextlib
 import functools
 import os
+import shutil
 import sys
 import threading
 import time
@@ -20,6 +21,9 @@ from lab.debian import missing_packages
 
 QEMU_MISSING = missing_packages(core.NEEDS)
 qemu = pytest.mark.skipif(bool(QEMU_MISSING), reason=f"needs the Debian packages {' '.join(QEMU_MISSING)}")
+
+# The firmware's own source is compiled for this machine.
+gcc = pytest.mark.skipif(not shutil.which("gcc"), reason="needs the Debian packages gcc libc6-dev")
 
 SIMAVR_MISSING = emulator.missing_packages()
 simavr = pytest.mark.skipif(bool(SIMAVR_MISSING), reason=f"needs the Debian packages {' '.join(SIMAVR_MISSING)}")

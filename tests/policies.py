@@ -1,8 +1,6 @@
 """Policies and recordings that are small enough for tests, and made by the same tools as real ones."""
 
-import json
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,6 +19,7 @@ TINY = {
     "n_vae_encoder_layers": 1,
     "chunk_size": 32,
 }
+FULL = {"cameras": {"observation.images.cam_front": (360, 640)}, "n_decoder_layers": 7, "chunk_size": 32}
 
 
 def smooth_frame(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
@@ -128,7 +127,3 @@ def memory_samples(count: int, height: int = 72, width: int = 128, seed: int = 0
         MemorySample(rng.uniform(-0.5, 0.5, 2).astype(np.float32), smooth_frame(rng, height, width))
         for _ in range(count)
     ]
-
-
-def stage_of(folder: Path, name: str) -> dict:
-    return json.loads((folder / f"{name}.json").read_text())

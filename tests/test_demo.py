@@ -1,19 +1,25 @@
 """The demo's run, made by `make demo`, held to the gates of params.yml."""
 
+import nbformat
 import pytest
-from policies import stage_of
+from executed import printed
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.params import params
-from rover_lib.workshop.run import NAMES
+from rover_lib.onboard.stage import read_stage
+from rover_lib.workshop.run import NAMES, NOTEBOOKS
+from rover_lib.world import latency
 
 STAGES = ("load", "calibrate", "quantize", "compare", "drive")
 
 
+def stage_of(folder, name):
+    return read_stage(folder / f"{name}.json", name)
+
+
 def test_left_everything_that_a_run_leaves(demo_run):
     for stage in STAGES:
-        content = stage_of(demo_run, stage)
-        assert content["schema"] == 1 and content["stage"] == stage and content["inputs"]
+        assert stage_of(demo_run, stage)["inputs"]
     for mode in ("fp32", "dynamic", "static", "mixed"):
         assert load_policy(demo_run / f"policy_{mode}.pt").manifest["mode"] == mode
     assert {p.stem for p in demo_run.glob("*.ipynb")} >= {*NAMES, "07_drive"}
@@ -51,3 +57,20 @@ def test_drives_by_plans_that_are_150_ms_late_as_by_fresh_ones(demo_run):
     assert late["hits"] >= fresh["hits"] - params()["gates"]["hits_lost_at_150_ms"]
     assert fresh["plan_age_max_ms"] == 0 and late["plan_age_min_ms"] >= 150  # the loop really drove by late plans
     assert all(g["passed"] for g in metrics["gates"])
+
+
+def test_late_plans_are_drawn(demo_run):
+    text = printed(demo_run / "07_drive.ipynb")
+    assert latency.table(stage_of(demo_run, "drive")) in text and "ensembling, 0.01" in text
+    figures = {p.stem for p in (demo_run / "figures").glob("07_*.png")}
+    assert figures == {f"07_{figure}" for figure in ("age", "hits", "path", "above", "gates")}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_outputs_that_never_change_are_those_committed(demo_run, name):
+    """The cells that nbval would compare, were it to execute again what the demo has just executed."""
+    ran, committed = (nbformat.read(f / f"{name}.ipynb", as_version=4) for f in (demo_run, NOTEBOOKS))
+    shown = {c.id: "".join(o.text for o in c.outputs) for c in ran.cells if "NBVAL_CHECK_OUTPUT" in c.source}
+    for cell in committed.cells:
+        if "NBVAL_CHECK_OUTPUT" in cell.source:
+            assert shown[cell.id] == "".join(o.text for o in cell.outputs), cell.id

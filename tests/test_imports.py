@@ -1,6 +1,7 @@
 """Imports go one way: the rover's part needs nothing of a workstation, and nothing needs the laboratory."""
 
 import ast
+import functools
 import sys
 from pathlib import Path
 
@@ -9,14 +10,16 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = ("rover_lib.onboard", "rover_lib.workshop", "rover_lib.world", "rover_lib.cli", "lab")  # the lowest first
 ROOMS = ("lab.debian", "lab.arduino", "lab.driving", "lab.a76", "lab.pi", "lab.__main__")  # of the laboratory, the same
-ONBOARD_NEEDS = {"torch", "numpy", "cv2", "serial", "yaml", "systemd_watchdog", "click", "rover_lib"}
+ONBOARD_NEEDS = {"torch", "numpy", "cv2", "simplejpeg", "serial", "yaml", "systemd_watchdog", "click", "rover_lib"}
 
 
+@functools.cache
 def modules() -> dict[str, Path]:
     files = [p for top in ("rover_lib", "lab") for p in (ROOT / top).rglob("*.py") if "guest" not in p.parts]
     return {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in files}
 
 
+@functools.cache
 def imported(path: Path) -> set[str]:
     """Every name that a file imports, those for functions and for type checkers alone too."""
     names, waiting = set(), [ast.parse(path.read_text())]

@@ -52,7 +52,7 @@ class _Event(ctypes.Structure):
 def _library() -> ctypes.CDLL:
     library = ctypes.CDLL(str(compiled("libarduino.so", "-shared", "-fPIC", *arduino.WITH_SIMAVR)))
     library.uno_new.restype = ctypes.c_void_p
-    library.uno_now_us.restype = ctypes.c_double
+    library.uno_now_us.restype = library.uno_longest_us.restype = ctypes.c_double
     pointer, real = ctypes.c_void_p, ctypes.c_double
     for name, arguments in {
         "uno_new": [ctypes.c_char_p],
@@ -60,8 +60,11 @@ def _library() -> ctypes.CDLL:
         "uno_now_us": [pointer],
         "uno_send": [pointer, ctypes.POINTER(ctypes.c_uint16), ctypes.c_int],
         "uno_transmitter": [pointer, ctypes.c_int, real, real],
+        "uno_wiggle": [pointer],
         "uno_reset": [pointer],
         "uno_hang": [pointer, ctypes.c_uint32],
+        "uno_watch": [pointer, ctypes.c_uint32, ctypes.c_uint32],
+        "uno_longest_us": [pointer],
         "uno_run_us": [pointer, real],
         "uno_read": [pointer, ctypes.c_char_p, ctypes.c_int],
         "uno_events": [pointer, ctypes.POINTER(_Event), ctypes.c_int],
@@ -82,7 +85,7 @@ def body_of(text: bytes) -> str | None:
 
 
 FIELDS = [
-    *("boot", "uptime_ms", "sequence", "result", "state", "reason", "steering_us", "throttle_us"),
+    *("boot", "uptime_ms", "sequence", "result", "state", "reason", "missing", "steering_us", "throttle_us", "cap_us"),
     *("receiver_steering_us", "receiver_steering_period_us", "receiver_throttle_us", "receiver_throttle_period_us"),
     *("bad", "old", "out_of_range", "lost"),
 ]
@@ -107,6 +110,7 @@ class Uno:
         self._rest = b""
         self.sequence = 0
         self.boot = None
+        self.heard_ms = None  # what the host says that it heard; None: of the newest status
 
     def close(self) -> None:
         if self._uno:
@@ -148,12 +152,19 @@ class Uno:
         self._c.uno_send(self._uno, (ctypes.c_uint16 * len(data))(*(b | flag for b in data)), len(data))
 
     def command(self, kind: str, *values: int, boot: int | None = None, sequence: int | None = None) -> bytes:
-        """Sends the next command: "A", "N", or "D" with two pulses. Returns its line."""
+        """Sends the next command: "A", "N", "L" with a throttle, or "D" with two pulses. Returns its line."""
+        text = self.next_line(kind, *values, boot=boot, sequence=sequence)
         if sequence is None:
-            self.sequence = sequence = self.sequence + 1
-        text = line(" ".join(map(str, (f">{kind}", self.boot if boot is None else boot, sequence, *values))))
+            self.sequence += 1
         self.send(text)
         return text
+
+    def next_line(self, kind: str, *values: int, boot: int | None = None, sequence: int | None = None) -> bytes:
+        """What command() would send now."""
+        if kind in "AD":
+            values = (self.status.uptime_ms if self.heard_ms is None else self.heard_ms, *values)
+        numbers = (self.boot if boot is None else boot, self.sequence + 1 if sequence is None else sequence, *values)
+        return line(" ".join(map(str, (f">{kind}", *numbers))))
 
     def transmitter(
         self, steering_us: float | None = None, throttle_us: float | None = None, **period_us: float
@@ -164,12 +175,26 @@ class Uno:
                 period = period_us.get(f"{'throttle' if channel else 'steering'}_period_us", 0)
                 self._c.uno_transmitter(self._uno, channel, pulse_us, period)
 
+    def wiggle(self) -> None:
+        """The human moves the steering stick to both sides, and lets go of it until that counts."""
+        self._c.uno_wiggle(self._uno)
+        self.run_ms(450)
+
     def reset(self) -> None:
         self._c.uno_reset(self._uno)
 
     def hang(self) -> None:
         """loop() becomes an endless loop, until the next reset."""
         self._c.uno_hang(self._uno, symbol("loop"))
+
+    def watch_loop(self) -> None:
+        """From now on the loop's longest turn is measured, until it has nothing to do but sleep."""
+        self._c.uno_watch(self._uno, symbol("loop"), symbol("_Z4restv"))
+
+    @property
+    def longest_ms(self) -> float:
+        """Of the loop's turns, since watch_loop()."""
+        return self._c.uno_longest_us(self._uno) / 1000
 
     @property
     def status(self) -> SimpleNamespace:

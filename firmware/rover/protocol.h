@@ -10,21 +10,28 @@
 extern "C" {
 #endif
 
-#define PROTOCOL_VERSION 1
-#define FIRMWARE_VERSION "1.0.0"
+#define PROTOCOL_VERSION 2
+#define FIRMWARE_VERSION "2.0.0" /* rover_lib/onboard/servo_link.py drives no other: change both */
 
 enum {
-    HOST_LINE_MAX = 63,     /* the longest line of the host without its end: ">D 65535 4294967295 65535 65535*12345678" */
+    HOST_LINE_MAX = 66,     /* the longest line of the host without its end: five numbers of ten digits */
     BOARD_LINE_MAX = 127,   /* the longest line of the Arduino, its end included */
-    LINE_LIFETIME_MS = 50   /* a line whose end comes later than this after its start is stale: 45 characters take 4 ms */
+    LINE_LIFETIME_MS = 50   /* a line whose end comes later than this after its start is stale: 52 characters take 5 ms */
 };
 
-enum command_kind { COMMAND_HELLO = 'Q', COMMAND_ARM = 'A', COMMAND_DRIVE = 'D', COMMAND_NEUTRAL = 'N' };
+enum command_kind {
+    COMMAND_HELLO = 'Q',
+    COMMAND_ARM = 'A',
+    COMMAND_DRIVE = 'D',
+    COMMAND_NEUTRAL = 'N',
+    COMMAND_LOWER = 'L' /* the throttle's cap */
+};
 
 struct command {
     char kind;
     uint32_t boot, sequence;           /* not in COMMAND_HELLO */
-    uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE only; any number, vehicle.c knows which are safe */
+    uint32_t heard_ms;                 /* in COMMAND_ARM and COMMAND_DRIVE: of the newest status that the host has seen */
+    uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE, COMMAND_LOWER; any number, vehicle.c knows which are safe */
 };
 
 enum reading { READING, READ_COMMAND, READ_BAD };

@@ -19,7 +19,8 @@ void setup() {
   hello_due = true;
 }
 
-static void take(uint8_t byte, uint32_t now_ms) {
+/* Whether the byte ended a line: reading that is enough work for one turn of the loop. */
+static bool take(uint8_t byte, uint32_t now_ms) {
   struct command command;
   switch (reader_take(&reader, byte, now_ms, &command)) {
     case READ_COMMAND:
@@ -29,13 +30,14 @@ static void take(uint8_t byte, uint32_t now_ms) {
         vehicle_command(&vehicle, &command, now_ms);
         status_due = true;
       }
-      break;
+      return true;
     case READ_BAD:
       count(&vehicle.bad_lines);
-      break;
+      return true;
     case READING:
       break;
   }
+  return false;
 }
 
 void loop() {
@@ -44,14 +46,16 @@ void loop() {
   if (receiver_take(STEERING, &pulse_us, &period_us)) vehicle_received(&vehicle, STEERING, pulse_us, period_us, now_ms);
   if (receiver_take(THROTTLE, &pulse_us, &period_us)) vehicle_received(&vehicle, THROTTLE, pulse_us, period_us, now_ms);
   int byte;
-  for (uint8_t n = 0; n < 64 && (byte = serial_take()) >= 0; n++) take((uint8_t)byte, now_ms);
+  bool read = false;
+  for (uint8_t n = 0; n < 32 && !read && (byte = serial_take()) >= 0; n++) read = take((uint8_t)byte, now_ms);
   for (uint8_t lost = serial_lost(); lost; lost--) count(&vehicle.lost_bytes);
   vehicle_tick(&vehicle, now_ms);
   pulses_set(vehicle.steering_us, vehicle.throttle_us);
 
-  /* A line that finds no room is tried again; a status is then the newest. */
-  if (hello_due && serial_put(line.text, vehicle_hello(&vehicle, reset_cause(), &line))) hello_due = false;
-  if (!hello_due && (status_due || now_ms - status_ms >= STATUS_MS)) {
+  /* A line that finds no room is tried again; a status is then the newest. One of these three a turn. */
+  if (!read && hello_due) {
+    if (serial_put(line.text, vehicle_hello(&vehicle, reset_cause(), &line))) hello_due = false;
+  } else if (!read && (status_due || now_ms - status_ms >= STATUS_MS)) {
     if (serial_put(line.text, vehicle_status(&vehicle, now_ms, &line))) {
       status_due = false;
       status_ms = now_ms;

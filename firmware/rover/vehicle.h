@@ -17,6 +17,10 @@ enum {
     STEERING_MAX_US = 2012,
     THROTTLE_MIN_US = 120,
     THROTTLE_MAX_US = 711,
+    /* What it gets at most, however much it asks for: ../README.md has the recordings' figures behind these. */
+    THROTTLE_CAP_US = 238,     /* action 0.2 */
+    STEERING_SLEW_US_PER_MS = 4,
+    THROTTLE_SLEW_US_PER_MS = 2,
     /* What is a pulse of the transmitter: recordings have 1008 to 1948 us and up to 948 us; periods within a quarter. */
     RECEIVER_STEERING_MIN_US = 800,
     RECEIVER_STEERING_MAX_US = 2200,
@@ -28,9 +32,17 @@ enum {
      * within 16 us. */
     STEERING_DEAD_BAND_US = 48,
     THROTTLE_DEAD_BAND_US = 32,
-    THROTTLE_MOVED_PULSES = 3, /* in a row: 3 ms; steering has a pulse every 21 ms and one must do, to be quick */
+    THROTTLE_MOVED_PULSES = 5, /* of the last eight, so that single ones may be misread; steering's one pulse must do */
+    /* A signal is there while its last two (steering) or eight (throttle) pulses are all younger than this. */
+    SIGNAL_TIMEOUT_MS = 100,
+    STEERING_SIGNAL_PULSES = 2,
+    THROTTLE_SIGNAL_PULSES = 8,
+    /* A wiggle of the steering stick: so far to either side of neutral, then held still for LET_GO_MS. */
+    WIGGLE_US = 200,
+    WIGGLE_LIFETIME_MS = 30000,
+    LET_GO_MS = 250,
     COMMAND_TIMEOUT_MS = 150,
-    SIGNAL_TIMEOUT_MS = 100,   /* four missing steering pulses */
+    LATE_MS = 150,             /* a drive or arm of a host that has not heard from us for longer */
     SEQUENCE_WINDOW = 65535    /* a sequence number may be ahead of the last by 1 to this, modulo 2^32 */
 };
 
@@ -42,17 +54,24 @@ enum reason { AFTER_RESET = 'r', HUMAN = 'h', ARMED = 'a', TIMEOUT = 't', NO_SIG
 enum result {
     NONE_YET = '-',
     DONE = 'k',
-    IGNORED = 'i',         /* a drive or neutral while not autonomous */
+    IGNORED = 'i',         /* a drive or neutral while not autonomous, a lower cap while autonomous */
     OUT_OF_RANGE = 'r',
     OLD = 'o',             /* a sequence number that was there already, or another boot's */
-    REFUSED_NO_SIGNAL = 's',
-    REFUSED_STICK = 't'    /* the throttle stick is not at rest */
+    LATE = 'l'             /* it waited in the link for longer than LATE_MS */
 };
+/* What arming lacks; the result of one that was refused. */
+enum missing { NOTHING = '-', SIGNAL = 's', THROTTLE_AT_REST = 't', WIGGLE = 'w' };
 
 struct received {
-    uint16_t pulse_us, period_us;
+    uint16_t pulse_us, period_us;            /* of the newest */
+    uint32_t at_ms[THROTTLE_SIGNAL_PULSES];  /* of the last two or eight, in a ring */
+    uint8_t oldest, seen;                    /* seen: of those, how many came since the signal was lost */
+    bool present;
+};
+
+struct side {
+    bool seen; /* the stick was there within WIGGLE_LIFETIME_MS, and arming has not used it up */
     uint32_t at_ms;
-    bool present; /* a pulse came within SIGNAL_TIMEOUT_MS */
 };
 
 struct vehicle {
@@ -61,10 +80,16 @@ struct vehicle {
     uint32_t sequence;                  /* of the last command that was accepted as new */
     uint16_t steering_us, throttle_us;  /* for the pins, always safe */
     struct received received[2];
+    struct side sides[2];               /* left and right: of a wiggle */
+    uint16_t still_us;                  /* the steering stick has been near this */
+    uint32_t still_ms;                  /* since then */
+    uint8_t throttle_off_rest;          /* the last eight pulses, a bit each: not at rest */
+    bool throttle_free;                 /* the human's throttle passes: it was seen at rest */
     uint16_t rest_us[2];                /* the sticks when the host armed */
-    uint8_t throttle_moved;             /* pulses in a row beyond the dead band */
+    uint8_t throttle_moved;             /* the last eight pulses, a bit each: not where it was then */
+    uint16_t cap_us;
     uint16_t wanted_us[2];              /* of the last valid drive since arming */
-    uint32_t commanded_ms;
+    uint32_t commanded_ms, slewed_ms;
     uint16_t bad_lines, old_commands, out_of_range, lost_bytes; /* stay at 65535 */
 };
 
@@ -72,6 +97,8 @@ void vehicle_start(struct vehicle *vehicle, uint16_t boot);
 /* A pulse of the transmitter, as measured. Implausible ones are no pulse. */
 void vehicle_received(struct vehicle *vehicle, enum channel channel, uint16_t pulse_us, uint16_t period_us,
                       uint32_t now_ms);
+/* What arming lacks now, after vehicle_tick. */
+enum missing vehicle_missing(const struct vehicle *vehicle, uint32_t now_ms);
 /* A command that reader_take returned; not COMMAND_HELLO, which asks nothing of the vehicle. */
 void vehicle_command(struct vehicle *vehicle, const struct command *command, uint32_t now_ms);
 /* Call after all that is new was given, at least every few milliseconds: judges the time and sets the pins' pulses. */

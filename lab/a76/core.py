@@ -33,6 +33,7 @@ from typing import IO, Any
 import numpy as np
 
 from lab.debian import fetch_packages, install_packages, missing_packages, unpack_packages
+from rover_lib.onboard.confine import AS_ROOT
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.program import last_words, run
@@ -173,6 +174,7 @@ def _environment(root: Path, home: Path) -> dict[str, str]:
         "PYTHONHASHSEED": "0",  # the same order in every dict, the same count
         "OMP_NUM_THREADS": "1",
         "OPENBLAS_NUM_THREADS": "1",
+        AS_ROOT: "1",  # of an emulated program, and of artifacts that were made here
     }
 
 

@@ -8,12 +8,15 @@
  *                          all: every pulse of a servo pin, every line of the host, every event
  *                          changes: of the pulses those that differ from the one before on their pin, and no lines
  *                          monotonic_s is when the pin rose; a log that nobody reads is lost, "lost" then has how many
- *         --reset-on-open  what DTR does to an Uno when its port is opened, and after it
+ *         --reset-on-open  what DTR's edge does to an Uno when its port is opened; there is none if who closed it last had
+ *                          HUPCL off
  *         --boot-ms        the boot loader's time: nothing runs for so long
  *         --slow           its clock runs N times slower than this world's, for an emulated Pi that needs so long too;
  *                          pulses and periods are by its own clock
  *     Where this machine stalls for more than 20 ms, so does the Arduino; the log then has "stall" with microseconds.
- *     Standard input takes, a line each: transmitter STEERING_US THROTTLE_US (0: no signal), reset, hang ADDRESS, quit.
+ *     Standard input takes, a line each: transmitter STEERING_US THROTTLE_US (0: no signal), wiggle, ready 0|1, reset,
+ *     hang ADDRESS, quit. ready 1: there is a human who wiggles the stick whenever that is all that arming lacks, but not
+ *     in a stopped car that nobody has opened the port of since.
  *     It ends with whoever started it.
  *
  * Written against simavr 1.6, which needs help in three places, see on_compare, on_flags and INT1.
@@ -50,8 +53,11 @@ struct channel {
     avr_cycle_count_t rise, rise_before;
     bool high;
     double sent_us, period_us;    /* the transmitter's pulse; 0: none */
+    double now_us;                /* the one that is on */
     bool in_high;
 };
+static const double WIGGLE_US[2] = {1750, 1150};
+enum { WIGGLE_SIDE_CYCLES = HZ / 1000 * 70 }; /* at each side: three pulses */
 
 struct uno {
     avr_t *avr;
@@ -62,6 +68,9 @@ struct uno {
     uint8_t output[QUEUE];
     struct uno_event events[QUEUE];
     unsigned queue_head, queue_tail, output_head, output_tail, event_head, event_tail;
+    avr_cycle_count_t wiggle_end; /* of the steering stick */
+    uint32_t watch_from, watch_to; /* flash addresses: the longest way from the one to the other is measured */
+    avr_cycle_count_t watched_from, longest;
     uint32_t hung_at; /* flash address of the instruction that hang replaced, 0: none */
     uint8_t hung_code[2];
     void (*chip_reset)(avr_t *);
@@ -128,18 +137,26 @@ static avr_cycle_count_t feed(avr_t *avr, avr_cycle_count_t when, void *param) {
 
 static avr_cycle_count_t cycles(double microseconds) { return (avr_cycle_count_t)(microseconds * HZ / 1e6 + 0.5); }
 
+/* Of the pulse that begins now. */
+static double stick_us(const struct channel *channel, avr_cycle_count_t now) {
+    avr_cycle_count_t end = channel->uno->wiggle_end;
+    if (channel->uno->channels + STEERING != channel || now >= end) return channel->sent_us;
+    return WIGGLE_US[now + WIGGLE_SIDE_CYCLES >= end];
+}
+
 static avr_cycle_count_t transmit(avr_t *avr, avr_cycle_count_t when, void *param) {
     struct channel *channel = param;
     (void)avr;
-    if (channel->in_high) { /* the pulse that ends here may have had another width than the next */
+    if (channel->in_high) {
         channel->in_high = false;
         avr_raise_irq(channel->in, 0);
-        return channel->sent_us > 0 ? when + cycles(channel->period_us - channel->sent_us) : 0;
+        return channel->sent_us > 0 ? when + cycles(channel->period_us - channel->now_us) : 0;
     }
     if (channel->sent_us <= 0) return 0;
     channel->in_high = true;
+    channel->now_us = stick_us(channel, when);
     avr_raise_irq(channel->in, 1);
-    return when + cycles(channel->sent_us);
+    return when + cycles(channel->now_us);
 }
 
 /* Called in each reset, the watchdog's included, after simavr forgot its cycle timers. */
@@ -241,6 +258,18 @@ void uno_transmitter(struct uno *uno, int index, double pulse_us, double period_
     if (idle && pulse_us > 0) avr_cycle_timer_register(uno->avr, 1, transmit, channel);
 }
 
+/* The human moves the steering stick to one side, to the other, and lets go of it. */
+void uno_wiggle(struct uno *uno) { uno->wiggle_end = uno->avr->cycle + 2 * WIGGLE_SIDE_CYCLES; }
+
+/* From now on the longest way from one flash address to another is measured. */
+void uno_watch(struct uno *uno, uint32_t from, uint32_t to) {
+    uno->watch_from = from;
+    uno->watch_to = to;
+    uno->watched_from = uno->longest = 0;
+}
+
+double uno_longest_us(struct uno *uno) { return us(uno->longest); }
+
 /* The reset button. */
 void uno_reset(struct uno *uno) {
     avr_reset(uno->avr);
@@ -262,6 +291,12 @@ int uno_run_us(struct uno *uno, double microseconds) {
      * times the work of all the rest, unless told not to; a reset forgets that. */
     avr_extint_set_strict_lvl_trig(uno->avr, 1, 0);
     while (uno->avr->cycle < end) {
+        if (uno->watch_from && uno->avr->pc == uno->watch_from) uno->watched_from = uno->avr->cycle;
+        if (uno->watched_from && uno->avr->pc == uno->watch_to) {
+            avr_cycle_count_t took = uno->avr->cycle - uno->watched_from;
+            if (took > uno->longest) uno->longest = took;
+            uno->watched_from = 0;
+        }
         int state = avr_run(uno->avr);
         if (state == cpu_Done || state == cpu_Crashed) return state;
     }
@@ -286,6 +321,7 @@ int uno_events(struct uno *uno, struct uno_event *events, int n) {
 #include <math.h>
 #include <poll.h>
 #include <pty.h>
+#include <sys/ioctl.h>
 #include <termios.h>
 #include <time.h>
 #include <unistd.h>
@@ -304,6 +340,16 @@ static struct {
     unsigned lost;
     struct uno_event last[CHANNELS];
 } pin_log;
+/* A human who sees to it that the car can be armed. */
+static struct {
+    bool ready;
+    bool asked;         /* the port was opened since the car was armed last */
+    double wiggled_us;  /* when, by the Arduino's clock */
+    char line[128];     /* of the Arduino, so far */
+    size_t length;
+} human;
+static const double WIGGLE_EVERY_US = 1e6;
+
 static double slow = 1; /* seconds of this world in a second of the Arduino's */
 
 /* The Arduino does not wait for who reads its log. */
@@ -335,15 +381,37 @@ static void log_events(struct uno *uno, double start_s) {
         for (int i = 0; i < n; i++) log_event(&events[i], start_s);
 }
 
+/* What the Arduino says, byte by byte. */
+static void human_reads(struct uno *uno, uint8_t byte) {
+    char state, missing;
+    if (byte != '\n') {
+        if (human.length < sizeof human.line - 1) human.line[human.length++] = (char)byte;
+        return;
+    }
+    human.line[human.length] = 0;
+    human.length = 0;
+    if (sscanf(human.line, "<S %*u %*u %*u %*c %c %*c %c", &state, &missing) != 2) return;
+    if (state == 'A') human.asked = false;
+    bool may = state == 'M' || (state == 'S' && human.asked);
+    if (!human.ready || !may || missing != 'w' || uno_now_us(uno) - human.wiggled_us < WIGGLE_EVERY_US) return;
+    human.wiggled_us = uno_now_us(uno);
+    uno_wiggle(uno);
+}
+
 /* false: quit. */
 static bool obey(struct uno *uno, const char *line) {
     double steering_us, throttle_us;
     unsigned address;
+    int ready;
     if (sscanf(line, "transmitter %lf %lf", &steering_us, &throttle_us) == 2) {
         uno_transmitter(uno, STEERING, steering_us, 0);
         uno_transmitter(uno, THROTTLE, throttle_us, 0);
     } else if (sscanf(line, "hang %x", &address) == 1) {
         uno_hang(uno, address);
+    } else if (sscanf(line, "ready %d", &ready) == 1) {
+        human.ready = ready;
+    } else if (!strncmp(line, "wiggle", 6)) {
+        uno_wiggle(uno);
     } else if (!strncmp(line, "reset", 5)) {
         uno_reset(uno);
     } else if (!strncmp(line, "quit", 4)) {
@@ -352,6 +420,17 @@ static bool obey(struct uno *uno, const char *line) {
         fprintf(stderr, "arduino: not understood: %s\n", line);
     }
     return true;
+}
+
+/* Whether DTR stays up although the port was closed. What a real port forgets then, a pty is made to forget too. */
+static bool stays_up(int master, const char *name) {
+    struct termios now;
+    int port = open(name, O_RDWR | O_NOCTTY);
+    if (port >= 0) {
+        ioctl(port, TIOCNXCL);
+        close(port);
+    }
+    return tcgetattr(master, &now) == 0 && !(now.c_cflag & HUPCL); /* a pty's master tells those of its other end */
 }
 
 int main(int argc, char **argv) {
@@ -386,6 +465,7 @@ int main(int argc, char **argv) {
     struct termios raw;
     memset(&raw, 0, sizeof raw);
     cfmakeraw(&raw);
+    raw.c_cflag |= HUPCL | CREAD | CLOCAL; /* as a serial port's is */
     if (openpty(&master, &slave, name, &raw, NULL)) {
         perror("arduino: openpty");
         return 1;
@@ -398,7 +478,7 @@ int main(int argc, char **argv) {
         return 1;
     }
     double start = monotonic(); /* when simulated time was 0 */
-    bool open = false, running = true;
+    bool open = false, running = true, dtr = false;
     int state = 0;
     char input[128];
     size_t input_length = 0;
@@ -416,13 +496,15 @@ int main(int argc, char **argv) {
         bool open_now = !(files[0].revents & POLLHUP);
         if (open_now && !open) {
             put_log(monotonic(), "open", "", 0, 0);
-            if (reset_on_open) {
+            human.asked = true;
+            if (reset_on_open && !dtr) {
                 uno_reset(uno);
                 log_events(uno, start);
                 start += boot_s * slow; /* stands still for so long */
                 ahead += boot_s * slow;
             }
         }
+        if (open && !open_now) dtr = stays_up(master, name);
         open = open_now;
         if (files[0].revents & POLLIN) {
             uint8_t bytes[512];
@@ -446,6 +528,7 @@ int main(int argc, char **argv) {
         }
         uint8_t bytes[512];
         int n = uno_read(uno, bytes, sizeof bytes);
+        for (int i = 0; i < n; i++) human_reads(uno, bytes[i]);
         /* What nobody reads is lost, as on a wire. */
         if (n > 0 && open && write(master, bytes, (size_t)n) < 0 && errno != EAGAIN) perror("arduino: write");
         if (ahead > 0) {

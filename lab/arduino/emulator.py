@@ -101,7 +101,8 @@ def symbol(name: str) -> int:
 class EmulatedArduino:
     """The real firmware in simavr, in real time, as a process of its own that ends with this one.
 
-    port: for a ServoLink. Opening it resets the Arduino, as a real one's. pid: of the process.
+    port: for a ServoLink. Opening it resets the Arduino, as a real one's: not if who had it last left DTR up. pid: of
+    the process.
     """
 
     def __init__(
@@ -109,15 +110,16 @@ class EmulatedArduino:
         *,
         every_pulse: bool = True,
         transmitter: tuple[float, float] = (0.0, 0.0),
+        ready: bool = False,
         boot_s: float = BOOT_S,
         nice: int = 0,
         slow: float = 1.0,
     ):
         """every_pulse: pulses() has each pulse, a thousand a second; otherwise those that differ from the one before.
 
-        transmitter: its pulses from the start on, see transmitter(). nice: scheduling priority, NICE comes near a
-        processor of its own (below 0 only for root, silently left out for others). slow: its clock runs that many times
-        slower than this machine's; pulses are by its own, monotonic_s by this machine's.
+        transmitter: its pulses from the start on, see transmitter(). ready: see ready(). nice: scheduling priority,
+        NICE comes near a processor of its own (below 0 only for root, silently left out for others). slow: its clock
+        runs that many times slower than this machine's; pulses are by its own, monotonic_s by this machine's.
         Raises ArduinoError as build() does, and if the program does not start.
         """
         built = build()
@@ -144,6 +146,7 @@ class EmulatedArduino:
                     )
                 time.sleep(0.005)
             self.transmitter(*transmitter)
+            self.ready(ready)
         except BaseException:
             self.close()
             raise
@@ -157,6 +160,17 @@ class EmulatedArduino:
     def transmitter(self, steering_us: float, throttle_us: float) -> None:
         """The pulses that the receiver gets, from the next on; 0 is no signal."""
         self._process.send_line(f"transmitter {steering_us} {throttle_us}")
+
+    def wiggle(self) -> None:
+        """The human moves the steering stick to both sides and lets go: 0.14 s, and 0.25 until it counts."""
+        self._process.send_line("wiggle")
+
+    def ready(self, ready: bool) -> None:
+        """Whether the human wiggles the stick by himself whenever that is all that arming lacks.
+
+        He leaves a stopped car alone until somebody opens its port again.
+        """
+        self._process.send_line(f"ready {ready:d}")
 
     def reset(self) -> None:
         """The reset button."""
@@ -196,5 +210,5 @@ BOARD = f"{__name__}:board"  # for a VirtualCar, which makes it in its own proce
 
 
 def board() -> EmulatedArduino:
-    """The real firmware as a virtual car's board: a transmitter at rest, and only pulses that changed are read."""
-    return EmulatedArduino(every_pulse=False, transmitter=REST_US, nice=NICE)
+    """The real firmware as a virtual car's board: a human who is ready, and only pulses that changed are read."""
+    return EmulatedArduino(every_pulse=False, transmitter=REST_US, ready=True, nice=NICE)

@@ -107,14 +107,14 @@ class Drive(RoverCommand):
         self.start = start
         self._marked = 0
         self.log = bench.disk / "flight.log" if start == "disk" else bench.folder / "flight.log"
-        run: list[str] = []
         env: dict[str, str] = {}
+        code = "from lab.driving.policy import obey_pictures; obey_pictures(); "
         if start in INSIDE:
-            code = f"from {__name__} import on_signal; on_signal({start!r}); from rover_lib.cli import main; main()"
-            run = [sys.executable, "-c", code]
+            code += f"from {__name__} import on_signal; on_signal({start!r}); "
+        run = [sys.executable, "-c", f"{code}from rover_lib.cli import main; main()"]
         if start == "clock":
             env = {"LD_PRELOAD": str(bench.clock_library()), "CLOCK_STEP": str(bench.clock)}
-        options = ["--hz", RATE_HZ, "--threads", 1, "--log", self.log]
+        options = ["--film", "--hz", RATE_HZ, "--threads", 1, "--log", self.log]
         super().__init__("drive", bench.artifact, *bench.devices(), *options, run=run, env=env)
 
     def children(self) -> list[int]:
@@ -223,9 +223,7 @@ class DrivingBench:
 
     def restart(self, start: str = "") -> None:
         """A new drive, from the start until it has been driving for a while."""
-        self.end_drive()
-        self.repair()
-        self._drive = drive = Drive(self, start)
+        drive = self.start(start)
         deadline = time.monotonic() + START_S
         first_s = None  # command
         while first_s is None or time.monotonic() - first_s < AT_SPEED_S or not self._driving():
@@ -236,6 +234,16 @@ class DrivingBench:
                 raise FaultError(
                     f"rover drive did not drive within {START_S:g} s: {drive.last_words()}", remedy="drive it by hand"
                 )
+        self.arduino.ready(False)  # from here on the human does nothing but what a fault says
+
+    def start(self, start: str = "", fault: Callable[["DrivingBench"], object] = lambda bench: None) -> Drive:
+        """A new drive, with a fault that is there before it."""
+        self.end_drive()
+        self.repair()
+        self.arduino.ready(True)
+        fault(self)
+        self._drive = Drive(self, start)
+        return self._drive
 
     def repair(self) -> None:
         """Whatever was broken is as before."""

@@ -42,11 +42,25 @@ def dropping(rng: random.Random, share: float) -> Change:
     return whole_lines(lambda line: b"" if rng.random() < share else line)
 
 
-_DRIVE = re.compile(rb">D \d+ \d+ (\d+) (\d+)\*[0-9A-F]{8}")
+def lagging(share: float) -> Change:
+    """Falls behind by that share of the time, as far as more bytes come."""
+    start_s, waiting = time.monotonic(), deque[tuple[float, bytes]]()
+
+    def lag(data: bytes) -> bytes:
+        now_s, ready = time.monotonic(), b""
+        waiting.append((now_s, data))
+        while waiting and waiting[0][0] + share * (waiting[0][0] - start_s) <= now_s:
+            ready += waiting.popleft()[1]
+        return ready
+
+    return lag
+
+
+_DRIVE = re.compile(rb">D \d+ \d+ \d+ (\d+) (\d+)\*[0-9A-F]{8}")
 
 
 class Cable:
-    """The cable between a host and an Arduino. port: the host's end; opening it resets the Arduino, as DTR does.
+    """The cable between a host and an Arduino. port: the host's end; opening it opens the Arduino's.
 
     to_arduino, to_host: may be set; change what passes. commands: the drives that the host wrote, before any change.
     lines: all that it wrote. not_ours: lines that others write to the port, and which are no commands of the drive.
@@ -56,6 +70,7 @@ class Cable:
         self._arduino_port = arduino_port
         self._master, slave = pty.openpty()
         tty.setraw(slave)
+        _set_hang_up(slave, True)  # as a serial port has it
         self.port = os.ttyname(slave)
         os.close(slave)  # so that POLLHUP tells whether somebody has the port open
         os.set_blocking(self._master, False)
@@ -94,6 +109,8 @@ class Cable:
             if events.get(self._master, 0) & select.POLLHUP:  # nobody has it open
                 if arduino >= 0:
                     poller.unregister(arduino)
+                    # What the host left: whether its next opening is an edge of DTR, which resets the Arduino.
+                    _set_hang_up(arduino, bool(termios.tcgetattr(self._master)[2] & termios.HUPCL))
                     os.close(arduino)
                     arduino = -1
                 self._closing.wait(0.005)
@@ -124,6 +141,12 @@ class Cable:
             drive = _DRIVE.fullmatch(line)
             if drive and frame(line.split(b"*")[0].decode()) == line + b"\n":
                 self.commands.append(Command(now, int(drive[1]), int(drive[2])))
+
+
+def _set_hang_up(fd: int, on: bool) -> None:
+    attributes = termios.tcgetattr(fd)
+    attributes[2] = attributes[2] | termios.HUPCL if on else attributes[2] & ~termios.HUPCL
+    termios.tcsetattr(fd, termios.TCSANOW, attributes)
 
 
 def _read(fd: int) -> bytes:

@@ -1,4 +1,4 @@
-"""What the servo pins do after a fault, judged: stopped, the human's, or going on as commanded.
+"""What the servo pins do after a fault, judged: stopped, the human's, going on as commanded, or never driven.
 
 All times are of the monotonic clock that simavr's pins, the cable and the bench share.
 """
@@ -13,7 +13,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.pwm import ARDUINO_STEP_US, STOPPED_THROTTLE_US
 from rover_lib.world.standin import REST_US, PinEvent
 
-STOPPED, HUMAN, CONTINUES = "stopped", "human", "continues"
+STOPPED, HUMAN, CONTINUES, REFUSED = "stopped", "human", "continues", "refused"
 NEUTRAL_US = {"steering": 1456, "throttle": 120}
 PERIOD_US = {"steering": 21316, "throttle": 1016}
 TICK_US = {"steering": 0.5, "throttle": 4.0}  # of the pin's timer: all that its hardware can do
@@ -115,7 +115,7 @@ def judge(
         "steering_us_after": round(steering[-1].pulse_us, 1) if steering else None,
     }
     wrong = []
-    if not seen.was_driving(gates.throttle_max_us):
+    if expected != REFUSED and not seen.was_driving(gates.throttle_max_us):
         wrong.append(f"the car was not driving in the {BEFORE_S * 1e3:g} ms before the fault")
     for pin, period_us in PERIOD_US.items():
         count, wanted = len(seen.pulses(pin, seen.end_s - LAST_S)), LAST_S * 1e6 / period_us
@@ -123,6 +123,10 @@ def judge(
             wrong.append(f"{count} {pin} pulses in the last {LAST_S * 1e3:g} ms, {wanted:.0f} are its rate")
     if expected == STOPPED:
         wrong += _not_stopped(seen, gates, figures, human_us)
+    elif expected == REFUSED:
+        figures["stopped_after_ms"] = None
+        if moving:
+            wrong.append(f"throttle at {max(e.pulse_us for e in throttle):g} us, and the car was not to be armed")
     elif expected == HUMAN:
         wrong += _not_human(seen, gates, figures, human_us)
     else:
@@ -176,7 +180,9 @@ def _not_continued(seen: Observation, gates: Gates, figures: dict[str, Any], unt
                 yield f"a {pin} pulse out of time: {e.period_us:g} us after the one before, {period_us} is its period"
                 return
             neutral = until_limit and e.end_s > stopped_s and abs(e.pulse_us - NEUTRAL_US[pin]) <= COMMAND_US[pin]
-            if not neutral and min((abs(e.pulse_us - us) for us in recent), default=1e9) > COMMAND_US[pin]:
+            # Between two commands a pulse goes no faster than the firmware lets it.
+            within = recent and min(recent) - COMMAND_US[pin] <= e.pulse_us <= max(recent) + COMMAND_US[pin]
+            if not neutral and not within:
                 yield f"{pin} at {e.pulse_us:g} us {(e.monotonic_s - seen.at_s) * 1e3:.0f} ms after the fault, which "\
                       f"was not commanded ({sorted(set(recent))})"  # fmt: skip
                 return

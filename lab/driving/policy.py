@@ -1,6 +1,9 @@
 """A policy that does what the picture's corner tells it to, so that what happens inside an inference can be chosen."""
 
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,48 +16,31 @@ PLAN, OTHER_PLAN = (0.2, 0.15), (-0.3, 0.08)  # steering, throttle
 
 # Instructions: red, green and blue of the picture's corner are on or off.
 PLAIN, RAISE, HANG, NAN, OUT_OF_RANGE, SLOW, OTHER = range(7)
+SLOW_S = 0.3
 
 
 def make_artifact(
     path: Path, *, camera: str = "front", size: tuple[int, int] = (48, 96), engine: str | None = None
 ) -> None:
-    """An artifact with constant plans that obeys the corner of the picture: PLAIN to OTHER.
+    """An artifact with the constant plan PLAN.
 
     camera, size: its name, and height and width of what the policy looks at. engine: in the manifest; this machine's.
     """
     import torch
 
-    class Obedient(torch.nn.Module):
+    class Constant(torch.nn.Module):
         plan: torch.Tensor
-        other: torch.Tensor
 
         def __init__(self):
             super().__init__()
             self.register_buffer("plan", torch.tensor([PLAN] * CHUNK)[None])
-            self.register_buffer("other", torch.tensor([OTHER_PLAN] * CHUNK)[None])
 
         def forward(self, state, frame):
-            corner = frame[4:12, 4:12].float().mean(dim=(0, 1)) > 127.0
-            instruction = int(corner[0]) * 4 + int(corner[1]) * 2 + int(corner[2])
-            plan = self.plan.clone()
-            if instruction == 1:
-                raise RuntimeError("told to fail by the picture")
-            if instruction == 2 or instruction == 5:
-                work_ns = 300000000 if instruction == 5 else 1 << 62
-                start, rounds = torch.ops.prim.TimePoint(), 0
-                while torch.ops.prim.TimePoint() - start < work_ns:
-                    rounds += 1
-                plan = plan + 0 * rounds
-            if instruction == 3:
-                plan = plan * float("nan")
-            if instruction == 4:
-                plan = plan * 0 + 5.0
-            if instruction == 6:
-                plan = self.other.clone()
-            return plan
+            return self.plan + 0 * state[:, None]
 
     height, width = size
-    module = torch.jit.script(Obedient().eval())
+    inputs = torch.zeros(1, 2), torch.zeros((height, width, 3), dtype=torch.uint8)
+    module = torch.jit.freeze(torch.jit.trace(Constant().eval(), inputs))
     names = ["steering", "throttle"]
     manifest = {
         "schema": SCHEMA,
@@ -83,8 +69,44 @@ def make_artifact(
     save_artifact(path, module, manifest, parity)
 
 
-def pictures(instruction: int, size: tuple[int, int] = SIZE, level: int = 100, count: int = 16) -> list[bytes]:
-    """JPEGs with a sensor's noise, no two the same, whose corner has an instruction. level: their grey, 0 is black."""
+def obey_pictures() -> None:
+    """From now on the policy's process of this one does what the picture's corner tells it to: PLAIN to OTHER.
+
+    No artifact can do that, whose operators are a closed list. The process is the real one otherwise.
+    """
+    from rover_lib.onboard.inference import PolicyProcess
+
+    PolicyProcess.program = __name__
+
+
+def obey(policy: Any) -> None:
+    """Give a loaded policy with the plan PLAN the will of the picture."""
+    plain = policy.run
+
+    def run(state: np.ndarray, frames_rgb: list[np.ndarray]) -> np.ndarray:
+        red, green, blue = frames_rgb[0][4:12, 4:12].mean((0, 1)) > 127
+        instruction = 4 * red + 2 * green + blue
+        if instruction == RAISE:
+            raise RuntimeError("told to fail by the picture")
+        if instruction in (HANG, SLOW):
+            end_s = time.monotonic() + (SLOW_S if instruction == SLOW else float("inf"))
+            while time.monotonic() < end_s:
+                pass
+        plan = plain(state, frames_rgb)
+        if instruction == NAN:
+            return plan * np.nan
+        if instruction == OUT_OF_RANGE:
+            return plan * 0 + 5
+        return plan * 0 + np.array(OTHER_PLAN, np.float32) if instruction == OTHER else plan
+
+    policy.run = run
+
+
+def pictures(instruction: int, size: tuple[int, int] = SIZE, level: int = 100, count: int = 40) -> list[bytes]:
+    """JPEGs with a sensor's noise, no two the same, whose corner has an instruction. level: their grey, 0 is black.
+
+    count: shown over and over again they are a live camera's only if they are more than that remembers.
+    """
     rng = np.random.default_rng(instruction)
     height, width = size
     made = []
@@ -96,3 +118,9 @@ def pictures(instruction: int, size: tuple[int, int] = SIZE, level: int = 100, c
             picture[: height // 3, : width // 3] += rng.integers(0, 12, (height // 3, width // 3, 3), np.uint8)
         made.append(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
     return made
+
+
+if __name__ == "__main__":
+    from rover_lib.onboard.inference import main
+
+    main(sys.argv[1:], loaded=obey)

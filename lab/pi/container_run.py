@@ -116,6 +116,7 @@ class _Run:
             "rover_packed": str(folder / "packed"),
             "rover_fetched": str(folder / "fetched"),
             "rover_camera": CAMERA,
+            "rover_film": True,
             "rover_port": PORT,
             "rover_hz": HZ,
             "rover_ready_s": READY_S,
@@ -325,7 +326,7 @@ def _car(pi: Container) -> Iterator[Pins]:
     """Camera and Arduino, plugged in; what the pins do."""
     with (
         CameraFeed(pi.bench / "camera", *pictures(PLAIN, (180, 320)), rate_hz=HZ),
-        EmulatedArduino(every_pulse=False, transmitter=REST_US, nice=ARDUINO_NICE) as board,
+        EmulatedArduino(every_pulse=False, transmitter=REST_US, ready=True, nice=ARDUINO_NICE) as board,
         Pins(board) as pins,
     ):
         (pi.bench / "camera").chmod(0o666)

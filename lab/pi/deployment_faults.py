@@ -39,9 +39,9 @@ from lab.pi.deployment_bench import (
     rovers,
 )
 from lab.pi.emulation import EmulationError
-from rover_lib.onboard.artifact import read_manifest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.release import ORIGIN, SPARE_BYTES
+from rover_lib.workshop.program import run
 
 ROOM = 4 << 20  # bytes free on a full disk
 TRIES = 2  # of a row whose moment was missed
@@ -154,17 +154,22 @@ def _refused(message: str, **changes: Any) -> Callable[[DeploymentBench], None]:
         there = bench.state / "by-hand.pt"
         shutil.copy(bad, there)
         bench.undo.callback(there.unlink, missing_ok=True)
-        if not re.search(message, bench.rover("release", "stage", f"/{STATE}/by-hand.pt")):
+        if not re.search(message, bench.rover("release", "stage", "--unsigned", f"/{STATE}/by-hand.pt")):
             what = f"{bench.pi.name}: the rover did not refuse it by '{message}'"
             raise EmulationError(what, found=bench.outputs[-1])
 
     return inject
 
 
+def _sign_by_another(bench: DeploymentBench) -> None:
+    key = bench.folder / "another"
+    if not key.exists():
+        run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "another laptop", "-f", key, error=EmulationError)
+    bench.deploy(rover_signing_key=str(key))
+
+
 def _fail_parity(bench: DeploymentBench) -> None:
-    artifact = bench.artifacts[bench.target]
-    parity = {"tolerance": dict.fromkeys(read_manifest(artifact)["action_names"], -1.0), "reason": "to fail"}
-    bench.deploy(changed_artifact(artifact, bench.folder / "parity.pt", parity=parity))
+    bench.deploy(changed_artifact(bench.artifacts[bench.target], bench.folder / "parity.pt", answers=0.5))
 
 
 def _two_at_once(bench: DeploymentBench) -> None:
@@ -330,10 +335,17 @@ FAULTS = [
         "it says dynamic of INT8 convolutions; refused by laptop and rover",
     ),
     DeploymentFault(
+        "artifact signed by another laptop",
+        _sign_by_another,
+        "not signed by a laptop that this rover knows",
+        "with an ssh key that did not provision the rover",
+        fresh=True,
+    ),
+    DeploymentFault(
         "parity vectors that fail",
         _fail_parity,
         "computes something else here",
-        "the manifest tolerates less than no difference",
+        "they want other answers",
     ),
     DeploymentFault(
         "two deployments at once",

@@ -116,7 +116,7 @@ def card() -> Card:
     with emulation():
         flashed = debian_image()
     made = [RECIPE, CARD_GB, MODULES, FIRST_MODULES, INIT, NETWORK, MASKED, ROVER_PACKAGES, KERNEL_PACKAGES]
-    key = key_of({"system": str(flashed.root), "made": made})
+    key = key_of({"system": str(flashed.root), "made": made, "holds": "public key"})
     return Card(cached_folder("pi-card", key, lambda folder: _make_card(flashed, folder)))
 
 
@@ -139,6 +139,7 @@ def _make_card(flashed: DebianImage, folder: Path) -> None:
         _configure(root)
         shutil.copy(flashed.key, made.key)
         made.key.chmod(0o600)
+        shutil.copy(f"{flashed.key}.pub", f"{made.key}.pub")  # who deploys signs with it
         # Without checksums of its own: the kernel would need modules for them before it has the card.
         options = ["-t", "ext4", "-E", "lazy_itable_init=1,lazy_journal_init=1", "-O", "^metadata_csum"]
         _run("mke2fs", "-q", *options, "-d", root, made.disk, f"{CARD_GB}G")

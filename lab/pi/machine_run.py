@@ -127,7 +127,7 @@ class _Run:
             frames = _frames(recordings, self.folder / "frames.yuyv")
         with contextlib.ExitStack() as on:
             self.pi = on.enter_context(Machine(flashed, self.folder, layer=layer, slow=self.slow, drives=[frames]))
-            board = on.enter_context(EmulatedArduino(transmitter=REST_US, slow=self.slow, nice=-5))
+            board = on.enter_context(EmulatedArduino(transmitter=REST_US, ready=True, slow=self.slow, nice=-5))
             self.pins = on.enter_context(Pins(board))
             self.pi.plug(board.port)
             with self.report.step("boot, until ssh answers"):
@@ -278,7 +278,9 @@ class _Run:
     def doctor(self) -> dict[str, Any]:
         """`rover doctor` on the rover: whether the car would drive, and each check."""
         output = self.pi.ssh(
-            f"sudo rover doctor {MODEL} --camera {CAMERA} --port {PORT} --json", check=False, timeout_s=900
+            f"cd / && sudo -u rover rover doctor {MODEL} --camera {CAMERA} --port {PORT} --json",
+            check=False,
+            timeout_s=900,
         )
         try:
             found = json.loads(output[output.index("{") : output.rindex("}") + 1])

@@ -59,9 +59,10 @@ def compare(
     """Each pulse of a drive against the commands that it may be, and each command against the pulses that it caused.
 
     host_s: the rover's monotonic seconds as the host's, by which the events are. slow: seconds of the host in one of
-    the rover's and the Arduino's. worst_us: the largest difference of any pulse from the nearest of its commands, and
-    of any command from the nearest of its pulses; None where there is nothing to compare. unseen: commands without any
-    pulse in their time. distinct: values among the commands: a servo that stands still proves little.
+    the rover's and the Arduino's. worst_us: the largest difference of any pulse from the nearest of its commands, those
+    between two of them being on the way, and of any command from the nearest of its pulses; None where there is nothing
+    to compare. unseen: commands without any pulse in their time. distinct: values among the commands: a servo that
+    stands still proves little.
     """
     sent_s = host_s(flight.ticks["t_s"] + float(flight.header["start_monotonic_s"]))
     held_s, error_s = HELD_S * slow, ERROR_S * slow
@@ -78,7 +79,9 @@ def compare(
         driven = np.flatnonzero((rose_s > sent_s[0] + held_s) & (rose_s < sent_s[-1]))
         for i in driven:
             choice = commanded[(sent_s > rose_s[i] - held_s) & (sent_s <= rose_s[i] + error_s)]
-            worst.append(float(np.abs(choice - us[i]).min()) if len(choice) else np.inf)
+            # Between two commands: the firmware limits how fast a pulse changes.
+            off = max(choice.min() - us[i], us[i] - choice.max(), 0.0) if len(choice) else np.inf
+            worst.append(float(off))
         result["pulses"] += len(driven)
         for at_s, wanted in zip(sent_s[:-3], commanded[:-3], strict=True):
             caused = us[(rose_s > at_s - error_s) & (rose_s <= at_s + held_s)]

@@ -13,7 +13,7 @@ SECTIONS = {
     "Prepare a policy": (prepare.run, prepare.inspect, prepare.quantize, prepare.compare, ROVERS["benchmark"]),
     "Try it without a car": (world.world,),
     "Set up a rover": (prepare.wheelhouse, ROVERS["release"]),
-    "Drive": (ROVERS["doctor"], ROVERS["record"], drive.drive, ROVERS["arm-car"], drive.log),
+    "Drive": (ROVERS["doctor"], ROVERS["record"], drive.drive, ROVERS["arm-car"], ROVERS["heartbeat"], drive.log),
 }
 
 

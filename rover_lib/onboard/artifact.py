@@ -10,12 +10,14 @@ import json
 import math
 import re
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.stage import atomic_path
+from rover_lib.onboard.torchscript import check_program, open_archive, read_record
 
 if TYPE_CHECKING:  # reading what an artifact says of itself needs neither
     import numpy as np
@@ -41,6 +43,17 @@ MANIFEST_KEYS: dict[str, type | tuple[type, ...]] = {
     "parity": dict,  # {tolerance: {action: largest difference}, reason}
     "versions": dict,  # {torch, rover_lib}
 }
+MODES = ("fp32", "dynamic", "static", "mixed")
+SCHEMES = ("float", "dynamic", "symmetric", "affine")
+# What the reader takes, whatever a manifest says; both ends included
+SIDE_PX, CHUNK, RATE_HZ = (16, 8192), (1, 256), (5.0, 120.0)
+WEIGHTS_MB, GMAC = (0.0, 1000.0), (0.0, 1000.0)
+MOST_NAMES, NAME_LENGTH = 64, 64
+MOST_VECTORS = 16
+# How far parity vectors may differ on a car: FP32 policies by the order of sums, INT8 ones by flipped roundings, which
+# were 0.13 on the worst of those with random weights and 0.03 on trained ones.
+LARGEST_TOLERANCE = {"fp32": 1e-3, "int8": 0.3}
+CAR_ACTIONS = ("steering", "throttle")
 
 
 def save_artifact(
@@ -76,11 +89,11 @@ def content_hash(path: Path | str) -> str:
     names with a counter of all classes that the process ever made.
     """
     digest = hashlib.sha256()
-    with _open(path) as z:
+    with open_archive(path) as z:
         for name in sorted(z.namelist()):
             if name.endswith((".debug_pkl", "/.data/serialization_id")):
                 continue
-            record = z.read(name)
+            record = read_record(z, name)
             if not name.startswith("archive/constants/"):
                 record = MANGLED.sub(b"", record)
             digest.update(MANGLED.sub(b"", name.encode()) + b"\0")
@@ -90,37 +103,62 @@ def content_hash(path: Path | str) -> str:
 
 def read_manifest(path: Path | str) -> dict[str, Any]:
     """The manifest of an artifact, without running or even loading the policy. Raises ArtifactError."""
-    with _open(path) as z:
+    with open_archive(path) as z:
         return _manifest_in(z, path)
 
 
 def read_parity(path: Path | str) -> "dict[str, np.ndarray]":
-    """The parity vectors of an artifact. Raises ArtifactError."""
+    """The parity vectors of an artifact, of the shapes that its manifest says. Raises ArtifactError."""
     import numpy as np
 
-    with _open(path) as z:
+    with open_archive(path) as z:
+        manifest = _manifest_in(z, path)
+        wanted: dict[str, tuple[str, tuple[int, ...]]] = {
+            "state": ("float32", (len(manifest["state_names"]),)),
+            "chunk": ("float32", (manifest["chunk"], len(manifest["action_names"]))),
+        } | {f"frame_{c['name']}": ("uint8", (c["height"], c["width"], 3)) for c in manifest["cameras"]}
+        vectors = {}
         try:
-            content = np.load(io.BytesIO(z.read(_record(z, "parity.npz", path))), allow_pickle=False)
-            vectors = {k: content[k] for k in content.files}
-        except (ValueError, OSError, zipfile.BadZipFile) as e:
+            with zipfile.ZipFile(io.BytesIO(read_record(z, "archive/extra/parity.npz"))) as packed:
+                for name, (dtype, shape) in wanted.items():
+                    size = packed.getinfo(f"{name}.npy").file_size
+                    if size > MOST_VECTORS * math.prod(shape) * np.dtype(dtype).itemsize + 200:
+                        raise ArtifactError(f"{path}: its parity vectors are too large", remedy="quantize again")
+                    raw = io.BytesIO(read_record(packed, f"{name}.npy"))
+                    if np.lib.format.read_magic(raw) != (1, 0):
+                        raise ValueError("another version of numpy's format")
+                    found, _, kind = np.lib.format.read_array_header_1_0(raw)
+                    if found[1:] != shape or not 1 <= found[0] <= MOST_VECTORS or kind != dtype:
+                        raise ArtifactError(
+                            f"{path}: its parity vectors have another shape than its manifest says",
+                            found=f"{name} of {kind} {found}",
+                            remedy="quantize again",
+                        )
+                    raw.seek(0)
+                    vectors[name] = np.load(raw, allow_pickle=False)
+        except (KeyError, ValueError, OSError, zipfile.BadZipFile, zlib.error, RuntimeError) as e:
             raise ArtifactError(f"{path}: its parity vectors are not readable ({e})", remedy="quantize again") from None
-    if "state" not in vectors or "chunk" not in vectors or len(vectors["chunk"]) == 0:
-        raise ArtifactError(f"{path}: it has no parity vectors", found=sorted(vectors), remedy="quantize again")
+    if len({len(v) for v in vectors.values()}) != 1 or not all(np.isfinite(v).all() for v in vectors.values()):
+        raise ArtifactError(f"{path}: its parity vectors do not belong together", remedy="quantize again")
     return vectors
 
 
-def check_integrity(path: Path | str) -> None:
-    """Raise ArtifactError if any byte changed since the artifact was written (TorchScript itself does not look)."""
-    with _open(path) as z:
+def check_artifact(path: Path | str) -> None:
+    """Raise ArtifactError if any byte changed since the artifact was written, or if it has what no artifact has.
+
+    TorchScript looks for neither. Nothing in the artifact is run.
+    """
+    with open_archive(path) as z:
         try:
             damaged = z.testzip()
         # RuntimeError, its subclasses too: a damaged header may ask for a password, or for an unknown compression
-        except (zipfile.BadZipFile, OSError, RuntimeError) as e:
+        except (zipfile.BadZipFile, OSError, RuntimeError, zlib.error) as e:
             raise ArtifactError(f"{path}: damaged ({e})", remedy="copy the file again") from None
-    if damaged:
-        raise ArtifactError(
-            f"{path}: damaged, the checksum of '{damaged}' does not match", remedy="copy the file again"
-        )
+        if damaged:
+            raise ArtifactError(
+                f"{path}: damaged, the checksum of '{damaged}' does not match", remedy="copy the file again"
+            )
+        check_program(z, path)
 
 
 def check_manifest(manifest: Any, where: str) -> None:
@@ -140,39 +178,67 @@ def check_manifest(manifest: Any, where: str) -> None:
             raise ArtifactError(
                 f"{where}: manifest key '{key}' is {value}, not what it should be", remedy="quantize again"
             )
+    for key, known in (("mode", MODES), ("scheme", SCHEMES)):
+        if manifest[key] not in known:
+            raise ArtifactError(
+                f"{where}: manifest {key} must be one of {', '.join(known)}",
+                found=repr(manifest[key])[:60],
+                remedy="quantize again",
+            )
     if not manifest["cameras"]:
         raise ArtifactError(f"{where}: manifest has no cameras", remedy="quantize again")
     for camera in manifest["cameras"]:
         if not isinstance(camera, dict) or not {"name", "height", "width"} <= camera.keys():
             raise ArtifactError(
-                f"{where}: manifest camera {camera!r} lacks name, height or width", remedy="quantize again"
+                f"{where}: manifest camera {str(camera)[:80]!r} lacks name, height or width", remedy="quantize again"
             )
-        if not isinstance(camera["name"], str) or not _is_count(camera["height"]) or not _is_count(camera["width"]):
+        sides = [camera["height"], camera["width"]]
+        if not _is_name(camera["name"]) or not all(isinstance(s, int) and _is_within(s, SIDE_PX) for s in sides):
             raise ArtifactError(
-                f"{where}: manifest camera {camera!r} is not a name and a size", remedy="quantize again"
+                f"{where}: manifest camera {str(camera)[:80]!r} is not a name and a size", remedy="quantize again"
             )
-    if not _is_count(manifest["chunk"]):
-        raise ArtifactError(
-            f"{where}: manifest chunk must be 1 or more", found=manifest["chunk"], remedy="quantize again"
-        )
-    if not 0 < manifest["rate_hz"] < math.inf:
-        raise ArtifactError(
-            f"{where}: manifest rate_hz must be above 0", found=manifest["rate_hz"], remedy="quantize again"
-        )
-    for key in ("state_names", "action_names"):
-        if not manifest[key] or not all(isinstance(name, str) for name in manifest[key]):
+    if not isinstance(manifest["chunk"], int) or not _is_within(manifest["chunk"], CHUNK):
+        raise _out_of_range(where, manifest, "chunk", CHUNK)
+    for key, limits in (("rate_hz", RATE_HZ), ("weights_mb", WEIGHTS_MB), ("gmac", GMAC)):
+        if not _is_within(manifest[key], limits):
+            raise _out_of_range(where, manifest, key, limits)
+    for key in ("state_names", "action_names", "cameras"):
+        names = [c["name"] for c in manifest[key]] if key == "cameras" else manifest[key]
+        if not 1 <= len(names) <= MOST_NAMES or not all(map(_is_name, names)) or len(set(names)) != len(names):
             raise ArtifactError(
-                f"{where}: manifest {key} must be names", found=repr(manifest[key]), remedy="quantize again"
+                f"{where}: manifest {key} must be names, each once", found=repr(names)[:80], remedy="quantize again"
             )
     tolerance = manifest["parity"].get("tolerance")
     if not isinstance(tolerance, dict) or set(tolerance) != set(manifest["action_names"]):
         raise ArtifactError(
-            f"{where}: manifest parity tolerance {tolerance!r} does not cover its actions", remedy="quantize again"
+            f"{where}: manifest parity tolerance {str(tolerance)[:80]!r} does not cover its actions",
+            remedy="quantize again",
         )
+    most = LARGEST_TOLERANCE["fp32" if manifest["mode"] == "fp32" else "int8"]
+    for name, value in tolerance.items():
+        if not _is_within(value, (0.0, most if name in CAR_ACTIONS else math.inf)):
+            raise ArtifactError(
+                f"{where}: manifest parity tolerance of {name} must be from 0 to {most:g}",
+                found=repr(value)[:60],
+                remedy="quantize again",
+            )
 
 
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and value >= 1
+def _is_within(value: Any, limits: tuple[float, float]) -> bool:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and limits[0] <= value <= limits[1] and value != math.inf
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= NAME_LENGTH and value.isprintable() and "/" not in value
+
+
+def _out_of_range(where: str, manifest: dict[str, Any], key: str, limits: tuple[float, float]) -> ArtifactError:
+    return ArtifactError(
+        f"{where}: manifest {key} must be from {limits[0]:g} to {limits[1]:g}",
+        found=repr(manifest[key])[:60],
+        remedy="quantize again",
+    )
 
 
 def distinct_names(paths: Sequence[Path], drop: str = "") -> dict[str, Path]:
@@ -201,29 +267,10 @@ def _name(path: Path, folders: int, drop: str) -> str:
     return "/".join([*parents[max(0, len(parents) - folders) :], path.stem.removeprefix(drop)])
 
 
-def _open(path: Path | str) -> zipfile.ZipFile:
-    try:
-        return zipfile.ZipFile(path)
-    except FileNotFoundError:
-        raise ArtifactError(f"{path}: not found", remedy="'rover run' writes artifacts to runs/<name>/") from None
-    except (zipfile.BadZipFile, OSError) as e:
-        raise ArtifactError(f"{path}: not an artifact, or cut short ({e})", remedy="copy the file again") from None
-
-
-def _record(z: zipfile.ZipFile, name: str, path: Path | str) -> str:
-    records = [n for n in z.namelist() if n.endswith(f"/extra/{name}")]
-    if len(records) != 1:
-        raise ArtifactError(
-            f"{path}: no {name} in it", remedy="is it an artifact of this project? ('rover inspect' says what)"
-        )
-    return records[0]
-
-
 def _manifest_in(z: zipfile.ZipFile, path: Path | str) -> dict[str, Any]:
-    record = _record(z, "manifest.json", path)
     try:
-        manifest = json.loads(z.read(record))
-    except (ValueError, zipfile.BadZipFile) as e:
+        manifest = json.loads(read_record(z, "archive/extra/manifest.json"))
+    except (ValueError, zipfile.BadZipFile, RecursionError) as e:
         raise ArtifactError(f"{path}: its manifest is not readable ({e})", remedy="copy the file again") from None
     check_manifest(manifest, str(path))
     return manifest

@@ -3,34 +3,44 @@
     with Camera(0) as camera:
         frame = camera.wait(after=0, timeout_s=1)
 
-The same reader also takes what stands in for a camera: a video file, a folder of frames, or JPEGs through a FIFO.
+The same reader also takes what stands in for a camera: a folder of frames, a file of JPEGs, or JPEGs through a FIFO.
+What a camera gives is no frame just because it came: it must be all of a picture, and of now. Some that are not are
+left out, a few in a row are a camera that failed.
 """
 
 import contextlib
+import math
 import os
 import select
 import stat
 import threading
 import time
-import zlib
-from collections.abc import Callable, Generator, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
-from itertools import takewhile
-from operator import itemgetter
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.picture import LEAST, MOST_BYTES, PictureError, block_sums, brightness, decode_jpeg
 
 FIRST_FRAME_S = 5.0
 CLOSE_S = 1.0
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"  # FF D9 is not in the data of a JPEG: there FF is followed by 00
-JPEG_MOST = 8_000_000  # bytes; a stream without an end of a picture in so much is none
-PICTURES = (".jpg", ".jpeg", ".png")
+PICTURES = (".jpg", ".jpeg")
+MJPG = cv2.VideoWriter.fourcc(*"MJPG")
+MONOTONIC, WALL, NO_CLOCK = "monotonic", "wall", "no"  # clocks that time stamps are of
+REFUSED_MOST = 4  # pictures in a row that are none; 0.13 s
+SAME = 0.9  # of a picture's blocks; a sensor's noise alone leaves at most 0.37 of them as they were
+REMEMBERED = 32  # pictures: no driver has more buffers that it could give again and again (VIDEO_MAX_FRAME)
+DECIDING = 5  # frames that show which clock a camera's time stamps are of
+OLD_S = 0.5  # age at which a plan's throttle begins to fade; a frame needs a plan first
+AHEAD_S = 0.01  # a time stamp may be rounded
+NEAR_S = 600.0  # a time stamp that is further from a clock than this is not of that clock
 
-Read = tuple[np.ndarray, float | None]  # a picture, and when it was captured if the camera says so
+Read = tuple[bytes | np.ndarray, float | None]  # a JPEG or a picture, and when it was captured if the camera says so
 Reader = Generator[Read, None, None]
 
 
@@ -43,8 +53,9 @@ class Frame:
     """One picture. Nobody writes into it.
 
     image: (h, w, 3) uint8 BGR. captured_s: time.monotonic() (or the camera's clock) at which it was captured, or
-    arrived where the camera does not say. number: 1, 2, ... of this camera. repeats: how many frames before it were the
-    same, byte for byte. mean: of its pixels, 0 to 255.
+    arrived where the camera does not say. number: 1, 2, ... of this camera. repeats: of how many frames in a row, this
+    one the last, nearly all had been in one of the 32 before them, byte for byte; a sensor's noise makes that 0.
+    mean: of its pixels, 0 to 255. contrast: as picture.brightness().
     """
 
     image: np.ndarray
@@ -52,14 +63,15 @@ class Frame:
     number: int
     repeats: int
     mean: float
+    contrast: float
 
 
 class Camera:
     """A source of frames, from entering the context until leaving it; a thread keeps only the newest.
 
-    source: a number or /dev/videoN (V4L2), a video file, a folder of pictures (or an episode's), or a FIFO or .mjpeg
-    file of JPEGs one after another. size: (width, height) to ask a V4L2 camera for. rate_hz: to ask it for, and of
-    sources without a rate of their own. Any thread may call any method.
+    source: a number or /dev/videoN (V4L2), a folder of JPEGs (or an episode's), or a FIFO or .mjpeg file of JPEGs one
+    after another. size: (width, height) to ask a V4L2 camera for. rate_hz: to ask it for, and of sources without a rate
+    of their own. clock, wall_clock: the two that a camera's time stamps may be of. Any thread may call any method.
     """
 
     def __init__(
@@ -69,16 +81,18 @@ class Camera:
         size: tuple[int, int] = (640, 360),
         rate_hz: float = 30.0,
         clock: Callable[[], float] = time.monotonic,
+        wall_clock: Callable[[], float] = time.time,
     ):
         self.source = str(source)
         self.size, self.wanted_hz = size, rate_hz
-        self._clock = clock
+        self._stamps = _Stamps(clock, wall_clock)
+        self._shown = np.zeros((REMEMBERED, 0), np.uint64)  # the newest pictures' blocks, as block_sums()
+        self._refusal: PictureError | None = None
         self._closing = threading.Event()
         self._changed = threading.Condition()  # guards the four below
         self._frame: Frame | None = None
         self._failure: CameraError | None = None
         self._first_s = 0.0
-        self._began_s = 0.0
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> "Camera":
@@ -94,8 +108,11 @@ class Camera:
         self._thread.start()
         try:
             if self.wait(0, FIRST_FRAME_S) is None:
+                what = f"{self.source}: no frame within {FIRST_FRAME_S:g} s"
+                if refusal := self._refusal:
+                    raise CameraError(f"{what}: {refusal.what}", found=refusal.found, remedy=refusal.remedy)
                 raise CameraError(
-                    f"{self.source}: no frame within {FIRST_FRAME_S:g} s",
+                    what,
                     remedy="is it a camera, and does no other program use it? ('rover doctor' looks at all of them)",
                 )
         except BaseException:
@@ -140,34 +157,33 @@ class Camera:
                 return None
             return (frame.number - 1) / (frame.captured_s - self._first_s)
 
+    @property
+    def time_stamps(self) -> str:
+        """The clock that its time stamps are of: "monotonic", "wall", or "no", where frames count from arrival."""
+        return self._stamps.kind or NO_CLOCK
+
     def _read(self, reader: Reader) -> None:
-        before, repeats, number = None, 0, 0
+        refused = 0
         try:
             with contextlib.closing(reader):
-                for image, captured_s in reader:
+                for picture, stamp_s in reader:
                     if self._closing.is_set():
                         return
-                    now = self._clock()
-                    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-                        raise CameraError(f"{self.source}: a frame must be (h, w, 3) uint8", found=image.shape)
-                    if self._frame and image.shape != self._frame.image.shape:
-                        (h, w), (h0, w0) = image.shape[:2], self._frame.image.shape[:2]
-                        raise CameraError(
-                            f"{self.source}: the picture changed from {w0}x{h0} to {w}x{h}",
-                            remedy="is another program using the camera?",
-                        )
-                    seen = zlib.crc32(image.data)
-                    repeats = repeats + 1 if seen == before else 0
-                    before, number = seen, number + 1
-                    # A camera's own time counts if it is of this clock; some drivers give none, or of another.
-                    if captured_s is None or not now - 1 < captured_s <= now:
-                        captured_s = now
-                    frame = Frame(image, captured_s, number, repeats, float(image[::8, ::8].mean()))
-                    with self._changed:
-                        self._frame = frame
-                        self._first_s = self._first_s or frame.captured_s
-                        self._changed.notify_all()
-                raise CameraError(f"{self.source}: it ended after {number} frames", remedy="is the camera unplugged?")
+                    try:
+                        captured_s = self._stamps.captured_s(stamp_s)
+                        image = decode_jpeg(picture) if isinstance(picture, bytes) else picture
+                    except PictureError as error:
+                        self._refusal, refused = error, refused + 1
+                        if self._frame and refused >= REFUSED_MOST:
+                            what = f"{self.source}: {refused} pictures in a row were no frames: {error.what}"
+                            raise CameraError(what, found=error.found, remedy=error.remedy) from None
+                        continue
+                    refused = 0
+                    if captured_s is not None:
+                        self._add(image, captured_s)
+                raise CameraError(
+                    f"{self.source}: it ended after {self.frames} frames", remedy="is the camera unplugged?"
+                )
         except CameraError as error:
             failure = error
         except Exception as error:  # whatever a driver does, the car must learn of it
@@ -178,11 +194,95 @@ class Camera:
             self._failure = failure
             self._changed.notify_all()
 
+    def _add(self, image: np.ndarray, captured_s: float) -> None:
+        """Makes a picture the newest frame. Raises CameraError if it is not like those before it."""
+        before = self._frame
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise CameraError(f"{self.source}: a frame must be (h, w, 3) uint8", found=image.shape)
+        (h, w), (h0, w0) = image.shape[:2], (before.image if before else image).shape[:2]
+        if (h, w) != (h0, w0):
+            raise CameraError(
+                f"{self.source}: the picture changed from {w0}x{h0} to {w}x{h}",
+                remedy="is another program using the camera?",
+            )
+        if w < LEAST[0] or h < LEAST[1]:
+            raise CameraError(f"{self.source}: too small a picture to drive by", found=f"{w}x{h}")
+        shown, number = block_sums(image), self.frames + 1
+        if before is None:
+            self._shown = np.zeros((REMEMBERED, len(shown)), np.uint64)
+        same = (self._shown[: number - 1] == shown).mean(axis=1).max(initial=0.0)
+        self._shown[(number - 1) % REMEMBERED] = shown
+        repeats = before.repeats + 1 if before and same >= SAME else 0
+        frame = Frame(image, captured_s, number, repeats, *brightness(image))
+        with self._changed:
+            self._frame = frame
+            self._first_s = self._first_s or captured_s
+            self._changed.notify_all()
+
+
+class _Stamps:
+    """When frames were captured, by the time stamps that their camera gives.
+
+    Which clock those are of is decided once, by the first frames; from then on one that is old, ahead or standing still
+    is a fault of the camera. kind: "monotonic", "wall", or "no" if they are of neither; "" before the decision.
+    """
+
+    def __init__(self, clock: Callable[[], float], wall_clock: Callable[[], float]):
+        self._clock, self._wall_clock = clock, wall_clock
+        self.kind = ""
+        self._last_s = -math.inf
+        self._first: deque[tuple[float, float, float]] = deque(maxlen=DECIDING)  # stamp, and age by either clock
+
+    def captured_s(self, stamp_s: float | None) -> float | None:
+        """By the clock, of a frame that has just come; None before the decision. No stamp: its arrival.
+
+        Raises PictureError for a stamp that cannot be right.
+        """
+        now_s = self._clock()
+        if stamp_s is None or self.kind == NO_CLOCK:
+            return now_s
+        wall_age_s = self._wall_clock() - stamp_s
+        if not self.kind:
+            self._first.append((stamp_s, now_s - stamp_s, wall_age_s))
+            self._last_s = -math.inf
+            if len(self._first) < DECIDING:
+                return None
+            self.kind = self._decided()
+            if self.kind == NO_CLOCK:
+                return now_s
+        age_s = now_s - stamp_s if self.kind == MONOTONIC else wall_age_s
+        stands, self._last_s = stamp_s <= self._last_s, stamp_s
+        if stands or not -AHEAD_S <= age_s <= OLD_S:
+            raise _bad_stamp(stands, age_s)
+        return now_s - max(0.0, age_s)
+
+    def _decided(self) -> str:
+        """By most of the first frames: one of them may have come late."""
+        stamps, *ages = np.array(self._first).T
+        stands = float(np.median(np.diff(stamps))) <= 0
+        monotonic_s, wall_s = (float(np.median(age)) for age in ages)
+        for kind, age_s in ((MONOTONIC, monotonic_s), (WALL, wall_s)):
+            if not stands and -AHEAD_S <= age_s <= OLD_S:
+                return kind
+        nearest_s = min(monotonic_s, wall_s, key=abs)
+        if abs(nearest_s) < NEAR_S:
+            raise _bad_stamp(stands, nearest_s)
+        return NO_CLOCK
+
+
+def _bad_stamp(stands: bool, age_s: float) -> PictureError:
+    found = "the same again" if stands else f"one of {abs(age_s):.2f} s {'ago' if age_s > 0 else 'ahead'}"
+    return PictureError("a frame's time stamp is not of now", found=found, remedy="plug the camera in again")
+
+
+def path_of(source: str, dev: Path = Path("/dev")) -> Path:
+    """Where a camera's frames come from: a number N is videoN in `dev`."""
+    return dev / f"video{source}" if source.isdigit() else Path(source)
+
 
 def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:
-    if source.isdigit():
-        source = f"/dev/video{source}"
-    path = Path(source)
+    path = path_of(source)
+    source = str(path)
     try:
         mode = path.stat().st_mode
     except OSError as error:
@@ -196,8 +296,11 @@ def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threadi
     if stat.S_ISDIR(mode):
         return _folder(path, rate_hz, closing)
     if path.suffix == ".mjpeg":
-        return _paced(_decoded(_split(iter([path.read_bytes()]))), rate_hz, closing)
-    return _video(path, rate_hz, closing)
+        return _paced(_split(_contents(path)), rate_hz, closing)
+    raise CameraError(
+        f"{source}: neither a camera nor a folder, a FIFO or an .mjpeg file of JPEGs",
+        remedy=f"ffmpeg -i {path.name} -q:v 3 {path.stem}.mjpeg makes one of a video",
+    )
 
 
 def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
@@ -207,58 +310,52 @@ def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
             raise CameraError(
                 f"{source}: cannot be opened", remedy="is the user in group video, and does nobody else use it?"
             )
-        device.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))  # raw pictures do not fit USB 2 at 30 Hz
+        device.set(cv2.CAP_PROP_FOURCC, MJPG)  # raw pictures do not fit USB 2 at 30 Hz
         device.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
         device.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
         device.set(cv2.CAP_PROP_FPS, rate_hz)
         device.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        jpegs = int(device.get(cv2.CAP_PROP_FOURCC)) == MJPG and device.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         while True:
             ok, image = device.read()
             if not ok:
                 raise CameraError(f"{source}: gives no more frames", remedy="is the camera unplugged?")
-            yield image, device.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the driver's time of the buffer, monotonic
-    finally:
-        device.release()
-
-
-def _video(path: Path, rate_hz: float, closing: threading.Event) -> Reader:
-    device = cv2.VideoCapture(str(path))
-    try:
-        if not device.isOpened():
-            raise CameraError(
-                f"{path}: no video that OpenCV can read", remedy="give /dev/videoN, a video, a folder or a FIFO"
-            )
-        own_hz = device.get(cv2.CAP_PROP_FPS)
-        images = map(itemgetter(1), takewhile(itemgetter(0), iter(device.read, None)))
-        yield from _paced(images, own_hz if 1 <= own_hz <= 240 else rate_hz, closing)
+            stamp_s = device.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the driver's time of the buffer
+            yield image.tobytes() if jpegs else image, stamp_s or None
     finally:
         device.release()
 
 
 def _folder(path: Path, rate_hz: float, closing: threading.Event) -> Reader:
     folder = path / "frames" if (path / "frames").is_dir() else path
-    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in PICTURES)
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in PICTURES and f.is_file())
     if not files:
         raise CameraError(
             f"{folder}: no pictures in it ({', '.join(PICTURES)})", remedy="give /dev/videoN or another folder"
         )
-    pictures = (cv2.imread(str(f), cv2.IMREAD_COLOR) for f in files)
-    return _paced((p for p in pictures if p is not None), rate_hz, closing)
+    return _paced((next(_contents(f, MOST_BYTES + 1), b"") for f in files), rate_hz, closing)
 
 
-def _paced(images: Iterator[np.ndarray], rate_hz: float, closing: threading.Event) -> Reader:
+def _contents(path: Path, piece: int = 1 << 20) -> Iterator[bytes]:
+    """A file's bytes, in pieces."""
+    with path.open("rb") as file:
+        while data := file.read(piece):
+            yield data
+
+
+def _paced(jpegs: Iterable[bytes], rate_hz: float, closing: threading.Event) -> Reader:
     """Pictures that are all there, at a camera's rate."""
     start = time.monotonic()
-    for i, image in enumerate(images):
+    for i, jpeg in enumerate(jpegs):
         if closing.wait(max(0.0, start + i / rate_hz - time.monotonic())):
             return
-        yield image, None
+        yield jpeg, None
 
 
 def _fifo(path: Path, closing: threading.Event) -> Reader:
     """JPEGs from a FIFO, the last of those that are there; its end is the end of the camera."""
-    for image in _decoded(_split(_pieces(path, closing), newest=True)):
-        yield image, None
+    for jpeg in _split(_pieces(path, closing), newest=True):
+        yield jpeg, None
 
 
 def _pieces(path: Path, closing: threading.Event) -> Iterator[bytes]:
@@ -287,25 +384,20 @@ def _split(pieces: Iterator[bytes], newest: bool = False) -> Iterator[bytes]:
     """Whole JPEGs out of a stream; newest: of several that came together only the last."""
     pending = bytearray()
     for piece in pieces:
+        searched = max(0, len(pending) - 1)  # where an end marker may have been cut in two
         pending += piece
         last = None
-        while (end := pending.find(JPEG_END)) >= 0:
+        while (end := pending.find(JPEG_END, searched)) >= 0:
             start = pending.find(JPEG_START, 0, end)
             if start >= 0:
                 if last is not None and not newest:
                     yield last
                 last = bytes(pending[start : end + 2])
             del pending[: end + 2]
+            searched = 0
         if last is not None:
             yield last
-        if len(pending) > JPEG_MOST:
+        if len(pending) > MOST_BYTES:
             raise CameraError(
-                f"no JPEG in {JPEG_MOST / 1e6:g} MB of the stream", remedy="write JPEGs one after another"
+                f"no JPEG in {MOST_BYTES / 1e6:g} MB of the stream", remedy="write JPEGs one after another"
             )
-
-
-def _decoded(jpegs: Iterator[bytes]) -> Iterator[np.ndarray]:
-    for jpeg in jpegs:
-        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-        if image is not None:  # a damaged one is no frame
-            yield image

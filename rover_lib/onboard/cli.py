@@ -19,7 +19,7 @@ FILE = click.Path(path_type=Path)
 LONG_LIST = 12  # longer ones are for programs
 # Of every command that works with the car:
 CAMERA = click.option(
-    "--camera", default="0", show_default=True, help="Number, /dev/videoN, video, folder or FIFO of JPEGs."
+    "--camera", default="0", show_default=True, help="Number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
 )
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
@@ -27,6 +27,8 @@ LOG_DRIVE = click.option(
     "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
 )
 
+
+SECONDS = click.FloatRange(min=0, min_open=True)
 
 WORKSTATION_COMMANDS = frozenset({"run", "quantize", "compare", "wheelhouse", "world"})  # rover_lib.cli's
 
@@ -116,7 +118,7 @@ DRIVE_OPTIONS = (
     click.option("--dry-run", is_flag=True, help="No Arduino, no motor: logs what would be sent."),
     click.option("--record", type=FILE, help="Write the drive as an episode into this folder."),
     click.option("--record-mb", type=click.FloatRange(min=1), help="Most megabytes of that folder."),
-    click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="Longest duration of the drive."),
+    click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive."),
     click.option("--ticks", type=click.IntRange(min=1), help="End after this number of commands."),
     click.option("--throttle-limit", type=click.FloatRange(0, 1), help="[default: params.yml; with --replay: none]"),
     click.option(
@@ -131,6 +133,7 @@ DRIVE_OPTIONS = (
         "--json", "json_file", type=click.File("w", lazy=True), help="Write what the drive was there; - prints it."
     ),
     click.option("--replay", type=FILE, help="Send this episode's pulses; no policy, no camera."),
+    click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder, FIFO or .mjpeg."),
     click.option("--service", is_flag=True, help="As a systemd service: disarmed until `rover arm-car`."),
 )
 
@@ -142,7 +145,8 @@ def drive(ctx: click.Context, **options: Any) -> None:
     """Drive ARTIFACT: arms the car once camera, plan and Arduino are ready, and stops it whatever fails.
 
     Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP); 1 could not begin;
-    2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start.
+    2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start; with --service,
+    which waits disarmed after each drive, another request.
     """
     ctx.exit(run_drive(**options))
 
@@ -188,7 +192,7 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
 @click.option(
     "--hz", type=click.FloatRange(5, 50), default=30.0, show_default=True, help="Controls and frames a second."
 )
-@click.option("--max-seconds", type=click.FloatRange(min=0, min_open=True), help="Longest duration of an episode.")
+@click.option("--max-seconds", type=SECONDS, help="Longest duration of an episode.")
 @click.option("--label", default="", help='What is done, such as "hit red balloon".')
 @click.option("--episodes", type=click.IntRange(min=1), default=1, show_default=True, help="One after another.")
 @click.pass_context
@@ -214,19 +218,27 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -
 @CAMERA
 @PORT
 @click.option("--hz", type=click.FloatRange(1, 120), default=30.0, show_default=True, help="Frames a second wanted.")
+@click.option("--receiver", is_flag=True, help="Lead a human, with the transmitter in hand, through its receiver only.")
 @AS_JSON
 @click.pass_context
-def doctor(ctx: click.Context, artifact: Path | None, camera: str, port: str, hz: float, as_json: bool) -> None:
+def doctor(
+    ctx: click.Context, artifact: Path | None, camera: str, port: str, hz: float, receiver: bool, as_json: bool
+) -> None:
     """Look at all that driving needs: camera, Arduino, ARTIFACT, power, disk. Say what to do.
 
-    Nothing is armed and no servo is moved, but opening the port resets the Arduino. Exit code 1 if anything fails that
-    driving cannot do without; warnings do not count.
+    Nothing is armed, and no servo is moved but by the transmitter. Exit code 1 if anything fails that driving cannot do
+    without; warnings do not count. With --receiver it asks for a stick to be moved and the transmitter to be switched
+    off: do that once.
     """
-    from rover_lib.onboard.doctor import examine
+    from rover_lib.onboard import doctor as checking
     from rover_lib.onboard.host import default_log
 
+    if receiver:
+        found = checking.receiver(port, lambda text: click.prompt(text + " Enter", "", show_default=False, err=True))
+    else:
+        found = checking.examine(artifact, camera=camera, port=port, rate_hz=hz, log_folder=default_log().parent)
     checks = []
-    for check in examine(artifact, camera=camera, port=port, rate_hz=hz, log_folder=default_log().parent):
+    for check in found:
         checks.append(check)
         if not as_json:
             click.echo(str(check))
@@ -248,9 +260,9 @@ def inspect(file: Path, as_json: bool) -> None:
 
 def describe_artifact(file: Path) -> dict[str, Any]:
     """What `rover inspect` says of an artifact that is whole. Raises ArtifactError for another."""
-    from rover_lib.onboard.artifact import check_integrity, content_hash, read_manifest
+    from rover_lib.onboard.artifact import check_artifact, content_hash, read_manifest
 
-    check_integrity(file)
+    check_artifact(file)
     return {"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}
 
 
@@ -304,17 +316,38 @@ def benchmark(
 
 @main.command("arm-car")
 @click.option("--yes", is_flag=True, help="Do not ask.")
-def arm_car(yes: bool) -> None:
+@click.option(
+    "--model", default="", help="Content hash of the model that is meant; with another, the car is not armed."
+)
+@click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive [default: the service's].")
+@click.option("--heartbeat-s", type=SECONDS, help="End the drive when no `rover heartbeat` comes for this long.")
+@click.option(
+    "--wait-s", type=click.FloatRange(min=0), default=60, show_default=True, help="For what arming needs of a human."
+)
+def arm_car(yes: bool, model: str, max_seconds: float | None, heartbeat_s: float | None, wait_s: float) -> None:
     """Arm the car whose service waits for it (rover-drive.service): it drives at once. Needs root.
 
-    The Arduino refuses without the transmitter, and unless its throttle stick is at rest. Moving a stick takes the car
-    back; `sudo systemctl restart rover-drive` stops and disarms it.
+    Says what the Arduino still wants, and waits for it: the transmitter switched on, its throttle stick at rest, its
+    steering stick just wiggled. Moving a stick takes the car back; `sudo systemctl restart rover-drive` disarms it.
     """
+    from rover_lib.onboard.service import Request
     from rover_lib.onboard.service import arm_car as arm
 
-    if not yes:
+    def confirm(state: dict[str, Any]) -> None:
+        click.echo(f"model {state['model'][:12]}, {state['text']}")
         click.confirm("The car will drive now. Is the way free, and the transmitter in your hand?", abort=True)
-    click.echo(arm())
+
+    request = Request(max_seconds, heartbeat_s)
+    ask = (lambda state: None) if yes else confirm
+    click.echo(arm(request, model=model, confirm=ask, notify=click.echo, wait_s=wait_s))
+
+
+@main.command()
+def heartbeat() -> None:
+    """Tell the drive that its operator is there, and say what the car does. See `rover arm-car --heartbeat-s`."""
+    from rover_lib.onboard.service import ask_service
+
+    click.echo(ask_service(ask="heartbeat")["text"])
 
 
 @main.group()
@@ -322,9 +355,12 @@ def arm_car(yes: bool) -> None:
 @click.option("--chunk", type=click.IntRange(min=1), default=32, show_default=True, help="Actions of a plan.")
 @click.option("--camera", default="cam_front", show_default=True, help="The policy's name for this rover's camera.")
 @click.option("--aspect", type=float, default=1.78, show_default=True, help="Of its pictures, width to height.")
+@click.option("--signers", type=FILE, help="Whose artifacts it takes [default: /etc/rover/allowed_signers].")
 @click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
 @click.pass_context
-def release(ctx: click.Context, models: Path, chunk: int, camera: str, aspect: float, sandboxed: bool) -> None:
+def release(
+    ctx: click.Context, models: Path, chunk: int, camera: str, aspect: float, signers: Path | None, sandboxed: bool
+) -> None:
     """Models on the rover: staged, proven, used; what is in use changes at once or not at all.
 
     `ansible-playbook ansible/deploy.yml` does all of it over a network.
@@ -332,7 +368,7 @@ def release(ctx: click.Context, models: Path, chunk: int, camera: str, aspect: f
     from rover_lib.onboard import release as r
 
     expected = r.Expected(chunk=chunk, camera=camera, aspect=aspect)
-    ctx.obj = r.Releases(models, check=r.sandboxed if sandboxed else None, expected=expected)
+    ctx.obj = r.Releases(models, check=r.sandboxed if sandboxed else None, expected=expected, signers=signers)
 
 
 ALLOW = click.option(
@@ -346,31 +382,41 @@ ALLOW = click.option(
 @release.command()
 @click.argument("artifact", type=FILE)
 @click.argument("folder", type=FILE)
+@click.option("--sign-key", type=FILE, help="The ssh key that logs in to the rover, to sign with.")
 @ALLOW
 @click.pass_obj
-def pack(releases: Any, artifact: Path, folder: Path, allow: tuple[str, ...]) -> None:
+def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, allow: tuple[str, ...]) -> None:
     """Cut ARTIFACT into parts that travel one by one, in FOLDER. Refuses what the rover would refuse."""
     from rover_lib.onboard.release import pack as pack_parts
 
-    show(pack_parts(artifact, folder, releases.expected, allow), True)
+    show(pack_parts(artifact, folder, releases.expected, allow, sign_key), True)
 
 
 @release.command()
 @click.argument("source", type=FILE)
 @click.option("--sha256", help="The SHA-256 that the artifact must have.")
+@click.option("--unsigned", is_flag=True, help="Take it without the signature of a laptop that this rover knows.")
 @ALLOW
 @click.pass_obj
-def stage(releases: Any, source: Path, sha256: str | None, allow: tuple[str, ...]) -> None:
+def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow: tuple[str, ...]) -> None:
     """Make a release of SOURCE, an artifact or what `pack` wrote. What is in use stays in use."""
-    show(vars(releases.stage(source, sha256=sha256, allow=allow)), True)
+    show(vars(releases.stage(source, sha256=sha256, allow=allow, unsigned=unsigned)), True)
 
 
 @release.command()
 @click.argument("name", default="current")
+@click.option("--confined", is_flag=True, help="Give up first what an inference does not need, as rover-check@ does.")
 @click.pass_obj
-def verify(releases: Any, name: str) -> None:
+def verify(releases: Any, name: str, confined: bool) -> None:
     """Prove that a release is whole and computes here what it should: checksums and parity vectors."""
-    releases.verify(name)
+    if confined and (path := releases.path_of(name)).exists():
+        import torch
+
+        from rover_lib.onboard.confine import confine, memory_mb
+
+        if unconfined := confine(memory_mb(path, torch.get_num_threads())):
+            click.echo(f"rover: not confined: {unconfined}", err=True)
+    releases.check(name)
     click.echo(f"{name}: whole, and computes what it should")
 
 
@@ -418,8 +464,10 @@ def status(releases: Any, as_json: bool) -> None:
         report |= {"rover": socket.gethostname(), **Host().reading(), "last_drive_s": log and log.stat().st_mtime}
         return show(report, True)
     for r in report["releases"]:
-        mark = "*" if r["current"] else " "
-        click.echo(f"{mark} {r['name'][:12]}  {r['mode']:<7} {r['megabytes']:6.1f} MB  {r['wrong'] or r['origin']}")
+        mark, unsigned = "*" if r["current"] else " ", "" if r["signed"] else ", not signed"
+        click.echo(
+            f"{mark} {r['name'][:12]}  {r['mode']:<7} {r['megabytes']:6.1f} MB  {r['wrong'] or r['origin']}{unsigned}"
+        )
     if not report["healthy"]:
         raise RoverError(report["trouble"])
 

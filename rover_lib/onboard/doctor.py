@@ -22,11 +22,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rover_lib.onboard.camera import Camera
+from rover_lib.onboard.camera import Camera, path_of
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.host import Host, throttled_means
+from rover_lib.onboard.inference import PolicyProcess
 from rover_lib.onboard.params import params
-from rover_lib.onboard.servo_link import BOOT_S, PROTOCOL_VERSION, ServoLink
+from rover_lib.onboard.pilot import blank, frozen
+from rover_lib.onboard.plan import Settings
+from rover_lib.onboard.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, ServoLink, Telemetry
 
 NAME_WIDTH = 15
 RATE_SHARE = 0.9  # of the wanted frame rate
@@ -34,6 +37,8 @@ SETTLE_S, MEASURE_S = 0.5, 1.0  # a camera's first frames come when its exposure
 ROUND_TRIPS = 20
 SLOW_MS = 20.0  # an answer takes 3 to 8 ms: 40 bytes at 115200 baud and the USB adapter's 1 ms
 SIGNAL_S = 1.0
+RITUAL_S = 30.0  # for a human to do what is asked
+SAME_US = 16  # pulses of a stick that nobody touches
 REST_US = 32  # the firmware arms with the throttle stick so near to neutral
 HOT_C = 75.0  # a Pi 5 slows down from 80
 MEMORY_MB = 700  # the real policy has 436 resident while predicting, the loop's process 100
@@ -87,7 +92,7 @@ def examine(
     dev and boot_s: for the tests' sake.
     """
     host = host or Host()
-    device = dev / f"video{camera}" if str(camera).isdigit() else Path(camera)
+    device = path_of(str(camera), dev)
     checks: dict[str, Callable[[], Iterable[Check]]] = {}
     if device.is_relative_to(dev):  # else a file or a pipe, for which no camera need be there
         checks["group video"] = lambda: access("group video", device, "video")
@@ -255,6 +260,7 @@ def camera_rate(
             end, last = time.monotonic() + MEASURE_S, first
             while (left := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, left)):
                 last = frame
+            clock = camera.time_stamps
     except RoverError as error:
         used = f"; used by {', '.join(users)}" if users else ""
         yield Check("camera", "fail", f"{_found(error)}{used}", f"end {users[0]}" if users else error.remedy)
@@ -262,16 +268,17 @@ def camera_rate(
     number = last.number - first.number
     measured_hz = number / (last.captured_s - first.captured_s) if number and last.captured_s > first.captured_s else 0
     height, width = last.image.shape[:2]
-    found = f"{source}: {width}x{height}, {measured_hz:.1f} frames a second"
+    found = f"{source}: {width}x{height}, {clock} time stamps, {measured_hz:.1f} frames a second"
+    settings = Settings.of(params()["drive"])
     if not measured_hz:
         yield Check("camera", "fail", f"{source}: no new frame within {MEASURE_S:g} s", "plug it in again")
     elif measured_hz < RATE_SHARE * rate_hz:
         light = "more light (long exposures halve the rate), a USB 3 port, or --hz of what it gives"
         yield Check("camera", "warning", f"{found}, wanted {rate_hz:g}", light)
-    elif last.mean < float(params()["drive"]["black_level"]):
-        yield Check(
-            "camera", "warning", f"{found}, but black (mean {last.mean:.1f} of 255)", "take the cap off the lens"
-        )
+    elif fault := frozen(last, settings):
+        yield Check("camera", "fail", f"{found}, but {fault.what}", fault.remedy)
+    elif fault := blank(last, settings):
+        yield Check("camera", "warning", f"{found}, but {fault.what}", fault.remedy)
     else:
         yield Check("camera", "ok", found)
 
@@ -301,7 +308,7 @@ def arduino(
         yield Check("Arduino", "fail", f"no {port}; there is {', '.join(others) or 'no other serial port'}", remedy)
         return
     if users := users_of(port, proc_root):
-        # To open it would reset the Arduino under somebody who may be driving.
+        # What we read would be lost to somebody who may be driving.
         yield Check("Arduino", "fail", f"{port}: used by {', '.join(users)}", f"end {users[0]}")
         return
     with ServoLink(port, boot_s=boot_s) as link:
@@ -341,6 +348,60 @@ def _transmitter(link: ServoLink) -> Check:
     return Check("transmitter", "ok", found)
 
 
+def receiver(port: str, ask: Callable[[str], object], *, boot_s: float = BOOT_S) -> Iterator[Check]:
+    """Leads a human once through what arming takes, and through what the receiver sends without its transmitter.
+
+    ask: tells the human what to do, and returns when it is done. Nothing is armed; the human can drive meanwhile.
+    Raises LinkError as the link does.
+    """
+    with ServoLink(port, boot_s=boot_s) as link:
+        ask("Jack up the car. Switch the transmitter on, and let go of both sticks.")
+        check = _transmitter(link)
+        yield check
+        if check.verdict != "ok":
+            return
+        ask("Move the steering stick far to both sides, and let go of it.")
+        if (seen := _soon(link, lambda status: status.missing == "-", RITUAL_S)).missing != "-":
+            yield Check(
+                "arming", "fail", "the receiver's pulses did not show it", f"{MISSING[seen.missing]}, and try again"
+            )
+            return
+        yield Check("arming", "ok", "transmitter on, throttle at rest, stick wiggled: it could be armed for 30 s now")
+        before = _pulses(seen)
+        ask("Switch the transmitter off.")
+        after = _pulses(_soon(link, lambda status: None in _pulses(status), SIGNAL_S))
+        yield _failsafe(before, after, link.calibration.throttle.pulse_us(0.0))
+        ask("Switch the transmitter on again.")
+
+
+def _soon(link: ServoLink, condition: Callable[[Telemetry], bool], seconds: float) -> Telemetry:
+    """The first status of which that holds, or the newest after `seconds`."""
+    end = time.monotonic() + seconds
+    while True:
+        telemetry = link.latest()
+        assert telemetry, "an open link has a status"
+        if condition(telemetry) or time.monotonic() > end:
+            return telemetry
+        time.sleep(0.02)
+
+
+def _pulses(telemetry: Telemetry) -> tuple[int | None, int | None]:
+    return telemetry.receiver_steering_us, telemetry.receiver_throttle_us
+
+
+def _failsafe(before: tuple[int | None, ...], after: tuple[int | None, ...], rest_us: int) -> Check:
+    name, remedy = "failsafe", "set the receiver's failsafe to no pulses (its manual says how), then run this again"
+    if None in after:
+        return Check(name, "ok", "without its transmitter the receiver sends no pulses: the car stops within 100 ms")
+    steering_us, throttle_us = (us or 0 for us in after)
+    found = f"without its transmitter the receiver goes on: steering {steering_us} us, throttle {throttle_us} us"
+    if abs(throttle_us - rest_us) > REST_US:
+        return Check(name, "fail", f"{found}: a car that a human drives runs away", remedy)
+    if all(abs(a - (b or 0)) <= SAME_US for a, b in zip((steering_us, throttle_us), before, strict=True)):
+        return Check(name, "warning", f"{found}, as before: nobody can tell, and an armed car drives on", remedy)
+    return Check(name, "warning", f"{found}: an armed car is handed to nobody, and stands", remedy)
+
+
 def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:
     """Whether the one program runs that writes to every new serial port."""
     for process in proc_root.glob("[0-9]*"):
@@ -374,19 +435,23 @@ def policy(artifact: Path | str | None) -> Iterator[Check]:
     if artifact is None:
         yield Check("artifact", "warning", "none was named, so none was looked at", "name it: rover doctor ARTIFACT")
         return
-    from rover_lib.onboard.policy import load_policy
-
-    loaded = load_policy(artifact)
-    cameras = loaded.manifest["cameras"]
-    sizes = ", ".join(f"{c['name']} {c['width']}x{c['height']}" for c in cameras)
-    about = f"{loaded.manifest['mode']}, {loaded.chunk} actions at {loaded.rate_hz:g} Hz, camera {sizes}"
-    yield Check("artifact", "ok", f"{artifact}: whole, computes what it should; {about}")
-    frames = {c["name"]: np.zeros((c["height"], c["width"], 3), np.uint8) for c in cameras}
     times_s = []
-    for _ in range(3):
-        start = time.perf_counter()
-        loaded.predict_chunk(frames, np.zeros(len(loaded.state_names), np.float32))
-        times_s.append(time.perf_counter() - start)
+    with PolicyProcess(artifact) as process:
+        loaded = process.manifest
+        camera = loaded["cameras"][0]
+        size = f"{camera['name']} {camera['width']}x{camera['height']}"
+        about = f"{loaded['mode']}, {loaded['chunk']} actions at {loaded['rate_hz']:g} Hz, camera {size}"
+        yield Check("artifact", "ok", f"{artifact}: whole, computes what it should; {about}")
+        if process.unconfined:
+            remedy = "a kernel with seccomp, as Raspberry Pi OS has; until then drive only what you made"
+            yield Check("confinement", "warning", f"the policy's process is not confined: {process.unconfined}", remedy)
+        else:
+            yield Check("confinement", "ok", "the policy's process opens no file to write, no port and no socket")
+        frame = np.zeros((camera["height"], camera["width"], 3), np.uint8)
+        for _ in range(3):
+            start = time.perf_counter()
+            process.predict(frame, np.zeros(2, np.float32))
+            times_s.append(time.perf_counter() - start)
     median_s, fade_s = statistics.median(times_s), float(params()["drive"]["fade_s"])
     found = f"{1000 * median_s:.0f} ms"
     if median_s < fade_s / 2:  # a plan is as old as two inferences before the next one is there

@@ -10,25 +10,27 @@ import contextlib
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from rover_lib.onboard.camera import Camera
-from rover_lib.onboard.errors import ParamsError
+from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.camera import Camera, CameraError, path_of
+from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver
 from rover_lib.onboard.host import default_log
 from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
-from rover_lib.onboard.loop import Hooks, Report, Until, Warnings, drive
+from rover_lib.onboard.loop import Arm, Hooks, Report, Until, Warnings, drive
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import PolicyPilot, ReplayPilot
 from rover_lib.onboard.plan import Commanded, Settings
 from rover_lib.onboard.recorder import Recorder, room_for
 from rover_lib.onboard.recording import read_controls
-from rover_lib.onboard.service import Service
-from rover_lib.onboard.servo_link import ServoLink, Telemetry
+from rover_lib.onboard.service import CHECK_S, NotArmed, Service
+from rover_lib.onboard.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.telemetry import FlightLog, StatusLine
 from rover_lib.onboard.watch import (
     HealthWatch,
@@ -61,6 +63,7 @@ class DriveOptions:
     all in it may take together, None: what the disk has. max_seconds, ticks: ends. throttle_limit, blend_ticks,
     ensemble: instead of params.yml's. threads: the policy's, None: all cores but one. log_file: None: the user's.
     replay: an episode whose pulses are sent. service: as a systemd service, disarmed until a human arms it.
+    film: the camera may be recorded pictures (a folder, a FIFO, an .mjpeg), which know nothing of where the car is.
     latency_ms: what a plan takes at least, to compare.
     """
 
@@ -80,7 +83,18 @@ class DriveOptions:
     log_file: Path | None = None
     replay: Path | None = None
     service: bool = False
+    film: bool = False
     latency_ms: float = 0.0
+
+
+def _check_no_film(camera: str) -> None:
+    """Raises CameraError for pictures that do not come from a camera's device."""
+    path = path_of(camera)
+    if path.exists() and not path.is_char_device():
+        raise CameraError(
+            f"{camera}: recorded pictures know nothing of where the car is",
+            remedy="give the camera's /dev/videoN, or --film if this is no real car",
+        )
 
 
 def drive_car(
@@ -89,6 +103,7 @@ def drive_car(
     """Drives as the options say, in this process's main thread; raises as loop.drive.
 
     report: is filled as it goes, so that it is there after a fault too. car: opens another than that of the options.
+    As a service it drives again and again, each time that a human arms the car, until it is told to stop.
     """
     settings = Settings.of(
         params()["drive"],
@@ -97,6 +112,9 @@ def drive_car(
         ensemble=options.ensemble,
     )
     controls = read_controls(options.replay) if options.replay else None
+    artifact = options.artifact.resolve() if options.artifact else None  # another may take its place meanwhile
+    if not (controls or car or options.dry_run or options.film):
+        _check_no_film(options.camera)
     until = Until(options.ticks, options.max_seconds)
     with ExitStack() as stack:
         log = stack.enter_context(_flight_log(options, settings, report))
@@ -106,41 +124,94 @@ def drive_car(
             other = stack.enter_context(car())
             options = replace(options, camera=other.camera, port=other.port)
             stack.callback(lambda: report.world.update(other.summary()))
-        service = stack.enter_context(Service(report, until.stop, log.event)) if options.service else None
+        service = None
+        if options.service and artifact:
+            service = Service(report, until.stop, log.event, model=content_hash(artifact))
+            stack.enter_context(service)
+            until = replace(until, over=service.over)
         link = None if options.dry_run else stack.enter_context(ServoLink(options.port))
         run_loop = partial(drive, link=link, log=log, rate_hz=options.hz, until=until, report=report)
         if controls:
             limit = 1.0 if options.throttle_limit is None else options.throttle_limit
             warnings = _all_of(HealthWatch(report, link), MemoryWatch(report, [os.getpid()]))
+            arm: Arm | None = None
+            if link and sys.stdin.isatty():
+                arm = partial(arm_when_ready, link.arm, link, until.stop, log.event)
+            hooks = Hooks(arm, warnings)
             with boosted_priority(log):
-                run_loop(ReplayPilot(controls, throttle_limit=limit), hooks=Hooks(warnings=warnings))
+                run_loop(ReplayPilot(controls, throttle_limit=limit), hooks=hooks)
             return
-        if not options.artifact:
+        if not artifact:
             raise ParamsError("a drive needs an artifact or a replay")
         camera = stack.enter_context(Camera(options.camera))
-        policy = stack.enter_context(PolicyProcess(options.artifact, threads=options.threads))
+        policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
+        if policy.unconfined:
+            log.event(f"the policy's process is not confined: {policy.unconfined}", level=logging.WARNING)
         predict = delayed(policy.predict, options.latency_ms / 1e3) if options.latency_ms else policy.predict
         commanded = Commanded()
         planner = stack.enter_context(Planner(camera, predict, commanded, policy.rate_hz, rest_s=REST_S))
-        pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz)
-        arming = stack.enter_context(_Arming(options, settings, planner, camera, link, log, policy.manifest["mode"]))
+        arming = partial(_Arming, options, settings, planner, camera, link, log, policy.manifest["mode"])
         checks = [camera.latest, planner.newest, *([link.latest] if link else [])]
-        warnings = _all_of(
-            artifact_changes(options.artifact),
-            pilot.warnings,
-            HealthWatch(report, link),
-            MemoryWatch(report, [os.getpid(), *policy.pids]),
-        )
-        hooks = Hooks(
-            arm=partial(service.wait_for_human, arming.arm, checks) if service else arming.arm,
-            warnings=warnings,
-            record=arming.record if options.record else None,
-        )
-        run_loop(pilot, hooks=hooks)
+        said = ""
+        while True:
+            pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz)
+            warnings = _all_of(
+                artifact_changes(artifact),
+                pilot.warnings,
+                HealthWatch(report, link),
+                MemoryWatch(report, [os.getpid(), *policy.pids]),
+            )
+            with arming(pilot) as this:
+                report.clear()
+                if service and link:
+                    arm = partial(service.wait_for_human, this.arm, checks, partial(what_is_missing, link), said=said)
+                elif link and sys.stdin.isatty():
+                    arm = partial(arm_when_ready, this.arm, link, until.stop, log.event, checks)
+                else:
+                    arm = this.arm
+                hooks = Hooks(arm, warnings, this.record if options.record else None)
+                try:
+                    run_loop(pilot, hooks=hooks)
+                except (DriveFault, TakenOver):
+                    if not service:
+                        raise
+            if not service or until.stop.is_set():
+                return
+            said = report.ended
+
+
+def what_is_missing(link: ServoLink) -> str:
+    """What a human must do before the Arduino can be armed, "" if nothing. Raises LinkError as latest()."""
+    telemetry = link.latest()
+    return MISSING[telemetry.missing] if telemetry and telemetry.missing != "-" else ""
+
+
+def arm_when_ready(
+    arm: Arm,
+    link: ServoLink,
+    stop: threading.Event,
+    notify: Callable[[str], None],
+    checks: Sequence[Callable[[], object]] = (),
+) -> Telemetry | None:
+    """Arms for a human in a terminal, as the loop's hooks do: says what is missing, and waits for it before.
+
+    checks: what must go on working meanwhile. Raises NotArmed when told to stop, what a check raises, and as arm().
+    """
+    told = ""
+    while missing := what_is_missing(link):
+        if missing != told:
+            notify(f"before the car can drive: {missing}")
+            told = missing
+        for check in checks:
+            check()
+        if stop.wait(CHECK_S):
+            raise NotArmed("told to stop before a human armed the car")
+    return arm()
 
 
 class _Arming:
-    """Arms the car with a fresh plan, at the boosted priority, recorded; where that is refused, all of it is undone.
+    """Arms the car with a camera that sees and a fresh plan, at the boosted priority, recorded; where that is refused,
+    all of it is undone.
 
     A context manager: leaving it ends what arming began.
     """
@@ -154,9 +225,10 @@ class _Arming:
         link: ServoLink | None,
         log: FlightLog,
         mode: str,
+        pilot: PolicyPilot,
     ):
         self._options, self._settings, self._planner, self._camera = options, settings, planner, camera
-        self._link, self._log, self._mode = link, log, mode
+        self._link, self._log, self._mode, self._pilot = link, log, mode, pilot
         self._room: int | None = None
         if options.record and options.record_mb:
             self._room = room_for(options.record, options.record_mb)  # now: it may take a while
@@ -181,6 +253,7 @@ class _Arming:
                 self._recorder = driving.enter_context(self._new_recorder(self._options.record))
             driving.enter_context(boosted_priority(self._log))
             self._planner.renew(self._settings.fade_s)
+            self._pilot.check_sight()
             telemetry = self._link.arm() if self._link else None
             self._driving = driving.pop_all()
         return telemetry

@@ -26,8 +26,10 @@ from typing import Any
 
 import numpy as np
 
+from rover_lib.onboard.artifact import read_manifest
 from rover_lib.onboard.camera import Camera
-from rover_lib.onboard.errors import PolicyError, RoverError
+from rover_lib.onboard.confine import confine, memory_mb, open_no_more
+from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
 from rover_lib.onboard.plan import Commanded, Plan
 
 LOAD_S = 120.0  # torch and a full policy from a slow card
@@ -37,6 +39,7 @@ FRESH_S = 0.8  # WatchdogSec of the service is 2 s, and the Arduino has to answe
 END_S = 1.0
 NICE = 5  # the control loop goes first
 PR_SET_PDEATHSIG = 1
+ANSWER_BYTES = 100_000
 _REQUEST = struct.Struct("<IIff")  # height, width, state
 
 Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint8 BGR, state (2,) -> (chunk, 2)
@@ -153,25 +156,37 @@ class PolicyProcess:
 
     threads: of torch, None: all cores but one, which is the loop's. Raises ArtifactError's sentences as PolicyError if
     the artifact cannot be used here.
+
+    What runs there is somebody's artifact, so that it is confined (see confine.py), and its answers are believed only
+    if they are of the shape that the manifest says, as it is read here. unconfined: why the kernel does not do that.
     """
+
+    program = __name__  # which the process runs
 
     def __init__(self, artifact: Path | str, *, threads: int | None = None):
         self.artifact = Path(artifact)
         self.threads = threads or max(1, (os.cpu_count() or 1) - 1)
         self.manifest: dict[str, Any] = {}
+        self.unconfined = ""
         self._process: subprocess.Popen | None = None
         self._pipe: Connection | None = None
         self._closing = threading.Event()
 
     def __enter__(self) -> "PolicyProcess":
+        try:
+            self.manifest = read_manifest(self.artifact)
+        except ArtifactError as error:
+            raise PolicyError(error.what, found=error.found, remedy=error.remedy) from None
         ours, theirs = Pipe()
-        command = [sys.executable, "-m", __name__, str(theirs.fileno()), str(self.artifact), str(self.threads)]
+        command = [sys.executable, "-m", self.program, str(theirs.fileno()), str(self.artifact), str(self.threads)]
         # A session of its own, so that the terminal's Ctrl-C comes to the loop alone, which stops the car first.
-        self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], start_new_session=True)
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()], start_new_session=True
+        )
         theirs.close()
         self._pipe = ours
         try:
-            self.manifest = json.loads(self._answer(LOAD_S))
+            self.unconfined = self._answer(LOAD_S).decode(errors="replace")
         except BaseException:
             self.close()
             raise
@@ -220,8 +235,10 @@ class PolicyProcess:
             pipe.send_bytes(frame.data.cast("B"))
         except (OSError, ValueError) as error:
             raise self._ended() from error
-        answer = self._answer(None)
-        return np.frombuffer(answer, np.float32).reshape(-1, 2)
+        answer = np.frombuffer(self._answer(None), np.uint8)
+        if answer.size != 4 * 2 * self.chunk:
+            raise PolicyError(f"{self.artifact}: {answer.size} bytes are no plan of {self.chunk} actions")
+        return answer.view(np.float32).reshape(self.chunk, 2)
 
     def _open_pipe(self) -> Connection:
         if self._pipe is None:
@@ -241,11 +258,11 @@ class PolicyProcess:
                     raise PolicyError(
                         f"{self.artifact}: not loaded within {timeout_s:g} s", remedy="is the memory full?"
                     )
-            answer = pipe.recv_bytes()
+            answer = pipe.recv_bytes(ANSWER_BYTES)
         except (EOFError, OSError) as error:
             raise self._ended() from error
         if answer[:1] == b"!":
-            raise PolicyError(answer[1:].decode(errors="replace"))
+            raise PolicyError(**json.loads(answer[1:]))
         return answer[1:]
 
     def _ended(self) -> PolicyError:
@@ -270,16 +287,18 @@ def delayed(predict: Predict, latency_s: float) -> Predict:
     return predict_delayed
 
 
-def serve(pipe: Connection, artifact: str, threads: int) -> None:
+def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any], None] = lambda policy: None) -> None:
     """The policy's process: an answer to each request until the other side is gone.
 
-    An answer is "=" and bytes (first the manifest, then chunks), or "!" and the sentence of an error.
+    An answer is "=" and bytes (first why it is not confined, then chunks), or "!" and an error's fields as JSON.
+    loaded: gets the policy before it is asked; for the laboratory, whose policies misbehave.
     """
     with contextlib.suppress(EOFError, OSError):
         try:
             # Here, because the side that drives must not load torch.
             from rover_lib.onboard.policy import load_policy
 
+            unconfined = confine(memory_mb(artifact, threads))
             policy = load_policy(artifact, threads=threads)
             names = list(policy.state_names), list(policy.action_names)
             if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
@@ -287,31 +306,41 @@ def serve(pipe: Connection, artifact: str, threads: int) -> None:
                     f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}",
                     remedy="this car has one camera, steering and throttle",
                 )
+            loaded(policy)
+            open_no_more()
         except RoverError as error:
-            return pipe.send_bytes(b"!" + str(error).encode())
+            return pipe.send_bytes(_refusal(error))
         except Exception as error:
-            return pipe.send_bytes(f"!{artifact}: cannot be loaded ({type(error).__name__}: {error})".encode())
-        pipe.send_bytes(b"=" + json.dumps(policy.manifest).encode())
+            what = f"{artifact}: cannot be loaded ({type(error).__name__}: {error})"
+            return pipe.send_bytes(_refusal(PolicyError(what)))
+        pipe.send_bytes(b"=" + unconfined.encode())
         while True:
             height, width, *state = _REQUEST.unpack(pipe.recv_bytes())
             frame = np.frombuffer(pipe.recv_bytes(), np.uint8).reshape(height, width, 3)
             try:
                 chunk = policy.predict_unclipped(frame, np.array(state, np.float32))
             except RoverError as error:
-                pipe.send_bytes(b"!" + str(error).encode())
+                pipe.send_bytes(_refusal(error))
             except Exception as error:
                 what = " ".join(str(error).split())[-300:]
-                pipe.send_bytes(f"!{artifact}: inference failed ({type(error).__name__}: {what})".encode())
+                failed = PolicyError(f"{artifact}: inference failed ({type(error).__name__}: {what})")
+                pipe.send_bytes(_refusal(failed))
             else:
                 pipe.send_bytes(b"=" + np.ascontiguousarray(chunk, np.float32).tobytes())
 
 
-def main(fd: str, artifact: str, threads: str) -> None:
-    """What PolicyProcess starts."""
+def _refusal(error: RoverError) -> bytes:
+    found = None if error.found is None else str(error.found)
+    return b"!" + json.dumps({"what": error.what, "found": found, "remedy": error.remedy}).encode()
+
+
+def main(arguments: list[str], loaded: Callable[[Any], None] = lambda policy: None) -> None:
+    """What PolicyProcess starts. arguments: its pipe, artifact and threads. loaded: as of serve()."""
+    fd, artifact, threads = arguments
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a policy that hangs must not outlive the loop
     os.nice(NICE)
-    serve(Connection(int(fd)), artifact, int(threads))
+    serve(Connection(int(fd)), artifact, int(threads), loaded)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(sys.argv[1:])

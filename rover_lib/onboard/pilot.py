@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rover_lib.onboard.camera import Camera
+from rover_lib.onboard.camera import Camera, CameraError, Frame
 from rover_lib.onboard.errors import DriveFault, PolicyError
 from rover_lib.onboard.inference import Planner
 from rover_lib.onboard.plan import Commanded, Follower, Settings
@@ -16,8 +16,11 @@ from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import Controls
 
 FIRST_PLAN_S = 10.0
-MOVING = 0.004  # throttle above which a car moves, and no two pictures are the same
+MOVING = 0.004  # throttle above which a car moves, so that it matters what it sees
+COASTS_S = 0.5  # a car without throttle moves on for a while
+BEGINS_S = 0.12  # a car that was just told to go may see what it saw; 0.2 s after that it must stand if it still does
 LATE_FRAME_S = 0.2  # six frames of a camera
+CAP = "is there a cap or dirt on the lens?"
 SLACK_S = 0.002  # a control of this much later is of the same tick: recordings have the ticks' rate, or close to it
 HOLE_S = 0.3  # a gap between measured pulses after which a replay stops the car
 LAST_S = 0.1  # how long a replay's last pulses are held
@@ -68,7 +71,8 @@ class PolicyPilot:
         self._calibration = calibration or PwmCalibration()
         self._follower = Follower(settings, rate_hz)
         self._moving_s: float | None = None  # since when the car has been driving
-        self._black_s: float | None = None  # since when the picture has been black
+        self._throttle_s = 0.0  # when it was last told to
+        self._blank_s: float | None = None  # since when nothing has been on the picture
         self._frame_age_s = self._asking_s = 0.0  # the most, since warnings()
 
     def ready(self, stop: threading.Event) -> None:
@@ -82,7 +86,7 @@ class PolicyPilot:
     def order(self, now_s: float) -> Order | None:
         frame = self._camera.latest()
         if frame:
-            self._watch(frame.captured_s, frame.repeats, frame.mean, now_s)
+            self._watch(frame, now_s)
             self._frame_age_s = max(self._frame_age_s, now_s - frame.captured_s)
         self._asking_s = max(self._asking_s, self._planner.asking_s)
         plan = self._planner.newest()
@@ -108,10 +112,17 @@ class PolicyPilot:
 
     def sent(self, at_s: float, order: Order) -> None:
         self._commanded.add(at_s, order.steering, order.throttle)
-        if order.throttle <= MOVING:
+        if order.throttle > MOVING:
+            self._throttle_s = at_s
+            self._moving_s = at_s if self._moving_s is None else self._moving_s
+        elif at_s - self._throttle_s > COASTS_S:
             self._moving_s = None
-        elif self._moving_s is None:
-            self._moving_s = at_s
+
+    def check_sight(self) -> None:
+        """Raises CameraError if the newest frame is no reason to drive: frozen, black or without contrast."""
+        frame = self._camera.latest()
+        if frame and (fault := frozen(frame, self._settings) or blank(frame, self._settings)):
+            raise fault
 
     def warnings(self) -> Iterator[str]:
         """A source of warnings: of camera and policy, since it was asked last."""
@@ -122,19 +133,36 @@ class PolicyPilot:
         if plan and asking_s > LATE_FRAME_S + 1.5 * plan.latency_s:
             yield f"the policy took {asking_s:.2f} s or more, for the plan before {plan.latency_s:.2f} s"
 
-    def _watch(self, captured_s: float, repeats: int, mean: float, now_s: float) -> None:
-        limit, period_s = self._settings.frozen_frames, 1 / self._camera.wanted_hz
-        moving_s = now_s - self._moving_s if self._moving_s is not None else 0.0
-        if limit and repeats + 1 >= limit and moving_s > repeats * period_s:
-            raise DriveFault(f"the camera is frozen: {repeats + 1} frames were the same while the car was driving")
-        if mean >= self._settings.black_level or not self._settings.black_frames:
-            self._black_s = None
+    def _watch(self, frame: Frame, now_s: float) -> None:
+        moves = self._moving_s is not None and now_s - self._moving_s > BEGINS_S
+        if moves and (fault := frozen(frame, self._settings)):
+            raise fault
+        fault = blank(frame, self._settings)
+        if not fault:
+            self._blank_s = None
             return
-        self._black_s = captured_s if self._black_s is None else self._black_s
-        if captured_s - self._black_s >= (self._settings.black_frames - 1.5) * period_s:
-            raise DriveFault(
-                f"the camera's picture is black (mean {mean:.1f} of 255)", remedy="is there a cap on the lens?"
-            )
+        self._blank_s = frame.captured_s if self._blank_s is None else self._blank_s
+        if frame.captured_s - self._blank_s >= (self._settings.black_frames - 1.5) / self._camera.wanted_hz:
+            raise fault
+
+
+def frozen(frame: Frame, settings: Settings) -> CameraError | None:
+    """Of the pictures alone: whether it matters depends on what the car does."""
+    seen = frame.repeats + 1
+    if not settings.frozen_frames or seen < settings.frozen_frames:
+        return None
+    return CameraError(f"the camera is frozen: {seen} frames showed nothing new", remedy="plug it in again")
+
+
+def blank(frame: Frame, settings: Settings) -> CameraError | None:
+    """By this frame alone: it is black, or without contrast."""
+    if not settings.black_frames:
+        return None
+    if frame.mean < settings.black_level:
+        return CameraError(f"the camera's picture is black (mean {frame.mean:.1f} of 255)", remedy=CAP)
+    if frame.contrast < settings.flat_level:
+        return CameraError(f"nothing is on the camera's picture (contrast {frame.contrast:.1f} of 255)", remedy=CAP)
+    return None
 
 
 class ReplayPilot:

@@ -31,7 +31,8 @@ class Settings:
     blend_ticks: ticks over which a fresh plan takes over, 0: at once. fade_s, stop_s: ages of a plan from which the
     throttle fades, and at which the car is stopped. compensate: whether the time since the frame is made up for.
     ensemble: LeRobot's coefficient of temporal ensembling, None: off. throttle_limit: of the throttle, in [0, 1].
-    frozen_frames, black_frames: how many in a row are a fault of the camera; black_level: mean of a black one.
+    frozen_frames, black_frames: how many in a row that show nothing new, or nothing at all, are a fault of the camera.
+    black_level, flat_level: mean of a black one, and contrast of one that shows nothing, in grey levels of 255.
     """
 
     fade_s: float = 0.5
@@ -40,16 +41,17 @@ class Settings:
     compensate: bool = True
     ensemble: float | None = None
     throttle_limit: float = 0.2
-    frozen_frames: int = 5
-    black_frames: int = 4
+    frozen_frames: int = 3
+    black_frames: int = 3
     black_level: float = 8.0
+    flat_level: float = 2.0
 
     def __post_init__(self):
         def must(holds: bool, what: str) -> None:
             if not holds:
                 raise ParamsError(f"drive: {what}", remedy="look at the section 'drive' of params.yml")
 
-        for name in ("fade_s", "stop_s", "throttle_limit", "black_level"):
+        for name in ("fade_s", "stop_s", "throttle_limit", "black_level", "flat_level"):
             value = getattr(self, name)
             number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
             must(number, f"{name} must be a finite number, found {value!r}")

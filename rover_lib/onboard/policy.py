@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from rover_lib.onboard.artifact import check_integrity, read_manifest, read_parity
+from rover_lib.onboard.artifact import check_artifact, read_manifest, read_parity
+from rover_lib.onboard.confine import refuse_root
 from rover_lib.onboard.errors import ArtifactError, PolicyError
 from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.torchscript import unknown_operators
 
 # What a pulse can express (facts of the car: steering both ways, throttle forward only). Others pass unclipped.
 ACTION_LIMITS = {"steering": (-1.0, 1.0), "throttle": (0.0, 1.0)}
@@ -67,10 +69,19 @@ class Policy:
         return [(frame_bgr[c["name"]], c) for c in cameras]
 
     def run(self, state: np.ndarray, frames_rgb: list[np.ndarray]) -> np.ndarray:
-        """The bare graph: (S,) float32 and prepared frames in, (chunk, A) float32 out, neither checked nor clipped."""
+        """The bare graph: (S,) float32 and prepared frames in, (chunk, A) float32 out, not clipped.
+
+        Raises PolicyError for an answer of another shape or type than the manifest says.
+        """
         # TorchScript re-optimises in its second call (0.37 G instructions on a Cortex-A76); the switch is thread-local.
         with torch.inference_mode(), torch.jit.optimized_execution(False):
             y = self._module(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames_rgb))
+        if y.dtype != torch.float32 or y.shape != (1, self.chunk, len(self.action_names)):
+            raise PolicyError(
+                f"{self.path}: the policy must give {self.chunk} times {len(self.action_names)} float32",
+                found=f"{tuple(y.shape)} {y.dtype}",
+                remedy="do not drive with it",
+            )
         return y[0].numpy().copy()
 
 
@@ -78,11 +89,13 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
     """Load an artifact and prove that it computes here what it computed where it was made.
 
     threads: for torch's kernels in this process; None leaves them as they are.
-    Checks the file's checksums, the manifest's schema, the torch version, the quantization engine and the parity
-    vectors (which also warm the kernels). Raises ArtifactError, in one sentence, if any of these fails.
+    Checks the file's checksums, that its program is of the form and the operators that artifacts have, the manifest,
+    the torch version, the quantization engine and the parity vectors (which also warm the kernels). Raises
+    ArtifactError, in one sentence, if any of these fails, and for root, who has too much to lose.
     """
     path = Path(path)
-    check_integrity(path)
+    refuse_root()
+    check_artifact(path)
     manifest = read_manifest(path)
     made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
     if made_with.split(".")[:2] != here.split(".")[:2]:
@@ -105,6 +118,12 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
         raise ArtifactError(
             f"{path}: TorchScript cannot load it ({str(e).splitlines()[0][:200]})", remedy="quantize again"
         ) from None
+    if unknown := unknown_operators(module.graph):
+        raise ArtifactError(
+            f"{path}: its program has operators that no artifact has",
+            found=", ".join(unknown)[:200],
+            remedy="do not load it; quantize again",
+        )
     policy = Policy(path, module, manifest)
     check_parity(policy)
     return policy
@@ -119,17 +138,16 @@ def check_parity(policy: Policy) -> dict[str, float]:
     LayerNorm) round differently and each flipped rounding grows over the layers.
     """
     vectors = read_parity(policy.path)
+    frames = [vectors[f"frame_{c}"] for c in policy.cameras]
     try:
-        frames = [vectors[f"frame_{c}"] for c in policy.cameras]
         chunks = [policy.run(s, [f[i] for f in frames]) for i, s in enumerate(vectors["state"])]
-    except (KeyError, IndexError, RuntimeError) as e:
+    except PolicyError as e:
+        raise ArtifactError(e.what, found=e.found, remedy=e.remedy) from None
+    except (IndexError, RuntimeError) as e:
         raise ArtifactError(
-            f"{policy.path}: its parity vectors do not run ({str(e)[:200]})", remedy="quantize again"
+            f"{policy.path}: its parity vectors do not run ({' '.join(str(e).split())[-200:]})",
+            remedy="quantize again",
         ) from None
-    if vectors["chunk"].shape != (len(chunks), policy.chunk, len(policy.action_names)):
-        raise ArtifactError(
-            f"{policy.path}: its parity vectors have another shape than its manifest says", remedy="quantize again"
-        )
     difference = np.abs(np.stack(chunks) - vectors["chunk"]).max((0, 1))
     tolerance = policy.manifest["parity"]["tolerance"]
     result = {name: float(d) for name, d in zip(policy.action_names, difference, strict=True)}

@@ -5,7 +5,8 @@
     releases.switch(name)                                     # proven before, proven again after; rolls back by itself
 
     models/current              a symbolic link to releases/<content hash>, and the only truth about what is in use
-    models/releases/<hash>/     policy.pt, policy.pt.sha256 (for sha256sum -c) and release.json: where it came from
+    models/releases/<hash>/     policy.pt, policy.pt.sha256 (for sha256sum -c), policy.pt.sig (its signature, for
+                                ssh-keygen -Y verify) and release.json: where it came from
     models/history.json         what was in use, the newest last; for rollback and prune
     models/.lock                held by whoever changes something
 
@@ -25,23 +26,28 @@ import shutil
 import socket
 import subprocess
 import time
-import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
-from rover_lib.onboard.artifact import check_integrity, content_hash, read_manifest
+from rover_lib.onboard.artifact import check_artifact, content_hash, read_manifest, read_parity
 from rover_lib.onboard.errors import ArtifactError, RoverError
-from rover_lib.onboard.stage import sha256_of
+from rover_lib.onboard.stage import open_plain, sha256_of
+from rover_lib.onboard.torchscript import ARCHIVE_BYTES, open_archive, read_record
 
 MODELS = Path("/var/lib/rover/models")
 POLICY, DIGEST, ORIGIN = "policy.pt", "policy.pt.sha256", "release.json"
+SIGNATURE = "policy.pt.sig"
+SIGNERS = Path("/etc/rover/allowed_signers")  # of ssh-keygen(1); provision.yml writes it
+SIGNER, NAMESPACE = "rover", "rover-policy"  # the principal there, and what a signature is for
 NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # the second whole copy of a release in use that was damaged is ...-2
 PART = re.compile(r"part-\d{4,}")
 PART_BYTES = 8 << 20  # what a transfer that was cut off sends again at most
+MOST_PARTS = 1000
 SPARE_BYTES = 64 << 20  # left free for logs
+JSON_BYTES = 100_000  # of release.json and history.json
 HISTORY = 100
 LOCK_TRIES, LOCK_S = 5, 0.05
 SANDBOX = "rover-check@{}.service"
@@ -99,30 +105,37 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
     allow = set(allow)
     if unknown := allow - set(MAY_DIFFER):
         raise ReleaseError(f"only {', '.join(MAY_DIFFER)} can be allowed", found=", ".join(sorted(unknown)))
-    check_integrity(path)
+    check_artifact(path)
     manifest = read_manifest(path)
-    with zipfile.ZipFile(path) as z:
-        code = b"".join(z.read(n) for n in z.namelist() if "/code/" in n and n.endswith(".py"))
+    with open_archive(path) as z:
+        code = b"".join(read_record(z, n) for n in z.namelist() if n.endswith(".py"))
     if (wanted := CODE_OF_MODE.get(manifest["mode"])) and wanted not in code:
         raise ArtifactError(f"{path}: its manifest says {manifest['mode']}, its code is not", remedy="quantize again")
     for kind, why in expected.refusals(manifest).items():
         if kind not in allow:
             remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
             raise ReleaseError(f"{path}: {why}", remedy=remedy)
+    read_parity(path)
     return manifest
 
 
 def pack(
-    artifact: Path | str, folder: Path | str, expected: Expected = THIS_CAR, allow: Iterable[str] = ()
+    artifact: Path | str,
+    folder: Path | str,
+    expected: Expected = THIS_CAR,
+    allow: Iterable[str] = (),
+    key: Path | str | None = None,
 ) -> dict[str, Any]:
     """Cut an artifact into parts in a folder of their own, with a release.json that says what they make together.
 
     Parts travel one by one, so that a transfer goes on where it was cut. What an earlier pack() wrote there is
-    replaced. Returns what release.json says: name (the content hash), sha256, bytes, parts, mode, origin. Raises as
-    inspect_artifact(), and ReleaseError, with nothing touched, for a folder that holds anything else.
+    replaced. key: of ssh, to sign the artifact with; a rover takes only what its own laptops have signed. Returns what
+    release.json says: name (the content hash), sha256, bytes, parts, mode, origin. Raises as inspect_artifact(), and
+    ReleaseError, with nothing touched, for a key that does not sign, or a folder that holds anything else.
     """
     artifact, folder = Path(artifact), Path(folder)
     manifest = inspect_artifact(artifact, expected, allow)
+    signature = sign(artifact, key) if key else None
     for old in _packed_before(artifact, folder):
         old.unlink()
     folder.mkdir(parents=True, exist_ok=True)
@@ -131,6 +144,8 @@ def pack(
         while part := f.read(PART_BYTES):
             (folder / f"part-{count:04d}").write_bytes(part)
             count += 1
+    if signature:
+        (folder / SIGNATURE).write_bytes(signature)
     about = {**_about(artifact, manifest), "parts": count}
     (folder / ORIGIN).write_text(json.dumps(about, indent=1, sort_keys=True) + "\n")
     return about
@@ -156,7 +171,39 @@ def _packed_before(artifact: Path, folder: Path) -> list[Path]:
 
 
 def _is_packed(path: Path) -> bool:
-    return path.is_file() and (path.name == ORIGIN or PART.fullmatch(path.name) is not None)
+    return path.is_file() and (path.name in (ORIGIN, SIGNATURE) or PART.fullmatch(path.name) is not None)
+
+
+def sign(artifact: Path | str, key: Path | str) -> bytes:
+    """The signature of an artifact, as `ssh-keygen -Y sign` makes it; a key in the agent is used from there.
+
+    Raises ReleaseError.
+    """
+    with _open_file(artifact) as content:
+        return _ssh_keygen(["sign", "-f", key], content, f"{artifact}: cannot be signed", "is it the right key?")
+
+
+def check_signature(artifact: Path | str, signature: Path | str, signers: Path | str) -> None:
+    """Raise ReleaseError unless one of the signers has signed exactly this artifact."""
+    remedy = "deploy it from a laptop that has provisioned this rover, or say --unsigned (rover_unsigned=true)"
+    for path, what in ((signature, f"{artifact}: not signed"), (signers, f"{signers}: this rover knows no laptop")):
+        if not Path(path).is_file():
+            raise ReleaseError(what, remedy=remedy)
+    with _open_file(artifact) as content:
+        call = ["verify", "-f", signers, "-I", SIGNER, "-s", signature]
+        _ssh_keygen(call, content, f"{artifact}: not signed by a laptop that this rover knows", remedy)
+
+
+def _ssh_keygen(call: list[Any], content: BinaryIO, what: str, remedy: str) -> bytes:
+    try:
+        command = ["ssh-keygen", "-Y", *map(str, call), "-n", NAMESPACE]
+        done = subprocess.run(command, stdin=content, capture_output=True, timeout=60)
+    except (OSError, subprocess.SubprocessError) as e:
+        raise ReleaseError(f"{what} ({e})", remedy="apt install openssh-client") from None
+    if done.returncode:
+        why = done.stderr.decode(errors="replace").strip().splitlines()
+        raise ReleaseError(f"{what} ({why[-1][:200] if why else f'exit code {done.returncode}'})", remedy=remedy)
+    return done.stdout
 
 
 def _about(artifact: Path, manifest: dict[str, Any]) -> dict[str, Any]:
@@ -189,21 +236,30 @@ class Release:
     mode: str
     origin: str
     megabytes: float
+    signed: bool
     wrong: str
 
 
 class Releases:
     """The models of a rover. check: proves that a release computes what it should; runs its parity vectors if None.
 
-    Every command that changes something holds the lock, and raises ReleaseError if another one does.
+    signers: whose signatures it takes, SIGNERS if None. Every command that changes something holds the lock, and raises
+    ReleaseError if another one does.
     """
 
-    def __init__(self, models: Path | str = MODELS, *, check: Check | None = None, expected: Expected = THIS_CAR):
+    def __init__(
+        self,
+        models: Path | str = MODELS,
+        *,
+        check: Check | None = None,
+        expected: Expected = THIS_CAR,
+        signers: Path | str | None = None,
+    ):
         self.models = Path(models)
         self.releases = self.models / "releases"
         self.current_link = self.models / "current"
-        self.expected = expected
-        self._check = check or self.verify
+        self.expected, self.signers = expected, Path(signers or SIGNERS)
+        self.check = check or self.verify
 
     # Questions
 
@@ -238,7 +294,7 @@ class Releases:
         if not named:
             return f"'{name}' is no content hash"
         try:
-            json.loads((folder / ORIGIN).read_text())
+            _read_json(folder / ORIGIN)
             if (folder / DIGEST).read_text().split()[:1] != [sha256_of(folder / POLICY)]:
                 return f"{POLICY} is not what {DIGEST} says"
             content = content_hash(folder / POLICY)
@@ -253,12 +309,14 @@ class Releases:
         current, releases = self.current, []
         for name in self._by_use():
             try:
-                about = json.loads((self.releases / name / ORIGIN).read_text())
+                about = _read_json(self.releases / name / ORIGIN)
                 mode, origin = str(about["mode"]), "{host}:{file}".format(**about["origin"])
                 megabytes = (self.releases / name / POLICY).stat().st_size / 1e6
-            except (OSError, ValueError, KeyError, TypeError):
+            except (OSError, ValueError, KeyError, TypeError, ReleaseError):
                 mode, origin, megabytes = "?", "?", 0.0
-            releases.append(Release(name, name == current, mode, origin, round(megabytes, 1), self.wrong_with(name)))
+            signed = (self.releases / name / SIGNATURE).is_file()
+            wrong = self.wrong_with(name)
+            releases.append(Release(name, name == current, mode, origin, round(megabytes, 1), signed, wrong))
         return releases
 
     def status(self) -> dict[str, Any]:
@@ -301,11 +359,15 @@ class Releases:
 
     # Changes
 
-    def stage(self, source: Path | str, *, sha256: str | None = None, allow: Iterable[str] = ()) -> Staged:
+    def stage(
+        self, source: Path | str, *, sha256: str | None = None, allow: Iterable[str] = (), unsigned: bool = False
+    ) -> Staged:
         """Make a release of an artifact, or of the folder that pack() wrote; what is in use stays in use.
 
-        sha256: what the artifact's must be, if it is known. A release that is there and whole is left as it is; one
-        that is not whole is replaced, the one in use by a second copy beside it. Raises ReleaseError, ArtifactError.
+        Its signature is policy.pt.sig in that folder, or lies beside the artifact with .sig added to its name.
+        sha256: what the artifact's must be, if it is known. unsigned: take it from anybody. A release that is there and
+        whole is left as it is; one that is not whole is replaced, the one in use by a second copy beside it. Raises
+        ReleaseError, ArtifactError.
         """
         source = Path(source)
         with _disk_errors_explained(), self._exclusively():
@@ -321,12 +383,17 @@ class Releases:
             new.mkdir()
             new.chmod(0o755)  # whatever the umask: the service's user reads it
             parts = [source / f"part-{i:04d}" for i in range(about["parts"])] if about else [source]
-            arrived, wanted = _join(parts, new / POLICY), sha256 or (about or {}).get("sha256")
+            most = about["bytes"] if about else ARCHIVE_BYTES
+            arrived, wanted = _join(parts, new / POLICY, most), sha256 or (about or {}).get("sha256")
             if wanted and arrived != wanted:
                 raise ReleaseError(
                     f"{source}: arrived damaged (sha256 {arrived[:12]}, not {wanted[:12]})", remedy="send it again"
                 )
             try:
+                if not unsigned:
+                    signature = source / SIGNATURE if about else Path(f"{source}.sig")
+                    check_signature(new / POLICY, signature, self.signers)
+                    _join([signature], new / SIGNATURE, JSON_BYTES)
                 here = _about(new / POLICY, inspect_artifact(new / POLICY, self.expected, allow))
             except RoverError as e:
                 what = e.what.replace(str(new / POLICY), str(source))
@@ -356,12 +423,12 @@ class Releases:
             if name == "current":
                 raise ReleaseError("'current' is in use already", remedy="name the release to switch to")
             self.path_of(name)
-            self._check(name)
+            self.check(name)
             if before == name:
                 return False
             self._point_current_at(name)
             try:
-                self._check("current")
+                self.check("current")
             except BaseException as error:
                 self._point_current_at(before)
                 now = f"{before[:12]} is in use again" if before else "no model is in use, as before"
@@ -377,7 +444,7 @@ class Releases:
             refused = []
             for name in self._used_before():
                 try:
-                    self._check(name)
+                    self.check(name)
                 except RoverError as error:
                     refused.append(f"{name[:12]}: {error}")
                     continue
@@ -456,11 +523,18 @@ class Releases:
 
     def _packed(self, folder: Path) -> dict[str, Any]:
         try:
-            about = json.loads((folder / ORIGIN).read_text())
-            if not (NAME.fullmatch(about["name"]) and NAME.fullmatch(about["sha256"]) and about["origin"]):
+            about = _read_json(folder / ORIGIN)
+            if not (NAME.fullmatch(about["name"]) and NAME.fullmatch(about["sha256"])):
                 raise ValueError("its hashes are none")
-            return {**about, "bytes": int(about["bytes"]), "parts": int(about["parts"])}
-        except (OSError, ValueError, KeyError, TypeError) as e:
+            origin = {key: about["origin"][key] for key in ("file", "host")}
+            if not all(isinstance(v, str) and v.isprintable() for v in origin.values()):
+                raise ValueError("its origin is none")
+            size, parts = about["bytes"], about["parts"]
+            counts = isinstance(size, int) and isinstance(parts, int)
+            if not counts or not 0 < size <= ARCHIVE_BYTES or not 0 < parts <= MOST_PARTS:
+                raise ValueError("its sizes are none")
+            return {"name": about["name"], "sha256": about["sha256"], "origin": origin, "bytes": size, "parts": parts}
+        except (OSError, ValueError, KeyError, TypeError, ReleaseError) as e:
             raise ReleaseError(
                 f"{folder / ORIGIN}: not what 'rover release pack' writes ({e})", remedy="send it again"
             ) from None
@@ -512,14 +586,16 @@ class Releases:
         else:
             new = self.models / ".new-current"
             new.symlink_to(Path("releases", name))
+            if self.current_link.is_dir() and not self.current_link.is_symlink():  # somebody's; a link it must be
+                self.current_link.rename(self.models / ".new-was-current")  # the next command removes it
             new.replace(self.current_link)
         _sync(self.models)
 
     def _history(self) -> list[str]:
         try:
-            names = json.loads((self.models / "history.json").read_text())
+            names = _read_json(self.models / "history.json")
             return [n for n in names if isinstance(n, str) and NAME.fullmatch(n)]
-        except (OSError, ValueError, TypeError):
+        except (OSError, ValueError, TypeError, ReleaseError):
             return []
 
     def _write_history(self, names: list[str]) -> None:
@@ -588,19 +664,38 @@ def _disk_errors_explained() -> Iterator[None]:
         raise
 
 
-def _join(parts: list[Path], target: Path) -> str:
-    """One file from parts, synced; its SHA-256."""
+def _open_file(path: Path | str) -> BinaryIO:
+    return open_plain(path, ReleaseError(f"{path}: not a file", remedy="send it again"))
+
+
+def _read_json(path: Path) -> Any:
+    """What a small JSON file holds. Raises ValueError, OSError or ReleaseError."""
+    with _open_file(path) as file:
+        text = file.read(JSON_BYTES + 1)
+    if len(text) > JSON_BYTES:
+        raise ValueError(f"more than {JSON_BYTES} bytes")
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def _join(parts: list[Path], target: Path, most: int) -> str:
+    """One file from parts, synced; its SHA-256. Raises ReleaseError for more than that many bytes."""
     digest = hashlib.sha256()
     file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
     try:
         os.fchmod(file, 0o644)
         for part in parts:
             try:
-                content = part.read_bytes()
+                with _open_file(part) as source:
+                    while content := source.read(min(PART_BYTES, most + 1)):
+                        if (most := most - len(content)) < 0:
+                            raise ReleaseError(f"{part}: larger than it can be", remedy="send it again")
+                        digest.update(content)
+                        _write_all(file, content)
             except FileNotFoundError:
                 raise ReleaseError(f"{part}: not arrived", remedy="send it again") from None
-            digest.update(content)
-            _write_all(file, content)
         os.fsync(file)
     finally:
         os.close(file)

@@ -1,11 +1,12 @@
 """The serial link to the rover's Arduino: commands out, telemetry in, by the protocol of firmware/README.md.
 
-The Arduino is the one that keeps the car safe: it stops by itself 150 ms after the last valid command, and hands over
-to the human at the first move of a stick. What is here adds: nothing out of range is sent, leaving the link sends
-neutral, and what the Arduino says is known with the time at which it came.
+The Arduino is the one that keeps the car safe: it stops by itself 150 ms after the last valid command, takes none that
+waited in the link for longer, and hands over to the human at the first move of a stick. What is here adds: nothing out
+of range is sent, leaving the link sends neutral, and what the Arduino says is known with the time at which it came.
 """
 
 import contextlib
+import fcntl
 import logging
 import os
 import re
@@ -13,6 +14,7 @@ import termios
 import threading
 import time
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -22,9 +24,10 @@ from typing import Any
 import serial
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.pwm import Pulses, PwmCalibration
+from rover_lib.onboard.pwm import Channel, Pulses, PwmCalibration
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
+FIRMWARE_VERSION = "2.0.0"  # what is known of an Arduino is known of this one; firmware/rover/protocol.h has the same
 BAUD = 115200
 LINE_MAX = 128  # of the Arduino's lines
 SEQUENCES = 1 << 32
@@ -35,6 +38,8 @@ REPEAT_S = 0.05
 ANSWER_S = 0.5
 SIGNALS_MS = 250  # from the Arduino's start; it knows the transmitter's signals after two pulses of each
 STALE_S = 0.5  # the Arduino speaks every 20 ms
+LATE_S = 0.150  # the Arduino takes no command that is older, and a link that is so slow is none to drive by
+DATED = (">A", ">D")  # commands that say what the host had heard when it sent them
 READ_TIMEOUT_S = 0.05
 
 # serial.SerialException is an OSError, termios.error is not; TypeError is pyserial's of a port just closed elsewhere.
@@ -66,11 +71,19 @@ REASONS = {
 RESULTS = {
     "-": "no command yet",
     "k": "done",
-    "i": "ignored: not autonomous",
+    "i": "ignored: not for who drives now",
     "r": "out of range",
     "o": "an old command, or one for another start of the Arduino",
+    "l": "late: it had waited in the link",
     "s": "refused: the transmitter gives no signal",
     "t": "refused: the throttle stick is not at rest",
+    "w": "refused: nobody has just wiggled the steering stick",
+}
+MISSING = {  # before the car can be armed, and what the human does about it
+    "s": "switch the transmitter on",
+    "t": "let go of the throttle stick",
+    "w": "move the steering stick far to both sides and let go of it",
+    "-": "nothing is missing",
 }
 RESETS = {"p": "power-on", "e": "reset pin", "b": "brown-out", "w": "watchdog", "-": "unknown"}
 
@@ -92,9 +105,9 @@ class Telemetry:
 
     host_s: time.monotonic() (or the link's clock) at which its line was complete here; uptime_ms: the Arduino's
     clock, which wraps at 2^32. sequence: of the last command that it took as new; result: what became of the last one,
-    a key of RESULTS. steering_us, throttle_us: what its pins do. receiver_*: the transmitter's pulses. The counters
-    stay at 65535: lines that were no command, commands that were replayed or another start's, pulses out of range,
-    bytes lost.
+    a key of RESULTS. missing: before it can be armed, a key of MISSING. steering_us, throttle_us: what its pins do.
+    cap_us: the most throttle that the host gets. receiver_*: the transmitter's pulses. The counters stay at 65535:
+    lines that were no command, commands that were replayed, late or another start's, pulses out of range, bytes lost.
     """
 
     host_s: float
@@ -104,8 +117,10 @@ class Telemetry:
     result: str
     state: State
     reason: str  # why the state is what it is, a key of REASONS
+    missing: str
     steering_us: int
     throttle_us: int
+    cap_us: int
     receiver_steering_us: int | None
     receiver_steering_period_us: int | None
     receiver_throttle_us: int | None
@@ -135,8 +150,8 @@ _NUMBER = r"(0|[1-9][0-9]{0,9})"
 _PULSE = rf"(?:{_NUMBER} {_NUMBER}|- -)"
 _HELLO = re.compile(rf"<H {_NUMBER} (\S+)(?: {_NUMBER} {_NUMBER} ([pebw-]))?(?: .*)?", re.ASCII)
 _STATUS = re.compile(
-    rf"<S {_NUMBER} {_NUMBER} {_NUMBER} ([{''.join(RESULTS)}]) ([MAS]) ([{''.join(REASONS)}]) {_NUMBER} {_NUMBER} "
-    rf"{_PULSE} {_PULSE} {_NUMBER} {_NUMBER} {_NUMBER} {_NUMBER}",
+    rf"<S {_NUMBER} {_NUMBER} {_NUMBER} ([{''.join(RESULTS)}]) ([MAS]) ([{''.join(REASONS)}]) "
+    rf"([{''.join(MISSING)}]) {_NUMBER} {_NUMBER} {_NUMBER} {_PULSE} {_PULSE} {_NUMBER} {_NUMBER} {_NUMBER} {_NUMBER}",
     re.ASCII,
 )
 
@@ -160,9 +175,22 @@ def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
         return Hello(int(protocol), firmware, int(boot or 0), int(sequence or 0), RESETS[reset or "-"])
     if not (found := _STATUS.fullmatch(text)):
         return None
-    boot, uptime, sequence, result, state, reason, *numbers = found.groups()
+    boot, uptime, sequence, result, state, reason, missing, *numbers = found.groups()
     values: list[Any] = [None if n is None else int(n) for n in numbers]  # the pattern says which may be None
-    return Telemetry(host_s, int(boot), int(uptime), int(sequence), result, State(state), reason, *values)
+    return Telemetry(host_s, int(boot), int(uptime), int(sequence), result, State(state), reason, missing, *values)
+
+
+def _reached(telemetry: Telemetry, sequence: int) -> bool:
+    """Whether the Arduino has taken the command of that number, or a later one."""
+    return (telemetry.sequence - sequence) % SEQUENCES < SEQUENCES // 2
+
+
+def _keep(port: serial.Serial) -> None:
+    """Nobody else opens it meanwhile, and closing it leaves DTR as it is: its edge is what resets an Arduino."""
+    fcntl.ioctl(port.fileno(), termios.TIOCEXCL)  # for programs that know nothing of pyserial's lock
+    attributes = termios.tcgetattr(port.fileno())
+    attributes[2] &= ~termios.HUPCL
+    termios.tcsetattr(port.fileno(), termios.TCSANOW, attributes)
 
 
 class ServoLink:
@@ -194,11 +222,12 @@ class ServoLink:
         self._serial: serial.Serial | None = None
         self._reader: threading.Thread | None = None
         self._closing = threading.Event()
-        self._heard = threading.Condition()  # guards the four below
+        self._heard = threading.Condition()  # guards the five below
         self._hello: Hello | None = None
         self._hellos = 0
         self._telemetry: Telemetry | None = None
         self._failure: LinkError | None = None
+        self._unanswered: deque[tuple[int, float]] = deque(maxlen=256)  # commands: number, and when it was sent
         self._sending = threading.RLock()  # guards the two below, and keeps lines whole; never taken inside _heard
         self._boot = 0
         self._sequence = 0
@@ -214,16 +243,18 @@ class ServoLink:
         self.close()
 
     def open(self) -> Hello:
-        """Opens the port, which resets most Arduinos, and waits for the hello.
+        """Opens the port, for nobody else meanwhile, and waits for the hello and a first status.
 
+        The first time after it was plugged in, that resets most Arduinos; from then on it goes on with what it does.
         Raises LinkError if the port cannot be opened, is in use, nothing there says hello within `boot_s` seconds, or
-        it speaks another protocol.
+        it has another firmware than this program knows.
         """
         if self._serial:
             raise LinkError(f"{self.port}: the link is open already", remedy="close it first")
         try:
             self._serial = serial.Serial(self.port, BAUD, timeout=READ_TIMEOUT_S, exclusive=True)
-            self._serial.reset_input_buffer()  # what came before this reset
+            _keep(self._serial)
+            self._serial.reset_input_buffer()  # what came before
         except (*PORT_ERRORS, ValueError) as error:
             self._release()
             raise LinkError(
@@ -234,6 +265,7 @@ class ServoLink:
         self._closing.clear()
         with self._heard:
             self._hello = self._telemetry = self._failure = None
+            self._unanswered.clear()
         self._reader = threading.Thread(
             target=self._read, args=(self._serial,), name=f"servo link {self.port}", daemon=True
         )
@@ -266,12 +298,15 @@ class ServoLink:
             if now - opened > due and now - self._asked > HELLO_EVERY_S / 2:
                 self._asked = now
                 self._write(frame(">Q"))
-        if hello.protocol != PROTOCOL_VERSION:
+        if (hello.protocol, hello.firmware) != (PROTOCOL_VERSION, FIRMWARE_VERSION):
             raise LinkError(
-                f"{self.port}: the Arduino speaks protocol {hello.protocol} (firmware {hello.firmware}), this program "
-                f"{PROTOCOL_VERSION}",
-                remedy=f"put the matching firmware on it: make flash PORT={self.port}",
+                f"{self.port}: the Arduino has firmware {hello.firmware} (protocol {hello.protocol}), this program "
+                f"knows {FIRMWARE_VERSION} (protocol {PROTOCOL_VERSION})",
+                remedy=f"put the matching firmware on it: make -C firmware flash PORT={self.port}",
             )
+        with self._heard:
+            if not self._heard.wait_for(lambda: self._telemetry or self._failure, timeout=STALE_S):
+                raise LinkError(f"{self.port}: the Arduino sends no status", remedy="press its reset button")
         return hello
 
     def close(self) -> None:
@@ -296,24 +331,25 @@ class ServoLink:
             with contextlib.suppress(*PORT_ERRORS):
                 port.reset_output_buffer()  # else the kernel waits up to 30 s for a line that is stuck
             with contextlib.suppress(*PORT_ERRORS):
+                fcntl.ioctl(port.fileno(), termios.TIOCNXCL)  # a pseudo-terminal would stay so
+            with contextlib.suppress(*PORT_ERRORS):
                 port.close()
         self._reader = None
 
     def arm(self) -> Telemetry:
         """Hands the car to the host: from here on, commands have to come. Returns the status that says so.
 
-        Raises LinkError if the Arduino refuses (no transmitter, throttle stick not at rest), or does not answer within
-        0.5 s.
+        Raises LinkError if the Arduino refuses, with what is missing as its remedy, or does not answer within 0.5 s.
         """
         for telemetry in self._ask(">A"):
             if telemetry.state is State.AUTONOMOUS:
                 return telemetry
             if telemetry.result == "s" and telemetry.uptime_ms < SIGNALS_MS:
                 continue  # it has just started, and nothing can have come yet
-            if telemetry.result in "st":
-                remedy = "switch the transmitter on" if telemetry.result == "s" else "let go of the throttle stick"
+            if telemetry.result in MISSING and telemetry.result != "-":
                 raise LinkError(
-                    f"{self.port}: arming was {RESULTS[telemetry.result]}", remedy=f"{remedy} and try again"
+                    f"{self.port}: arming was {RESULTS[telemetry.result]}",
+                    remedy=f"{MISSING[telemetry.result]}, then try again",
                 )
         raise LinkError(f"{self.port}: no answer to arming within {ANSWER_S:g} s; {self._last_words()}")
 
@@ -327,12 +363,25 @@ class ServoLink:
                 return telemetry
         raise LinkError(f"{self.port}: no answer to neutral within {ANSWER_S:g} s; {self._last_words()}")
 
-    def _ask(self, kind: str) -> Iterator[Telemetry]:
+    def lower_cap(self, throttle_us: int) -> Telemetry:
+        """Lowers the most throttle that the host gets, until the Arduino's next reset. Returns the status that says so.
+
+        Raises LinkError for a pulse out of range, while the car is armed, or without an answer within 0.5 s.
+        """
+        most_us = self._whole(self.calibration.throttle, throttle_us)
+        for telemetry in self._ask(">L", most_us):
+            if telemetry.cap_us <= most_us:
+                return telemetry
+            if telemetry.state is State.AUTONOMOUS:
+                raise LinkError(f"{self.port}: the throttle's cap is not changed while the car drives")
+        raise LinkError(f"{self.port}: no answer to the throttle's cap within {ANSWER_S:g} s; {self._last_words()}")
+
+    def _ask(self, kind: str, *values: int) -> Iterator[Telemetry]:
         """Sends a command, again and again; yields what the Arduino says about it, until ANSWER_S are over."""
         first = None
         end = self._clock() + ANSWER_S
         while self._clock() < end:
-            number = self._send(kind)
+            number = self._send(kind, *values)
             first = number if first is None else first
             until = self._clock() + REPEAT_S
             seen = None
@@ -343,7 +392,7 @@ class ServoLink:
                         raise self._failure
                     seen = self._telemetry
                 # A status from before the command says nothing about it.
-                if seen and (seen.sequence - first) % SEQUENCES < SEQUENCES // 2 and seen.boot == self._boot:
+                if seen and _reached(seen, first) and seen.boot == self._boot:
                     yield seen
 
     def send(self, steering_us: int, throttle_us: int) -> int:
@@ -351,15 +400,21 @@ class ServoLink:
 
         Raises LinkError for pulses outside the calibration's range, and if the port failed; nothing is sent then.
         """
-        for channel, value in ((self.calibration.steering, steering_us), (self.calibration.throttle, throttle_us)):
-            low, high = channel.pulse_us(channel.low), channel.pulse_us(channel.high)
-            if isinstance(value, bool) or not isinstance(value, Integral) or not low <= value <= high:
-                raise LinkError(
-                    f"{channel.name} pulse must be whole microseconds from {low} to {high}",
-                    found=repr(value),
-                    remedy="it was not sent",
-                )
-        return self._send(">D", int(steering_us), int(throttle_us))
+        steering_us = self._whole(self.calibration.steering, steering_us)
+        throttle_us = self._whole(self.calibration.throttle, throttle_us)
+        return self._send(">D", steering_us, throttle_us)
+
+    @staticmethod
+    def _whole(channel: Channel, pulse_us: object) -> int:
+        low, high = channel.pulse_us(channel.low), channel.pulse_us(channel.high)
+        whole_us = int(pulse_us) if isinstance(pulse_us, Integral) and not isinstance(pulse_us, bool) else None
+        if whole_us is None or not low <= whole_us <= high:
+            raise LinkError(
+                f"{channel.name} pulse must be whole microseconds from {low} to {high}",
+                found=repr(pulse_us),
+                remedy="it was not sent",
+            )
+        return whole_us
 
     def send_action(self, steering: float, throttle: float) -> int:
         """Sends steering in [-1, 1] and throttle in [0, 1] as pulses. PwmError for all else; otherwise as send()."""
@@ -375,6 +430,14 @@ class ServoLink:
         if telemetry and (age := self._clock() - telemetry.host_s) > STALE_S:
             raise LinkError(f"{self.port}: the Arduino said nothing for {age:.1f} s", remedy="is it still plugged in?")
         return telemetry
+
+    def unacknowledged_s(self, now_s: float) -> float:
+        """Age of the oldest command that the Arduino has not acknowledged, nor any after it; 0 if there is none.
+
+        now_s: by the link's clock. Above LATE_S the car obeys what is over: stop it.
+        """
+        with self._heard:
+            return now_s - self._unanswered[0][1] if self._unanswered else 0.0
 
     def round_trip_s(self) -> float:
         """Seconds from a question to its answer. Raises LinkError if none comes within 0.5 s."""
@@ -399,16 +462,23 @@ class ServoLink:
     def _last_words(self) -> str:
         with self._heard:
             telemetry = self._telemetry
-        return f"its last status was {telemetry.why}" if telemetry else "it never sent a status"
+        return f"its last status was {telemetry.why}" if telemetry else "it sent no status"
 
     def _send(self, kind: str, *values: int) -> int:
         with self._heard:
             if self._failure:
                 raise self._failure
+            heard = self._telemetry
+        if kind in DATED:
+            if not heard:
+                raise LinkError(f"{self.port}: the Arduino has sent no status yet")
+            values = heard.uptime_ms, *values
         with self._sending:
-            self._sequence = (self._sequence + 1) % SEQUENCES
-            self._write(frame(" ".join([kind, *map(str, (self._boot, self._sequence, *values))])))
-            return self._sequence
+            self._sequence = number = (self._sequence + 1) % SEQUENCES
+            self._write(frame(" ".join([kind, *map(str, (self._boot, number, *values))])))
+            with self._heard:
+                self._unanswered.append((number, self._clock()))
+            return number
 
     def _write(self, line: bytes) -> None:
         port = self._serial
@@ -474,7 +544,11 @@ class ServoLink:
                 self._write(frame(">Q"))
         with self._heard:
             if isinstance(message, Hello):
+                if self._hello and message.boot != self._hello.boot:
+                    self._unanswered.clear()
                 self._hello, self._hellos = message, self._hellos + 1
             else:
                 self._telemetry = message
+                while self._unanswered and _reached(message, self._unanswered[0][0]):
+                    self._unanswered.popleft()
             self._heard.notify_all()

@@ -11,13 +11,14 @@ import os
 import platform
 import secrets
 import socket
+import stat
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from rover_lib.onboard.errors import RoverError
 
@@ -40,6 +41,18 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def open_plain(path: Path | str, refusal: RoverError) -> BinaryIO:
+    """A file to read from. Raises OSError, and `refusal` for what is no plain file.
+
+    A FIFO would be waited for, by Path.open() too, and a device never ends.
+    """
+    file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise refusal
+    return file
 
 
 def sha256_of(path: Path | str) -> str:

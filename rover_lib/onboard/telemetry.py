@@ -21,6 +21,7 @@ import errno
 import glob
 import json
 import logging
+import math
 import os
 import shutil
 import sys
@@ -30,6 +31,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
@@ -49,6 +51,7 @@ MACHINE_S = 1.0
 CLOSE_S = 2.0
 MIN_BYTES = 20_000
 EVENT_CHARACTERS = 800
+ARMED = "armed"  # the loop's event, with which a drive begins
 MISSING = "ticks are missing before this one"
 BACK_S = 1.0  # a tick that is so much older than the one before it belongs to another drive
 
@@ -482,6 +485,18 @@ class _Drive:
     def goes_on(self, t_s: float) -> bool:
         return not self.ticks or t_s > self.ticks[-1][0] - BACK_S
 
+    def split(self) -> "list[_Drive]":
+        """A service's drives, one from each arming to the next; what was before the first belongs to it."""
+        armed_s = [e.t_s for e in self.events if e.text == ARMED][1:]
+        parts = []
+        for since_s, until_s in pairwise([-math.inf, *sorted(armed_s), math.inf]):
+            part = _Drive(self.header)
+            part.ticks = [t for t in self.ticks if since_s <= t[0] < until_s]
+            part.events = [e for e in self.events if since_s <= e.t_s < until_s]
+            part.machine = [m for m in self.machine if since_s <= m["t_s"] < until_s]
+            parts.append(part)
+        return parts
+
 
 def read_log(path: Path | str, drive: int = -1) -> Flight:
     """Read a flight log, with the older files path.1, path.2, ... that belong to it.
@@ -515,6 +530,7 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
             drives[-1].events.append(row)
         elif row["kind"] == "machine":
             drives[-1].machine.append(row)
+    drives = [part for drive_ in drives for part in drive_.split()]
     if not drives:
         raise LogError(
             f"{path}: no line of a flight log in it, {damaged} of something else",

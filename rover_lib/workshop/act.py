@@ -11,7 +11,7 @@ Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions,
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +20,9 @@ from torch import Tensor, nn
 
 from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
 from rover_lib.workshop.episodes import Sample
+
+if TYPE_CHECKING:
+    from lerobot.policies.act.modeling_act import ACTPolicy
 
 Projection = nn.Linear | nn.Conv2d
 Layer = TypeVar("Layer", nn.Linear, nn.Conv2d, nn.LayerNorm)
@@ -81,6 +84,38 @@ class ActConfig:
     @property
     def stride(self) -> int:
         return 16 if self.dilation else 32
+
+
+def lerobot_act(c: ActConfig) -> "ACTPolicy":
+    """LeRobot's own ACTPolicy of this shape, with fresh weights and nothing normalised. Downloads nothing."""
+    # here, because it takes ten seconds that what only reads or quantizes a checkpoint need not wait for
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    cameras = zip(c.cameras, c.image_sizes, strict=True)
+    inputs = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, *size)) for name, size in cameras}
+    config = ACTConfig(
+        input_features={**inputs, "observation.state": PolicyFeature(FeatureType.STATE, (len(c.state_names),))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (len(c.action_names),))},
+        device="cpu",
+        chunk_size=c.chunk,
+        n_action_steps=c.chunk,
+        vision_backbone=c.backbone,
+        pretrained_backbone_weights=None,
+        replace_final_stride_with_dilation=c.dilation,
+        pre_norm=c.pre_norm,
+        dim_model=c.dim,
+        n_heads=c.heads,
+        dim_feedforward=c.feedforward,
+        feedforward_activation=c.activation,
+        n_encoder_layers=c.encoder_layers,
+        n_decoder_layers=c.decoder_layers,
+        use_vae=c.vae_layers > 0,
+        latent_dim=c.latent,
+        n_vae_encoder_layers=max(c.vae_layers, 1),
+    )
+    return ACTPolicy(config)
 
 
 def positions_2d(dim: int, h: int, w: int) -> Tensor:

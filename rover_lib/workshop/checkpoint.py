@@ -45,6 +45,11 @@ LARGEST_SIDE_PX = 8192  # the largest picture of a Pi's cameras has 4608 pixels 
 MOST_ACTIONS = 1000  # and numbers in a state
 REPORTED = 1000  # entries of the trainer's config, in the report
 
+# What helps most often.
+COPY_AGAIN = "copy it again, the whole folder if it is one"
+CORRECT_IT = "correct the config to what the policy was trained with"
+IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole?"
+
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
 SQUEEZED = 0.05  # of the aspect ratio: 432x240 for 640x360 is 0.013
 
@@ -199,9 +204,7 @@ def _read_pickle(path: Path) -> Any:
     except Exception as e:  # zipfile says in many types that a file is damaged
         raise _no_archive(path, e) from None
     if damaged:
-        raise CheckpointError(
-            f"{path}: damaged, the checksum of '{damaged}' does not match", remedy="copy the file again"
-        )
+        raise CheckpointError(f"{path}: damaged, the checksum of '{damaged}' does not match", remedy=COPY_AGAIN)
     try:
         with torch.serialization.safe_globals(_numpy_scalars()), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torch, about sparse tensors and the like: they are refused below
@@ -210,7 +213,7 @@ def _read_pickle(path: Path) -> Any:
     except Exception as e:  # torch wraps what it meets in many types; each means the same to the user
         if wanted := re.search(r"GLOBAL ([\w.]+)", str(e)):
             raise _runs_code(path, wanted[1]) from None
-        raise CheckpointError(f"{path}: not readable ({_reason(e)})", remedy="copy the file again") from None
+        raise CheckpointError(f"{path}: not readable ({_reason(e)})", remedy=COPY_AGAIN) from None
 
 
 def _no_archive(path: Path, error: Exception) -> CheckpointError:
@@ -222,9 +225,9 @@ def _no_archive(path: Path, error: Exception) -> CheckpointError:
                 remedy="load it with torch.load(path, weights_only=True) and save that again with torch.save",
             )
     if zipfile.is_zipfile(path):
-        return CheckpointError(f"{path}: damaged ({_reason(error)})", remedy="copy the file again")
+        return CheckpointError(f"{path}: damaged ({_reason(error)})", remedy=COPY_AGAIN)
     return CheckpointError(
-        f"{path}: not a torch checkpoint of this decade, or cut short ({_reason(error)})", remedy="copy the file again"
+        f"{path}: not a torch checkpoint of this decade, or cut short ({_reason(error)})", remedy=COPY_AGAIN
     )
 
 
@@ -366,7 +369,7 @@ def _load_lerobot(folder: Path) -> Checkpoint:
         if shape != [size]:
             raise CheckpointError(
                 f"{folder}: config and weights do not agree ('{name}' has shape {shape}, the weights are for {size})",
-                remedy="copy the whole folder again",
+                remedy=COPY_AGAIN,
             )
     extra = {"optimizer_mb": 0.0, "normalisation": {"in": inner.modes, "out": outer.modes}}
     return _checked(folder, "lerobot", config, weights, sha256_of(file), file.stat().st_size, extra)
@@ -376,9 +379,7 @@ def _features(folder: Path, raw: Mapping[str, Any], key: str) -> dict[str, tuple
     """Type and shape of each of the config's features, by name."""
     features = raw.get(key) or {}
     if not isinstance(features, dict):
-        raise CheckpointError(
-            f"{folder}/config.json: '{key}' is no object", found=shown(features), remedy="copy the folder again"
-        )
+        raise CheckpointError(f"{folder}/config.json: '{key}' is no object", found=shown(features), remedy=COPY_AGAIN)
     checked = {}
     for name, feature in features.items():
         kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
@@ -386,7 +387,7 @@ def _features(folder: Path, raw: Mapping[str, Any], key: str) -> dict[str, tuple
             raise CheckpointError(
                 f"{folder}/config.json: feature {shown(name)} has no type and shape",
                 found=f"{shown(kind)} and {shown(shape)}",
-                remedy="copy the folder again",
+                remedy=COPY_AGAIN,
             )
         checked[name] = kind, shape
     return checked
@@ -426,7 +427,7 @@ class Normaliser:
             raise CheckpointError(
                 f"{self.where}: a norm_map of texts and an eps from 0 to 1 are expected",
                 found=f"{shown(self.modes)} and {shown(self.eps)}",
-                remedy="copy the folder again",
+                remedy=COPY_AGAIN,
             )
 
     def _steps(self) -> list[dict[str, Any]]:
@@ -438,16 +439,14 @@ class Normaliser:
         )
         if not named:
             raise CheckpointError(
-                f"{self.where}: its steps are no list of objects with a registry_name and a config",
-                remedy="copy the folder again",
+                f"{self.where}: its steps are no list of objects with a registry_name and a config", remedy=COPY_AGAIN
             )
         return [{**s, "config": s.get("config") or {}} for s in steps]
 
     def _read_statistics(self, folder: Path, name: Any) -> dict[str, Tensor]:
         if not isinstance(name, str) or Path(name).name != name or not name.isprintable():
             raise CheckpointError(
-                f"{self.where}: its state file {shown(name)} is no file of the folder",
-                remedy="copy the whole folder again",
+                f"{self.where}: its state file {shown(name)} is no file of the folder", remedy=COPY_AGAIN
             )
         return _read_safetensors(folder / name, STATISTICS_BYTES)
 
@@ -481,8 +480,7 @@ class Normaliser:
         a, b = (stats[p].double().flatten() for p in pairs[mode])
         if len(a) != size or len(b) != size:
             raise CheckpointError(
-                f"{self.where}: statistics of '{key}' have {len(a)} values, the feature has {size}",
-                remedy="copy the whole folder again",
+                f"{self.where}: statistics of '{key}' have {len(a)} values, the feature has {size}", remedy=COPY_AGAIN
             )
         if mode == "MEAN_STD":
             scale, shift = (b, a) if inverse else (1 / (b + self.eps), -a / (b + self.eps))
@@ -507,8 +505,7 @@ def _of_folder(path: Path, most_bytes: int | None = None) -> Path:
         raise CheckpointError(f"{path}: not a file", remedy="a LeRobot folder has config.json and model.safetensors")
     if most_bytes is not None and status.st_size > most_bytes:
         raise CheckpointError(
-            f"{path}: has {status.st_size / 1e6:.1f} MB, at most {most_bytes / 1e6:g} are read",
-            remedy="copy the folder again",
+            f"{path}: has {status.st_size / 1e6:.1f} MB, at most {most_bytes / 1e6:g} are read", remedy=COPY_AGAIN
         )
     return path
 
@@ -517,11 +514,9 @@ def _read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(_of_folder(path, JSON_BYTES).read_bytes())
     except (ValueError, OSError, RecursionError) as e:  # RecursionError: brackets nested without end
-        raise CheckpointError(f"{path}: not readable as JSON ({e})", remedy="copy the folder again") from None
+        raise CheckpointError(f"{path}: not readable as JSON ({e})", remedy=COPY_AGAIN) from None
     if not isinstance(content, dict):
-        raise CheckpointError(
-            f"{path}: expected a JSON object", found=type(content).__name__, remedy="copy the folder again"
-        )
+        raise CheckpointError(f"{path}: expected a JSON object", found=type(content).__name__, remedy=COPY_AGAIN)
     return content
 
 
@@ -533,15 +528,13 @@ def _read_safetensors(path: Path, most_bytes: int | None = None) -> dict[str, Te
             raise CheckpointError(
                 f"{path}: not readable as safetensors (its header claims {header_bytes / 1e6:.1f} MB, "
                 f"at most {HEADER_BYTES / 1e6:g} are read)",
-                remedy="copy the file again",
+                remedy=COPY_AGAIN,
             )
         return load_file(path)
     except CheckpointError:
         raise
     except Exception as e:  # whatever its Rust or torch says of a header that lies
-        raise CheckpointError(
-            f"{path}: not readable as safetensors ({shown(str(e))})", remedy="copy the file again"
-        ) from None
+        raise CheckpointError(f"{path}: not readable as safetensors ({shown(str(e))})", remedy=COPY_AGAIN) from None
 
 
 # --- what both have in common ---------------------------------------------------------------------------------------
@@ -555,9 +548,7 @@ def _named_weights(path: Path, state: dict[Any, Any], file_bytes: int) -> dict[s
             f"{path}: weights that are no tensors: {listed(odd)}", remedy="save policy.state_dict() as it is"
         )
     if outside := [k for k in state if not k.startswith("model.")]:
-        raise CheckpointError(
-            f"{path}: names outside 'model.': {listed(outside)}", remedy="is it an ACTPolicy of LeRobot?"
-        )
+        raise CheckpointError(f"{path}: names outside 'model.': {listed(outside)}", remedy=IS_IT_WHOLE)
     weights = {k.removeprefix("model."): v for k, v in state.items()}
     for name, weight in weights.items():
         if problem := _unusable(weight):
@@ -598,7 +589,7 @@ def _positive(path: Path, raw: dict[str, Any], key: str, most: int = LARGEST_SIZ
         raise CheckpointError(
             f"{path}: config '{key}' must be a whole number of at least 1 and at most {most}",
             found=shown(value),
-            remedy="correct it to what the policy was trained with",
+            remedy=CORRECT_IT,
         )
     return value
 
@@ -607,11 +598,7 @@ def _flag(path: Path, raw: dict[str, Any], key: str) -> bool:
     value = raw.get(key)
     if value is None or (isinstance(value, int) and value in (0, 1)):
         return bool(value)
-    raise CheckpointError(
-        f"{path}: config '{key}' must be true or false",
-        found=shown(value),
-        remedy="correct it to what the policy was trained with",
-    )
+    raise CheckpointError(f"{path}: config '{key}' must be true or false", found=shown(value), remedy=CORRECT_IT)
 
 
 def _one_observation(path: Path, raw: dict[str, Any]) -> None:
@@ -640,8 +627,7 @@ def _config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActCon
         )
     if known["dim"] % known["heads"]:
         raise CheckpointError(
-            f"{path}: {known['heads']} heads do not divide a width of {known['dim']}",
-            remedy="correct them to what the policy was trained with",
+            f"{path}: {known['heads']} heads do not divide a width of {known['dim']}", remedy=CORRECT_IT
         )
     if known["dim"] % 4:
         raise CheckpointError(
@@ -650,7 +636,7 @@ def _config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActCon
 
     def shape(name: str) -> tuple[int, ...]:
         if name not in weights:
-            raise CheckpointError(f"{path}: no weight '{name}'", remedy="is it an ACTPolicy of LeRobot, and whole?")
+            raise CheckpointError(f"{path}: no weight '{name}'", remedy=IS_IT_WHOLE)
         return tuple(weights[name].shape)
 
     def last(name: str) -> int:
@@ -658,7 +644,7 @@ def _config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActCon
         if not 1 <= size <= MOST_ACTIONS:
             raise CheckpointError(
                 f"{path}: weight '{name}' has shape {shape(name)}, with no size from 1 to {MOST_ACTIONS} at its end",
-                remedy="is it an ACTPolicy of LeRobot, and whole?",
+                remedy=IS_IT_WHOLE,
             )
         return size
 
@@ -667,7 +653,7 @@ def _config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActCon
         if (count := known[f"{part}_layers"]) > len(weights):
             raise CheckpointError(
                 f"{path}: config and weights do not agree ({count} {part} layers, {len(weights)} weights in all)",
-                remedy="correct the config to what the policy was trained with",
+                remedy=CORRECT_IT,
             )
     vae = {m[1] for k in weights if (m := re.match(r"vae_encoder\.layers\.(\d+)\.", k))}
     return ActConfig(
@@ -775,10 +761,7 @@ def _checked(
     ]:
         problems.append(f"of another shape: {listed(wrong)}")
     if problems:
-        raise CheckpointError(
-            f"{path}: config and weights do not agree ({'; '.join(problems)})",
-            remedy="correct the config to what the policy was trained with",
-        )
+        raise CheckpointError(f"{path}: config and weights do not agree ({'; '.join(problems)})", remedy=CORRECT_IT)
     if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
         raise CheckpointError(
             f"{path}: NaN or Inf in {listed(bad)}", remedy="training diverged, take an earlier checkpoint"

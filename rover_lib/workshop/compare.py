@@ -28,7 +28,7 @@ from rover_lib.onboard.policy import ACTION_LIMITS, Policy, load_policy
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.workshop import judge
-from rover_lib.workshop.act import Affine
+from rover_lib.workshop.act import Affine, lerobot_act
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.progress import Progress, silent
 
@@ -152,42 +152,10 @@ class LerobotEager:
     """
 
     def __init__(self, checkpoint: Checkpoint):
-        # seconds to import, and only the benchmark's notebook wants it
-        from lerobot.configs.types import FeatureType, PolicyFeature
-        from lerobot.policies.act.configuration_act import ACTConfig
-        from lerobot.policies.act.modeling_act import ACTPolicy
-
         c = checkpoint.config
         self.config, self.chunk = c, c.chunk
         self.action_names, self.state_names = c.action_names, c.state_names
-        inputs = {
-            f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, *size))
-            for name, size in zip(c.cameras, c.image_sizes, strict=True)
-        }
-        config = ACTConfig(
-            input_features={
-                **inputs,
-                "observation.state": PolicyFeature(FeatureType.STATE, (len(c.state_names),)),
-            },
-            output_features={"action": PolicyFeature(FeatureType.ACTION, (len(c.action_names),))},
-            device="cpu",
-            chunk_size=c.chunk,
-            n_action_steps=c.chunk,
-            vision_backbone=c.backbone,
-            pretrained_backbone_weights=None,
-            replace_final_stride_with_dilation=c.dilation,
-            pre_norm=c.pre_norm,
-            dim_model=c.dim,
-            n_heads=c.heads,
-            dim_feedforward=c.feedforward,
-            feedforward_activation=c.activation,
-            n_encoder_layers=c.encoder_layers,
-            n_decoder_layers=c.decoder_layers,
-            use_vae=c.vae_layers > 0,
-            latent_dim=c.latent,
-            n_vae_encoder_layers=max(c.vae_layers, 1),
-        )
-        self._policy = ACTPolicy(config)
+        self._policy = lerobot_act(c)
         self._policy.model.load_state_dict(checkpoint.weights)
         self._policy.eval()
         limits = [ACTION_LIMITS.get(name, (-np.inf, np.inf)) for name in c.action_names]

@@ -32,10 +32,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.picture import PictureError, read_jpeg
 from rover_lib.onboard.pwm import NEUTRAL, PwmCalibration
 from rover_lib.onboard.recording import (
     BURST_MIN,
@@ -88,24 +88,17 @@ class Sample:
     is_pad: np.ndarray
 
     def frame_bgr(self) -> np.ndarray:
-        """The picture, (h, w, 3) uint8 BGR. Raises EpisodeError if it is gone, cut short or no JPEG."""
+        """The picture, (h, w, 3) uint8 BGR. Raises EpisodeError if it is gone, or no whole JPEG of a camera's size."""
         try:
-            data = self.frame_path.read_bytes()
+            return read_jpeg(self.frame_path)
         except OSError as e:
             raise EpisodeError(
                 f"{self.frame_path}: cannot be read ({e.strerror})", remedy="restore it or load again"
             ) from None
-        if problem := _jpeg_problem(data[:2], data[-JPEG_TAIL:]):
-            raise EpisodeError(f"{self.frame_path}: {problem}", remedy="delete the picture or record the episode again")
-        try:
-            frame = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        except cv2.error:
-            frame = None
-        if frame is None:
+        except PictureError as e:
             raise EpisodeError(
-                f"{self.frame_path}: does not decode as a JPEG", remedy="delete it or record the episode again"
-            )
-        return frame
+                f"{self.frame_path}: {e.what}", found=e.found, remedy="delete it or record the episode again"
+            ) from None
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,7 @@ RESULTS_OF = {  # stages that a notebook leaves
     "06_arm": "arm",
     "07_drive": "drive",
 }
-OF_LABORATORY = ("faults.json", "pi-fast.json", "pi.json")  # in runs/, where `make faults` and `make pi` leave them
+OF_LABORATORY = ("faults.json", "random.json", "pi-fast.json", "pi.json")  # in runs/, where make leaves them
 IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
 NOTEBOOK_LIMIT = 1_000_000  # bytes, of a committed notebook
 RESULT_LIMIT = 200_000  # bytes, of a committed JSON

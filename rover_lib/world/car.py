@@ -43,6 +43,7 @@ KEEP_DRIVES = 8
 KEEP_OUTCOMES = 1000
 STANDSTILL_S = 0.5  # a machine that stopped for longer has stopped the world too
 NOISE = 3  # grey levels of the camera's noise: two frames of a car that stands still are never the same
+SHIFTS = 256  # of the noise, in either direction: enough that the same one hardly comes again
 PIPE_BYTES = 1 << 20  # a frame fits in whole
 NICE = 5  # what drives goes first; a camera may be late
 PRIORITY = 1  # of real time, below the loop that drives it
@@ -457,11 +458,11 @@ class _Sensor:
 
     def __init__(self) -> None:
         self._rng = np.random.default_rng()
-        shape = (FRAME_HEIGHT + 64, FRAME_WIDTH + 64, 3)
+        shape = (FRAME_HEIGHT + SHIFTS, FRAME_WIDTH + SHIFTS, 3)
         self._noise = self._rng.integers(0, NOISE, shape, np.uint8)
 
     def see(self, frame: np.ndarray) -> np.ndarray:
-        row, column = self._rng.integers(0, 64, 2)
+        row, column = self._rng.integers(0, SHIFTS, 2)
         return cv2.add(frame, self._noise[row : row + FRAME_HEIGHT, column : column + FRAME_WIDTH])
 
 

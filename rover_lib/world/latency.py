@@ -147,7 +147,7 @@ class _Car:
 
     def latest(self) -> Frame:
         # The loop only asks whether the camera is frozen or black: nothing is drawn for it.
-        return Frame(np.empty((0, 0, 3), np.uint8), self.clock(), self._tick + 1, 0, 255.0)
+        return Frame(np.empty((0, 0, 3), np.uint8), self.clock(), self._tick + 1, 0, 255.0, 255.0)
 
     @property
     def asking_s(self) -> float:

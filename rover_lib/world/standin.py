@@ -5,6 +5,7 @@ import os
 import pty
 import re
 import select
+import termios
 import threading
 import time
 import tty
@@ -13,6 +14,7 @@ from collections import deque
 from typing import Any, NamedTuple
 
 from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.servo_link import FIRMWARE_VERSION, PROTOCOL_VERSION
 
 BOOT_S = 0.2  # of the boot loader; a board's takes 1 to 2 s
 REST_US = (1456.0, 120.0)  # a transmitter whose sticks nobody touches
@@ -41,20 +43,25 @@ class PinEvent(NamedTuple):
 
 
 _NUMBER = r"(0|[1-9][0-9]{0,9})"
-_COMMAND = re.compile(rf">(?:Q|([AN]) {_NUMBER} {_NUMBER}|(D) {_NUMBER} {_NUMBER} {_NUMBER} {_NUMBER})", re.ASCII)
+_COMMAND = re.compile(rf">([ADLN]) {_NUMBER} {_NUMBER}((?: {_NUMBER})*)", re.ASCII)
+_NUMBERS = {"A": 1, "D": 3, "N": 0, "L": 1}  # after boot and sequence
 _STATUS_S = 0.02
 _TIMEOUT_S = 0.150
+LATE_MS = 150
+CAP_US = 238
 _SEQUENCE_WINDOW = 65535
 _LINE_MAX = 64
 
 
 class StandIn:
-    """A stand-in for the Arduino, for machines without simavr: protocol version 1 of firmware/README.md on a pty.
+    """A stand-in for the Arduino, for machines without simavr: protocol version 2 of firmware/README.md on a pty.
 
-    It is no firmware and proves nothing about the firmware. Like it, it resets when its port is opened, starts in
-    manual with a transmitter at rest, drives only when armed and within range, rejects what is old or another start's,
-    and is in neutral 150 ms after the last command, until it is armed again. Unlike it, there is no human who could
-    take over, no watchdog, a line may take as long as it likes, and a pulse starts when its command comes.
+    It is no firmware and proves nothing about the firmware. Like it, it resets when its port is opened and DTR was not
+    left up, starts in manual with a transmitter at rest, drives only when armed, within range and its throttle's cap,
+    rejects what is old, late or another start's, and is in neutral 150 ms after the last command, until it is armed
+    again. Unlike it, there is no human who could take over, but one who has always just wiggled the stick when the host
+    wants to arm; no watchdog, no limit to how fast a pulse may change, a line may take as long as it likes, and a pulse
+    starts when its command comes.
     """
 
     def __init__(self, boot_s: float = BOOT_S):
@@ -65,6 +72,9 @@ class StandIn:
         self._boot_s = boot_s
         self._master, slave = pty.openpty()
         tty.setraw(slave)
+        attributes = termios.tcgetattr(slave)
+        attributes[2] |= termios.HUPCL  # as a serial port has it
+        termios.tcsetattr(slave, termios.TCSANOW, attributes)
         self.port = os.ttyname(slave)
         os.close(slave)  # so that POLLHUP tells whether somebody has the port open
         os.set_blocking(self._master, False)
@@ -96,6 +106,7 @@ class StandIn:
     def _reset(self) -> None:
         self._boot = (self._boot + 1) % 65536
         self._sequence = 0
+        self._cap_us = CAP_US
         self._result, self._state, self._reason = "-", "M", "r"
         self._bad = self._old = self._out_of_range = 0
         self._line: bytes | None = None  # what came since a '>'
@@ -108,18 +119,21 @@ class StandIn:
     def _run(self) -> None:
         poller = select.poll()
         poller.register(self._master, select.POLLIN)
-        is_open = False
+        is_open = dtr = False
         while not self._closing.is_set():
             due = min(self._status_due, self._commanded + _TIMEOUT_S) if self._state == "A" else self._status_due
             wait_s = min(max(due - time.monotonic(), 0.0), _STATUS_S)
             events = dict(poller.poll(wait_s * 1000)).get(self._master, 0)
             was_open, is_open = is_open, not events & select.POLLHUP
             if not is_open:
+                if was_open:  # the master tells the settings of the other end
+                    dtr = not termios.tcgetattr(self._master)[2] & termios.HUPCL
                 self._check_timeout()
                 time.sleep(0.005)
                 continue
             if not was_open:
                 self._event("open")
+            if not was_open and not dtr:
                 self._reset()
                 self._closing.wait(self._boot_s)
                 self._read()  # the boot loader has it
@@ -144,18 +158,20 @@ class StandIn:
             os.write(self._master, line.encode())
 
     def _hello(self, reset: str = "-") -> None:
-        self._send(f"<H 1 stand-in {self._boot} {self._sequence} {reset}")
+        self._send(f"<H {PROTOCOL_VERSION} {FIRMWARE_VERSION} {self._boot} {self._sequence} {reset}")
+
+    @property
+    def _uptime_ms(self) -> int:
+        return int((time.monotonic() - self._started) * 1000) % (1 << 32)
 
     def _status(self) -> None:
-        now = time.monotonic()
-        self._status_due = now + _STATUS_S
-        uptime_ms = int((now - self._started) * 1000) % (1 << 32)
+        self._status_due = time.monotonic() + _STATUS_S
         receiver = " ".join(
             f"{us} {channel.period_us}" for us, channel in zip(self._neutral, self._channels, strict=True)
         )
         self._send(
-            f"<S {self._boot} {uptime_ms} {self._sequence} {self._result} {self._state} {self._reason} "
-            f"{self._pins[0]} {self._pins[1]} {receiver} {self._bad} {self._old} {self._out_of_range} 0"
+            f"<S {self._boot} {self._uptime_ms} {self._sequence} {self._result} {self._state} {self._reason} - "
+            f"{self._pins[0]} {self._pins[1]} {self._cap_us} {receiver} {self._bad} {self._old} {self._out_of_range} 0"
         )
 
     def _take(self, byte: int) -> None:
@@ -175,39 +191,44 @@ class StandIn:
     def _command(self, line: bytes) -> None:
         body, _, crc = line.rpartition(b"*")
         command = _COMMAND.fullmatch(body.decode("ascii", "replace"))
-        if not command or crc != b"%08X" % zlib.crc32(body):
-            self._bad += 1
-            return
-        if body == b">Q":
+        numbers = [int(number) for number in command[4].split()] if command else []
+        whole = crc == b"%08X" % zlib.crc32(body)
+        if whole and body == b">Q":
             self._hello()
             return
-        kind = command[1] or command[4]
-        boot, sequence, *pulses = (int(number) for number in command.groups() if number and number.isdigit())
+        if not whole or not command or len(numbers) != _NUMBERS[command[1]]:
+            self._bad += 1
+            return
+        kind, boot, sequence = command[1], int(command[2]), int(command[3])
         if boot != self._boot or not 1 <= (sequence - self._sequence) % (1 << 32) <= _SEQUENCE_WINDOW:
             self._old += 1
             self._result = "o"
+        elif kind in "AD" and (self._uptime_ms - numbers[0]) % (1 << 32) > LATE_MS:
+            self._old += 1
+            self._result = "l"
         else:
             self._sequence = sequence
-            self._result = self._obey(kind, pulses)
+            self._result = self._obey(kind, numbers)
         self._status()
 
-    def _obey(self, kind: str, pulses: list[int]) -> str:
-        now = time.monotonic()
-        if kind == "A":
-            if self._state != "A":  # a host that repeats itself renews nothing
-                self._commanded = now
-                self._enter("A", "a")
-            return "k"
-        if kind == "D" and not all(low <= us <= high for us, (low, high) in zip(pulses, self._ranges, strict=True)):
+    def _obey(self, kind: str, numbers: list[int]) -> str:
+        armed = self._state == "A"
+        pulses = {"D": numbers[1:], "L": [self._neutral[0], *numbers]}.get(kind, self._neutral)
+        if not all(low <= us <= high for us, (low, high) in zip(pulses, self._ranges, strict=True)):
             self._out_of_range += 1
             return "r"
-        if self._state != "A":
+        if (kind in "DN" and not armed) or (kind == "L" and armed):
             return "i"
         if kind == "N":
             self._enter("S", "n")
-        else:
-            self._commanded = now
-            self._set_pins(*pulses)
+        elif kind == "L":
+            self._cap_us = min(self._cap_us, *numbers)
+        elif kind == "D":
+            self._commanded = time.monotonic()
+            self._set_pins(pulses[0], min(pulses[1], self._cap_us))
+        elif not armed:  # a host that repeats itself renews nothing
+            self._commanded = time.monotonic()
+            self._enter("A", "a")
         return "k"
 
     def _check_timeout(self) -> None:

@@ -26,7 +26,9 @@ from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.preprocess import normalise, prepare_frame
 from rover_lib.onboard.stage import atomic_path, sha256_of
+from rover_lib.workshop import act as act_module
 from rover_lib.workshop import episodes as episodes_module
+from rover_lib.workshop.act import ActConfig, lerobot_act
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.episodes import Sample, load_recordings, split
 from rover_lib.workshop.progress import Progress, silent
@@ -36,9 +38,7 @@ if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
 IMAGE, STATE, ACTION, IS_PAD = "observation.images.cam_front", "observation.state", "action", "action_is_pad"
-CHUNK = 32
-LATENT = 32
-DROPOUT = 0.1
+DROPOUT = 0.1  # LeRobot's default
 KL_WEIGHT = 10.0
 WEIGHT_DECAY = 1e-4
 BETAS = (0.9, 0.999)
@@ -47,20 +47,6 @@ SWAPPED_STATES = 0.5  # the share of samples that get another's state, so that i
 # Below it two threads wait for each other longer than they compute: 40 times slower on a busy machine.
 SMALL_DIM = 256
 STANDING_THROTTLE = 0.01  # below it the car stands, which no frame shows: these states are never swapped
-
-
-@dataclass(frozen=True)
-class Size:
-    """A policy's shape. Image sizes in pixels."""
-
-    image_height: int
-    image_width: int
-    dim: int
-    heads: int
-    encoder_layers: int
-    decoder_layers: int
-    feedforward: int
-    vae_layers: int
 
 
 @dataclass(frozen=True)
@@ -92,26 +78,10 @@ class Recipe:
 
 
 SIZES = {
-    "small": Size(
-        image_height=72,
-        image_width=128,
-        dim=128,
-        heads=4,
-        encoder_layers=1,
-        decoder_layers=1,
-        feedforward=512,
-        vae_layers=1,
+    "small": ActConfig(
+        image_sizes=((72, 128),), dim=128, heads=4, feedforward=512, encoder_layers=1, decoder_layers=1, vae_layers=1
     ),
-    "full": Size(
-        image_height=360,
-        image_width=640,
-        dim=512,
-        heads=8,
-        encoder_layers=4,
-        decoder_layers=7,
-        feedforward=3200,
-        vae_layers=4,
-    ),
+    "full": ActConfig(),
 }
 RECIPES = {
     ("small", "cpu"): Recipe(300, 900, 60, batch=16, transformer_batch=16, samples=4000),
@@ -137,38 +107,6 @@ class Frames:
 
     def __len__(self) -> int:
         return len(self.images)
-
-
-def build_policy(size: Size) -> ACTPolicy:
-    """LeRobot's ACTPolicy of that size with fresh weights; downloads nothing."""
-    # here, because it takes ten seconds that a checkpoint from the cache need not wait for
-    from lerobot.configs.types import FeatureType, PolicyFeature
-    from lerobot.policies.act.configuration_act import ACTConfig
-    from lerobot.policies.act.modeling_act import ACTPolicy
-
-    config = ACTConfig(
-        input_features={
-            IMAGE: PolicyFeature(FeatureType.VISUAL, (3, size.image_height, size.image_width)),
-            STATE: PolicyFeature(FeatureType.STATE, (2,)),
-        },
-        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (2,))},
-        device="cpu",
-        chunk_size=CHUNK,
-        n_action_steps=CHUNK,
-        vision_backbone="resnet18",
-        pretrained_backbone_weights=None,
-        dim_model=size.dim,
-        n_heads=size.heads,
-        dim_feedforward=size.feedforward,
-        n_encoder_layers=size.encoder_layers,
-        n_decoder_layers=size.decoder_layers,
-        use_vae=True,
-        latent_dim=LATENT,
-        n_vae_encoder_layers=size.vae_layers,
-        dropout=DROPOUT,
-        kl_weight=KL_WEIGHT,
-    )
-    return ACTPolicy(config)
 
 
 def train(
@@ -212,7 +150,7 @@ def train(
         "split": params()["calibration"],
         "names": [episodes_dir.name, out_path.parent.name],
     }
-    key = key_of(made_of, sys.modules[__name__], preprocess, episodes_module)
+    key = key_of(made_of, sys.modules[__name__], preprocess, act_module, episodes_module)
 
     def make(folder: Path) -> None:
         checkpoint = _train(episodes_dir, out_path, SIZES[size], recipe, seed, torch.device(device), progress)
@@ -256,6 +194,7 @@ def _files(episodes_dir: Path) -> list[Path]:
 class _Training:
     """What every phase works with."""
 
+    size: ActConfig
     policy: ACTPolicy
     data: Frames
     recipe: Recipe
@@ -277,14 +216,14 @@ class _Training:
 def _train(
     episodes_dir: Path,
     out_path: Path,
-    size: Size,
+    size: ActConfig,
     recipe: Recipe,
     seed: int,
     device: torch.device,
     progress: Progress,
 ) -> dict[str, Any]:
     p = params()["calibration"]
-    recordings = load_recordings(episodes_dir, CHUNK, p["sync_s"], progress)
+    recordings = load_recordings(episodes_dir, size.chunk, p["sync_s"], progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
     rng = np.random.default_rng([seed, 77])
     data = _load(parts.calibration, recipe.samples, size, "reading frames", progress)
@@ -295,12 +234,12 @@ def _train(
     loss_weights = torch.from_numpy(1 / spread).to(device)
 
     with _seeded(seed):
-        policy = build_policy(size)
+        policy = lerobot_act(size)
         with torch.no_grad():  # starts at the mean action, give or take: a fresh head plans wild ones
             policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
             policy.model.action_head.bias.copy_(torch.from_numpy(recorded.mean(axis=0)))
         policy.to(device)
-        training = _Training(policy, data, recipe, loss_weights, rng, progress)
+        training = _Training(size, policy, data, recipe, loss_weights, rng, progress)
         _train_backbone(training)
         _train_transformer(training)
         optimizer, scheduler = _train_together(training)
@@ -315,15 +254,16 @@ def _train(
 
 
 def _config(
-    size: Size, recipe: Recipe, seed: int, device: torch.device, episodes_dir: Path, out_path: Path
+    size: ActConfig, recipe: Recipe, seed: int, device: torch.device, episodes_dir: Path, out_path: Path
 ) -> dict[str, Any]:
     """The trainer's plain dict, key for key. Folders by name only: a checkpoint is shown to others."""
+    ((height, width),) = size.image_sizes
     return {
-        "image_width": size.image_width,
-        "image_height": size.image_height,
+        "image_width": width,
+        "image_height": height,
         "n_obs_steps": 1,
-        "chunk_size": CHUNK,
-        "n_action_steps": CHUNK,
+        "chunk_size": size.chunk,
+        "n_action_steps": size.chunk,
         "hidden_size": size.dim,
         "n_encoder_layers": size.encoder_layers,
         "n_decoder_layers": size.decoder_layers,
@@ -331,7 +271,7 @@ def _config(
         "feedforward_dim": size.feedforward,
         "dropout": DROPOUT,
         "kl_weight": KL_WEIGHT,
-        "vision_encoder": "resnet18",
+        "vision_encoder": size.backbone,
         "pretrained_backbone": True,  # as the trainer writes it, whatever the weights came from
         "learning_rate": recipe.transformer_rate,
         "weight_decay": WEIGHT_DECAY,
@@ -350,13 +290,13 @@ def _config(
     }
 
 
-def _load(samples: tuple[Sample, ...], most: int, size: Size, desc: str, progress: Progress) -> Frames:
+def _load(samples: tuple[Sample, ...], most: int, size: ActConfig, desc: str, progress: Progress) -> Frames:
     """At most `most` samples, evenly over all drives, with their frames at the policy's size."""
     if len(samples) > most:
         samples = tuple(samples[i] for i in np.linspace(0, len(samples) - 1, most).round().astype(int))
     images = []
     for sample in progress(samples, desc=desc, total=len(samples)):
-        images.append(prepare_frame(sample.frame_bgr(), size.image_height, size.image_width))
+        images.append(prepare_frame(sample.frame_bgr(), *size.image_sizes[0]))
     return Frames(
         np.stack(images),
         np.stack([s.state for s in samples]).astype(np.float32),
@@ -432,28 +372,28 @@ def _descend(loss: Tensor, module: nn.Module, optimizer: torch.optim.Optimizer, 
 class _ChunkFromFeatures(nn.Module):
     """The throw-away head of the first phase: feature map to chunk, position by position."""
 
-    def __init__(self, backbone: nn.Module, height: int, width: int, features: int = 512, width_after: int = 32):
+    def __init__(self, backbone: nn.Module, size: ActConfig, features: int = 512, width_after: int = 32):
         super().__init__()
-        self.backbone = backbone
+        self.backbone, self.chunk = backbone, size.chunk
+        ((height, width),) = size.image_sizes
         convolution = nn.Conv2d(features, width_after, 1)
-        last = nn.Linear(width_after * -(-height // 32) * -(-width // 32), 2 * CHUNK)
+        last = nn.Linear(width_after * -(-height // size.stride) * -(-width // size.stride), 2 * size.chunk)
         nn.init.zeros_(last.weight)  # from "no action": actions are small, and an untrained head's are not
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(convolution, nn.ReLU(), nn.Flatten(), last)
 
     def forward(self, image: Tensor) -> Tensor:
-        return self.head(self.backbone(image)["feature_map"]).unflatten(1, (CHUNK, 2))
+        return self.head(self.backbone(image)["feature_map"]).unflatten(1, (self.chunk, 2))
 
 
 def _train_backbone(training: _Training) -> None:
     """Phase one: live batch norm; its statistics, measured on the data, become the frozen ones."""
     recipe, data = training.recipe, training.data
-    height, width = data.images.shape[1:3]
     import torchvision
 
     resnet = torchvision.models.resnet18(weights=None)
     live = torchvision.models._utils.IntermediateLayerGetter(resnet, {"layer4": "feature_map"})
-    model = _ChunkFromFeatures(live, height, width).to(training.loss_weights.device).train()
+    model = _ChunkFromFeatures(live, training.size).to(training.loss_weights.device).train()
     optimizer, scheduler = _optimiser(model.parameters(), recipe.backbone_rate, recipe.backbone_steps)
     for _ in training.steps(recipe.backbone_steps, "training the backbone"):
         batch = training.batch()

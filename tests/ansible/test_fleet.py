@@ -57,6 +57,10 @@ class Fleet:
         ):
             (folder / "bin" / name).write_text(text)
             (folder / "bin" / name).chmod(0o755)
+        # The laptop's key, which these rovers know
+        key = folder / "laptop"
+        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", key], check=True)
+        (folder / "signers").write_text(f'rover namespaces="rover-policy" {key.with_suffix(".pub").read_text()}')
         self.service("inactive")
         self.environment = {"ANSIBLE_CONNECTION_PLUGINS": str(Path(__file__).parent / "connections")}
         self.lines = {name: f"{name} rover_models={folder}/{name}/models" for name in NAMES}
@@ -84,7 +88,7 @@ class Fleet:
         """These rovers use that artifact, as after a deployment."""
         for name in names:
             releases = self.releases(name)
-            releases.switch(releases.stage(artifact).name)
+            releases.switch(releases.stage(artifact, unsigned=True).name)
 
     def play(self, book: str, *options: str, **variables: object) -> subprocess.CompletedProcess:
         inventory = [
@@ -100,6 +104,8 @@ class Fleet:
             "rover_home": str(self.folder / "home"),
             "rover_command": str(BINARY / "rover"),
             "rover_packed": str(self.folder / "packed"),
+            "rover_signing_key": str(self.folder / "laptop"),
+            "rover_signers": str(self.folder / "signers"),
             "rover_ready_s": 2,
             **variables,
         }
@@ -146,7 +152,7 @@ def test_deployed_to_all_and_told_by_status(fleet, artifacts):
     good = content_hash(artifacts["static"])
     for name in ("canary", "third"):
         status = fleet.releases(name).status()
-        assert status["healthy"] and status["current"] == good
+        assert status["healthy"] and status["current"] == good and status["releases"][0]["signed"]
         assert not (fleet.folder / name / "incoming").exists()
     policy = fleet.releases("third").policy
     policy.write_bytes(policy.read_bytes()[:-1] + b"x")
@@ -249,3 +255,35 @@ def test_parts_that_were_damaged_on_the_way_are_sent_again(fleet, artifacts):
     done = fleet.deploy(artifacts["static"], "--limit", "third")
     assert done.returncode == 0, done.stdout
     assert fleet.releases("third").status()["healthy"]
+
+
+def test_a_fleet_is_not_armed_at_once(fleet):
+    done = fleet.play("drive", rover_arm=True)
+    assert done.returncode != 0
+    assert "rover_arm arms one car, and these are canary, second, third: choose one with --limit" in done.stdout
+    assert not (fleet.folder / "asked").exists()  # before anything was asked of systemd
+
+
+DRIVING = """#!/bin/sh
+echo "$*" >> {folder}/rover
+case $1 in
+  heartbeat) [ $(grep -c ^heartbeat {folder}/rover) -gt 1 ] && echo "disarmed: 600 s" || echo "driving: armed" ;;
+esac
+"""
+
+
+@pytest.mark.release
+def test_the_model_that_was_checked_is_armed_and_the_laptop_is_heard(fleet, artifacts):
+    fleet.given(artifacts["static"], "canary")
+    fleet.service("active", "disarmed: waiting for a human to arm it")
+    rover = fleet.folder / "home" / "venv" / "bin" / "rover"
+    rover.unlink()
+    rover.write_text(DRIVING.format(folder=fleet.folder))
+    rover.chmod(0o755)
+    done = fleet.play("drive", "--limit", "canary", rover_arm=True, rover_fetched=str(fleet.folder))
+    assert done.returncode == 0, done.stdout
+    doctor, *asked = (fleet.folder / "rover").read_text().splitlines()
+    model = content_hash(artifacts["static"])
+    assert doctor.startswith("doctor ")
+    assert asked == [f"arm-car --yes --model={model} --max-seconds=600 --heartbeat-s=10", "heartbeat", "heartbeat"]
+    assert "stop" in (fleet.folder / "asked").read_text().splitlines()[-1]

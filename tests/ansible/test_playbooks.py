@@ -2,8 +2,10 @@
 
 import importlib.util
 import json
+import os
 import platform
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -23,6 +25,7 @@ ANSIBLE = ROOT / "ansible"
 ROLE = ANSIBLE / "roles" / "rover"
 PLAYBOOKS = ["provision", "deploy", "rollback", "status", "benchmark", "drive"]
 SPECS = yaml.safe_load((ROLE / "meta" / "argument_specs.yml").read_text())["argument_specs"]
+UNITS = ["rover-drive.service", "rover-check@.service", "rover-benchmark.service"]
 DEFAULTS = yaml.safe_load((ROLE / "defaults" / "main.yml").read_text())
 
 
@@ -47,8 +50,8 @@ def run(*command: object, cwd: Path = ROOT, tmp: Path | None = None) -> subproce
     )
 
 
-def play(tmp_path: Path, tasks: list[dict], **variables: object) -> subprocess.CompletedProcess:
-    """Tasks of the role on this machine, without becoming root."""
+def play(tmp_path: Path, tasks: list[dict], *options: str, **variables: object) -> subprocess.CompletedProcess:
+    """Tasks of the role on this machine, without becoming root. options: of ansible-playbook."""
     book = tmp_path / "play.yml"
     book.write_text(
         yaml.safe_dump([{"name": "Test", "hosts": "localhost", "connection": "local", "gather_facts": False,
@@ -58,7 +61,7 @@ def play(tmp_path: Path, tasks: list[dict], **variables: object) -> subprocess.C
     if not (tmp_path / "roles" / "rover").exists():
         (tmp_path / "roles" / "rover").symlink_to(ROLE)
     given = {"ansible_python_interpreter": sys.executable, **variables}
-    return run(program("ansible-playbook"), "-i", "localhost,", book, "-e", json.dumps(given), tmp=tmp_path)
+    return run(program("ansible-playbook"), "-i", "localhost,", book, *options, "-e", json.dumps(given), tmp=tmp_path)
 
 
 def entry(name: str) -> dict:
@@ -151,7 +154,9 @@ def test_the_other_checks_of_a_machine_pass_here(tmp_path):
 
 
 def test_an_artifact_that_is_not_there_or_not_fit_does_not_travel(tmp_path, artifacts):
-    rover = {"rover_command": program("rover"), "rover_packed": str(tmp_path / "packed")}
+    key = tmp_path / "laptop"
+    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", key], check=True)
+    rover = {"rover_command": program("rover"), "rover_packed": str(tmp_path / "packed"), "rover_signing_key": str(key)}
     found = play(tmp_path, [entry("pack")], rover_artifact="nowhere.pt", **rover)
     assert found.returncode == 2 and "nowhere.pt: not found" in found.stdout
     found = play(tmp_path, [entry("pack")], rover_artifact=str(artifacts["fp32"]), **rover)
@@ -159,7 +164,7 @@ def test_an_artifact_that_is_not_there_or_not_fit_does_not_travel(tmp_path, arti
     assert not (tmp_path / "packed").exists()
     found = play(tmp_path, [entry("pack")], rover_artifact=str(artifacts["fp32"]), rover_allow=["mode"], **rover)
     assert found.returncode == 0, found.stdout
-    assert (tmp_path / "packed" / "release.json").exists()
+    assert {"release.json", "policy.pt.sig"} < {p.name for p in (tmp_path / "packed").iterdir()}
 
 
 @pytest.mark.parametrize(
@@ -278,7 +283,7 @@ def units(tmp_path) -> Path:
     """The service's units with the defaults, and a rover_home that has something to execute."""
     (tmp_path / "venv" / "bin").mkdir(parents=True)
     (tmp_path / "venv" / "bin" / "rover").symlink_to("/bin/true")
-    for name in ("rover-drive.service", "rover-check@.service"):
+    for name in UNITS:
         (tmp_path / name).write_text(rendered(name, rover_home=tmp_path))
     return tmp_path
 
@@ -290,7 +295,7 @@ def analyze(*arguments: object) -> subprocess.CompletedProcess:
     return run("systemd-analyze", *arguments)
 
 
-@pytest.mark.parametrize("name", ["rover-drive.service", "rover-check@.service"])
+@pytest.mark.parametrize("name", UNITS)
 def test_systemd_understands_the_units(units, name):
     found = analyze("verify", "--man=no", "--recursive-errors=no", units / name)
     assert found.returncode == 0 and str(units) not in found.stderr, found.stderr
@@ -302,10 +307,26 @@ def test_systemd_would_not_understand_nonsense(units):
     assert "rover-drive.service" in analyze("verify", "--man=no", "--recursive-errors=no", unit).stderr
 
 
-@pytest.mark.parametrize("name", ["rover-drive.service", "rover-check@.service"])
+@pytest.mark.parametrize("name", UNITS)
 def test_the_sandbox_is_closed_enough(units, name):
     found = analyze("security", "--offline=true", "--threshold=20", "--no-pager", units / name)
     assert found.returncode == 0, found.stdout[-3000:]
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_no_unit_lets_root_load_an_artifact(units, name):
+    text = (units / name).read_text()
+    assert "\nUser=rover\n" in text and "\nUnsetEnvironment=ROVER_AS_ROOT\n" in text
+    assert (text.count("ROVER_AS_ROOT=") == 0 and "policy.pt" in text) or "verify --confined" in text
+
+
+def test_no_playbook_runs_an_artifact_itself():
+    """Root would: only a unit does, as rover and in the sandbox."""
+    tasks = "".join(p.read_text() for p in (ROLE / "tasks").glob("*.yml"))
+    for command in ("benchmark", "doctor", "verify"):
+        for line in [line for line in tasks.splitlines() if f'rover", {command}' in line or f", {command}," in line]:
+            assert "policy.pt" not in line, line
+    assert "'benchmark'" not in tasks and "--sandboxed, verify]" in tasks
 
 
 def test_both_units_have_the_same_sandbox(units):
@@ -355,14 +376,86 @@ def test_the_service_says_what_the_command_line_takes(units):
     from rover_lib.cli import main
 
     line = next(x for x in (units / "rover-drive.service").read_text().splitlines() if x.startswith("ExecStart="))
-    arguments = line.split()[1:]
+    arguments = shlex.split(line)[1:]
     assert arguments[:2] == ["drive", "--service"]
     found = CliRunner().invoke(main, [*arguments, "--help"])
     assert found.exit_code == 0, found.output
     drive = main.commands["drive"]
     assert {a for a in arguments if a.startswith("--")} <= {o for p in drive.params for o in p.opts}
     check = next(x for x in (units / "rover-check@.service").read_text().splitlines() if x.startswith("ExecStart="))
-    assert check.split()[1:] == ["release", "--models", "/var/lib/rover/models", "verify", "%i"]
+    assert shlex.split(check)[1:] == ["release", "--models", "/var/lib/rover/models", "verify", "--confined", "%i"]
+
+
+HOSTILE = [
+    "/dev/video0 --throttle-limit 1",
+    "/dev/video0\nExecStartPre=+/bin/touch /root/mine",
+    "/dev/video0\\",
+    "%h/video %n %%",
+    "$HOME ${PATH} $$",
+    "\"/dev/video0\" '--record' /",
+    "; /bin/true",
+    "\t\u00fc",
+]
+
+
+@pytest.mark.parametrize("value", HOSTILE)
+def test_a_value_in_the_unit_is_one_word_of_its_command(units, value):
+    """As systemd itself reads it; until then a camera could carry options, and a newline a command for root."""
+    given = {"rover_camera": value, "rover_port": value, "rover_home": units, "rover_threads": 2, "rover_record": True}
+    unit = units / "rover-drive.service"
+    plain = {"rover_camera": "CAMERA", "rover_port": "PORT"}
+    unit.write_text(rendered(unit.name, **given | plain))
+    expected = [value if word in ("CAMERA", "PORT") else word for word in commands(unit)["ExecStart"]]
+    before = commands(unit)["ExecStartPre"]
+    unit.write_text(rendered(unit.name, **given))
+    assert commands(unit) == {"ExecStart": expected, "ExecStartPre": before}
+
+
+@pytest.mark.parametrize("name", ["rover-drive.service", "rover-check@.service"])
+@pytest.mark.parametrize("value", [v for v in HOSTILE if v.isprintable()])
+def test_models_may_be_in_any_folder(units, name, value):
+    unit, models = units / name, f"/var/lib/{value}"
+    unit.write_text(rendered(name, rover_models=models, rover_home=units))
+    words = commands(unit)["ExecStart"]
+    assert {models, f"{models}/current/policy.pt"} & set(words)
+    assert words[0] == f"{units}/venv/bin/rover"
+
+
+def commands(unit: Path) -> dict[str, list[str]]:
+    """The command lines of a unit, by kind, in words: systemd's own reading, which it prints while it verifies."""
+    if not shutil.which("systemd-analyze"):
+        pytest.skip("no systemd-analyze: apt install systemd")
+    verify = ["systemd-analyze", "verify", "--man=no", "--recursive-errors=no", unit]
+    done = subprocess.run(verify, capture_output=True, text=True, env={**os.environ, "SYSTEMD_LOG_LEVEL": "debug"})
+    found = re.findall(r"-> (Exec\w+):\n\s+Command Line: (.*)", done.stdout)
+    words = {kind: re.findall(r'"(?:[^"\\]|\\.)*"|\S+', line) for kind, line in found}
+    assert len(words) == len(found), found
+    return {kind: [unquoted(word) for word in line] for kind, line in words.items()}
+
+
+def unquoted(word: str) -> str:
+    """A word as systemd prints it: in C's way if it needs that; $$ is a $ once it is started."""
+    text = re.sub(r"\\([$`])", r"\1", word.strip('"') if word[0] != '"' else word[1:-1])
+    text = text.encode("latin-1", "backslashreplace").decode("unicode_escape") if "\\" in text else text
+    return text.replace("$$", "$")
+
+
+@pytest.mark.parametrize(
+    "name, given",
+    [
+        ("service", {"rover_camera": "/dev/video0\nExecStartPre=+/bin/true"}),
+        ("service", {"rover_models": "/var/lib/rover\nUser=root"}),
+        ("service", {"rover_home": "opt"}),
+        ("service", {"rover_hz": "30\nUser=root"}),
+        ("service", {"rover_memory_mb": "1500M\nUser=root"}),
+        ("system", {"rover_port": '/dev/rover-arduino", RUN+="/bin/true'}),
+        ("system", {"rover_usb_ids": ['2341:0043", RUN+="/bin/true']}),
+    ],
+)
+def test_values_that_no_unit_can_have_are_refused(tmp_path, name, given):
+    found = play(tmp_path, [entry(name)], "--check", **given)  # were they taken, this machine would not be changed
+    assert found.returncode == 2 and next(iter(given)) in found.stdout, found.stdout + found.stderr
+    assert "changed=0" in found.stdout and "failed=1" in found.stdout
 
 
 def test_the_car_does_not_start_by_itself():

@@ -77,6 +77,7 @@ def test_debug_shows_the_traceback(tmp_path):
     assert result.exit_code == 1 and result.exception is not None
 
 
+@pytest.mark.slow
 def test_benchmark_writes_its_stage(artifacts, tmp_path):
     out = tmp_path / "benchmark-here.json"
     result = rover(
@@ -129,6 +130,7 @@ def drives(tmp_path, monkeypatch):
     return tmp_path / "episodes"
 
 
+@pytest.mark.slow
 def test_quantizes_and_compares_on_recordings(tiny_file, drives, tmp_path):
     for mode in ("fp32", "static", "dynamic"):
         result = rover("quantize", tiny_file, drives, "-o", tmp_path / f"{mode}.pt", "--mode", mode, "--samples", 8)
@@ -151,6 +153,7 @@ def test_quantizes_and_compares_on_recordings(tiny_file, drives, tmp_path):
     assert "32 values, see --json" in plain.output and "steering_mae_us" in plain.output
 
 
+@pytest.mark.slow
 def test_inspects_recordings_and_drives_a_trial(drives, artifacts):
     content = json.loads(rover("inspect", drives, "--json").output)
     assert content["recordings"]["episodes"] == 4

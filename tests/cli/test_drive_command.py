@@ -20,6 +20,7 @@ from rover_lib.onboard.telemetry import read_log
 from rover_lib.workshop.episodes import load_recordings
 from rover_lib.world.car import VirtualCar
 
+pytestmark = pytest.mark.slow
 ROVER = [str(Path(sys.executable).parent / "rover"), "drive"]
 
 
@@ -112,10 +113,11 @@ def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number):
 
 
 def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
-    """A camera of eight seconds, the car being another world's."""
-    (tmp_path / "short.mjpeg").write_bytes(b"".join(pictures(0) * 16))
+    """A camera of some seconds, which torch may take to load, the car being another world's."""
+    (tmp_path / "short.mjpeg").write_bytes(b"".join(pictures(0) * 14))
     with VirtualCar() as car:
         options = [
+            "--film",
             "--camera",
             tmp_path / "short.mjpeg",
             "--port",
@@ -133,7 +135,7 @@ def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
 
 
 def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
-    (tmp_path / "drive.mjpeg").write_bytes(b"".join(pictures(0) * 20))
+    (tmp_path / "drive.mjpeg").write_bytes(b"".join(pictures(0) * 50))
     options = [
         "--camera",
         tmp_path / "drive.mjpeg",
@@ -161,6 +163,7 @@ def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
         (["policy.pt", "--port", "/dev/nothing"], 1, "/dev/nothing: cannot be opened"),
         (["policy.pt", "--dry-run", "--camera", "/dev/video77"], 1, "/dev/video77: no such camera"),
         (["--replay", "nothing"], 1, "nothing"),
+        (["policy.pt", "--camera", "."], 1, ".: recorded pictures know nothing of where the car is; give the camera's"),
     ],
 )
 def test_what_cannot_begin(options, code, message, tmp_path):
@@ -172,8 +175,9 @@ def test_what_cannot_begin(options, code, message, tmp_path):
 
 def test_the_car_stands_after_it(artifact, tmp_path):
     with VirtualCar() as car:
-        (tmp_path / "drive.mjpeg").write_bytes(b"".join(pictures(0) * 20))
-        options = ["--camera", tmp_path / "drive.mjpeg", "--port", car.port, "--ticks", "20", "--log", tmp_path / "l"]
+        (tmp_path / "drive.mjpeg").write_bytes(b"".join(pictures(0) * 50))
+        options = ["--film", "--camera", tmp_path / "drive.mjpeg", "--port", car.port, "--ticks", "20"]
+        options += ["--log", tmp_path / "l"]
         done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         with ServoLink(car.port) as link:

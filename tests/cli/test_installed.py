@@ -17,6 +17,7 @@ from rover_lib.onboard import cli as onboard
 from rover_lib.onboard.telemetry import FlightLog, Tick
 from rover_lib.workshop.wheelhouse import REQUIREMENTS, make
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 

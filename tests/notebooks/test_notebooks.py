@@ -1,23 +1,19 @@
-"""The notebooks as files: they call, check and show; what a function could hold is not in them. nbval runs them."""
+"""The notebooks as files: they call, check and show; what a function could hold is not in them."""
 
 import ast
 import re
 import sys
-import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
 import nbformat
-import numpy as np
 import pytest
-from executed import printed
 
 from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop import progress, publish, session
 from rover_lib.workshop import run as runs
 from rover_lib.workshop.publish import NOTEBOOK_LIMIT, RESULTS_OF
 from rover_lib.workshop.run import AFTERWARDS, NAMES, NOTEBOOKS, parameters_of
-from rover_lib.world import latency
 
 PATHS = [NOTEBOOKS / f"{name}.ipynb" for name in NAMES + AFTERWARDS]
 MOST_LINES = 12
@@ -89,53 +85,26 @@ def test_all_know_the_run_folder():
     assert {"checkpoint", "episodes"} <= parameters_of(PATHS[0])
 
 
-# --- late plans ---
-
-
-def test_drives_are_drawn(tmp_path, monkeypatch):
-    class Straight:
-        rate_hz, chunk = 30.0, 32
-
-        def predict_unclipped(self, frame_bgr, state):
-            return np.tile(np.float32([0.0, 0.06]), (self.chunk, 1))
-
-    monkeypatch.setattr(latency, "load_policy", lambda path, threads: Straight())
-    with zipfile.ZipFile(tmp_path / "policy_static.pt", "w") as z:
-        z.writestr("archive/code/policy.py", "only this process knows it")
-    chosen = {"worlds": 2, "latencies_ms": [0, 150, 600], "pushes": 2, "pushed_latencies_ms": [150], "shown_ms": 150}
-    measured = latency.measured(tmp_path, **chosen)
-    text = printed(runs.execute("07_drive", tmp_path, **chosen))
-    assert latency.table(measured) in text and "ensembling, 0.01" in text
-    assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {
-        f"07_{figure}" for figure in ("age", "hits", "path", "above", "gates")
-    }
-
-
 # --- rovers beside this machine ---
 
 
-def test_rovers_are_drawn(tmp_path):
-    """The cells that draw, without those that measure here: nbval runs these."""
-    source, kept = (
-        nbformat.read(PATHS[4], as_version=4),
-        ("imports", "parameters", "derive", "latency", "rovers", "soak"),
-    )
-    source.cells = [c for c in source.cells if c.id in kept]
-    (derive,) = (c for c in source.cells if c.id == "derive")
-    folders = [line for line in derive.source.splitlines() if line.startswith(("p, run_dir", "fetched"))]
-    derive.source = "\n".join(folders)
-    (tmp_path / "notebooks").mkdir()
-    nbformat.write(source, tmp_path / "notebooks" / "05_benchmark.ipynb")
+def test_rovers_are_drawn(tmp_path, capsys):
+    """The cells that draw, without those that measure here: the demo executes these."""
     policy = {"latency_p50_ms": 60.0, "latency_p95_ms": 61.0, "latency_p99_ms": 62.0, "n": 16, "mode": "static"}
     series = [{"t_s": t_s, "artifacts": {"policy": policy}} for t_s in (1.0, 2.0)]
     metrics = {"artifacts": {"policy": policy}, "main": "policy", "series": series}
-    for folder in ("demo", "rovers"):
-        (tmp_path / folder).mkdir()
-        write_stage(tmp_path / folder / "benchmark-rover1.json", "benchmark", params={}, metrics=metrics)
-    (tmp_path / "rovers" / "benchmark-rover2.json").write_text("{")
-    text = printed(runs.execute("05_benchmark", tmp_path / "demo", notebooks=tmp_path / "notebooks"))
+    run_dir, fetched = tmp_path / "demo", tmp_path / "rovers"
+    for folder in (run_dir, fetched):
+        folder.mkdir()
+        write_stage(folder / "benchmark-rover1.json", "benchmark", params={}, metrics=metrics)
+    (fetched / "benchmark-rover2.json").write_text("{")
+    names = {"run_dir": run_dir, "fetched": fetched}
+    cells = {c.id: c.source for c in nbformat.read(PATHS[4], as_version=4).cells}
+    for cell in ("imports", "latency", "rovers", "soak"):
+        exec(cells[cell], names)
+    text = capsys.readouterr().out
     assert re.search(r"rover1 +static, another +60.0 ", text) and "1 file is left out:\nbenchmark-rover2.json: " in text
-    assert {p.stem for p in (tmp_path / "demo" / "figures").glob("*.png")} == {"05_latency", "05_soak"}
+    assert {p.stem for p in (run_dir / "figures").glob("*.png")} == {"05_latency", "05_soak"}
 
 
 # --- executing and publishing ---
@@ -160,6 +129,7 @@ def one_notebook(monkeypatch, tmp_path):
     return tmp_path / "notebooks"
 
 
+@pytest.mark.slow
 def test_a_run_fills_parameters_and_leaves_the_executed_notebook(one_notebook, tmp_path):
     written(
         one_notebook,
@@ -172,6 +142,7 @@ def test_a_run_fills_parameters_and_leaves_the_executed_notebook(one_notebook, t
     assert {p.name for p in folder.iterdir()} == {"made", "01_load.ipynb"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "words"),
     [

@@ -1,16 +1,15 @@
 """The artifact alone: what it holds, what it refuses, and that it drives without the workshop."""
 
 import io
-import json
 import shutil
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from archives import manifest_with, rewritten, vectors_with
 from policies import memory_samples
 
 import rover_lib
@@ -20,19 +19,6 @@ from rover_lib.onboard.policy import check_parity
 
 FRAME = memory_samples(1)[0].picture
 STATE = np.zeros(2, np.float32)
-
-
-def rewritten(source: Path, target: Path, change: dict[str, object]) -> Path:
-    """A copy of an artifact with records replaced, by the end of their names; checksums stay right."""
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
-        for item in old.infolist():
-            content = old.read(item)
-            for name, edit in change.items():
-                if item.filename.endswith(name):
-                    content = edit(content)
-            if content is not None:
-                new.writestr(item, content)
-    return target
 
 
 @pytest.mark.parametrize(
@@ -57,10 +43,6 @@ def test_an_artifact_that_is_given_twice_is_refused(tmp_path):
     (tmp_path / "link.pt").symlink_to("p.pt")
     with pytest.raises(ArtifactError, match=r"link\.pt: given twice; name each file once"):
         artifact.distinct_names([tmp_path / "p.pt", tmp_path / "link.pt"])
-
-
-def manifest_with(**values):
-    return lambda raw: json.dumps({k: v for k, v in (json.loads(raw) | values).items() if v is not ...}).encode()
 
 
 @pytest.mark.parametrize("mode", ["fp32", "dynamic", "static", "mixed"])
@@ -133,13 +115,13 @@ def refused(path) -> str:
         ({"cameras": [{"name": "cam_front", "height": 0, "width": 128}]}, "is not a name and a size"),
         ({"cameras": [{"name": ["cam"], "height": 72, "width": 128}]}, "is not a name and a size"),
         ({"cameras": []}, "has no cameras"),
-        ({"rate_hz": 0}, "rate_hz must be above 0, found 0"),
-        ({"rate_hz": float("nan")}, "rate_hz must be above 0, found nan"),
-        ({"chunk": 0}, "chunk must be 1 or more, found 0"),
+        ({"rate_hz": 0}, "rate_hz must be from 5 to 120, found 0"),
+        ({"rate_hz": float("nan")}, "rate_hz must be from 5 to 120, found nan"),
+        ({"chunk": 0}, "chunk must be from 1 to 256, found 0"),
         ({"state_names": []}, "state_names must be names"),
         ({"action_names": [["steering"]]}, "action_names must be names"),
         ({"action_names": ["steering"]}, "tolerance"),
-        ({"parity": {"tolerance": {"steering": 0.0, "throttle": -1.0}}}, "do not drive"),
+        ({"parity": {"tolerance": {"steering": 0.0, "throttle": -1.0}}}, "must be from 0 to 0.3"),
     ],
 )
 def test_refuses_manifests_that_do_not_fit(artifacts, tmp_path, values, says):
@@ -147,12 +129,7 @@ def test_refuses_manifests_that_do_not_fit(artifacts, tmp_path, values, says):
     assert says in refused(path)
 
 
-def other_answers(raw: bytes) -> bytes:
-    vectors = dict(np.load(io.BytesIO(raw)))
-    vectors["chunk"] = vectors["chunk"] + 0.5
-    out = io.BytesIO()
-    np.savez_compressed(out, **vectors)
-    return out.getvalue()
+other_answers = vectors_with(lambda vectors: vectors.update(chunk=vectors["chunk"] + 0.5))
 
 
 def test_refuses_a_policy_that_computes_something_else(artifacts, tmp_path):
@@ -216,6 +193,7 @@ def test_parity_difference_is_reported(artifacts):
     assert set(found) == {"steering", "throttle"} and max(found.values()) <= 1e-4
 
 
+@pytest.mark.slow
 def test_drives_in_a_clean_environment(artifacts, tmp_path):
     """torch, numpy and opencv only, as on the Pi: no lerobot, no torchvision, no workshop."""
     versions = {n: __import__(m).__version__ for n, m in {"torch": "torch", "numpy": "numpy"}.items()}

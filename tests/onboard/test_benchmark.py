@@ -315,6 +315,7 @@ def test_on_this_machine():
     json.dumps(metrics, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_memory_of_an_artifact_that_does_not_load(tmp_path):
     bad = tmp_path / "policy_static.pt"
     bad.write_bytes(b"no artifact")

@@ -5,6 +5,7 @@ import threading
 import time
 
 import cv2
+import hostile
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,9 +16,7 @@ from rover_lib.onboard.camera import Camera, CameraError
 
 
 def jpeg(value: int, size=(64, 36)) -> bytes:
-    image = np.full((size[1], size[0], 3), value, np.uint8)
-    image[0, 0] = (value + 40) % 256
-    return cv2.imencode(".jpg", image)[1].tobytes()
+    return hostile.jpeg(np.full((size[1], size[0], 3), value, np.uint8))
 
 
 @pytest.fixture
@@ -94,7 +93,7 @@ def test_the_same_frame_again_is_counted(camera, writer):
     writer.write(jpeg(101))
     frame = camera.wait(4, 1.0)
     assert frame.repeats == 0
-    assert frame.mean == pytest.approx(101, abs=3)
+    assert frame.mean == pytest.approx(101, abs=3) and frame.contrast == 0
 
 
 def test_an_unplugged_camera(camera, writer):
@@ -112,7 +111,7 @@ def test_another_size(camera, writer):
 
 
 def test_what_is_no_stream_of_jpegs(camera, writer, monkeypatch):
-    monkeypatch.setattr(c, "JPEG_MOST", 10_000)
+    monkeypatch.setattr(c, "MOST_BYTES", 10_000)
     writer.write(bytes(20_000))
     with pytest.raises(CameraError, match="no JPEG in"):
         camera.wait(1, 2.0)
@@ -148,19 +147,10 @@ def test_an_empty_folder(tmp_path):
         Camera(tmp_path).open()
 
 
-def test_a_video(tmp_path):
-    path = tmp_path / "drive.avi"
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 50, (64, 36))
-    assert video.isOpened()
-    for i in range(5):
-        video.write(np.full((36, 64, 3), 20 * i, np.uint8))
-    video.release()
-    with Camera(path) as camera:
-        assert camera.wait(3, 1.0).image.shape == (36, 64, 3)
-        assert 20 < camera.rate_hz < 80
-    (tmp_path / "no.avi").write_bytes(b"nothing")
-    with pytest.raises(CameraError, match="no video"):
-        Camera(tmp_path / "no.avi").open()
+def test_a_video_is_none(tmp_path):
+    (tmp_path / "drive.mp4").write_bytes(b"nothing")
+    with pytest.raises(CameraError, match=r"ffmpeg -i drive\.mp4 -q:v 3 drive\.mjpeg makes one of a video"):
+        Camera(tmp_path / "drive.mp4").open()
 
 
 def test_a_file_of_jpegs(tmp_path):
@@ -171,7 +161,7 @@ def test_a_file_of_jpegs(tmp_path):
 
 def test_a_reader_that_breaks(fifo, monkeypatch):
     def broken(*_):
-        yield np.zeros((4, 4, 3), np.uint8), None
+        yield jpeg(100), None
         time.sleep(0.1)
         raise RuntimeError("the driver is gone")
 
@@ -180,19 +170,206 @@ def test_a_reader_that_breaks(fifo, monkeypatch):
         camera.wait(1, 1.0)
 
 
-@pytest.mark.parametrize("own", ["now", "another clock's", "the future"])
-def test_the_cameras_own_time_counts_if_it_can_be(fifo, monkeypatch, own):
-    given_s = {"now": time.monotonic() - 0.02, "another clock's": 1.0, "the future": time.monotonic() + 60}[own]
+# ---- what is no frame, in a time of its own
 
-    def stamped(*_):
-        yield np.zeros((4, 4, 3), np.uint8), given_s
-        time.sleep(0.5)
 
-    monkeypatch.setattr(c, "_fifo", stamped)
-    with Camera(fifo) as camera:
-        captured_s = camera.latest().captured_s
-        assert (captured_s == given_s) == (own == "now")
-        assert abs(time.monotonic() - captured_s) < 0.5
+class Clock:
+    """Monotonic and wall clock of a machine, in one."""
+
+    def __init__(self):
+        self.now_s, self.wall_ahead_s = 5000.0, 1.7e9
+
+    def __call__(self):
+        return self.now_s
+
+    def wall(self):
+        return self.now_s + self.wall_ahead_s
+
+
+class Readings:
+    """A camera that is read without a thread: what it gives, and what becomes of it."""
+
+    def __init__(self):
+        self.clock = Clock()
+        self.camera = Camera("camera", clock=self.clock, wall_clock=self.clock.wall)
+
+    def read(self, pictures, stamp=lambda now_s, i: None):
+        """(number, repeats, age in s) of the newest frame after each picture, at 30 Hz, until reading fails."""
+        newest = []
+
+        def reader():
+            for i, picture in enumerate(pictures):
+                self.clock.now_s += 1 / 30
+                yield picture, stamp(self.clock.now_s, i)
+                if frame := self.camera._frame:
+                    newest.append((frame.number, frame.repeats, self.clock.now_s - frame.captured_s))
+
+        self.camera._read(reader())
+        return newest
+
+    @property
+    def ended(self):
+        with pytest.raises(CameraError) as failure:
+            self.camera.latest()
+        return str(failure.value)
+
+
+@pytest.fixture
+def readings():
+    return Readings()
+
+
+def live(count, seed=0):
+    """Pictures of a still scene with a sensor's noise."""
+    rng = np.random.default_rng(seed)
+    scene = hostile.scene(size=(160, 90))
+    return [hostile.jpeg(cv2.add(scene, rng.integers(0, 3, scene.shape, np.uint8))) for _ in range(count)]
+
+
+def test_a_still_scene_is_always_new(readings):
+    newest = readings.read(live(100))
+    assert [repeats for _, repeats, _ in newest] == [0] * 100
+
+
+@pytest.mark.parametrize("ring", [1, 2, 3, 10, 31])
+def test_a_ring_of_old_pictures_shows_nothing_new(readings, ring):
+    newest = readings.read(live(50) + live(50)[50 - ring :] * 40)
+    repeats = [repeats for _, repeats, _ in newest]
+    assert repeats[:50] == [0] * 50
+    assert repeats[50:90] == list(range(1, 41))
+
+
+def test_a_frozen_picture_on_which_a_pixel_flickers_shows_nothing_new(readings):
+    rng = np.random.default_rng(0)
+    pictures = []
+    for _ in range(20):
+        picture = hostile.scene()
+        picture[rng.integers(360), rng.integers(640)] = rng.integers(256, size=3)
+        pictures.append(hostile.jpeg(picture))
+    assert readings.read(pictures)[-1][1] == 19
+
+
+def test_damaged_pictures_are_left_out_and_four_in_a_row_are_a_fault(readings):
+    good = live(20)
+    damaged = [hostile.cut(picture) for picture in good]
+    newest = readings.read([*good[:5], *damaged[5:8], *good[8:12], *damaged[12:]])
+    assert len(newest) == 15  # the fourth ends it, 0.13 s after the first
+    assert newest[7][0] == 5 and newest[11][0] == 9
+    assert "4 pictures in a row were no frames: a JPEG is damaged or cut short" in readings.ended
+
+
+def test_damaged_pictures_before_the_first_frame_are_left_out(readings):
+    good = live(10)
+    assert readings.read([hostile.cut(p) for p in good] + good)[0][:2] == (1, 0)
+
+
+@pytest.mark.parametrize("name", ["a bomb of 16,000 x 16,000, whole", "a PNG", "nothing"])
+def test_what_is_no_picture_ends_a_camera(readings, name):
+    readings.read(live(5) + [hostile.HOSTILE[name]] * 5)
+    assert "4 pictures in a row were no frames" in readings.ended
+
+
+def test_too_small_a_picture(readings):
+    readings.read([jpeg(100, (40, 20))])
+    assert "too small a picture to drive by, found 40x20" in readings.ended
+
+
+LATE_S = 0.02
+CLOCKS = {
+    "monotonic": lambda now_s, i: now_s - LATE_S,
+    "wall": lambda now_s, i: now_s + 1.7e9 - LATE_S,
+    "no": lambda now_s, i: 1.0,
+}
+
+
+@pytest.mark.parametrize("kind", CLOCKS)
+def test_the_clock_of_a_cameras_time_stamps_is_found(readings, kind):
+    newest = readings.read(live(10), CLOCKS[kind])
+    assert readings.camera.time_stamps == kind
+    assert [number for number, _, _ in newest] == [1, 2, 3, 4, 5, 6]  # five decide
+    assert all(age_s == pytest.approx(0.0 if kind == "no" else LATE_S, abs=1e-5) for _, _, age_s in newest)
+
+
+@pytest.mark.parametrize("kind", ["monotonic", "wall"])
+@pytest.mark.parametrize("late_s", [1.5, 30.0, -1.0])
+def test_stamps_that_become_old_are_a_fault(readings, kind, late_s):
+    newest = readings.read(live(30), lambda now_s, i: CLOCKS[kind](now_s, i) - (late_s if i >= 20 else 0))
+    assert newest[-1][0] == 16 and len(newest) == 19
+    assert "were no frames: a frame's time stamp is not of now" in readings.ended
+
+
+def test_a_stamp_that_stands_still_is_a_fault(readings):
+    newest = readings.read(live(30), lambda now_s, i: min(now_s, 5000 + 20 / 30))
+    assert newest[-1][0] == 16 and len(newest) == 19
+    assert "found the same again" in readings.ended
+
+
+@pytest.mark.parametrize("stamp", [lambda now_s, i: now_s - 1.5, lambda now_s, i: now_s - 30, lambda now_s, i: 4999.0])
+def test_stamps_that_were_never_of_now_are_no_frames(readings, stamp):
+    assert readings.read(live(30), stamp) == []
+    assert readings.camera._refusal.what == "a frame's time stamp is not of now"
+
+
+def test_one_late_frame_among_the_first_does_not_decide(readings):
+    newest = readings.read(live(20), lambda now_s, i: now_s - (0.7 if i == 2 else 0.02))
+    assert readings.camera.time_stamps == "monotonic" and newest[-1][0] == 16
+
+
+def test_the_wall_clock_may_be_set(readings):
+    def stamp(now_s, i):
+        if i == 12:
+            readings.clock.wall_ahead_s += 3600  # while this frame is on its way
+            return now_s - 3600 + readings.clock.wall_ahead_s - 3600
+        return readings.clock.wall() - 0.02
+
+    newest = readings.read(live(20), stamp)
+    assert newest[-1][0] == 15 and readings.camera.time_stamps == "wall"
+
+
+def test_a_camera_whose_pictures_are_none_says_why(fifo, writer, monkeypatch):
+    monkeypatch.setattr(c, "FIRST_FRAME_S", 0.3)
+    feeding = threading.Thread(target=writer.write, args=(hostile.cut(hostile.WHOLE),))
+    feeding.start()
+    with pytest.raises(CameraError, match=r"no frame within 0\.3 s: a JPEG is damaged or cut short"), Camera(fifo):
+        pass
+    feeding.join()
+
+
+class Device:
+    """OpenCV's V4L2 device, as far as it is used here."""
+
+    def __init__(self, fourcc, picture):
+        self.fourcc, self.picture, self.converts = fourcc, picture, True
+
+    def __call__(self, source, backend):
+        return self
+
+    def isOpened(self):
+        return True
+
+    def set(self, what, value):
+        if what == cv2.CAP_PROP_CONVERT_RGB:
+            self.converts = bool(value)
+        return True
+
+    def get(self, what):
+        return {cv2.CAP_PROP_FOURCC: self.fourcc, cv2.CAP_PROP_POS_MSEC: 2500.0}[what]
+
+    def read(self):
+        return True, cv2.imdecode(np.frombuffer(self.picture, np.uint8), 1) if self.converts else self.picture
+
+    def release(self):
+        pass
+
+
+@pytest.mark.parametrize("fourcc", ["MJPG", "YUYV"])
+def test_jpegs_of_a_device_are_decoded_here_and_others_by_opencv(monkeypatch, fourcc):
+    """OpenCV gives a device's JPEG as (1, bytes) uint8 if it is told not to convert it."""
+    device = Device(cv2.VideoWriter.fourcc(*fourcc), np.frombuffer(hostile.WHOLE, np.uint8)[None])
+    monkeypatch.setattr(cv2, "VideoCapture", device)
+    picture, stamp_s = next(c._v4l2("/dev/video0", (640, 360), 30))
+    assert (picture == hostile.WHOLE) if fourcc == "MJPG" else picture.shape == (360, 640, 3)
+    assert stamp_s == 2.5
 
 
 @given(st.binary(max_size=400), st.lists(st.integers(1, 60), max_size=20))

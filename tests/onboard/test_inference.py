@@ -1,16 +1,19 @@
 """Plans beside the loop, and the policy in its own process: what it computes, and all the ways in which it can fail."""
 
 import os
+import platform
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.camera import CameraError, Frame
+from rover_lib.onboard.confine import PROCESSORS
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
 from rover_lib.onboard.plan import Commanded
@@ -30,7 +33,7 @@ class Frames:
         self.number += 1
         if self.fails_after and self.number > self.fails_after:
             raise CameraError("camera: unplugged")
-        return Frame(FRAME, time.monotonic(), self.number, 0, 100.0)
+        return Frame(FRAME, time.monotonic(), self.number, 0, 100.0, 40.0)
 
 
 def until_raises(planner, kind, match, seconds=3):
@@ -164,6 +167,24 @@ def test_the_process_computes_what_the_policy_does(process, artifacts):
     state = np.array([0.1, 0.02], np.float32)
     assert process.predict(FRAME, state).tolist() == policy.predict_unclipped(FRAME, state).tolist()
     assert (process.rate_hz, process.chunk, process.manifest["mode"]) == (policy.rate_hz, policy.chunk, "static")
+
+
+@pytest.mark.skipif(platform.machine() not in PROCESSORS, reason="no filter of system calls for this processor")
+def test_every_thread_of_the_process_is_confined(process):
+    assert process.unconfined == ""
+    for thread in Path(f"/proc/{process.pids[0]}/task").iterdir():
+        status = (thread / "status").read_text()
+        assert "\nNoNewPrivs:\t1\n" in status and "\nSeccomp:\t2\n" in status
+    assert process.predict(FRAME, np.zeros(2)).shape == (process.chunk, 2)
+
+
+@pytest.mark.parametrize("answer", [b"", bytes(7), bytes(8 * 33), bytes(1000)])
+def test_an_answer_of_another_size_is_no_plan(process, monkeypatch, answer):
+    monkeypatch.setattr(process, "_answer", lambda timeout_s: answer)
+    with pytest.raises(PolicyError, match="bytes are no plan of 32 actions"):
+        process.predict(FRAME, np.zeros(2))
+    monkeypatch.undo()
+    process._answer(None)  # of the request that was made
 
 
 def test_a_bad_state_is_a_sentence_and_the_process_goes_on(process):

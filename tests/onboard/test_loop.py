@@ -34,7 +34,7 @@ from rover_lib.onboard.watch import (
 )
 
 PERIOD = 1 / 30
-STATUS = Telemetry(0.0, 7, 0, 0, "k", State.AUTONOMOUS, "a", 1456, 120, None, None, None, None, 0, 0, 0, 0)
+STATUS = Telemetry(0.0, 7, 0, 0, "k", State.AUTONOMOUS, "a", "w", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)
 
 
 class Clock:
@@ -60,7 +60,7 @@ class Link:
     def __init__(self, clock, acknowledge=lambda n: True):
         self.clock, self.acknowledge = clock, acknowledge
         self.said, self.sent_at, self.status, self.sequence = [], [], STATUS, 0
-        self.hello = Hello(1, "1.0.0", 7, 0, "reset pin")
+        self.hello = Hello(2, "2.0.0", 7, 0, "reset pin")
         self.fails = None
 
     def arm(self):
@@ -84,6 +84,10 @@ class Link:
 
     def latest(self):
         return replace(self.status, host_s=self.clock())
+
+    def unacknowledged_s(self, now_s):
+        unanswered = self.sent_at[self.latest().sequence :]
+        return now_s - unanswered[0] if unanswered else 0.0
 
     @property
     def drives(self):
@@ -173,6 +177,63 @@ def test_ticks_that_were_missed_are_counted_and_left_out(link, clock):
     assert any("missed 2 ticks" in e for e in log.events)
 
 
+class Behind(Link):
+    """The Arduino's answers come late: late_s may be set."""
+
+    late_s, heard = 0.0, 0
+
+    def latest(self):
+        self.heard = max(self.heard, sum(sent_s <= self.clock() - self.late_s for sent_s in self.sent_at))
+        return replace(self.status, host_s=self.clock(), sequence=self.heard)
+
+
+def test_a_link_that_is_behind_stops_the_car(clock):
+    """Two seconds behind, it would bring the brake two seconds late."""
+    link = Behind(clock)
+
+    def falls_behind():
+        link.late_s = 2.0
+
+    with pytest.raises(DriveFault, match=r"not answered for 1[5-9]\d ms, the link is behind"):
+        go(Always({30: falls_behind}), link, clock, until=Until(ticks=300))
+    assert clock.now - 1000 - 29 * PERIOD < 0.2  # since the fault
+    assert link.said[-1] == "neutral"
+
+
+def test_a_link_that_is_a_little_late_drives(clock):
+    link = Behind(clock)
+    link.late_s = 0.08
+    assert go(Always(), link, clock, until=Until(ticks=90)).ticks == 90
+
+
+def stopped_in_turn(clock, stopped_s, every_s, *, until):
+    """Sleeps as a process sleeps that is stopped for a part of each turn, from a second on (SIGSTOP and SIGCONT)."""
+
+    def sleep(seconds):
+        end = clock.now + seconds
+        begun = (end - 1001) // every_s * every_s + 1001
+        if clock.now <= begun + stopped_s and 1001 <= begun < until and end > begun:
+            end = max(end, begun + stopped_s)
+        clock.now = end
+
+    return sleep
+
+
+def test_a_loop_that_is_stopped_again_and_again_does_not_drive(link, clock):
+    """110 ms of every 150: too short for the Arduino to notice."""
+    clock.sleep = stopped_in_turn(clock, 0.11, 0.15, until=1e9)
+    with pytest.raises(DriveFault, match=r"had no time for its ticks .* of the last 500 ms"):
+        go(Always(), link, clock, until=Until(ticks=300))
+    assert clock.now - 1001 <= 0.15 + 0.11 + PERIOD  # at the second time
+    assert link.said[-1] == "neutral"
+
+
+def test_a_loop_that_is_stopped_once_drives_on(link, clock):
+    clock.sleep = stopped_in_turn(clock, 0.14, 0.6, until=1001.7)
+    report = go(Always(), link, clock, until=Until(ticks=90))
+    assert (report.ticks, report.missed) == (90, 6)
+
+
 @pytest.mark.parametrize("rate_hz", [9.9, 101, float("nan")])
 def test_rates_of_no_car(link, clock, rate_hz):
     with pytest.raises(ParamsError, match="10 to 100 Hz"):
@@ -222,6 +283,18 @@ def test_whatever_ends_it_neutral_is_the_first_that_follows(link, clock, what, r
     assert report.ticks == 3
     assert report.ended in log.events  # no fault without its line
     assert report.ended.startswith(str(what) if raised is DriveFault else type(what).__name__)
+
+
+def test_what_ended_it_is_told_although_neutral_fails_too(link, clock, monkeypatch):
+    def interrupted():
+        raise ZeroDivisionError("another bug")
+
+    monkeypatch.setattr(link, "neutral", interrupted)
+    log, report = Log(), Report()
+    with pytest.raises(DriveFault, match="unplugged"):
+        go(Always({2: CameraError("unplugged")}), link, clock, log, report=report)
+    assert report.ended == "unplugged"
+    assert any("ZeroDivisionError: another bug" in event for event in log.events)
 
 
 def test_a_fault_keeps_its_remedy(link, clock):
@@ -332,10 +405,10 @@ class Eyes:
     wanted_hz = 30.0
 
     def __init__(self):
-        self.frame = Frame(np.zeros((4, 4, 3), np.uint8), 0.0, 1, 0, 100.0)
+        self.frame = Frame(np.zeros((4, 4, 3), np.uint8), 0.0, 1, 0, 100.0, 40.0)
 
-    def see(self, now_s, repeats=0, mean=100.0):
-        self.frame = Frame(self.frame.image, now_s, self.frame.number + 1, repeats, mean)
+    def see(self, now_s, repeats=0, mean=100.0, contrast=40.0):
+        self.frame = Frame(self.frame.image, now_s, self.frame.number + 1, repeats, mean, contrast)
 
     def latest(self):
         return self.frame
@@ -395,22 +468,50 @@ def test_a_plan_that_is_too_old(pilot):
 
 def test_a_frozen_camera(pilot):
     drives(pilot, 0.5)
-    with pytest.raises(DriveFault, match="frozen: 5 frames were the same"):
+    with pytest.raises(CameraError, match="frozen: 3 frames showed nothing new"):
         drives(pilot, 0.5, start_s=0.5, repeats=lambda i: i)
+
+
+def test_a_camera_that_froze_before_the_car_moved(pilot):
+    """It stood for a minute before; from the first throttle on it has 0.2 s."""
+    drives(pilot, 60, throttle=0.0, repeats=lambda i: i)
+    with pytest.raises(CameraError, match="frozen: 1805 frames"):  # at the fifth tick, 0.13 s after the first
+        drives(pilot, 1, start_s=60, repeats=lambda i: 1800 + i)
+
+
+def test_throttle_that_comes_and_goes_is_a_car_that_moves(pilot):
+    with pytest.raises(CameraError, match="frozen"):
+        for i in range(20):
+            drives(pilot, PERIOD, start_s=i * PERIOD, throttle=0.1 * (i % 2), repeats=lambda _, i=i: i)
 
 
 def test_a_car_that_stands_may_see_the_same_again(pilot):
     drives(pilot, 1.0, throttle=0.0, repeats=lambda i: i)
-    drives(pilot, 0.15, start_s=1.0, throttle=0.1, repeats=lambda i: 30 + i)  # it has only just been told to go
-    drives(pilot, 0.5, start_s=1.15, throttle=0.1)
+    drives(pilot, 0.12, start_s=1.0, throttle=0.1, repeats=lambda i: 30 + i)  # it has only just been told to go
+    drives(pilot, 0.5, start_s=1.12, throttle=0.1)
+    drives(pilot, 0.6, start_s=1.62, throttle=0.0)
+    drives(pilot, 1.0, start_s=2.22, throttle=0.0, repeats=lambda i: i)
 
 
-def test_a_black_camera(pilot):
+@pytest.mark.parametrize(("seen", "fault"), [({"mean": 2.0}, "black"), ({"contrast": 0.7}, "nothing is on")])
+def test_a_picture_without_anything_on_it(pilot, seen, fault):
     drives(pilot, 0.5)
-    drives(pilot, 0.08, start_s=0.5, mean=2.0)
+    drives(pilot, 0.08, start_s=0.5, **seen)
     drives(pilot, 0.1, start_s=0.6)  # light again: the count begins anew
-    with pytest.raises(DriveFault, match="black"):
-        drives(pilot, 0.2, start_s=0.7, mean=2.0)
+    with pytest.raises(CameraError, match=fault):
+        drives(pilot, 0.2, start_s=0.7, **seen)
+
+
+@pytest.mark.parametrize(
+    ("seen", "fault"),
+    [({"repeats": 2}, "frozen: 3 frames"), ({"mean": 2.0}, "black"), ({"contrast": 0.7}, "nothing is on")],
+)
+def test_nobody_arms_a_car_that_sees_nothing_new(pilot, seen, fault):
+    pilot.eyes.see(0.0, repeats=1)
+    pilot.check_sight()
+    pilot.eyes.see(0.0, **seen)
+    with pytest.raises(CameraError, match=fault):
+        pilot.check_sight()
 
 
 def test_faults_come_through(pilot):

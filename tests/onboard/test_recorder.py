@@ -32,21 +32,23 @@ PICTURE = np.full((36, 64, 3), (30, 90, 200), np.uint8)
 
 
 class FakeCamera:
-    """Frames when they are pushed; or, from start() on, 100 a second."""
+    """Frames when they are pushed; or, while it is filming, 100 a second."""
 
     source = "fake camera"
     wanted_hz = 100.0
 
-    def __init__(self):
+    def __init__(self, clock=time.monotonic):
+        self._clock = clock
         self._changed = threading.Condition()
         self._frame = self._failure = None
-        self.running = False
+        self._taken = 0  # number of the last frame that somebody has seen
 
     def push(self, image=PICTURE):
         with self._changed:
             number = self._frame.number + 1 if self._frame else 1
-            self._frame = Frame(image, time.monotonic(), number, 0, 100.0)
+            self._frame = Frame(image, self._clock(), number, 0, 100.0, 40.0)
             self._changed.notify_all()
+        return number
 
     def fail(self):
         with self._changed:
@@ -61,6 +63,7 @@ class FakeCamera:
 
     def wait(self, after, timeout_s):
         with self._changed:
+            self._taken = after
             self._changed.wait_for(lambda: self._failure or (self._frame and self._frame.number > after), timeout_s)
             if self._failure:
                 raise self._failure
@@ -83,17 +86,31 @@ class FakeCamera:
             thread.join()
 
 
+class Stepped(threading.Event):
+    """Virtual time, and the event that a loop waits for: waiting moves time on, and a picture is taken and seen."""
+
+    def __init__(self):
+        super().__init__()
+        self.now_s = 50.0
+        self.camera = FakeCamera(lambda: self.now_s)
+
+    def wait(self, timeout):
+        self.now_s += timeout
+        number = self.camera.push()
+        until(lambda: self.camera._taken >= number)
+
+
 class FakeLink:
     """An Arduino with a status every 20 ms of the clock; every fourth throttle pulse is lost."""
 
     port = "fake port"
 
-    def __init__(self):
-        self.start = time.monotonic()
+    def __init__(self, clock=time.monotonic):
+        self.start, self._clock = clock(), clock
         self.dies_s = self.silent_s = 1e9
 
     def latest(self):
-        now = time.monotonic() - self.start
+        now = self._clock() - self.start
         if now > self.dies_s:
             raise LinkError("fake port: reading failed; is it still plugged in?")
         n = int(min(now, self.silent_s) / 0.02)
@@ -103,7 +120,9 @@ class FakeLink:
 def status_of(n, host_s=0.0):
     throttle = (None, None) if n % 4 == 3 else (120 + n % 5 * 4, 1016)
     steering = 1456 + n % 50 * 4, 21316
-    return Telemetry(host_s, 7, 20 * n, 0, "-", State.MANUAL, "r", 1456, 120, *steering, *throttle, 0, 0, 0, 0)
+    return Telemetry(
+        host_s, 7, 20 * n, 0, "-", State.MANUAL, "r", "-", 1456, 120, 238, *steering, *throttle, 0, 0, 0, 0
+    )
 
 
 def content_of(folder):
@@ -118,19 +137,15 @@ def left_in(folder):
 
 
 def test_an_episode_beside_a_loop(tmp_path):
-    camera = FakeCamera()
-    camera.push()
+    virtual = Stepped()
+    virtual.camera.push()
     before_s = time.time()
-    recorder = Recorder(
-        tmp_path / "new", camera, label="driven", rate_hz=50, arduino_port="/dev/x", source="rover drive"
-    )
+    about = {"label": "driven", "rate_hz": 50, "arduino_port": "/dev/x", "source": "rover drive"}
+    recorder = Recorder(tmp_path / "new", virtual.camera, **about, clock=lambda: virtual.now_s)
     for i in range(5):
-        time.sleep(0.025)
-        camera.push()
-        recorder.control(
-            time.monotonic(), 20 * i, 1500, 136, 21316, 1016, mode="static", plan_age_ms=None if i < 2 else 80.5
-        )
-        until(lambda n=i: recorder.frames == n + 1)
+        virtual.wait(0.025)
+        age_ms = None if i < 2 else 80.5
+        recorder.control(virtual.now_s, 20 * i, 1500, 136, 21316, 1016, mode="static", plan_age_ms=age_ms)
     folder = recorder.close()
     assert folder == recorder.folder == recorder.path
     assert recorder.failure is None
@@ -157,7 +172,7 @@ def test_an_episode_beside_a_loop(tmp_path):
     assert all(c["throttle_measured"] is True for c in content["control_samples"])
     times = [c["system_timestamp"] for c in content["control_samples"]]
     times += [f["timestamp"] for f in content["frame_samples"]]
-    assert before_s <= min(times) <= max(times) <= time.time()
+    assert before_s <= min(times) <= max(times) <= time.time() + 0.125
     with (folder / "control_data.csv").open(newline="") as f:
         rows = list(csv.DictReader(f))
     assert [r["plan_age_ms"] for r in rows] == ["", "", "80.5", "80.5", "80.5"]
@@ -166,13 +181,13 @@ def test_an_episode_beside_a_loop(tmp_path):
 
 
 def test_a_faster_camera_is_thinned(tmp_path):
-    camera = FakeCamera()
-    with camera.filming(), Recorder(tmp_path, camera, rate_hz=20) as recorder:
-        recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
-        time.sleep(0.6)
+    virtual = Stepped()
+    with Recorder(tmp_path, virtual.camera, rate_hz=20, clock=lambda: virtual.now_s) as recorder:
+        recorder.control(virtual.now_s, 0, 1500, 136, 21316, 1016)
+        for _ in range(60):
+            virtual.wait(0.01)
     times = [f["timestamp"] for f in content_of(recorder.path)["frame_samples"]]
-    assert 8 <= len(times) <= 17
-    assert min(b - a for a, b in pairwise(times)) > 0.037
+    assert len(times) == 15 and np.diff(times) == pytest.approx(0.04, abs=1e-3)
 
 
 def test_a_clock_that_is_set_meanwhile_changes_nothing(tmp_path, monkeypatch):
@@ -363,15 +378,16 @@ def test_a_disk_that_hangs_holds_up_nothing(tmp_path, monkeypatch):
 
 
 def test_a_human_is_recorded(tmp_path):
-    link = FakeLink()
-    with FakeCamera().filming() as camera:
-        report = record(camera, link, tmp_path, rate_hz=100, max_seconds=0.8, label="left")
+    virtual = Stepped()
+    link = FakeLink(lambda: virtual.now_s)
+    options = {"rate_hz": 100, "max_seconds": 0.8, "label": "left", "stop": virtual, "clock": lambda: virtual.now_s}
+    report = record(virtual.camera, link, tmp_path, **options)
     assert report.fault is None
-    assert 0.75 < report.seconds < 2
+    assert report.seconds == pytest.approx(0.8, abs=0.02)
     content = content_of(report.folder)
     controls = content["control_samples"]
     assert len(controls) == report.controls
-    assert 15 < len(controls) <= 42  # each status once, though the loop ran twice as often
+    assert 38 <= len(controls) <= 41  # each status once, though the loop ran twice as often
     stamps = [c["arduino_timestamp"] for c in controls]
     assert stamps == sorted(set(stamps))
     steps = {round(1000 * (b["system_timestamp"] - a["system_timestamp"])) for a, b in pairwise(controls)}
@@ -432,14 +448,14 @@ def arduino():
 
     def status(n):
         throttle = "- -" if n % 10 == 9 else f"{120 + n % 5 * 4} 1016"
-        return frame(f"<S 7 {20 * n} 0 - M r 1456 120 {1456 + n % 50 * 4} 21316 {throttle} 0 0 0 0")
+        return frame(f"<S 7 {20 * n} 0 - M r - 1456 120 238 {1456 + n % 50 * 4} 21316 {throttle} 0 0 0 0")
 
     def run():
         os.write(master, b"".join(status(n) for n in range(40)))  # what waits in the buffer
         n, said = 40, False
         while not done.wait(0.02):
             if n % 25 == 0 or not said:
-                os.write(master, frame("<H 1 1.0.0 7 0 e"))
+                os.write(master, frame("<H 2 2.0.0 7 0 e"))
                 said = True
             os.write(master, status(n))
             n += 1

@@ -4,6 +4,7 @@ import functools
 import os
 import pty
 import select
+import termios
 import threading
 import time
 import tty
@@ -22,17 +23,18 @@ from rover_lib.onboard.errors import PwmError, RoverError
 from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
 
 until = functools.partial(needs.until, seconds=2.0)
-STATUS = "<S 7 1234 5 k M r 1456 120 1460 21316 - - 1 2 3 4"
+STATUS = "<S 7 1234 5 k M r w 1456 120 238 1460 21316 - - 1 2 3 4"
 
 
 def test_frame_and_parse():
     assert frame(">D 7 1 1456 120") == line(">D 7 1 1456 120")
     said = parse(line(STATUS)[:-1], 2.5)
-    assert said == Telemetry(2.5, 7, 1234, 5, "k", State.MANUAL, "r", 1456, 120, 1460, 21316, None, None, 1, 2, 3, 4)
+    pulses = (1456, 120, 238, 1460, 21316, None, None)
+    assert said == Telemetry(2.5, 7, 1234, 5, "k", State.MANUAL, "r", "w", *pulses, 1, 2, 3, 4)
     assert said.why == "manual: after a reset"
     assert (said.pulses.steering_us, said.pulses.throttle_us) == (1456, 120)
-    assert parse(line("<H 1 1.0.0 7 0 w")[:-1], 0) == Hello(1, "1.0.0", 7, 0, "watchdog")
-    assert parse(line("<H 2 3.1 whatever comes then")[:-1], 0).protocol == 2
+    assert parse(line("<H 2 2.0.0 7 0 w")[:-1], 0) == Hello(2, "2.0.0", 7, 0, "watchdog")
+    assert parse(line("<H 3 3.1 whatever comes then")[:-1], 0).protocol == 3
 
 
 @pytest.mark.parametrize(
@@ -45,7 +47,7 @@ def test_frame_and_parse():
         STATUS.replace("1460 21316", "1460 -"),
         STATUS.replace("1456", "-1456"),
         STATUS.replace("1456", "01456"),
-        "<H 1 1.0.0",
+        "<H 2 2.0.0",
         "<H",
         "",
     ],
@@ -70,7 +72,7 @@ def test_a_garbled_status_says_nothing(data):
 class Board:
     """The other end of a pty: says what it is told to, and records what the host says."""
 
-    def __init__(self, hello="<H 1 1.0.0 7 0 e", answer=None):
+    def __init__(self, hello="<H 2 2.0.0 7 0 e", answer=None):
         self.master, slave = pty.openpty()
         tty.setraw(slave)
         self.port = os.ttyname(slave)
@@ -83,17 +85,32 @@ class Board:
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
         if hello:
-            threading.Timer(0.1, self.say, (hello,)).start()
+            threading.Timer(0.1, self.greet).start()
+
+    def greet(self):
+        self.say(self.hello)
+        self.status(result="-", boot=self.hello.split()[3] if self.hello.count(" ") == 5 else 7)
 
     def say(self, body):
         if not self._closing:
             os.write(self.master, line(body))
 
     def status(
-        self, state="M", reason="r", result="k", sequence=None, boot=7, steering_us=1456, throttle_us=120, ms=999
+        self,
+        state="M",
+        reason="r",
+        result="k",
+        missing="-",
+        sequence=None,
+        boot=7,
+        steering_us=1456,
+        throttle_us=120,
+        cap_us=238,
+        ms=999,
     ):
         sequence = self.sequence if sequence is None else sequence
-        self.say(f"<S {boot} {ms} {sequence} {result} {state} {reason} {steering_us} {throttle_us} - - - - 0 0 0 0")
+        pulses = f"{steering_us} {throttle_us} {cap_us} - - - -"
+        self.say(f"<S {boot} {ms} {sequence} {result} {state} {reason} {missing} {pulses} 0 0 0 0")
 
     @property
     def sequence(self):
@@ -112,7 +129,7 @@ class Board:
                 assert body, said
                 self.heard.append(body)
                 if body == ">Q" and self.hello:
-                    self.say(self.hello)
+                    self.greet()
                 self.answer(self, body)
 
     def close(self):
@@ -128,7 +145,7 @@ def obedient(board, body):
     elif body[1] == "N":
         board.status("S", "n")
     elif body[1] == "D":
-        board.status("A", "a", steering_us=body.split()[3], throttle_us=body.split()[4])
+        board.status("A", "a", steering_us=body.split()[4], throttle_us=body.split()[5])
 
 
 @contextmanager
@@ -143,7 +160,7 @@ def board_of(**options):
 def test_a_drive_ends_in_neutral():
     with board_of(answer=obedient) as board:
         with ServoLink(board.port) as link:
-            assert link.hello == Hello(1, "1.0.0", 7, 0, "reset pin")
+            assert link.hello == Hello(2, "2.0.0", 7, 0, "reset pin")
             assert link.arm().state is State.AUTONOMOUS
             number = link.send(1500, 200)
             until(lambda: link.latest().sequence == number)
@@ -151,8 +168,8 @@ def test_a_drive_ends_in_neutral():
             assert 0 <= time.monotonic() - link.latest().host_s < 0.5
             link.send_action(0.0, 0.0)
         assert board.heard[-1].startswith(">N 7 ")
-        assert ">D 7 2 1500 200" in board.heard
-        assert ">D 7 3 1456 120" in board.heard  # throttle 0 is a stopped car
+        assert ">D 7 2 999 1500 200" in board.heard  # 999: when it sent the status that was heard last
+        assert ">D 7 3 999 1456 120" in board.heard  # throttle 0 is a stopped car
         with pytest.raises(LinkError, match="closed"):
             link.send(1500, 200)
 
@@ -180,25 +197,36 @@ def test_pulses_out_of_range_are_not_sent(steering_us, throttle_us):
                     link.send_action(0.0, bad)
             link.send(np.int64(900), np.int64(711))
         until(lambda: board.heard[-1].startswith(">N"))
-        assert [b for b in board.heard if b.startswith(">D")] == [">D 7 1 900 711"]
+        assert [b for b in board.heard if b.startswith(">D")] == [">D 7 1 999 900 711"]
 
 
 def test_sequence_numbers_go_on_where_the_arduino_was():
-    hello = "<H 1 1.0.0 9 4294967294 e"
+    hello = "<H 2 2.0.0 9 4294967294 e"
     with board_of(hello=hello, answer=lambda b, _: b.status("S", "n", boot=9)) as board, ServoLink(board.port) as link:
         assert [link.send(1456, 120) for _ in range(3)] == [4294967295, 0, 1]
 
 
-def test_another_protocol_is_refused():
-    with board_of(hello="<H 2 3.0.0 something else") as board:
-        with pytest.raises(LinkError, match=r"protocol 2 \(firmware 3\.0\.0\), this program 1; .*make flash"):
+@pytest.mark.parametrize(
+    ("hello", "sentence"),
+    [
+        (
+            "<H 3 3.0.0 something else",
+            r"firmware 3\.0\.0 \(protocol 3\), this program knows 2\.0\.0 \(protocol 2\); .*make",
+        ),
+        ("<H 2 2.0.1 7 0 e", r"firmware 2\.0\.1 \(protocol 2\), this program knows 2\.0\.0"),
+        ("<H 1 1.0.0 7 0 e", r"firmware 1\.0\.0 \(protocol 1\)"),
+    ],
+)
+def test_another_firmware_is_refused(hello, sentence):
+    with board_of(hello=hello) as board:
+        with pytest.raises(LinkError, match=sentence):
             ServoLink(board.port).open()
         assert board.heard == []
 
 
 def test_an_arduino_that_is_not_reset_is_asked():
     with board_of(hello=None) as board:
-        board.hello = "<H 1 1.0.0 7 40 p"
+        board.hello = "<H 2 2.0.0 7 40 p"
 
         def go_on(board=board):
             for _ in range(60):
@@ -228,7 +256,10 @@ def test_a_port_in_use():
         ServoLink(board.port).open()
 
 
-@pytest.mark.parametrize(("result", "sentence"), [("s", "switch the transmitter on"), ("t", "let go of the throttle")])
+@pytest.mark.parametrize(
+    ("result", "sentence"),
+    [("s", "switch the transmitter on"), ("t", "let go of the throttle"), ("w", "move the steering stick far to both")],
+)
 def test_arming_refused(result, sentence):
     with board_of(answer=lambda board, body: board.status("M", "r", result)) as board:
         with ServoLink(board.port) as link, pytest.raises(LinkError, match=sentence):
@@ -267,17 +298,17 @@ def test_a_reset_meanwhile_needs_arming_again():
     with board_of(answer=obedient) as board, ServoLink(board.port) as link:
         link.arm()
         link.send(1500, 200)
-        board.hello = "<H 1 1.0.0 8 0 w"
+        board.hello = "<H 2 2.0.0 8 0 w"
         board.say(board.hello)
         until(lambda: link.resets == 1)
         link.send(1500, 200)
-        until(lambda: board.heard[-1] == ">D 8 1 1500 200")
+        until(lambda: board.heard[-1] == ">D 8 1 999 1500 200")
         assert link.hello.reset == "watchdog"
 
 
 def test_a_reset_whose_hello_was_lost_is_noticed():
     with board_of(answer=obedient) as board, ServoLink(board.port) as link:
-        board.hello = "<H 1 1.0.0 8 0 w"
+        board.hello = "<H 2 2.0.0 8 0 w"
         until(lambda: board.status(boot=8, sequence=0) or link.resets == 1)
 
 
@@ -326,8 +357,69 @@ def test_silence_is_an_error():
 def test_garbled_lines_are_counted_and_dropped():
     with board_of(answer=obedient) as board, ServoLink(board.port) as link:
         os.write(board.master, b"<S 1 2 3*00000000\n" + b"x" * 1000 + b"\n\n" + line(STATUS))
-        until(lambda: link.latest() is not None)
+        until(lambda: link.latest().sequence == 5)
         assert link.garbled == 2
+
+
+def test_the_age_of_what_is_not_acknowledged():
+    """With a link 2 s behind nothing said so: the host knows how old the oldest command is that nobody has answered."""
+    now, answering = [0.0], [True]
+
+    def answer(board, body):
+        if answering[0]:
+            obedient(board, body)
+
+    with board_of(answer=answer) as board, ServoLink(board.port, clock=lambda: time.monotonic() + now[0]) as link:
+        clock = link._clock
+        assert link.unacknowledged_s(clock()) == 0
+        link.arm()
+        until(lambda: link.unacknowledged_s(clock()) == 0)
+        answering[0] = False
+        first = link.send(1500, 200)
+        now[0] = 0.1
+        second = link.send(1500, 200)
+        assert 0.1 <= link.unacknowledged_s(clock()) < 0.4
+        now[0] = 2.0
+        assert link.unacknowledged_s(clock()) > 2
+        board.status("A", "a", sequence=first)
+        until(lambda: link.unacknowledged_s(clock()) < 2)
+        assert link.unacknowledged_s(clock()) > 1.8  # the second waits too
+        board.status("A", "a", sequence=second)
+        until(lambda: link.unacknowledged_s(clock()) == 0)
+        link.send(1500, 200)
+        board.hello = "<H 2 2.0.0 8 0 w"  # another start will never answer
+        board.say(board.hello)
+        until(lambda: link.unacknowledged_s(clock()) == 0)
+
+
+def test_the_cap_is_lowered():
+    def answer(board, body):
+        if body[1] == "L":
+            board.status(cap_us=min(int(body.split()[3]), 238))
+
+    with board_of(answer=answer) as board, ServoLink(board.port) as link:
+        assert link.lower_cap(180).cap_us == 180
+        assert link.lower_cap(300).cap_us == 238
+        with pytest.raises(LinkError, match="throttle pulse must be"):
+            link.lower_cap(119)
+
+
+def test_the_cap_stays_while_the_car_drives():
+    sentence = "not changed while the car drives"
+    driving = lambda board, body: board.status("A", "a", "i")  # noqa: E731
+    with board_of(answer=driving) as board, ServoLink(board.port) as link, pytest.raises(LinkError, match=sentence):
+        link.lower_cap(180)
+
+
+def test_closing_the_port_leaves_dtr_up():
+    """Its edge, when the port is opened again, resets an Arduino: the human's pulses were gone for 0.2 s to 2 s."""
+    with board_of(answer=obedient) as board:
+        attributes = termios.tcgetattr(board._slave)
+        attributes[2] |= termios.HUPCL
+        termios.tcsetattr(board._slave, termios.TCSANOW, attributes)
+        with ServoLink(board.port):
+            pass
+        assert not termios.tcgetattr(board._slave)[2] & termios.HUPCL
 
 
 def test_threads_share_a_link():
@@ -366,7 +458,14 @@ def emulated():
 SLACK_S = 0.15  # this machine may be busy; what the firmware promises is judged in tests/emulated, without a clock
 
 
-def drive(link, seconds, steering_us=1800, throttle_us=600):
+def arm(link, board):
+    until(lambda: link.latest().missing == "w")
+    board.wiggle()
+    until(lambda: link.latest().missing == "-")
+    link.arm()
+
+
+def drive(link, seconds, steering_us=1800, throttle_us=232):
     needs.keep_sending(lambda: link.send(steering_us, throttle_us), seconds)
 
 
@@ -376,24 +475,24 @@ def drive(link, seconds, steering_us=1800, throttle_us=600):
 def test_the_real_firmware_arms_drives_and_stops(emulated):
     emulated.transmitter(1460, 124)
     with ServoLink(emulated.port) as link:
-        assert link.hello.firmware == "1.0.0"
+        assert link.hello.firmware == "2.0.0"
         until(lambda: link.latest() and link.latest().receiver_steering_us and link.latest().receiver_throttle_us)
         assert abs(link.latest().receiver_steering_us - 1460) <= 4
         assert link.latest().state is State.MANUAL
         assert link.round_trip_s() < 0.5
-        link.arm()
+        arm(link, emulated)
         drive(link, 0.6)
         telemetry = link.latest()
-        assert (telemetry.state, telemetry.steering_us, telemetry.throttle_us) == (State.AUTONOMOUS, 1800, 600)
+        assert (telemetry.state, telemetry.steering_us, telemetry.throttle_us) == (State.AUTONOMOUS, 1800, 232)
         assert telemetry.bad_lines == telemetry.old_commands == telemetry.out_of_range == 0
-        assert 600 in emulated.widths("throttle", time.monotonic() - 0.4)
+        assert 232 in emulated.widths("throttle", time.monotonic() - 0.4)
         # Nobody sends: it stops by itself.
         time.sleep(0.15 + SLACK_S)
         stopped = time.monotonic()
         time.sleep(0.1)
         assert emulated.widths("throttle", stopped) == {120}
         assert link.latest().why == "stopped: no valid command for 150 ms"
-        link.arm()
+        arm(link, emulated)
         drive(link, 0.2)
         left = time.monotonic()
     assert time.monotonic() - left < 0.5 + SLACK_S
@@ -418,20 +517,20 @@ def test_the_human_and_the_watchdog_are_seen_by_the_host(emulated):
     emulated.transmitter(1460, 124)
     with ServoLink(emulated.port) as link:
         until(lambda: link.latest() and link.latest().receiver_steering_us and link.latest().receiver_throttle_us)
-        link.arm()
+        arm(link, emulated)
         drive(link, 0.2)
         emulated.transmitter(1600, 124)
         drive(link, 0.2)
         assert link.latest().why == "manual: the human moved a stick"
         emulated.transmitter(1460, 124)
         time.sleep(0.1)
-        link.arm()
+        arm(link, emulated)
         drive(link, 0.2)
         emulated.hang()
         drive(link, 0.4)
         assert link.resets == 1
         assert link.hello.reset == "watchdog"
         assert link.latest().state is State.MANUAL
-        link.arm()
+        arm(link, emulated)
         drive(link, 0.2)
-        assert link.latest().throttle_us == 600
+        assert link.latest().throttle_us == 232

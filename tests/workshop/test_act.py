@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.policies.act.processor_act import make_act_pre_post_processors
-from policies import TINY, lerobot_policy, smooth_frame
+from policies import FULL, TINY, lerobot_policy, smooth_frame
 from torch.utils.flop_counter import FlopCounterMode
 
 from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise
@@ -26,9 +26,8 @@ from rover_lib.workshop.act import (
 )
 from rover_lib.workshop.checkpoint import load_checkpoint
 
-FULL = {"n_decoder_layers": 7, "chunk_size": 32}
 SHAPES = {
-    "the user's": {"cameras": {"observation.images.cam_front": (360, 640)}, **FULL},
+    "the user's": FULL,
     "tiny": TINY,
     "resnet34": {**TINY, "vision_backbone": "resnet34"},
     "dim 256, 4 heads, feed-forward 777": {**TINY, "dim_model": 256, "n_heads": 4, "dim_feedforward": 777},
@@ -49,6 +48,10 @@ SHAPES = {
 
 def saved(policy, folder, stats=None):
     policy.save_pretrained(folder)
+    return saved_processors(policy, folder, stats)
+
+
+def saved_processors(policy, folder, stats):
     inner, outer = make_act_pre_post_processors(policy.config, stats)
     inner.save_pretrained(folder)
     outer.save_pretrained(folder)
@@ -71,24 +74,24 @@ def image_stats(policy, mean=IMAGENET_MEAN, std=IMAGENET_STD):
 WHOLE_MEAN = (124 / 255, 116 / 255, 104 / 255)
 
 
-@pytest.mark.parametrize("for_int8", [False, True], ids=["float", "for_int8"])
-@pytest.mark.parametrize("name", SHAPES)
-def test_equals_lerobot(name, for_int8, tmp_path):
-    policy = lerobot_policy(**SHAPES[name])
-    mean = WHOLE_MEAN if for_int8 else IMAGENET_MEAN
-    saved(policy, tmp_path, image_stats(policy, mean))
-    checkpoint = load_checkpoint(tmp_path)
-    model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
-    assert all(isinstance(m, Columns if for_int8 else Pixels) for m in model.image_input)
-    for seed in range(2):
-        frames, state = observation(policy, seed)
-        batch = {k: torch.from_numpy(normalise(f, mean))[None] for k, f in frames.items()}
-        with torch.inference_mode():
-            expected = policy.predict_action_chunk(batch | {"observation.state": torch.from_numpy(state)[None]})
-            ours = model(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames.values()))
-        assert ours.shape == expected.shape
-        assert expected.std() > 1e-3  # a constant answer would prove nothing
-        assert (ours - expected).abs().max() < 1e-5
+@pytest.mark.parametrize("name", ["tiny", *(pytest.param(n, marks=pytest.mark.slow) for n in SHAPES if n != "tiny")])
+def test_equals_lerobot(name, request, tmp_path):
+    policy = request.getfixturevalue("full_policy") if SHAPES[name] is FULL else lerobot_policy(**SHAPES[name])
+    policy.save_pretrained(tmp_path)
+    for for_int8, mean in ((False, IMAGENET_MEAN), (True, WHOLE_MEAN)):
+        saved_processors(policy, tmp_path, image_stats(policy, mean))
+        checkpoint = load_checkpoint(tmp_path)
+        model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
+        assert all(isinstance(m, Columns if for_int8 else Pixels) for m in model.image_input)
+        for seed in range(2):
+            frames, state = observation(policy, seed)
+            batch = {k: torch.from_numpy(normalise(f, mean))[None] for k, f in frames.items()}
+            with torch.inference_mode():
+                expected = policy.predict_action_chunk(batch | {"observation.state": torch.from_numpy(state)[None]})
+                ours = model(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames.values()))
+            assert ours.shape == expected.shape
+            assert expected.std() > 1e-3  # a constant answer would prove nothing
+            assert (ours - expected).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY"])
@@ -157,19 +160,14 @@ def test_cameras_that_are_normalised_differently_keep_the_float_stem():
     assert not fits_columns(config)
 
 
-def test_counts_the_full_policys_arithmetic():
+@pytest.mark.slow
+def test_counts_the_full_policys_arithmetic(full_policy):
     """15.02 G multiply-accumulates in LeRobot's own forward, as torch counts them; ours does less, never more."""
-    policy = lerobot_policy(**SHAPES["the user's"])
-    from rover_lib.workshop.checkpoint import _config_from
-
-    weights = {k.removeprefix("model."): v for k, v in policy.state_dict().items()}
-    shape = {"cameras": ("cam_front",), "image_sizes": ((360, 640),), "chunk": 32, "dim": 512, "heads": 8}
-    shape |= {"feedforward": 3200, "encoder_layers": 4, "decoder_layers": 7, "backbone": "resnet18"}
-    config = _config_from("x", weights, **shape)
-    counts = multiply_accumulates(ACT(config, weights))
+    weights = {k.removeprefix("model."): v for k, v in full_policy.state_dict().items()}
+    counts = multiply_accumulates(ACT(ActConfig(), weights))
     batch = {"observation.images.cam_front": torch.zeros(1, 3, 360, 640), "observation.state": torch.zeros(1, 2)}
     with FlopCounterMode(display=False) as counter, torch.inference_mode():
-        policy.predict_action_chunk(batch)
+        full_policy.predict_action_chunk(batch)
     theirs = counter.get_total_flops() / 2
     assert theirs / 1e9 == pytest.approx(15.02, abs=0.15)
     assert 0.97 * theirs < sum(counts.values()) <= theirs

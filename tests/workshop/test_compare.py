@@ -24,18 +24,7 @@ LIMITS = {
     "hits_lost": 2,
     "fp32_hits": 36,
     "size_full_mb": 70,
-    "original": {
-        "latency_mean_ms": [20, 40],
-        "latency_p95_ms": [30, 50],
-        "throughput_fps": [25, 50],
-        "control_rate_hz": [22, 35],
-        "model_size_mb": 100,
-        "memory_mb": 500,
-        "cpu_pct": 80,
-        "accuracy_loss_pct": 5,
-        "temperature_c": 80,
-        "throttled": "0x0",
-    },
+    "original": {"model_size_mb": 100, "accuracy_loss_pct": 5},
 }
 
 

@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 
+import hostile
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -135,7 +136,8 @@ def test_pictures(tmp_path):
     assert np.abs(samples[0].frame_bgr().astype(int) - FRAME).max() <= 3
     picture = folder / "frames/frame_000001.jpg"
     whole = picture.read_bytes()
-    for damaged in (whole[:-30], b"", b"\xff\xd8\xff\xd9", b"\xff\xd8" + bytes(300) + b"\xff\xd9"):
+    damages = [whole[:-30], b"", b"\xff\xd8\xff\xd9", b"\xff\xd8" + bytes(300) + b"\xff\xd9"]
+    for damaged in (*damages, hostile.cut(whole), hostile.claims(whole, 16_000, 16_000)):
         picture.write_bytes(damaged)
         with pytest.raises(EpisodeError, match="frame_000001"):
             samples[0].frame_bgr()

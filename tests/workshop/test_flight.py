@@ -122,6 +122,7 @@ def rover(*args):
     return CliRunner().invoke(main, [str(a) for a in args])
 
 
+@pytest.mark.slow
 def test_the_command(path):
     fly(path)
     fly(path, seconds=1.0)

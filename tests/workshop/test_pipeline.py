@@ -29,6 +29,7 @@ def test_the_recipe_is_what_params_yml_says():
     assert Recipe.of(p, samples=7).samples == 7
 
 
+@pytest.mark.slow
 def test_one_artifact_is_the_one_of_a_run(loaded, tiny, tmp_path):
     recipe = Recipe.of(params())
     digest, warnings = make_artifact(loaded, tmp_path / "one.pt", recipe)

@@ -1,6 +1,9 @@
 """Quantization: exact where it claims to be, acting where it claims to act, loud where it cannot."""
 
+import functools
+import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +15,8 @@ from policies import TINY, lerobot_policy, memory_samples, trainer_content
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop import act, observe
 from rover_lib.workshop import quantize as q
-from rover_lib.workshop.act import ACT, inputs_of, predictions
-from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
+from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.choose import Chooser
 from rover_lib.workshop.export import export
 from rover_lib.workshop.observe import Calibration, RangeObserver, calibrate, observed_graph, qconfig_mapping
@@ -28,23 +31,29 @@ def inputs(checkpoint, count=4, seed=3):
     return [inputs_of(s, checkpoint.config) for s in memory_samples(count, *checkpoint.config.image_sizes[0], seed)]
 
 
-@pytest.mark.parametrize("for_int8", [False, True])
+@pytest.fixture(scope="module")
+def made(tiny, calibration):
+    """The tiny policy quantized by a scheme; each is made once, which takes seconds, and left as it is."""
+    return functools.cache(lambda scheme: quantize(tiny, scheme, calibration))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "variant", [{}, {"pre_norm": True, "n_encoder_layers": 2}, {"feedforward_activation": "gelu"}], ids=str
 )
-@pytest.mark.parametrize("smooth", [0.0, 0.5, 1.0])
-def test_channel_scales_are_exact_in_float(variant, smooth, for_int8, tmp_path):
+def test_channel_scales_are_exact_in_float(variant, tmp_path):
     from test_act import saved
 
     saved(lerobot_policy(**(TINY | variant)), tmp_path)
     checkpoint = load_checkpoint(tmp_path)
-    model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
     seen = inputs(checkpoint, 3)
-    before = predictions(model, seen)
-    maxima = channel_maxima(model, seen)
-    apply_channel_scales(model, maxima, smooth)
-    assert any(b is not None for n, b in model.named_buffers() if n.endswith("v_in"))
-    assert (predictions(model, seen) - before).abs().max() < 1e-5
+    for smooth, for_int8 in itertools.product((0.0, 0.5, 1.0), (False, True)):
+        model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
+        before = predictions(model, seen)
+        maxima = channel_maxima(model, seen)
+        apply_channel_scales(model, maxima, smooth)
+        assert any(b is not None for n, b in model.named_buffers() if n.endswith("v_in"))
+        assert (predictions(model, seen) - before).abs().max() < 1e-5
 
 
 def test_channel_scales_even_out_an_outlier_channel(tiny):
@@ -64,9 +73,9 @@ def test_channel_scales_even_out_an_outlier_channel(tiny):
 
 @pytest.mark.parametrize("kind", ["symmetric", "affine"])
 @pytest.mark.parametrize("mode", ["dynamic", "static", "mixed"])
-def test_acts_on_every_layer_and_stays_close(tiny, calibration, mode, kind):
-    scheme = Scheme(mode, kind, float_blocks=("backbone.stem",) if mode == "mixed" else ())
-    quantized = quantize(tiny, scheme, calibration)
+@pytest.mark.slow
+def test_acts_on_every_layer_and_stays_close(tiny, made, mode, kind):
+    quantized = made(Scheme(mode, kind, float_blocks=("backbone.stem",) if mode == "mixed" else ()))
     convs = [n for n, m in ACT(tiny.config, tiny.weights).named_modules() if isinstance(m, torch.nn.Conv2d)]
     expected_dynamic = len(projections(ACT(tiny.config, tiny.weights)))
     expected = {"dynamic": expected_dynamic, "static": expected_dynamic + len(convs)}
@@ -79,9 +88,10 @@ def test_acts_on_every_layer_and_stays_close(tiny, calibration, mode, kind):
     assert 0 < error.mean() < 0.1 * reference.std()
 
 
-def test_symmetric_means_what_the_fast_kernels_want(tiny, calibration):
+@pytest.mark.slow
+def test_symmetric_means_what_the_fast_kernels_want(made):
     """qint8 activations, weights per channel and symmetric in [-127, 127]: what dispatches to XNNPACK."""
-    module = quantize(tiny, Scheme("static"), calibration).module
+    module = made(Scheme("static")).module
     for name, m in module.named_modules():
         if isinstance(m, q.INT8_MODULES):
             w = m.weight()
@@ -90,7 +100,7 @@ def test_symmetric_means_what_the_fast_kernels_want(tiny, calibration):
             assert w.q_per_channel_scales().min() >= SMALLEST_SCALE and m.scale >= SMALLEST_SCALE, name
     dtypes = {n.args[3] for n in module.graph.nodes if n.target is torch.quantize_per_tensor}
     assert dtypes == {torch.qint8}
-    affine = quantize(tiny, Scheme("static", "affine"), calibration).module
+    affine = made(Scheme("static", "affine")).module
     assert {n.args[3] for n in affine.graph.nodes if n.target is torch.quantize_per_tensor} == {torch.quint8}
 
 
@@ -145,15 +155,15 @@ def test_the_guard_names_a_layer_that_misses_the_fast_kernels(reason, layer, x, 
         q.check_fast(Sandwich(layer, dtype, scale), (x,))
 
 
+@pytest.mark.slow
 def test_the_guard_sees_observers_of_another_type(tiny, calibration, monkeypatch):
     """A symmetric scheme whose activations came out as quint8: what a wrong qconfig would do, without a word."""
-    with monkeypatch.context() as m:
-        m.setitem(KINDS, "symmetric", KINDS["affine"])
-        with pytest.raises(QuantizeError, match=r"miss the fast kernels: backbone\.stem\.0: its input is quint8"):
-            quantize(tiny, Scheme("static"), calibration)
-    quantize(tiny, Scheme("static"), calibration)
+    monkeypatch.setitem(KINDS, "symmetric", KINDS["affine"])
+    with pytest.raises(QuantizeError, match=r"miss the fast kernels: backbone\.stem\.0: its input is quint8"):
+        quantize(tiny, Scheme("static"), calibration)
 
 
+@pytest.mark.slow
 def test_an_ignored_backend_config_is_an_error(tiny, calibration, monkeypatch):
     """With FX's default backend the mapping acts on nothing, and the policy would stay float."""
     from torch.ao.quantization.backend_config import get_native_backend_config
@@ -164,8 +174,9 @@ def test_an_ignored_backend_config_is_an_error(tiny, calibration, monkeypatch):
         quantize(tiny, Scheme("static"), calibration)
 
 
-def test_the_backbone_alone_gives_the_policys_tokens(tiny, calibration):
-    quantized = quantize(tiny, Scheme("static"), calibration)
+@pytest.mark.slow
+def test_the_backbone_alone_gives_the_policys_tokens(tiny, made):
+    quantized = made(Scheme("static"))
     backbone = q.backbone_of(quantized)
     seen = []
     project = quantized.module.get_submodule("image_project")
@@ -178,12 +189,13 @@ def test_the_backbone_alone_gives_the_policys_tokens(tiny, calibration):
     assert not any(n.startswith("encoder") for n, _ in backbone.named_modules())
     for mode in ({"mode": "dynamic"}, {"mode": "mixed", "float_blocks": ("image_project",)}):
         with pytest.raises(QuantizeError, match="no INT8 backbone"):
-            q.backbone_of(quantize(tiny, Scheme(**mode), calibration))
+            q.backbone_of(made(Scheme(**mode)))
 
 
-def test_pixels_enter_the_first_convolution_as_they_are(tiny, calibration):
+@pytest.mark.slow
+def test_pixels_enter_the_first_convolution_as_they_are(tiny, made):
     for kind, dtype in (("symmetric", torch.qint8), ("affine", torch.quint8)):
-        module = quantize(tiny, Scheme("static", kind), calibration).module
+        module = made(Scheme("static", kind)).module
         seen = []
         conv = module.get_submodule("backbone.stem.0")
         hook = conv.register_forward_pre_hook(lambda m, args, seen=seen: seen.append(args[0]))
@@ -194,7 +206,7 @@ def test_pixels_enter_the_first_convolution_as_they_are(tiny, calibration):
         assert x.dtype == dtype
         pixels = x.int_repr().int() + (128 if dtype == torch.qint8 else 0)
         assert torch.equal(pixels[0, :, 3:75, 1].reshape(8, 3, 72)[1:7].permute(2, 0, 1), frame[:, :6].int())
-    mixed = quantize(tiny, Scheme("mixed", float_blocks=("backbone.stem",)), calibration).module
+    mixed = made(Scheme("mixed", float_blocks=("backbone.stem",))).module
     assert mixed(*inputs(tiny, 1)[0]).isfinite().all()
 
 
@@ -204,14 +216,16 @@ def test_a_calibration_serves_one_image_size(tiny, calibration):
         quantize(other, Scheme("static"), calibration)
 
 
-def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration):
+@pytest.mark.slow
+def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration, made):
     """The first layer's INT8 output against quantize -> float convolution -> quantize, to one step."""
-    quantized = quantize(tiny, Scheme("static"), calibration)
+    quantized = made(Scheme("static"))
     prepared = observed_graph(tiny, Scheme("static"), calibration)
     seen = {}
     conv = quantized.module.get_submodule("backbone.stem.0")
-    conv.register_forward_hook(lambda m, args, out: seen.update(x=args[0], y=out))
+    hook = conv.register_forward_hook(lambda m, args, out: seen.update(x=args[0], y=out))
     quantized.module(*inputs(tiny, 1)[0])
+    hook.remove()
     x, y = seen["x"], seen["y"]
     plain = prepared.get_submodule("backbone.stem.0")
     float_conv = plain[0] if isinstance(plain, torch.nn.Sequential) else plain
@@ -281,14 +295,15 @@ def test_non_finite_activations_are_an_error(tiny):
         calibrate(replace(tiny, weights=weights), memory_samples(1))
 
 
-def test_a_calibration_survives_its_file(tiny, calibration, tmp_path):
+@pytest.mark.slow
+def test_a_calibration_survives_its_file(tiny, calibration, made, tmp_path):
     calibration.save(tmp_path / "c.pt")
-    again = Calibration.load(tmp_path / "c.pt")
+    again = quantize(tiny, Scheme(), Calibration.load(tmp_path / "c.pt"))
     x = inputs(tiny)
-    a, b = (predictions(quantize(tiny, Scheme(), c).module, x) for c in (calibration, again))
-    assert torch.equal(a, b)
+    assert torch.equal(predictions(again.module, x), predictions(made(Scheme("static")).module, x))
 
 
+@pytest.mark.slow
 def test_inspect_layers_sees_clipping(tiny, calibration):
     quantized = quantize(tiny, Scheme(observer="minmax"), calibration)
     rows = {r["name"]: r for r in q.inspect_layers(quantized, tiny, calibration, memory_samples(12))}
@@ -305,6 +320,7 @@ def test_inspect_layers_sees_clipping(tiny, calibration):
     assert any("layer1.0.body.0" in w for w in q.clipped_warnings(rows, 1.0))
 
 
+@pytest.mark.slow
 def test_chooses_by_error(tiny, calibration):
     chooser = Chooser(tiny, calibration, memory_samples(3, seed=8), RANGE)
     scheme, table = chooser.observer(Scheme())
@@ -321,6 +337,7 @@ def test_chooses_by_error(tiny, calibration):
     assert plain.float_blocks == () and len(steps) == 1
 
 
+@pytest.mark.slow
 def test_an_action_that_never_changes_takes_no_part_in_choosing(tiny, calibration):
     chooser = Chooser(tiny, calibration, memory_samples(2, seed=8), {"steering": (-0.5, 0.5), "throttle": (0.06, 0.06)})
     assert chooser.warnings == ["throttle never changes in these recordings: not judged"]
@@ -387,27 +404,15 @@ def test_an_observer_that_saw_nothing_says_so():
         observer().calculate_qparams()
 
 
-def test_same_inputs_same_content(tiny, calibration, tmp_path):
+@pytest.mark.slow
+def test_same_inputs_same_content(tiny, calibration, made, tmp_path):
     from rover_lib.onboard.artifact import content_hash
 
-    hashes = {
-        export(
-            quantize(tiny, Scheme(), calibration),
-            tiny,
-            tmp_path / n,
-            samples=memory_samples(2),
-            calibration=calibration,
-        )
-        for n in ("a.pt", "b.pt")
-    }
+    twice = {"a.pt": made(Scheme("static")), "b.pt": quantize(tiny, Scheme(), calibration)}
+    hashes = {export(p, tiny, tmp_path / n, memory_samples(2), calibration) for n, p in twice.items()}
     assert hashes == {content_hash(tmp_path / "a.pt")}
     other = export(ACT(tiny.config, tiny.weights), tiny, tmp_path / "c.pt", samples=memory_samples(2))
     assert other not in hashes
-
-
-def test_calibration_is_weights_only(calibration, tmp_path):
-    calibration.save(tmp_path / "c.pt")
-    torch.load(tmp_path / "c.pt", weights_only=True)  # no pickled objects
 
 
 def test_the_optimizer_is_not_in_the_artifact(tiny_policy, artifacts):
@@ -417,21 +422,16 @@ def test_the_optimizer_is_not_in_the_artifact(tiny_policy, artifacts):
     assert artifacts["static"].stat().st_size < 0.3 * artifacts["fp32"].stat().st_size
 
 
-def test_the_users_full_size_static_artifact_is_at_most_70_mb(tmp_path):
-    """The floor is 66.4 MB, a byte per weight that acts; the optimizer and the VAE encoder are not in it."""
-    from rover_lib.onboard import load_policy
+@pytest.mark.slow
+def test_the_users_full_size_static_artifact_is_at_most_70_mb(full_policy, tmp_path):
+    """The floor is 66.4 MB, a byte per weight that acts; the optimizer and the VAE encoder are not in it.
 
-    policy = lerobot_policy(
-        {"observation.images.cam_front": (360, 640)}, chunk_size=32, n_decoder_layers=7, n_vae_encoder_layers=4
-    )
-    torch.save(trainer_content(policy), tmp_path / "best_model.pth")
-    checkpoint = load_checkpoint(tmp_path / "best_model.pth")
-    samples = [
-        replace(s, picture=np.random.default_rng(i).integers(0, 256, (360, 640, 3), dtype=np.uint8))  # incompressible
-        for i, s in enumerate(memory_samples(3, 360, 640))
-    ]
+    Calibrated on small frames: their size adds 0.5 MB of positions at 640x360, and no weight.
+    """
+    weights = {k.removeprefix("model."): v for k, v in full_policy.state_dict().items()}
+    checkpoint = Checkpoint(Path("full"), "trainer", ActConfig(), weights, "full", {}).at_size(72, 128)
+    samples = memory_samples(2)
     calibration = calibrate(checkpoint, samples)
     quantized = quantize(checkpoint, Scheme("static"), calibration)
     export(quantized, checkpoint, tmp_path / "static.pt", samples=samples, calibration=calibration)
-    assert 60 < (tmp_path / "static.pt").stat().st_size / 1e6 <= 70
-    assert load_policy(tmp_path / "static.pt").manifest["gmac"] == pytest.approx(15.0, abs=0.1)
+    assert 66 < (tmp_path / "static.pt").stat().st_size / 1e6 <= 69

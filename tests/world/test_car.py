@@ -31,7 +31,7 @@ BOARDS = [
     pytest.param(BOARD, marks=[pytest.mark.emulated, needs.simavr], id="firmware"),
 ]
 AHEAD = 21783  # a world with its balloon 1.83 m straight ahead
-THROTTLE = 0.3
+THROTTLE = 0.2
 
 
 class Eye:
@@ -68,7 +68,7 @@ class Eye:
 
 
 def arm(link):
-    until(lambda: link.latest() and link.latest().receiver_steering_us and link.latest().receiver_throttle_us)
+    until(lambda: link.latest().missing == "-")
     link.arm()
 
 

@@ -208,8 +208,10 @@ def test_plans_from_above_lead_where_the_car_went():
 
 def write_policy(folder, acts, serial="1"):
     with zipfile.ZipFile(folder / "policy_static.pt", "w") as z:
-        z.writestr("archive/code/policy.py", acts)
+        z.writestr("archive/code/__torch__/policy.py", acts)
         z.writestr("archive/.data/serialization_id", serial)
+        for name in ("version", "data.pkl", "constants.pkl", "extra/manifest.json", "extra/parity.npz"):
+            z.writestr(f"archive/{name}", "not read here")
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ class Raw:
         self.port = serial.Serial(board.port, timeout=1)
         hello = next(body for body in iter(self.read, None) if body.startswith("<H"))
         self.boot, self.sequence = int(hello.split()[3]), int(hello.split()[4])
+        self.send(b"")
 
     def read(self):
         while True:
@@ -31,11 +32,14 @@ class Raw:
         time.sleep(0.03)
         self.port.reset_input_buffer()
         self.port.readline()
-        return status_of(next(body for body in iter(self.read, None) if body.startswith("<S")))
+        status = status_of(next(body for body in iter(self.read, None) if body.startswith("<S")))
+        self.heard_ms = status.uptime_ms
+        return status
 
     def command(self, kind, *values):
         self.sequence += 1
-        return line(f">{kind} {' '.join(map(str, (self.boot, self.sequence, *values)))}")
+        dated = (self.heard_ms,) if kind in "AD" else ()
+        return line(f">{kind} {' '.join(map(str, (self.boot, self.sequence, *dated, *values)))}")
 
 
 @contextlib.contextmanager

@@ -5,10 +5,11 @@ import pytest
 import torch
 
 from rover_lib.onboard.errors import RoverError, WorldError
+from rover_lib.workshop.act import lerobot_act
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.compare import LerobotEager
 from rover_lib.world import train as train_module
-from rover_lib.world.train import RECIPES, SIZES, build_policy, make_checkpoint, train
+from rover_lib.world.train import RECIPES, SIZES, make_checkpoint, train
 from rover_lib.world.trial import run_trials
 from rover_lib.world.world import World
 
@@ -100,7 +101,7 @@ def test_plain_weights_only_refuses_it_as_it_does_the_users(trained):
 
 
 def test_lerobots_policy_takes_the_weights(checkpoint):
-    policy = build_policy(SIZES["small"])
+    policy = lerobot_act(SIZES["small"])
     assert not policy.load_state_dict(checkpoint["model_state_dict"], strict=True)[0]
     assert all(name.startswith("model.") for name in checkpoint["model_state_dict"])
     assert all(torch.isfinite(v).all() for v in checkpoint["model_state_dict"].values())
@@ -108,7 +109,7 @@ def test_lerobots_policy_takes_the_weights(checkpoint):
 
 def test_the_optimizers_state_covers_all_parameters(checkpoint):
     state = checkpoint["optimizer_state_dict"]["state"]
-    trainable = [p for p in build_policy(SIZES["small"]).parameters() if p.requires_grad]
+    trainable = [p for p in lerobot_act(SIZES["small"]).parameters() if p.requires_grad]
     assert sum(s["exp_avg"].numel() for s in state.values()) == sum(p.numel() for p in trainable)
     optimizer = torch.optim.AdamW(trainable)
     optimizer.load_state_dict(checkpoint["optimizer_state_dict"])
@@ -120,7 +121,7 @@ def test_frozen_statistics_are_of_data(checkpoint):
     variances = [v for k, v in weights.items() if k.endswith("running_var")]
     assert len(variances) == 20
     assert not any(torch.all(v == 1) for v in variances)
-    policy = build_policy(SIZES["small"])
+    policy = lerobot_act(SIZES["small"])
     policy.load_state_dict(weights)
     with torch.no_grad():
         features = policy.model.backbone(torch.randn(2, 3, 72, 128))["feature_map"]
@@ -173,7 +174,7 @@ def test_the_policy_can_be_driven(trained):
 
 def test_the_full_size_is_the_users():
     size = SIZES["full"]
-    assert (size.image_height, size.image_width, size.dim, size.heads) == (360, 640, 512, 8)
+    assert (size.image_sizes, size.dim, size.heads) == (((360, 640),), 512, 8)
     assert (size.encoder_layers, size.decoder_layers, size.feedforward) == (4, 7, 3200)
 
 

@@ -4,6 +4,7 @@ import errno
 import os
 import pty
 import random
+import re
 import select
 import statistics
 import time
@@ -18,16 +19,20 @@ import serial
 from click.testing import CliRunner
 
 from lab.__main__ import main
+from lab.arduino.emulator import REPOSITORY
 from lab.driving import faults, policy
 from lab.driving.bench import FaultError
 from lab.driving.cable import Cable, dropping, flipping
-from lab.driving.pins import CONTINUES, HUMAN, PERIOD_US, STOPPED, Command, Gates, Observation, judge
+from lab.driving.pins import CONTINUES, HUMAN, PERIOD_US, REFUSED, STOPPED, Command, Gates, Observation, judge
+from lab.driving.row import FaultRow
+from lab.driving.rows import FAULTS, KINDS
+from lab.driving.stories import KEPT
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.servo_link import frame
 from rover_lib.world.standin import PinEvent
 
-GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50, rows=25, stopped_rows=18, bytes_us=4)
+GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50, rows=60, stopped_rows=30, bytes_us=4)
 AT, START, END = 100.0, 99.5, 102.0
 DRIVEN = (1567, 209)
 
@@ -105,6 +110,16 @@ def test_a_pulse_that_a_reset_cut_is_a_pulse():
     judged = judge(STOPPED, Observation(events, [], AT, END), GATES)
     assert judged.figures["max_throttle_us_after"] == 300
     assert judged.wrong
+
+
+# ---- refused
+
+
+def test_refused():
+    assert verdict(REFUSED, lambda t: (1456, 120), commands=[]).wrong == []
+    assert any("not to be armed" in w for w in verdict(REFUSED, then(), commands=[]).wrong)
+    floating = verdict(REFUSED, lambda t: (1456, 120) if t < 1 else (None, None), commands=[])
+    assert any("0 throttle pulses" in w for w in floating.wrong)
 
 
 # ---- human
@@ -204,7 +219,7 @@ def test_a_machine_that_stalled_is_known():
 
 
 def test_a_row_that_this_machine_spoilt_is_known():
-    fault = faults.FaultRow("a fault", CONTINUES, lambda bench: None, "", "", None)
+    fault = FaultRow("link", "a fault", CONTINUES, lambda bench: None, "", "", None)
     steady = Observation(pulses(then()), commanded(then()), AT, END)
     assert not faults._spoilt(fault, steady, GATES)
     commands = [c for c in steady.commands if not 0.5 < c.at_s - AT < 0.65]
@@ -221,11 +236,12 @@ def test_the_gates_are_those_of_params():
 
 
 def test_every_row_is_one_of_a_kind_and_there_are_enough():
-    names = [f.name for f in faults.FAULTS]
+    names = [f.name for f in FAULTS]
     assert len(set(names)) == len(names) >= GATES.rows
-    assert sum(f.expected == STOPPED for f in faults.FAULTS) >= GATES.stopped_rows
-    assert all(f.message and (f.method or f.start == "disk") for f in faults.FAULTS)
-    assert all(f.limits or f.until_limit for f in faults.FAULTS if f.expected == CONTINUES)
+    assert sum(f.expected == STOPPED for f in FAULTS) >= GATES.stopped_rows
+    assert all(kind.rows and {f.kind for f in kind.rows} == {name} for name, kind in KINDS.items())
+    assert all(f.message and (f.method or f.start == "disk") for f in FAULTS)
+    assert all(f.limits or f.until_limit for f in FAULTS if f.expected == CONTINUES)
 
 
 # ---- bytes
@@ -256,7 +272,9 @@ def test_steps_that_come_out_as_they_went_in():
 def obedient(tmp_path_factory):
     path = tmp_path_factory.mktemp("faults") / "policy.pt"
     policy.make_artifact(path)
-    return load_policy(path)
+    loaded = load_policy(path)
+    policy.obey(loaded)
+    return loaded
 
 
 def planned(obedient, instruction):
@@ -323,7 +341,7 @@ def ends():
 def test_a_cable_carries_both_ways(ends):
     board, cable, host = ends
     for i in range(200):
-        line = frame(f">D 1 {i} 1500 200")
+        line = frame(f">D 1 {i} 0 1500 200")
         host.write(line)
         assert board.read(len(line)) == line
         os.write(board.master, line)
@@ -347,7 +365,7 @@ def test_a_cable_has_no_delay(ends):
 
 def test_only_the_drives_own_whole_lines_are_commands(ends):
     board, cable, host = ends
-    good, other = frame(">D 1 7 1500 200"), frame(">D 1 8 1600 300")
+    good, other = frame(">D 1 7 0 1500 200"), frame(">D 1 8 0 1600 300")
     cable.not_ours.add(other[:-1])
     cable.to_arduino = lambda data: b""
     host.write(b">D 1 6 15" + good + other + good.replace(b"1500", b"1501") + b"AT\r\n")
@@ -391,6 +409,8 @@ def test_a_fault_that_is_none():
     assert "no fault ['camera melted']" in done.output
     with pytest.raises(FaultError):
         faults.run_faults(["camera melted"])
+    with pytest.raises(FaultError, match="kind"):
+        faults.run_faults(kinds=["weather"])
 
 
 @pytest.mark.emulated
@@ -409,5 +429,24 @@ def test_some_faults_on_the_pins(tmp_path):
     rows = {row["fault"]: row for row in content["metrics"]["faults"]}
     assert set(rows) == set(names)
     assert all(row["recovered"] and row["log_line"] for row in rows.values())
+    assert rows["SIGKILL"]["kind"] == "operator"
     assert rows["SIGKILL"]["stopped_after_ms"] > 50  # it is the Arduino that stops
     assert 0 < content["metrics"]["summary"]["takeover_ms"] <= 50
+
+
+# ---- what docs/safety.md names
+
+
+def test_what_proves_safety_exists():
+    """Each name in the last column of the page's table is a row of the bench, a kept story, or a test."""
+    text = (REPOSITORY / "docs" / "safety.md").read_text()
+    cells = [line.split("|")[-2] for line in text.splitlines() if line.startswith("| ")][1:]
+    tests = {
+        name
+        for path in (REPOSITORY / "tests").rglob("test_*.py")
+        for name in re.findall(r"def (test_\w+)", path.read_text())
+    }
+    for cell in cells:
+        names = re.findall(r"`([^`]+)`", cell)
+        assert names, f"a hazard that nothing proves: {cell}"
+        assert set(names) <= {f.name for f in FAULTS} | KEPT.keys() | tests

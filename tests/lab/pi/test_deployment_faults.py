@@ -47,6 +47,8 @@ def test_how_far_a_deployment_has_come_is_on_the_disk(tmp_path):
     seen = Disk.seen(tmp_path, ABOUT)
     assert seen.arrived == ("part-0000", "part-0001") and not seen.complete
     (incoming / "release.json").touch()
+    assert not Disk.seen(tmp_path, ABOUT).complete
+    (incoming / "policy.pt.sig").touch()
     assert Disk.seen(tmp_path, ABOUT).complete
     (releases / ".new").mkdir(parents=True)
     (releases / ".new" / "policy.pt").write_bytes(b"12345")

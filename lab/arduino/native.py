@@ -1,0 +1,218 @@
+"""The firmware's parser and state machine as a library for this machine, and a board of them in virtual time.
+
+It is firmware/rover/protocol.c and vehicle.c as they are flashed. What they have around them on the chip (timers,
+captures, the serial line) is a few lines here: judge that by the emulator. A second of it takes some 10 ms.
+"""
+
+import ctypes
+import functools
+from collections.abc import Callable
+from pathlib import Path
+
+from lab.arduino.emulator import CC, FIRMWARE, compile_c
+from rover_lib.onboard.servo_link import Hello, Telemetry, frame, parse
+from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.world.standin import REST_US
+
+SOURCES = (FIRMWARE / "rover" / "protocol.c", FIRMWARE / "rover" / "vehicle.c")
+STEERING, THROTTLE = range(2)
+PERIOD_US = (21316, 1016)
+READ_COMMAND, READ_BAD = 1, 2
+WIGGLE_US = (1750, 1750, 1750, 1150, 1150, 1150)  # the stick's pulses, 21 ms apart
+LET_GO_MS = 300  # a little more than the firmware's
+
+
+class Command(ctypes.Structure):
+    """As in protocol.h."""
+
+    _fields_ = (
+        ("kind", ctypes.c_char),
+        *((name, ctypes.c_uint32) for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us")),
+    )
+
+
+class Reader(ctypes.Structure):
+    """As in protocol.h."""
+
+    _fields_ = (
+        ("line", ctypes.c_char * 66),
+        ("length", ctypes.c_uint8),
+        ("noise", ctypes.c_bool),
+        ("started_ms", ctypes.c_uint32),
+    )
+
+
+class Line(ctypes.Structure):
+    """As in protocol.h."""
+
+    _fields_ = (("text", ctypes.c_char * 128), ("length", ctypes.c_uint8))
+
+
+class Received(ctypes.Structure):
+    """As in vehicle.h."""
+
+    _fields_ = (
+        ("pulse_us", ctypes.c_uint16),
+        ("period_us", ctypes.c_uint16),
+        ("at_ms", ctypes.c_uint32 * 8),
+        ("oldest", ctypes.c_uint8),
+        ("seen", ctypes.c_uint8),
+        ("present", ctypes.c_bool),
+    )
+
+
+class Side(ctypes.Structure):
+    """As in vehicle.h."""
+
+    _fields_ = (("seen", ctypes.c_bool), ("at_ms", ctypes.c_uint32))
+
+
+class Vehicle(ctypes.Structure):
+    """As in vehicle.h."""
+
+    _fields_ = (
+        *((name, ctypes.c_char) for name in ("state", "reason", "result")),
+        ("boot", ctypes.c_uint16),
+        ("sequence", ctypes.c_uint32),
+        ("steering_us", ctypes.c_uint16),
+        ("throttle_us", ctypes.c_uint16),
+        ("received", Received * 2),
+        ("sides", Side * 2),
+        ("still_us", ctypes.c_uint16),
+        ("still_ms", ctypes.c_uint32),
+        ("throttle_off_rest", ctypes.c_uint8),
+        ("throttle_free", ctypes.c_bool),
+        ("rest_us", ctypes.c_uint16 * 2),
+        ("throttle_moved", ctypes.c_uint8),
+        ("cap_us", ctypes.c_uint16),
+        ("wanted_us", ctypes.c_uint16 * 2),
+        ("commanded_ms", ctypes.c_uint32),
+        ("slewed_ms", ctypes.c_uint32),
+        *((name, ctypes.c_uint16) for name in ("bad_lines", "old_commands", "out_of_range", "lost_bytes")),
+    )
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """The firmware's C for this machine, from the cache or compiled now. Raises ArduinoError without gcc."""
+    headers = sorted((FIRMWARE / "rover").glob("*.h"))
+
+    def make(folder: Path) -> None:
+        compile_c(*CC, "-shared", "-fPIC", "-o", folder / "native.so", *SOURCES)
+
+    folder = cached_folder("native-firmware", key_of({"command": CC}, *SOURCES, *headers), make)
+    native = ctypes.CDLL(str(folder / "native.so"))
+    vehicle, u32 = ctypes.POINTER(Vehicle), ctypes.c_uint32
+    native.crc32.restype = u32
+    native.crc32.argtypes = [ctypes.c_char_p, ctypes.c_size_t]
+    native.reader_take.argtypes = [ctypes.POINTER(Reader), ctypes.c_uint8, u32, ctypes.POINTER(Command)]
+    native.vehicle_start.argtypes = [vehicle, ctypes.c_uint16]
+    native.vehicle_received.argtypes = [vehicle, ctypes.c_int, ctypes.c_uint16, ctypes.c_uint16, u32]
+    native.vehicle_command.argtypes = [vehicle, ctypes.POINTER(Command), u32]
+    native.vehicle_tick.argtypes = [vehicle, u32]
+    native.vehicle_status.restype = native.vehicle_hello.restype = ctypes.c_uint8
+    native.vehicle_status.argtypes = [vehicle, u32, ctypes.POINTER(Line)]
+    native.vehicle_hello.argtypes = [vehicle, ctypes.c_char, ctypes.POINTER(Line)]
+    return native
+
+
+def said(speak: Callable[..., int], *arguments: object) -> bytes:
+    """The line that vehicle_status or vehicle_hello makes of its arguments, with its end."""
+    line = Line()
+    length = speak(*arguments, ctypes.byref(line))
+    return ctypes.string_at(ctypes.addressof(line), length)
+
+
+class NativeArduino:
+    """A board in virtual time: a transmitter's pulses in, the host's lines in, pulses out, a millisecond at a time.
+
+    sticks: the transmitter's pulses (us), may be set; 0 is no signal. misread: may be set; what the receiver makes of
+    a throttle pulse, by its number (None: no pulse). now_ms: its clock, which wraps at 32 bits. sequence: of the last
+    command.
+    """
+
+    def __init__(self, now_ms: int = 0, sequence: int = 0):
+        self.sticks: list[float] = list(REST_US)
+        self.misread: Callable[[int, float], float | None] = lambda number, pulse_us: pulse_us
+        self.now_ms = now_ms
+        self.sequence = sequence
+        self.heard_ms: int | None = None  # what the host says that it heard; None: the newest
+        self._vehicle, self._reader = Vehicle(), Reader()
+        self._native = library()
+        self._due_us = [0.0, 0.0]
+        self._us = 0.0  # since the start
+        self._pulses = 0
+        self._native.vehicle_start(self._vehicle, 7)
+        self._vehicle.sequence = sequence
+
+    @property
+    def status(self) -> Telemetry:
+        """What it says of itself, as the host reads it."""
+        text = said(self._native.vehicle_status, self._vehicle, self.now_ms)
+        telemetry = parse(text[:-1], 0.0)
+        assert isinstance(telemetry, Telemetry), text
+        return telemetry
+
+    @property
+    def hello(self) -> Hello:
+        """As after a power-on."""
+        hello = parse(said(self._native.vehicle_hello, self._vehicle, b"p")[:-1], 0.0)
+        assert isinstance(hello, Hello)
+        return hello
+
+    def run(self, ms: int) -> list[tuple[int, int]]:
+        """Lets time pass; the pulses (steering, throttle; us) for the pins after each millisecond."""
+        pins = []
+        for _ in range(ms):
+            self.now_ms = (self.now_ms + 1) % (1 << 32)
+            self._us += 1000
+            self._receive()
+            self._native.vehicle_tick(self._vehicle, self.now_ms)
+            pins.append((self._vehicle.steering_us, self._vehicle.throttle_us))
+        return pins
+
+    def _receive(self) -> None:
+        for channel, period_us in enumerate(PERIOD_US):
+            while self._due_us[channel] <= self._us:
+                self._due_us[channel] += period_us
+                pulse_us: float | None = self.sticks[channel]
+                if channel == THROTTLE and pulse_us:
+                    self._pulses += 1
+                    pulse_us = self.misread(self._pulses, pulse_us)
+                if pulse_us:
+                    self._native.vehicle_received(self._vehicle, channel, round(pulse_us), period_us, self.now_ms)
+
+    def wiggle(self) -> None:
+        """The human moves the steering stick both ways, lets go and waits for what that takes."""
+        rest_us = self.sticks[STEERING]
+        for pulse_us in WIGGLE_US:
+            self.sticks[STEERING] = pulse_us
+            self.run(PERIOD_US[STEERING] // 1000)
+        self.sticks[STEERING] = rest_us
+        self.run(LET_GO_MS)
+
+    def send(self, data: bytes) -> str:
+        """Bytes of the host; the result of the last command, a key of servo_link.RESULTS."""
+        command = Command()
+        for byte in data:
+            reading = self._native.reader_take(self._reader, byte, self.now_ms, command)
+            if reading == READ_COMMAND and command.kind != b"Q":
+                self._native.vehicle_command(self._vehicle, command, self.now_ms)
+                self._native.vehicle_tick(self._vehicle, self.now_ms)
+        return self._vehicle.result.decode()
+
+    def command(self, kind: str, *pulses_us: int, sequence: int | None = None) -> str:
+        """The host's next command: "A", "N", "L" with a throttle, "D" with both pulses. Its result."""
+        if sequence is None:
+            self.sequence = sequence = (self.sequence + 1) % (1 << 32)
+        heard_ms = self.now_ms if self.heard_ms is None else self.heard_ms
+        dated = (heard_ms % (1 << 32),) if kind in "AD" else ()
+        return self.send(frame(" ".join(map(str, (f">{kind}", self._vehicle.boot, sequence, *dated, *pulses_us)))))
+
+    def drive(self, steering_us: int, throttle_us: int, ms: int, every_ms: int = 33) -> list[tuple[int, int]]:
+        """Commands at a rate, for a time; the pins as from run()."""
+        pins = []
+        for start in range(0, ms, every_ms):
+            self.command("D", steering_us, throttle_us)
+            pins += self.run(min(every_ms, ms - start))
+        return pins

@@ -1,0 +1,149 @@
+/* The rover's sketch for this machine: firmware/rover/rover.ino itself, with a board of virtual time around it.
+ *
+ * A start of the board is this library loaded anew, so that every variable is as after power-on. A millisecond is one
+ * turn of the sketch's loop. What is not here is the chip: judge that by simavr. */
+#include <string.h>
+
+#include "rover.ino"
+
+struct event {
+    uint32_t at_ms;
+    uint16_t steering_us, throttle_us; /* of the pins */
+    char state, reason, result, missing;
+    bool signals[2];
+};
+
+struct transmitted {
+    uint16_t pulse_us;   /* 0: none */
+    uint16_t one_in;     /* only one pulse in so many comes */
+    uint16_t misread_in; /* one pulse in so many is read as one at rest; 0: none */
+};
+
+static const uint32_t PERIOD_US[2] = {RECEIVER_STEERING_PERIOD_US, RECEIVER_THROTTLE_PERIOD_US};
+static const uint16_t REST_US[2] = {STEERING_NEUTRAL_US, THROTTLE_NEUTRAL_US};
+static const double BYTES_PER_MS = 11.7647; /* 117647 baud */
+
+static uint32_t now;
+static uint16_t boot;
+static char cause;
+static struct transmitted sent[2];
+static uint32_t due_us[2], number[2], since_us;
+static uint16_t measured_us[2];
+static bool fresh[2];
+static char in[128], out[1024];
+static uint16_t in_length, out_length;
+static double waiting; /* bytes that the chip has not sent yet */
+static uint8_t lost;
+static uint16_t pins[2];
+static struct event events[4096];
+static uint16_t event_count;
+
+void pulses_begin() { pulses_set(STEERING_NEUTRAL_US, THROTTLE_NEUTRAL_US); }
+void pulses_set(uint16_t steering_us, uint16_t throttle_us) {
+    pins[STEERING] = steering_us;
+    pins[THROTTLE] = throttle_us;
+}
+
+void receiver_begin() {}
+uint32_t clock_ms() { return now; }
+bool receiver_take(enum channel channel, uint16_t *pulse_us, uint16_t *period_us) {
+    bool came = fresh[channel];
+    fresh[channel] = false;
+    *pulse_us = measured_us[channel];
+    *period_us = (uint16_t)PERIOD_US[channel];
+    return came;
+}
+
+void serial_begin() {}
+int serial_take() {
+    if (!in_length) return -1;
+    char byte = in[0];
+    memmove(in, in + 1, --in_length);
+    return (uint8_t)byte;
+}
+bool serial_put(const char *text, uint8_t length) {
+    if (waiting + length > 255) return false;
+    memcpy(out + out_length, text, length);
+    out_length = (uint16_t)(out_length + length);
+    waiting += length;
+    return true;
+}
+uint8_t serial_lost() {
+    uint8_t n = lost;
+    lost = 0;
+    return n;
+}
+
+uint16_t boot_number() { return boot; }
+char reset_cause() { return cause; }
+void watchdog_begin() {}
+void watchdog_feed() {}
+void rest() {}
+
+static void note(void) {
+    struct event event = {now, pins[0], pins[1], vehicle.state, vehicle.reason, vehicle.result,
+                          (char)vehicle_missing(&vehicle, now),
+                          {vehicle.received[0].present, vehicle.received[1].present}};
+    struct event *last = events + event_count - 1;
+    event.at_ms = last->at_ms;
+    if (event_count && !memcmp(last, &event, sizeof event)) return;
+    event.at_ms = now;
+    if (event_count < sizeof events / sizeof *events) events[event_count++] = event;
+}
+
+void board_start(uint32_t clock, uint16_t boot_now, char cause_now) {
+    now = clock;
+    boot = boot_now;
+    cause = cause_now;
+    setup();
+    note();
+}
+
+void board_transmit(int channel, uint16_t pulse_us, uint16_t one_in, uint16_t misread_in) {
+    sent[channel] = (struct transmitted){pulse_us, one_in, misread_in};
+}
+
+void board_give(const char *bytes, int length) {
+    for (; length--; bytes++) {
+        if (in_length < sizeof in)
+            in[in_length++] = *bytes;
+        else if (lost < UINT8_MAX)
+            lost++;
+    }
+}
+
+/* Lets up to so many milliseconds pass, and stops after one in which the sketch has said something. How many passed. */
+int board_run(int ms) {
+    for (int n = 1; n <= ms; n++) {
+        now++;
+        since_us += 1000;
+        waiting = waiting > BYTES_PER_MS ? waiting - BYTES_PER_MS : 0;
+        for (int channel = STEERING; channel <= THROTTLE; channel++) {
+            struct transmitted *from = sent + channel;
+            if (since_us < due_us[channel]) continue;
+            due_us[channel] += PERIOD_US[channel];
+            if (!from->pulse_us || ++number[channel] % from->one_in) continue;
+            bool misread = from->misread_in && number[channel] / from->one_in % from->misread_in == 0;
+            measured_us[channel] = misread ? REST_US[channel] : from->pulse_us;
+            fresh[channel] = true;
+        }
+        loop();
+        note();
+        if (out_length) return n;
+    }
+    return ms;
+}
+
+int board_said(char *text) {
+    int length = out_length;
+    memcpy(text, out, out_length);
+    out_length = 0;
+    return length;
+}
+
+int board_events(struct event *to) {
+    int count = event_count;
+    memcpy(to, events, sizeof *events * event_count);
+    event_count = 0;
+    return count;
+}

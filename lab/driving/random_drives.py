@@ -1,0 +1,132 @@
+"""Random drives in virtual time, held against the invariants: `python -m lab random OUTPUT`.
+
+Stories are of a seed each, by a plain generator: hypothesis varies a few of its own (49 of the firmware's states in 300
+of ours, 34 in 150 of its), and a seed is a name.
+"""
+
+import logging
+import re
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field, fields
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from lab.driving.invariants import RESTING_US, Run, broken
+from lab.driving.stories import Story, drive_story, random_story, shortest
+from lab.driving.virtual import Event, Seen, library
+from rover_lib.onboard import servo_link
+from rover_lib.onboard.stage import write_stage
+
+
+@dataclass
+class Tally:
+    """What drives visited. driven: of them, those in which the host moved the car.
+
+    firmware: its states, each with the result of the last command, what is missing and which signals are there. loop:
+    what the loop is at, with the firmware's state and the reason for it. ends: last words, without their numbers.
+    """
+
+    drives: int = 0
+    driven: int = 0
+    firmware: set[tuple] = field(default_factory=set)
+    firmware_transitions: set[tuple] = field(default_factory=set)
+    loop: set[tuple] = field(default_factory=set)
+    loop_transitions: set[tuple] = field(default_factory=set)
+    ends: set[str] = field(default_factory=set)
+
+    def add(self, seen: Seen) -> None:
+        self.drives += 1
+        run = Run(seen)
+        self.driven += bool((run.autonomous & (run.throttle > RESTING_US)).any())
+        states = [_firmware_state(e) for _, e in seen.pins]
+        changes = [(ms, 0, name) for ms, name in seen.phases]
+        changes += [(ms, 1, "".join(map(str, _firmware_state(e)[:2]))) for ms, e in seen.pins]
+        now, both = ["off", ""], []
+        for _, which, value in sorted(changes, key=lambda change: change[:2]):
+            now[which] = value
+            both.append(tuple(now))
+        for path, visited, transitions in (
+            (states, self.firmware, self.firmware_transitions),
+            (both, self.loop, self.loop_transitions),
+        ):
+            visited |= set(path)
+            transitions |= {(a, b) for a, b in pairwise(path) if a != b}
+        self.ends |= {re.sub(r"[\d.]+", "N", text) for _, _, text in seen.drives if text}
+
+    def merge(self, other: "Tally") -> None:
+        for f in fields(self):
+            mine, theirs = getattr(self, f.name), getattr(other, f.name)
+            setattr(self, f.name, mine + theirs if isinstance(mine, int) else mine | theirs)
+
+    @property
+    def summary(self) -> dict[str, int]:
+        """For JSON: drives, driven, and how many different states and transitions."""
+        return {
+            "drives": self.drives,
+            "driven": self.driven,
+            "firmware_states": len(self.firmware),
+            "firmware_transitions": len(self.firmware_transitions),
+            "loop_states": len(self.loop),
+            "loop_transitions": len(self.loop_transitions),
+            "ends": len(self.ends),
+        }
+
+
+def _firmware_state(event: Event | None) -> tuple:
+    if event is None:
+        return ("floating",)
+    letters = (c.decode() for c in (event.state, event.reason, event.missing, event.result))
+    return (*letters, *event.signals)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A seed whose story breaks an invariant, the sentence that says so, and a short story that breaks the same."""
+
+    seed: int
+    sentence: str
+    story: Story
+
+    def __str__(self) -> str:
+        return f"seed {self.seed}: {self.sentence}\n    {self.story}"
+
+
+def random_drives(seeds: Sequence[int], jobs: int = 1) -> tuple[Tally, list[Failure]]:
+    """Drives the story of each seed: what they visited, and those that break an invariant.
+
+    jobs: processes that drive. Raises ArduinoError where there is no gcc.
+    """
+    library()  # here, where its errors are seen
+    if jobs == 1:
+        return _drive_seeds(seeds)
+    tally, failures = Tally(), []
+    with ProcessPoolExecutor(jobs) as pool:
+        for part, more in pool.map(_drive_seeds, [seeds[job::jobs] for job in range(jobs)]):
+            tally.merge(part)
+            failures += more
+    return tally, sorted(failures, key=lambda failure: failure.seed)
+
+
+def _drive_seeds(seeds: Sequence[int]) -> tuple[Tally, list[Failure]]:
+    logging.getLogger(servo_link.__name__).setLevel(logging.ERROR)  # it warns of what is broken here on purpose
+    tally, failures = Tally(), []
+    for seed in seeds:
+        story = random_story(seed)
+        seen = drive_story(story)
+        tally.add(seen)
+        if sentence := next(broken(seen), None):
+            failures.append(Failure(seed, sentence, shortest(story, partial(_breaks, sentence.partition(":")[0]))))
+    return tally, failures
+
+
+def _breaks(invariant: str, story: Story) -> bool:
+    return any(sentence.startswith(invariant) for sentence in broken(drive_story(story)))
+
+
+def write_random_drives(path: Path | str, first: int, tally: Tally, failures: Sequence[Failure]) -> dict[str, Any]:
+    """Writes the stage `random`, and returns it."""
+    metrics = tally.summary | {"broken": [str(failure) for failure in failures]}
+    return write_stage(path, "random", params={"first_seed": first}, metrics=metrics)

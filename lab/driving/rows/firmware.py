@@ -1,0 +1,17 @@
+"""The Arduino itself: reset, hung."""
+
+from lab.driving.bench import DrivingBench
+from lab.driving.pins import STOPPED
+from lab.driving.row import FaultKind
+
+FAULTS = FaultKind("firmware")
+
+
+@FAULTS.add("Arduino reset", STOPPED, r"was reset \(reset pin\)", "the reset button")
+def _reset(bench: DrivingBench) -> None:
+    bench.arduino.reset()
+
+
+@FAULTS.add("Arduino loop hung", STOPPED, r"was reset \(watchdog\)", "an endless loop in place of the firmware's")
+def _hang(bench: DrivingBench) -> None:
+    bench.arduino.hang()

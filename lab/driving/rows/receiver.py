@@ -1,0 +1,73 @@
+"""The transmitter and the human who holds it, as the receiver hears them."""
+
+import time
+
+from lab.driving.bench import DrivingBench
+from lab.driving.pins import HUMAN, NEUTRAL_US, REFUSED, STOPPED
+from lab.driving.row import FaultKind
+from rover_lib.world.standin import REST_US
+
+FAULTS = FaultKind("receiver")
+
+
+@FAULTS.add("receiver lost", STOPPED, "transmitter's signal was lost", "no pulses on the receiver's pins")
+def _lose_receiver(bench: DrivingBench) -> None:
+    bench.arduino.transmitter(0, 0)
+
+
+@FAULTS.add("receiver's throttle channel lost", STOPPED, "transmitter's signal was lost", "no pulses on that pin")
+def _lose_throttle(bench: DrivingBench) -> None:
+    bench.arduino.transmitter(REST_US[0], 0)
+
+
+@FAULTS.add(
+    "no transmitter at the start", REFUSED, "the transmitter gives no signal", "no pulses from before the drive"
+)
+def _begin_without(bench: DrivingBench) -> None:
+    bench.arduino.transmitter(0, 0)
+
+
+@FAULTS.add("receiver's steering channel lost", STOPPED, "transmitter's signal was lost", "no pulses on that pin")
+def _lose_steering(bench: DrivingBench) -> None:
+    bench.arduino.transmitter(0, REST_US[1])
+
+
+@FAULTS.add(
+    "receiver comes back with presets",
+    STOPPED,
+    "transmitter's signal was lost",
+    "no pulses for 0.3 s, then 400 us of throttle that nobody sends",
+)
+def _presets(bench: DrivingBench) -> float:
+    at_s = time.monotonic()
+    bench.arduino.transmitter(0, 0)
+    bench.wait(0.3)
+    bench.arduino.transmitter(REST_US[0], 400)
+    return at_s
+
+
+@FAULTS.add(
+    "receiver begins with presets",
+    REFUSED,
+    "throttle stick is not at rest",
+    "400 us of throttle since before the Arduino's start",
+)
+def _begin_with_presets(bench: DrivingBench) -> None:
+    bench.arduino.transmitter(REST_US[0], 400)
+    bench.arduino.reset()
+
+
+@FAULTS.add("nobody wiggles the stick", REFUSED, "nobody has just wiggled", "pulses that stay what they are")
+def _no_gesture(bench: DrivingBench) -> None:
+    bench.arduino.ready(False)
+
+
+def _by_human(name: str, sent_us: tuple[float, float], human_us: tuple[float, float]) -> None:
+    FAULTS.add(name, HUMAN, "the human took over", f"the transmitter sends {sent_us}", human_us=human_us)(
+        lambda bench: bench.arduino.transmitter(*sent_us)
+    )
+
+
+_by_human("human takes over by steering", (1600, 140), (1600, 140))
+# His throttle passes once it has been at rest: a receiver without its transmitter looks the same.
+_by_human("human takes over by throttle", (1470, 200), (1470, NEUTRAL_US["throttle"]))

@@ -1,0 +1,418 @@
+"""What may happen in a drive: faults of every kind, at any moment and in any order; before arming and after a stop too.
+
+    seen = drive_story(random_story(seed=7))
+
+A new kind of fault is a function here: it changes something of the world (virtual.py), and every random drive may have
+it from then on. KEPT are the stories that once broke an invariant.
+"""
+
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from lab.driving.virtual import HELD, LIVE, LOST, PRESET, STICKS_US, Killed, Seen, Wire, World
+from lab.driving.virtual_host import Process
+from rover_lib.onboard.servo_link import frame
+
+WIGGLE_MS, START_MS, ASK_MS, STOP_MS, END_MS = 100, 700, 1300, 4000, 4600
+
+
+@dataclass(frozen=True)
+class Happening:
+    """One of HAPPENINGS: when, how much of it, and for how long."""
+
+    at_ms: int
+    what: str
+    amount: int = 0
+    for_ms: int = 0
+
+
+@dataclass(frozen=True)
+class Story:
+    """What happens in a drive beside the usual: the human's gesture, an operator's start, and 3.3 s later his stop.
+
+    wiggled: whether the gesture comes before the start. service: it drives as a service, which the operator then asks
+    to arm the car, and so he does whenever he starts it again. clock_ms: of the Arduino when it is switched on.
+    """
+
+    happenings: tuple[Happening, ...] = ()
+    wiggled: bool = True
+    service: bool = False
+    clock_ms: int = 0
+
+
+# ---- what may happen
+
+
+class Stage:
+    """A world and, while there is one, the process that drives in it."""
+
+    def __init__(self, clock_ms: int):
+        self.world = World(clock_ms)
+        self.process: Process | None = None
+        self.start_due = False
+        self._usual: dict[tuple[object, str], Any] = {}
+
+    def during(self, happening: Happening, thing: object, **values: Any) -> None:
+        """Sets attributes of a thing, and sets them back to what is usual."""
+        for name, value in values.items():
+            self._usual.setdefault((thing, name), getattr(thing, name))
+            setattr(thing, name, value)
+        self.world.handle()
+
+        def back() -> None:
+            for name in values:
+                setattr(thing, name, self._usual[thing, name])
+            self.world.handle()
+
+        self.world.at(self.world.now_ms + happening.for_ms, back)
+
+    def again_and_again(self, happening: Happening, every_ms: int, what: Callable[[], None]) -> None:
+        for ms in range(0, happening.for_ms, every_ms):
+            self.world.at(self.world.now_ms + ms, what)
+
+    def wiggle(self) -> None:
+        """The human's gesture; it counts where the receiver hears something of either side."""
+        world, hand = self.world, self.world.hand
+        heard = []
+
+        def move(steering_us: int) -> None:
+            heard.append(hand.receiver in (LIVE, HELD))
+            hand.sticks = [steering_us, hand.sticks[1]]
+            heard.append(heard[-1])
+            world.handle()
+
+        def let_go() -> None:
+            move(STICKS_US[0])
+            if any(heard[1:3]) and any(heard[3:5]):  # when a side was reached, and when it was left
+                world.seen.wiggled.append(world.now_ms)
+
+        move(1750)
+        world.at(world.now_ms + 70, lambda: move(1150))
+        world.at(world.now_ms + 140, let_go)
+
+
+Happen = Callable[[Stage, Happening], None]
+HAPPENINGS: dict[str, tuple[Happen, tuple[int, int], tuple[int, int]]] = {}  # ranges: of amount and of for_ms
+
+
+def _may(what: str, amount: tuple[int, int] = (0, 0), for_ms: tuple[int, int] = (0, 0)) -> Callable[[Happen], Happen]:
+    def add(happen: Happen) -> Happen:
+        HAPPENINGS[what] = happen, amount, for_ms
+        return happen
+
+    return add
+
+
+A_WHILE = (20, 2500)
+
+
+def _by_camera(what: str, **values: Any) -> None:
+    _may(what, for_ms=(20, 4000))(lambda stage, h: stage.during(h, stage.world.lens, **values))
+
+
+_by_camera("the camera is black", black=True)
+_by_camera("the camera gives no more frames", silent=True)
+
+
+@_may("the camera freezes", for_ms=(20, 4000))
+def _freeze(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.lens, frozen_ms=stage.world.now_ms)
+
+
+@_may("frames come late", (20, 3000), A_WHILE)
+def _late(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.lens, late_ms=h.amount)
+
+
+@_may("the camera is unplugged")
+def _unplug_camera(stage: Stage, h: Happening) -> None:
+    if stage.process:
+        stage.process.eyes.unplug()
+
+
+def _by_policy(does: str) -> None:
+    _may(f"the policy's answer: {does}", for_ms=(20, 300))(
+        lambda stage, h: stage.during(h, stage.world.mind, does=does)
+    )
+
+
+_by_policy("raise")
+_by_policy("nan")
+_by_policy("wild")
+
+
+@_may("the policy is slow", (90, 2000), A_WHILE)
+def _slow(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.mind, latency_ms=h.amount)
+
+
+@_may("the policy wants full throttle", for_ms=A_WHILE)
+def _full_throttle(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.mind, throttle=1.0)
+
+
+@_may("the host goes mad", (120, 711), A_WHILE)
+def _mad(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world, mad_us=h.amount)
+
+
+def _by_wire(what: str, wire: Callable[[World], Wire], fault: str, most: int) -> None:
+    _may(f"{what}: {fault}", (1, most), A_WHILE)(
+        lambda stage, h: stage.during(h, wire(stage.world), **{fault: h.amount})
+    )
+
+
+def _by_lag(what: str, wire: Callable[[World], Wire]) -> None:
+    def slower(stage: Stage, h: Happening) -> None:
+        for ms in range(0, h.for_ms, 10):
+            later = Happening(h.at_ms + ms, what, for_ms=h.for_ms - ms)
+            latency_ms = 1 + ms * h.amount // 100
+            stage.world.at(
+                stage.world.now_ms + ms, partial(stage.during, later, wire(stage.world), latency_ms=latency_ms)
+            )
+
+    _may(f"{what}: further and further behind", (1, 99), (200, 4000))(slower)
+
+
+_by_lag("to the Arduino", lambda world: world.down)
+_by_lag("from the Arduino", lambda world: world.up)
+
+for _fault, _most in (("latency_ms", 2500), ("lost_pct", 100), ("garbled_pct", 100)):
+    _by_wire("to the Arduino", lambda world: world.down, _fault, _most)
+    _by_wire("from the Arduino", lambda world: world.up, _fault, _most)
+
+
+@_may("the cable is unplugged", for_ms=A_WHILE)
+def _unplug(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world, unplugged=True)
+    if stage.world.port:
+        stage.world.port.unplug()
+
+
+@_may("the port is stuck", for_ms=A_WHILE)
+def _stick(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world, stuck=True)
+
+
+@_may("old lines come again", (1, 200), (20, 1000))
+def _replay(stage: Stage, h: Happening) -> None:
+    old = iter(stage.world.written[-h.amount :])
+    stage.again_and_again(h, 10, lambda: stage.world.down.send(next(old, b"?\n")))
+
+
+@_may("another program writes to the port", (0, 5), (20, 1000))
+def _intrude(stage: Stage, h: Happening) -> None:
+    what = (b"AT+GCAP\r\n", b">D 1", frame(">D 0 7 2000 700"), frame(">A 0 8"), frame(">N 0 9"), frame(">Q"))
+    stage.again_and_again(h, 10, lambda: stage.world.down.send(what[h.amount]))
+
+
+@_may("the Arduino is reset")
+def _reset(stage: Stage, h: Happening) -> None:
+    stage.world.reset()
+
+
+@_may("the Arduino's loop hangs")
+def _hang(stage: Stage, h: Happening) -> None:
+    stage.world.hang()
+
+
+@_may("the transmitter is off", for_ms=A_WHILE)
+def _lose(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.hand, receiver=LOST)
+
+
+@_may("the receiver's throttle wire is off", for_ms=A_WHILE)
+def _lose_throttle(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.hand, throttle_wire=False)
+
+
+@_may("the receiver sends presets", (60, 700), A_WHILE)
+def _preset(stage: Stage, h: Happening) -> None:
+    world, hand = stage.world, stage.world.hand
+    stage.during(Happening(h.at_ms, h.what, for_ms=h.for_ms + 200), hand, receiver=LOST)
+
+    def make_up() -> None:
+        if hand.receiver == LOST:  # from the human's own pulses at once to others: nobody can tell
+            stage.during(h, hand, receiver=PRESET, sent=[STICKS_US[0], h.amount])
+
+    world.at(world.now_ms + 200, make_up)
+
+
+@_may("the receiver holds its last values", for_ms=(20, 4000))
+def _hold(stage: Stage, h: Happening) -> None:
+    hand = stage.world.hand
+    if hand.receiver == LIVE:
+        stage.during(h, hand, receiver=HELD, sent=list(hand.sticks))
+
+
+@_may("throttle pulses are misread", (3, 10), A_WHILE)
+def _misread(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.hand, misread_in=h.amount)
+
+
+@_may("few throttle pulses come", (2, 99), A_WHILE)
+def _sparse(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.hand, one_in=h.amount)
+
+
+@_may("the human steers", (-400, 400), A_WHILE)
+def _steer(stage: Stage, h: Happening) -> None:
+    hand = stage.world.hand
+    stage.during(h, hand, sticks=[STICKS_US[0] + h.amount, hand.sticks[1]])
+
+
+@_may("the human pulls the throttle", (120, 700), A_WHILE)
+def _pull(stage: Stage, h: Happening) -> None:
+    hand = stage.world.hand
+    stage.during(h, hand, sticks=[hand.sticks[0], h.amount])
+
+
+@_may("the human wiggles the stick")
+def _wiggle(stage: Stage, h: Happening) -> None:
+    stage.wiggle()
+
+
+@_may("the process is stopped", for_ms=A_WHILE)
+def _pause(stage: Stage, h: Happening) -> None:
+    stage.world.pause(h.for_ms)
+
+
+@_may("the process stutters", (20, 140), A_WHILE)
+def _stutter(stage: Stage, h: Happening) -> None:
+    stage.again_and_again(h, 150, lambda: stage.world.pause(h.amount))
+
+
+@_may("an exception in the loop")
+def _raise(stage: Stage, h: Happening) -> None:
+    stage.world.failing = RuntimeError("raised in the loop") if stage.process else None
+
+
+@_may("the process is killed")
+def _kill(stage: Stage, h: Happening) -> None:
+    if stage.process:
+        stage.world.alive, stage.world.failing = False, Killed()
+
+
+@_may("the operator says stop")
+def _stop(stage: Stage, h: Happening) -> None:
+    if stage.process:
+        stage.process.until.stop.set()
+
+
+@_may("the operator starts it")
+def _start(stage: Stage, h: Happening) -> None:
+    if stage.process:
+        stage.process.ask()
+    else:
+        stage.start_due = True
+
+
+H = Happening
+KEPT: dict[str, tuple[Story, str]] = {  # stories that once broke an invariant, and how a drive ends in them
+    "frozen since before the start": (Story((H(0, "the camera freezes", for_ms=4000),)), "frozen"),
+    "pictures of 1.5 s ago": (Story((H(0, "frames come late", 1500, 4000),)), "before it began"),
+    "pictures of 2.5 s ago, from now on": (Story((H(1500, "frames come late", 2500, 2000),)), "too old"),
+    "presets after a loss": (Story((H(2000, "the receiver sends presets", 400, 1500),)), "signal was lost"),
+    "presets from the first moment": (
+        Story((H(0, "the receiver sends presets", 400, 4000),), wiggled=False),
+        "throttle stick is not at rest",
+    ),
+    "held since before the start": (
+        Story((H(0, "the receiver holds its last values", for_ms=4000),), wiggled=False),
+        "wiggled",
+    ),
+    "a host that asks for full throttle": (Story((H(2000, "the host goes mad", 711, 500),)), "told to stop"),
+    "every third pulse misread": (
+        Story((H(1500, "throttle pulses are misread", 3, 2000), H(2000, "the human pulls the throttle", 500, 1500))),
+        "the human took over",
+    ),
+    "a throttle pulse every 99 ms": (
+        Story((H(1500, "few throttle pulses come", 99, 2000), H(2000, "the human pulls the throttle", 500, 1500))),
+        "signal was lost",
+    ),
+    "a link further and further behind": (
+        Story((H(1100, "to the Arduino: further and further behind", 80, 4000),)),
+        "the link is behind",
+    ),
+    "armed by a line that waited": (
+        Story((H(600, "to the Arduino: further and further behind", 50, 4000),)),
+        "no answer to arming",
+    ),
+    "started again without a gesture": (
+        Story((H(1500, "the operator says stop"), H(2200, "the operator starts it"))),
+        "wiggled",
+    ),
+    "an exception while neutral is on its way": (
+        Story((H(2400, "from the Arduino: latency_ms", 617, 20), H(3000, "an exception in the loop"))),
+        "has not answered",
+    ),
+}
+
+
+def random_story(seed: int) -> Story:
+    """Up to eight happenings; the same for the same seed, as long as HAPPENINGS are the same."""
+    rng = random.Random(seed)
+    happenings = []
+    for _ in range(rng.randint(0, 8)):
+        what = rng.choice(list(HAPPENINGS))
+        _, amount, (shortest, longest) = HAPPENINGS[what]
+        for_ms = round(shortest * (longest / shortest) ** rng.random()) if shortest else 0
+        happenings.append(Happening(rng.randint(0, STOP_MS), what, rng.randint(*amount), for_ms))
+    in_order = tuple(sorted(happenings, key=lambda h: h.at_ms))
+    return Story(in_order, rng.random() < 0.8, rng.random() < 0.5, rng.choice([0, 2**32 - 2000]))
+
+
+def shortest(story: Story, breaks: Callable[[Story], bool]) -> Story:
+    """A simpler story that breaks the same: a happening or what it is like is left out for as long as it still does."""
+    while True:
+        simpler = next((other for other in _simpler(story) if breaks(other)), None)
+        if simpler is None:
+            return story
+        story = simpler
+
+
+def _simpler(story: Story) -> Iterator[Story]:
+    if story.clock_ms:
+        yield replace(story, clock_ms=0)
+    if story.service:
+        yield replace(story, service=False)
+    if not story.wiggled:
+        yield replace(story, wiggled=True)
+    for i, h in enumerate(story.happenings):
+        before, after = story.happenings[:i], story.happenings[i + 1 :]
+        yield replace(story, happenings=before + after)
+        _, (least, _), (briefest, _) = HAPPENINGS[h.what]
+        for other in (
+            replace(h, for_ms=max(briefest, h.for_ms // 2)),
+            replace(h, amount=(h.amount + least) // 2 if least >= 0 else h.amount),
+            replace(h, at_ms=h.at_ms // 100 * 100),
+        ):
+            if other != h:
+                yield replace(story, happenings=(*before, other, *after))
+
+
+def drive_story(story: Story) -> Seen:
+    """What is to be seen of it. Takes some hundredths of a second; raises ArduinoError where there is no gcc."""
+    stage = Stage(story.clock_ms)
+    world = stage.world
+    if story.wiggled:
+        world.at(WIGGLE_MS, stage.wiggle)
+    for h in story.happenings:
+        world.at(h.at_ms, lambda h=h: HAPPENINGS[h.what][0](stage, h))  # type: ignore[misc]
+    start, stop = (Happening(ms, what) for ms, what in ((START_MS, "start"), (STOP_MS, "stop")))
+    world.at(START_MS, lambda: _start(stage, start))
+    world.at(STOP_MS, lambda: _stop(stage, stop))
+    if story.service:
+        world.at(ASK_MS, lambda: _start(stage, start))
+    while world.now_ms < END_MS:
+        world.advance(world.now_ms + 1)
+        if stage.start_due and world.now_ms < STOP_MS:
+            stage.start_due = False
+            stage.process = Process(world, story.service)
+            stage.process.run()
+            stage.process = None
+    world.close()
+    return world.seen

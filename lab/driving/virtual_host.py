@@ -1,0 +1,348 @@
+"""`rover drive` in a virtual world: the real link, camera class, plans, pilot and loop, without their threads.
+
+Whoever waits lets the world go on. What stands in: the port, the driver of the camera, the policy.
+"""
+
+import contextlib
+import functools
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lab.driving.virtual import FRAME_MS, Killed, World
+from rover_lib.onboard.camera import Camera
+from rover_lib.onboard.errors import DriveFault, PolicyError, RoverError, TakenOver, sentence_of
+from rover_lib.onboard.inference import Planner
+from rover_lib.onboard.loop import Hooks, Report, Until, drive
+from rover_lib.onboard.params import params
+from rover_lib.onboard.pilot import Order, PolicyPilot
+from rover_lib.onboard.plan import Commanded, Plan, Settings
+from rover_lib.onboard.service import NotArmed
+from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink
+
+RATE_HZ = 30.0
+PLAN = (0.2, 0.15)  # steering, throttle
+GO_MS, BRAKE_MS = 1200, 600  # in turn
+WALL_S = 1.7e9
+
+
+class _Waiting:
+    """In the place of a threading.Condition: who waits lets the world go on."""
+
+    def __init__(self, world: World):
+        self._world = world
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, *exc: object) -> None: ...
+
+    def notify_all(self) -> None: ...
+
+    def wait_for(self, predicate: Callable[[], Any], timeout: float) -> Any:
+        end_s = self._world.clock() + timeout
+        while not (found := predicate()) and self._world.clock() < end_s:
+            self._world.sleep(0.001)
+        return found
+
+
+class VirtualLink(ServoLink):
+    """A ServoLink whose port and reader are the world's."""
+
+    def __init__(self, world: World):
+        super().__init__("the virtual port", clock=world.clock)
+        self._world = world
+        condition: Any = _Waiting(world)
+        self._heard = condition
+
+    def open(self) -> Hello:
+        self._world.port = self
+        if self._world.unplugged:
+            self._world.port = None
+            raise LinkError(f"{self.port}: cannot be opened", remedy="is the Arduino plugged in?")
+        port: Any = self
+        self._serial = port
+        return self._wait_for_hello()
+
+    def _release(self) -> None:
+        self._serial = self._world.port = None
+
+    def _write(self, line: bytes) -> None:
+        try:
+            self._world.write(line)
+        except BlockingIOError:
+            raise LinkError(f"{self.port}: the port took no data, its buffer is full") from None
+        except OSError as error:
+            raise self._fail(f"{self.port}: writing failed ({error})") from error
+
+    def unplug(self) -> None:
+        self._fail(f"{self.port}: reading failed")
+
+    def hear(self, data: bytes) -> None:
+        for line in data.split(b"\n"):
+            if line:
+                self._hear(line, self._clock())
+
+
+@functools.cache
+def _scenery() -> list[np.ndarray]:
+    """Pictures of a drive, (72, 128, 3) uint8 BGR, no two of them alike."""
+    rng = np.random.default_rng(0)
+    wide = rng.integers(30, 220, (9, 40, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    return [
+        np.clip(wide[:, i : i + 128] + rng.integers(-3, 4, (72, 128, 3)), 0, 255).astype(np.uint8) for i in range(150)
+    ]
+
+
+class Eyes:
+    """The real Camera, whose thread gets a picture when the world says so, and nothing else meanwhile."""
+
+    def __init__(self, world: World):
+        self._world = world
+        self.camera = Camera("the virtual camera", clock=world.clock, wall_clock=lambda: WALL_S + world.clock())
+        self.content: dict[int, int] = {}  # when what a frame shows was really seen, by its number
+        self._next: tuple[np.ndarray, float] | None = None
+        self._seen_ms = -1_000_000
+        self._turn, self._idle = threading.Semaphore(0), threading.Semaphore(0)
+        self._over = False
+        self._thread = threading.Thread(target=self.camera._read, args=(self._pictures(),), daemon=True)
+        self._thread.start()
+        self._idle.acquire()
+        self._due_ms = float(world.now_ms)
+        self.on_frame: Callable[[], None] = lambda: None
+        self._tick()
+
+    def _pictures(self) -> Iterator[tuple[np.ndarray, float | None]]:
+        try:
+            while True:
+                self._idle.release()
+                self._turn.acquire()
+                if self._next is None:
+                    return
+                yield self._next
+        finally:
+            self._over = True
+            self._idle.release()
+
+    def _give(self, picture: tuple[np.ndarray, float] | None) -> None:
+        if self._over:
+            return
+        self._next = picture
+        self._turn.release()
+        self._idle.acquire()
+        if self._over:
+            self._thread.join()
+
+    def unplug(self) -> None:
+        """The reader comes to its end."""
+        self._give(None)
+
+    def close(self) -> None:
+        self.camera._closing.set()
+        self.unplug()
+        self.on_frame = lambda: None
+
+    def _tick(self) -> None:
+        world = self._world
+        if self._over:
+            return
+        self._due_ms += FRAME_MS
+        world.at(round(self._due_ms), self._tick)
+        lens = world.lens
+        if lens.silent or world.paused_until_ms > world.now_ms:
+            return
+        seen_ms = world.now_ms - lens.late_ms
+        if seen_ms <= self._seen_ms:
+            return  # on its way
+        self._seen_ms = seen_ms
+        content_ms = seen_ms if lens.frozen_ms is None else lens.frozen_ms
+        picture = _scenery()[round(content_ms / FRAME_MS) % len(_scenery())]
+        if lens.black:
+            picture = (picture - picture.min()) // 64 + world.now_ms % 2
+        # The driver of a frozen camera goes on with its stamps.
+        self._give((picture, seen_ms / 1e3))
+        self.content.setdefault(self.camera.frames, content_ms)
+        self.on_frame()
+
+
+class VirtualPlanner(Planner):
+    """A Planner without its thread: it thinks in virtual time."""
+
+    def __init__(self, world: World, eyes: Eyes, commanded: Commanded):
+        self._world, self._eyes = world, eyes
+        self._thinking = False
+        self._looked_at = 0
+        self._number = 0
+        self.content: dict[int, int] = {}  # by a plan's number
+        super().__init__(eyes.camera, self._never, commanded, RATE_HZ, clock=world.clock)
+        condition: Any = _Waiting(world)
+        self._news = condition
+        eyes.on_frame = self._look
+
+    def _never(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
+        raise AssertionError("the thread that asks for predictions is never started here")
+
+    def _look(self) -> None:
+        """What the thread does as soon as it may."""
+        if self._thinking or self._failure:
+            return
+        try:
+            frame = self._camera.latest()
+            if frame is None or frame.number <= self._looked_at:
+                return
+            self._looked_at = frame.number
+            self._commanded.state(frame.captured_s, RATE_HZ)
+            self._thinking, self._asked_s = True, self._clock()
+            world, mind = self._world, self._world.mind
+            throttle = PLAN[1] if world.now_ms % (GO_MS + BRAKE_MS) < GO_MS else 0.0
+            actions = np.tile([PLAN[0], throttle if mind.throttle is None else mind.throttle], (32, 1))
+            if mind.does in ("nan", "wild"):
+                actions[:] = {"nan": np.nan, "wild": 5.0}[mind.does]
+            content_ms = self._eyes.content[frame.number]
+            world.at(world.now_ms + mind.latency_ms, lambda: self._answer(frame.captured_s, content_ms, actions))
+        except Exception as error:
+            self._fail(error)
+
+    def _answer(self, captured_s: float, content_ms: int, actions: np.ndarray) -> None:
+        world = self._world
+        if world.paused_until_ms > world.now_ms:
+            return world.at(world.paused_until_ms, lambda: self._answer(captured_s, content_ms, actions))
+        self._thinking, self._asked_s = False, None
+        try:
+            if world.mind.does == "raise":
+                raise PolicyError("the policy was told to fail")
+            self._number += 1
+            self._plan = Plan(self._number, captured_s, self._clock(), actions)
+            self.content[self._number] = content_ms
+        except Exception as error:
+            return self._fail(error)
+        self._look()
+
+    def _fail(self, error: Exception) -> None:
+        self._failure = error if isinstance(error, RoverError) else PolicyError(f"the policy failed ({error})")
+
+
+class _Pilot(PolicyPilot):
+    """Whose orders' pictures are known, and who can go mad."""
+
+    world: World
+    planner: VirtualPlanner
+
+    def order(self, now_s: float) -> Order | None:
+        order = super().order(now_s)
+        if order:
+            self.world.content_ms = self.planner.content[order.plan]
+            if self.world.mad_us:
+                order = replace(order, throttle_us=self.world.mad_us)
+        return order
+
+
+class _Log:
+    def __init__(self, world: World):
+        self._world = world
+        self.start_s = world.clock()
+
+    def tick(self, row: Any) -> None: ...
+
+    def event(self, text: str, **fields: Any) -> None:
+        self._world.seen.log.append((self._world.now_ms, text))
+
+
+@functools.cache
+def _settings() -> Settings:
+    return Settings.of(params()["drive"])
+
+
+class Process:
+    """`rover drive` from its start to its end, in this one; its parts, for what breaks them.
+
+    service: it drives again and again, each time that an operator asks for it with ask().
+    """
+
+    def __init__(self, world: World, service: bool):
+        self.world = world
+        self.until = Until()
+        self.commanded = Commanded()
+        world.alive = True
+        self.eyes = Eyes(world)
+        self.planner = VirtualPlanner(world, self.eyes, self.commanded)
+        self._service, self._asked = service, False
+        self._log = _Log(world)
+
+    def ask(self) -> None:
+        """The operator asks for the car to be armed."""
+        self._asked = True
+        self.world.seen.asked.append(self.world.now_ms)
+
+    def run(self) -> None:
+        """Until it ends; nothing is raised."""
+        world = self.world
+        try:
+            with contextlib.ExitStack() as stack:
+                link = None
+                while link is None or (self._service and not self.until.stop.is_set()):
+                    with self._told(report := Report()):
+                        link = link or stack.enter_context(VirtualLink(world))
+                        self._drive(link, report)
+        except (Killed, Exception):
+            pass
+        finally:
+            world.phase("off")
+            world.paused_until_ms = world.now_ms
+            world.failing = None
+            self.eyes.close()
+
+    @contextlib.contextmanager
+    def _told(self, report: Report) -> Iterator[None]:
+        """A drive, and its last words; what ends a service goes on from here."""
+        world, begin_ms = self.world, self.world.now_ms
+        world.phase("opening")
+        try:
+            yield
+        except (DriveFault, TakenOver):
+            if not self._service:
+                raise
+        except Exception as error:
+            report.ended = report.ended or sentence_of(error)
+            raise
+        finally:
+            world.seen.drives.append((begin_ms, world.now_ms, report.ended if world.alive else None))
+
+    def _drive(self, link: ServoLink, report: Report) -> None:
+        world = self.world
+        world.phase("ready")
+        pilot = _Pilot(self.eyes.camera, self.planner, self.commanded, _settings(), RATE_HZ)
+        pilot.world, pilot.planner = world, self.planner
+        hooks = Hooks(arm=functools.partial(self._arm, pilot, link))
+        drive(pilot, link, self._log, rate_hz=RATE_HZ, until=self.until, hooks=hooks, report=report,
+              clock=world.clock, sleep=world.sleep)  # fmt: skip
+
+    def _arm(self, pilot: PolicyPilot, link: ServoLink) -> Any:
+        """As drive.py and service.py do: one request, one attempt."""
+        world = self.world
+        if not self._service:
+            self.ask()
+        while True:
+            world.phase("disarmed")
+            while not self._asked:
+                self.eyes.camera.latest()
+                self.planner.newest()
+                link.latest()
+                if self.until.stop.is_set():
+                    raise NotArmed("told to stop before a human armed the car")
+                world.sleep(0.1)
+            self._asked = False
+            world.phase("arming")
+            try:
+                self.planner.renew(_settings().fade_s)
+                pilot.check_sight()
+                telemetry = link.arm()
+            except RoverError as error:
+                if not self._service:
+                    raise
+                self._log.event(f"not armed: {error}")
+                continue
+            world.phase("driving")
+            return telemetry

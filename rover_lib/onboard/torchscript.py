@@ -1,0 +1,410 @@
+"""What a TorchScript archive would run, read without running any of it: such a file is code, and anybody can write one.
+
+    with open_archive("policy_static.pt") as z:
+        check_program(z, "policy_static.pt")
+
+The graphs of this project have one form: one class without attributes, one method without a branch, a few dozen
+operators on tensors, constants and numbers. The archive is read as that and as nothing else, before torch sees it:
+torch.jit.load calls __setstate__ of every class that it finds in a pickle, and takes from the pickle how large a tensor
+is, without looking whether its bytes are there (torch 2.8, tests/onboard/test_hostile_artifacts.py shows both).
+"""
+
+import ast
+import io
+import math
+import os
+import pickle
+import pickletools
+import re
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.stage import open_plain
+
+# Sizes, each several times what a policy of full size needs; total: 266 MB in FP32
+ARCHIVE_BYTES, DIRECTORY_BYTES, RECORDS = 1_000_000_000, 1_000_000, 5000
+CODE_BYTES, DEBUG_BYTES, PICKLE_BYTES = 250_000, 2_000_000, 1_000_000
+MANIFEST_BYTES, PARITY_BYTES = 100_000, 50_000_000
+LARGEST_NUMBER = 10_000_000  # of a size or an index in the program
+TO_THE_END = 2**63 - 1  # of a slice
+REQUIRED = frozenset({"data.pkl", "constants.pkl", "version", "extra/manifest.json", "extra/parity.npz"})
+RECORD_BYTES = {  # by name after "archive/"; None: as large as the file
+    r"version|byteorder|\.data/serialization_id": 100,
+    r"(data|constants)\.pkl": PICKLE_BYTES,
+    r"extra/manifest\.json": MANIFEST_BYTES,
+    r"extra/parity\.npz": PARITY_BYTES,
+    r"code/__torch__/[\w/]+\.py": CODE_BYTES,
+    r"code/__torch__/[\w/]+\.py\.debug_pkl": DEBUG_BYTES,
+    r"constants/\d{1,6}": None,
+}
+
+OPERATORS = frozenset({
+    "torch._convolution", "torch._make_per_tensor_quantized_tensor", "torch.add", "torch.addcmul", "torch.as_strided",
+    "torch.bitwise_xor", "torch.cat", "torch.contiguous", "torch.dequantize", "torch.flatten", "torch.gelu",
+    "torch.layer_norm", "torch.linear", "torch.max_pool2d", "torch.mul", "torch.permute", "torch.quantize_per_tensor",
+    "torch.relu", "torch.scaled_dot_product_attention", "torch.slice", "torch.squeeze", "torch.sub", "torch.to",
+    "torch.transpose", "torch.unflatten", "torch.unsqueeze",
+    "ops.quantized.add_relu", "ops.quantized.conv2d", "ops.quantized.conv2d_relu", "ops.quantized.linear_dynamic",
+})  # fmt: skip
+# What torch makes of the program beside calls of operators.
+NODES = frozenset({"prim::Constant", "prim::ListConstruct", "prim::GetAttr"})
+RESERVED = frozenset({"torch", "ops", "CONSTANTS", "self", "Tensor", "Module"})
+# No strings, comments or escapes, in which Python and torch could read different things.
+SOURCE = re.compile(rb"[\w \n().,:=>\[\]-]*", re.ASCII)
+
+# What a pickle of such an archive consists of
+OPCODES = frozenset({
+    "PROTO", "STOP", "MARK", "GLOBAL", "REDUCE", "NEWOBJ", "BUILD", "BINPERSID", "BINUNICODE", "BININT", "BININT1",
+    "BININT2", "BINFLOAT", "LONG1", "NONE", "NEWTRUE", "NEWFALSE", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3",
+    "EMPTY_LIST", "APPEND", "APPENDS", "EMPTY_DICT", "SETITEM", "SETITEMS", "BINPUT", "LONG_BINPUT", "BINGET",
+    "LONG_BINGET",
+})  # fmt: skip
+ITEM_BYTES = {
+    "torch.FloatStorage": 4, "torch.DoubleStorage": 8, "torch.LongStorage": 8, "torch.IntStorage": 4,
+    "torch.ShortStorage": 2, "torch.ByteStorage": 1, "torch.CharStorage": 1, "torch.BoolStorage": 1,
+    "torch.QInt8Storage": 1, "torch.QUInt8Storage": 1, "torch.QInt32Storage": 4,
+}  # fmt: skip
+
+
+def open_archive(path: Path | str) -> zipfile.ZipFile:
+    """An artifact whose records are few, of known names and of bounded sizes, by its headers alone.
+
+    Raises ArtifactError.
+    """
+    try:
+        with open_plain(path, ArtifactError(f"{path}: not a file", remedy="give a policy_*.pt")) as file:
+            _check_directory(file, path)
+        z = zipfile.ZipFile(path)
+        try:
+            _check_records(z.infolist(), path)
+        except BaseException:
+            z.close()
+            raise
+    except FileNotFoundError:
+        raise ArtifactError(f"{path}: not found", remedy="'rover run' writes artifacts to runs/<name>/") from None
+    # NotImplementedError: zipfile's, for a version of the format that it does not know
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as e:
+        raise ArtifactError(f"{path}: not an artifact, or cut short ({e})", remedy="copy the file again") from None
+    return z
+
+
+def read_record(z: zipfile.ZipFile, name: str) -> bytes:
+    """A record, of which no more is unpacked than its header says. Raises as zipfile does."""
+    with z.open(name) as record:
+        return record.read(z.getinfo(name).file_size)
+
+
+def _check_directory(file: BinaryIO, path: Path | str) -> None:
+    """One zip archive from the file's first byte to its last, with a directory that may be read into memory.
+
+    Two readers that look at different places for it would see two archives.
+    """
+    if file.read(4) != b"PK\3\4":
+        raise zipfile.BadZipFile("it does not begin as an archive")
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - 98))
+    tail = file.read()
+    end, locator, end64 = tail[-22:], tail[-42:-22], tail[:-42]
+    if end[:4] != b"PK\5\6" or end[20:] != b"\0\0":
+        raise zipfile.BadZipFile("it does not end as an archive")
+    records, length, start = struct.unpack("<10xHII2x", end)
+    after = 22
+    if locator[:4] == b"PK\6\7":  # torch writes the larger form of this, too
+        if end64[:4] != b"PK\6\6" or struct.unpack("<4xIQI", locator)[1] != size - 98:
+            raise zipfile.BadZipFile("its end is not where it says")
+        records, length, start = struct.unpack("<32xQQQ", end64)
+        after = 98
+    if start + length + after != size:
+        raise zipfile.BadZipFile("its directory is not where it says")
+    if records > RECORDS or length > DIRECTORY_BYTES:
+        raise ArtifactError(f"{path}: {records} records are more than an artifact has", remedy="quantize again")
+    file.seek(0)
+
+
+def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
+    names, total = set(), 0
+    for record in records:
+        name = record.filename.removeprefix("archive/")
+        known = [limit for pattern, limit in RECORD_BYTES.items() if re.fullmatch(pattern, name, re.ASCII)]
+        if not known or not record.filename.startswith("archive/"):
+            raise ArtifactError(
+                f"{path}: a record that no artifact has", found=repr(record.filename)[:80], remedy="quantize again"
+            )
+        if name.lower() in names:  # torch finds names without regard to case
+            raise ArtifactError(f"{path}: '{name}' is in it twice", remedy="quantize again")
+        if known[0] is not None and record.file_size > known[0]:
+            raise ArtifactError(
+                f"{path}: '{name}' unpacks to {record.file_size} bytes, at most {known[0]} are taken",
+                remedy="quantize again",
+            )
+        packed = record.compress_type == zipfile.ZIP_DEFLATED and name.startswith("code/")
+        if not packed and (record.compress_type != zipfile.ZIP_STORED or record.compress_size != record.file_size):
+            raise ArtifactError(f"{path}: '{name}' is compressed, only code may be", remedy="quantize again")
+        names.add(name.lower())
+        total += record.file_size
+    if total > ARCHIVE_BYTES:
+        raise ArtifactError(f"{path}: {total} bytes are more than an artifact has", remedy="quantize again")
+    for name in sorted(REQUIRED - names):
+        raise ArtifactError(
+            f"{path}: no {name.removeprefix('extra/')} in it",
+            remedy="is it an artifact of this project? ('rover inspect' says what)",
+        )
+
+
+# The program
+
+
+def check_program(z: zipfile.ZipFile, path: Path | str) -> None:
+    """Raise ArtifactError unless the archive's code and constants are of the one form that artifacts have.
+
+    z: from open_archive(). Nothing in it is run, and no tensor is made.
+    """
+    try:
+        sizes = {r.filename.removeprefix("archive/"): r.file_size for r in z.infolist()}
+        programs = [n for n in sizes if n.endswith(".py") and sizes[n]]
+        if len(programs) != 1:
+            raise _Unknown(f"{len(programs)} programs")
+        name = _Program(read_record(z, f"archive/{programs[0]}")).name
+        module = programs[0].removeprefix("code/").removesuffix(".py").replace("/", ".")
+        for record in sizes:
+            if record.endswith(".debug_pkl"):
+                _check_opcodes(read_record(z, f"archive/{record}"), {"torch.jit._pickle.build_intlist"})
+        attributes = _read_pickle(read_record(z, "archive/data.pkl"), {}, f"{module}.{name}")
+        if not isinstance(attributes, _Module):
+            raise _Unknown("a module that is none")
+        stored = {n.removeprefix("constants/"): size for n, size in sizes.items() if n.startswith("constants/")}
+        if not isinstance(_read_pickle(read_record(z, "archive/constants.pkl"), stored), tuple):
+            raise _Unknown("constants that are none")
+    except _Unknown as e:
+        raise ArtifactError(
+            f"{path}: its program has what no artifact has", found=e, remedy="do not load it; quantize again"
+        ) from None
+    except (zipfile.BadZipFile, OSError, RuntimeError) as e:
+        raise ArtifactError(f"{path}: damaged ({e})", remedy="copy the file again") from None
+
+
+def unknown_operators(graph: Any) -> list[str]:
+    """Kinds of nodes in a torch graph that no artifact has: the closed list, held against torch's own reading."""
+    known = NODES | {f"aten::{o.removeprefix('torch.')}" for o in OPERATORS}
+    known |= {o.removeprefix("ops.").replace(".", "::") for o in OPERATORS}
+    nodes = list(graph.nodes())
+    return sorted({n.kind() for n in nodes} - known | {"a block" for n in nodes if list(n.blocks())})
+
+
+class _Unknown(Exception):
+    """Something that the programs of artifacts do not have; its text names it."""
+
+
+class _Program:
+    """A program in the text of TorchScript. Raises _Unknown if it is not of the one form that artifacts have."""
+
+    def __init__(self, source: bytes):
+        if not SOURCE.fullmatch(source):
+            raise _Unknown(f"the character {SOURCE.sub(b'', source, count=1)[:1].decode('latin-1')!r}")
+        try:
+            body = ast.parse(source).body
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as e:
+            raise _Unknown(f"a program that cannot be read ({type(e).__name__})") from None
+        match body:
+            case [ast.ClassDef(name=name, bases=[ast.Name(id="Module")], keywords=[], decorator_list=[], body=parts)]:
+                self.name = name
+            case _:
+                raise _Unknown("more than a class of type Module")
+        match parts:
+            case [
+                ast.Assign(targets=[ast.Name(id="__parameters__")], value=ast.List(elts=[])),
+                ast.Assign(targets=[ast.Name(id="__buffers__")], value=ast.List(elts=[])),
+                ast.FunctionDef(name="forward", decorator_list=[]) as forward,
+            ]:
+                self._known: set[str] = set()
+                self._method(forward)
+            case _:
+                raise _Unknown(f"a class with {', '.join(self._describe(p) for p in parts[:5])}")
+
+    def _method(self, forward: ast.FunctionDef) -> None:
+        given = forward.args
+        if given.posonlyargs or given.vararg or given.kwonlyargs or given.kwarg or given.defaults or not given.args:
+            raise _Unknown("arguments of another form")
+        for argument in given.args[1:]:
+            match argument.annotation:
+                case ast.Name(id="Tensor"):
+                    self._define(argument.arg)
+                case _:
+                    raise _Unknown("an argument that is no tensor")
+        *steps, last = forward.body
+        for step in steps:
+            match step:
+                case ast.Assign(targets=[ast.Name(id=name)], value=value):
+                    self._expression(value)
+                    self._define(name)
+                case _:
+                    raise _Unknown(self._describe(step))
+        match last:
+            case ast.Return(value=ast.expr() as value):
+                self._expression(value)
+            case _:
+                raise _Unknown(self._describe(last))
+
+    def _define(self, name: str) -> None:
+        if name in RESERVED:
+            raise _Unknown(f"a variable called {name}")
+        self._known.add(name)
+
+    def _expression(self, value: ast.expr) -> None:
+        match value:
+            case ast.Name(id=name) if name in self._known:
+                return
+            case ast.Attribute(value=ast.Name(id="CONSTANTS"), attr=name) if re.fullmatch(r"c\d+", name, re.ASCII):
+                return
+            case ast.Constant(value=None | bool() | float()):
+                return
+            case ast.Constant(value=int(number)) if number <= LARGEST_NUMBER or number == TO_THE_END:
+                return
+            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant() as operand):
+                return self._expression(operand)
+            case ast.List(elts=parts):
+                pass
+            case ast.Call(func=called, args=parts, keywords=[]):
+                if (name := ast.unparse(called)) not in OPERATORS:
+                    raise _Unknown(name[:80])
+            case _:
+                raise _Unknown(self._describe(value))
+        for part in parts:
+            self._expression(part)
+
+    @staticmethod
+    def _describe(node: ast.AST) -> str:
+        return ast.unparse(node).splitlines()[0][:80]
+
+
+# Its constants
+
+
+def _check_opcodes(raw: bytes, names: set[str] | None = None) -> None:
+    """Raise _Unknown for an opcode that is not needed, or for a global that is not among names."""
+    count = 0
+    try:
+        for count, (opcode, argument, _) in enumerate(pickletools.genops(raw)):
+            if opcode.name not in OPCODES:
+                raise _Unknown(f"a pickle with {opcode.name}")
+            if opcode.name == "GLOBAL" and names is not None and (name := str(argument).replace(" ", ".")) not in names:
+                raise _Unknown(f"a pickle with {name[:80]}")
+            # Python's reader and torch's make room for as many entries as such a number says.
+            if "PUT" in opcode.name and isinstance(argument, int) and argument > count:
+                raise _Unknown(f"a pickle with {opcode.name} {argument}")
+    except ValueError as e:
+        raise _Unknown(f"a pickle that cannot be read ({str(e)[:80]})") from None
+
+
+def _read_pickle(raw: bytes, storages: dict[str, int], module: str = "") -> Any:
+    """What a pickle of the archive describes; nothing that it names is called. storages: bytes by name of record."""
+    _check_opcodes(raw)
+    try:
+        return _Reader(raw, storages, module).load()
+    except _Unknown:
+        raise
+    except Exception as e:  # whatever hinders Python from reading it
+        raise _Unknown(f"a pickle that cannot be read ({type(e).__name__})") from None
+
+
+class _Storage(tuple):
+    """(bytes of an item, items) of the memory behind a tensor."""
+
+
+class _Tensor(tuple):
+    """The sizes of a tensor whose bytes are there."""
+
+
+class _Module:
+    """What data.pkl describes: an object without attributes."""
+
+    def __setstate__(self, state: Any) -> None:
+        if state != {}:
+            raise _Unknown(f"attributes, such as {str(next(iter(state)))[:80]!r}" if state else "attributes")
+
+
+class _Conv2d:
+    """Weights of a convolution, as torch packs them: ("2", [config, weight], [bias or None])."""
+
+    def __setstate__(self, state: Any) -> None:
+        match state:
+            case ("2", [_Tensor() as config, _Tensor() as weight], [_Tensor() | None]):
+                if config == (11,) and len(weight) == 4:
+                    return
+        raise _Unknown("weights of a convolution in another form")
+
+
+class _Linear:
+    """Weights of a linear layer: (weight, bias or None)."""
+
+    def __setstate__(self, state: Any) -> None:
+        match state:
+            case (_Tensor() as weight, _Tensor() | None) if len(weight) == 2:
+                return
+        raise _Unknown("weights of a linear layer in another form")
+
+
+class _Reader(pickle.Unpickler):
+    """Makes values of this module of what a pickle describes, and refuses what it does not know."""
+
+    def __init__(self, raw: bytes, storages: dict[str, int], module: str):
+        super().__init__(io.BytesIO(raw))
+        self._storages, self._module = storages, module
+        self._known = {
+            "torch._utils._rebuild_tensor_v2": self._tensor,
+            "torch._utils._rebuild_qtensor": self._quantized,
+            "torch.jit._pickle.build_tensorlist": self._list,
+            "torch.jit._pickle.restore_type_tag": self._list,
+            "collections.OrderedDict": lambda: {},
+            "torch.per_channel_affine": "per_channel_affine",
+            "torch.per_tensor_affine": "per_tensor_affine",
+            "__torch__.torch.classes.quantized.Conv2dPackedParamsBase": _Conv2d,
+            "__torch__.torch.classes.quantized.LinearPackedParamsBase": _Linear,
+            **({module: _Module} if module else {}),
+            **{name: name for name in ITEM_BYTES},
+        }
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (known := self._known.get(f"{module}.{name}")) is None:
+            raise _Unknown(f"{module}.{name}"[:80])
+        return known
+
+    def persistent_load(self, pid: Any) -> _Storage:
+        match pid:
+            case ("storage", str(kind), str(key), "cpu", int(items)) if kind in ITEM_BYTES:
+                if self._storages.get(key) == items * ITEM_BYTES[kind]:
+                    return _Storage((ITEM_BYTES[kind], items))
+        raise _Unknown(f"a tensor without its bytes, {str(pid)[:80]}")
+
+    @staticmethod
+    def _tensor(storage: Any, offset: Any, sizes: Any, strides: Any, needs_gradient: Any, hooks: Any) -> _Tensor:
+        numbers = (offset, *sizes, *strides)
+        if not isinstance(storage, _Storage) or not all(type(n) is int and n >= 0 for n in numbers):
+            raise _Unknown("a tensor of another form")
+        last = offset + sum((n - 1) * stride for n, stride in zip(sizes, strides, strict=True))
+        if math.prod(sizes) > storage[1] or (math.prod(sizes) and last >= storage[1]):
+            raise _Unknown(f"a tensor of {list(sizes)} on {storage[1]} items")
+        return _Tensor(sizes)
+
+    def _quantized(
+        self, storage: Any, offset: Any, sizes: Any, strides: Any, scheme: Any, needs_gradient: Any, hooks: Any
+    ) -> _Tensor:
+        match scheme:
+            case ("per_tensor_affine", float(), int()):
+                pass
+            case ("per_channel_affine", _Tensor() as scales, _Tensor() as zero_points, int(axis)) if 0 <= axis < len(
+                sizes
+            ) and scales == zero_points == (sizes[axis],):
+                pass
+            case _:
+                raise _Unknown("a quantized tensor of another form")
+        return self._tensor(storage, offset, sizes, strides, needs_gradient, hooks)
+
+    @staticmethod
+    def _list(values: Any, kind: Any = "List[Optional[Tensor]]") -> list:
+        if not isinstance(values, list) or kind != "List[Optional[Tensor]]":
+            raise _Unknown(f"a list of {str(kind)[:80]}")
+        return values

@@ -1,0 +1,79 @@
+"""Pictures that no camera sends, small enough to make in a test."""
+
+import io
+import struct
+
+import cv2
+import numpy as np
+from PIL import Image
+
+
+def scene(seed=0, size=(640, 360)) -> np.ndarray:
+    """A picture with something on it, (height, width, 3) uint8, always the same for a seed."""
+    width, height = size
+    coarse = np.random.default_rng(seed).integers(20, 235, (9, 16, 3), np.uint8)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def jpeg(image, quality=90, *more) -> bytes:
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality, *more])[1].tobytes()
+
+
+def cut(data, share=2 / 3) -> bytes:
+    """The first part, closed with an end marker, so that OpenCV and Pillow take it for a picture."""
+    return data[: int(len(data) * share)] + b"\xff\xd9"
+
+
+def claims(data, width, height) -> bytes:
+    """The same data under a header that claims another size."""
+    at = next(data.find(marker) for marker in (b"\xff\xc0", b"\xff\xc2") if marker in data)
+    return data[: at + 5] + struct.pack(">HH", height, width) + data[at + 9 :]
+
+
+def grey(size) -> bytes:
+    """All of a grey picture of size x size pixels, without making one: a block of it is the bits 001010."""
+    small = jpeg(np.full((8, 8), 128, np.uint8))
+    header = claims(small, size, size)[: small.index(b"\xff\xda") + 10]
+    return header + b"\x28\xa2\x8a" * (size * size // 64 // 4) + b"\xff\xd9"
+
+
+def progressive(image, last_scans=1) -> bytes:
+    """With its last scan that many times over."""
+    out = io.BytesIO()
+    Image.fromarray(image).save(out, "JPEG", progressive=True)
+    data = out.getvalue()
+    last = data.rindex(b"\xff\xda")
+    return data[:last] + data[last:-2] * last_scans + b"\xff\xd9"
+
+
+WHOLE = jpeg(scene())
+RESTARTS = jpeg(scene(), 90, cv2.IMWRITE_JPEG_RST_INTERVAL, 4)
+SCAN = WHOLE.index(b"\xff\xda") + 14  # where the picture's own data begins
+
+HOSTILE = {
+    "nothing": b"",
+    "zeros": bytes(5000),
+    "start markers": b"\xff\xd8" * 2500,
+    "noise": np.random.default_rng(1).bytes(50_000),
+    "start and end": b"\xff\xd8\xff\xd9",
+    "a PNG": cv2.imencode(".png", scene(size=(64, 36)))[1].tobytes(),
+    "a header alone": WHOLE[:SCAN],
+    "a header with an end": WHOLE[:SCAN] + b"\xff\xd9",
+    "cut in its header": cut(WHOLE, 0.01),
+    "cut to a half": WHOLE[: len(WHOLE) // 2],
+    "cut to two thirds, with an end": cut(WHOLE),
+    "cut to nine tenths, with an end": cut(WHOLE, 0.9),
+    "the last 50 bytes cut, with an end": cut(WHOLE, 1 - 50 / len(WHOLE)),
+    "cut, with restart markers": cut(RESTARTS),
+    "a piece missing, with restart markers": RESTARTS[: len(RESTARTS) // 3] + RESTARTS[2 * len(RESTARTS) // 3 :],
+    "cut, then another": WHOLE[: len(WHOLE) // 2] + WHOLE,
+    "its tables gone": WHOLE[:2] + WHOLE[WHOLE.index(b"\xff\xc0") :],
+    "no pixels": claims(WHOLE, 0, 360),
+    "more lines than there are": claims(WHOLE, 640, 720),
+    "wider than it is": claims(WHOLE, 4000, 360),
+    "a bomb of 65,000 x 65,000, in its header": claims(WHOLE, 65_000, 65_000),
+    "a bomb of 16,000 x 16,000, whole": grey(16_000),
+    "a progressive bomb": claims(progressive(scene()), 30_000, 30_000),
+    "20,000 scans": progressive(scene(size=(64, 36)), 20_000),
+    "9 MB": WHOLE[:-2] + bytes(9_000_000) + b"\xff\xd9",
+}

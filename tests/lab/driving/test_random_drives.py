@@ -1,0 +1,125 @@
+"""Random drives: what they find, that each invariant can find something, and that a failure becomes short."""
+
+import re
+import shutil
+
+import needs
+import pytest
+from click.testing import CliRunner
+
+from lab.__main__ import main
+from lab.driving import virtual
+from lab.driving.invariants import broken
+from lab.driving.random_drives import random_drives
+from lab.driving.stories import HAPPENINGS, KEPT, Happening, Story, drive_story, random_story, shortest
+from rover_lib.onboard import loop, pilot
+
+pytestmark = needs.gcc
+
+
+@pytest.mark.slow
+def test_200_random_drives_break_nothing(capsys):
+    tally, failures = random_drives(range(200))
+    with capsys.disabled():
+        print(f"\nrandom drives: {tally.summary}")
+    assert not failures, "\n".join(map(str, failures))
+    assert tally.driven > 100
+    assert len(tally.firmware) > 50
+    assert len(tally.loop) > 20
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_what_once_broke_one(name):
+    story, end = KEPT[name]
+    seen = drive_story(story)
+    assert list(broken(seen)) == []
+    assert re.search(end, seen.drives[-1][2])
+
+
+def test_a_drive_without_faults_drives_until_it_is_told_to_stop():
+    seen = drive_story(Story())
+    assert [words for _, _, words in seen.drives] == ["told to stop"]
+    assert max(event.throttle_us for _, event in seen.pins) == 209
+
+
+def test_the_same_seed_is_the_same_drive():
+    first, second = (drive_story(random_story(4)) for _ in range(2))
+    assert first.log == second.log
+    assert [(ms, bytes(e)) if e else (ms, e) for ms, e in first.pins] == [
+        (ms, bytes(e)) if e else (ms, e) for ms, e in second.pins
+    ]
+
+
+# ---- each invariant can find something
+
+KILLED = Story((Happening(2200, "the process is killed"),))
+OFF = Story((Happening(1500, "the transmitter is off", for_ms=2500),))
+STEERED = Story((Happening(1500, "the human steers", 300, 2000),))
+
+
+@pytest.mark.parametrize(
+    ("invariant", "good", "bad", "story"),
+    [
+        ("asked_for", ">= COMMAND_TIMEOUT_MS", ">= 4000", KILLED),
+        ("asked_for", "vehicle->throttle_free ? ", "true ? ", "presets after a loss"),
+        ("asked_for", "now_ms - command->heard_ms > LATE_MS", "false", "a link further and further behind"),
+        ("capped", "capped ? ", "capped && false ? ", "a host that asks for full throttle"),
+        ("slewed", "ms * THROTTLE_SLEW_US_PER_MS", "ms * 1000", Story()),
+        ("slewed", "ms * STEERING_SLEW_US_PER_MS", "ms * 1000", Story()),
+        ("human_wins", "pulses >= THROTTLE_MOVED_PULSES", "pulses == 8", "every third pulse misread"),
+        ("human_wins", "if (moved && vehicle->state != MANUAL)", "if (moved && channel == THROTTLE)", STEERED),
+        ("human_wins", "if (!has_signal(vehicle))\n            enter", "if (false)\n            enter", OFF),
+        ("human_keeps", "vehicle->steering_us = vehicle->received[STEERING].pulse_us", "(void)0", STEERED),
+        ("armed_by_people", "return wiggled ? ", "return wiggled || true ? ", "held since before the start"),
+    ],
+)  # fmt: skip
+@pytest.mark.slow
+def test_a_planted_fault_of_the_firmware_is_found(tmp_path, monkeypatch, invariant, good, bad, story):
+    shutil.copytree(virtual.FIRMWARE, tmp_path / "firmware")
+    source = tmp_path / "firmware" / "rover" / "vehicle.c"
+    text = source.read_text()
+    assert text.count(good) == 1
+    source.write_text(text.replace(good, bad))
+    monkeypatch.setattr(loop, "LATE_S", 99.0)  # the host's own limit, which would hide that the firmware has none
+    virtual.compile_sketch(tmp_path / "firmware", tmp_path)
+    monkeypatch.setattr(virtual, "library", lambda: tmp_path / virtual.LIBRARY)
+    found = list(broken(drive_story(KEPT[story][0] if isinstance(story, str) else story)))
+    assert any(sentence.startswith(f"{invariant}: ") for sentence in found), found
+
+
+@pytest.mark.parametrize(
+    ("invariant", "name", "stubbed", "story"),
+    [
+        ("not_blind", "frozen", lambda *_: None, "frozen since before the start"),
+        ("told", "DriveFault", ValueError, "pictures of 2.5 s ago, from now on"),
+    ],
+)
+def test_a_planted_fault_of_the_host_is_found(monkeypatch, invariant, name, stubbed, story):
+    monkeypatch.setattr(pilot, name, stubbed)
+    found = list(broken(drive_story(KEPT[story][0])))
+    assert any(sentence.startswith(f"{invariant}: ") for sentence in found), found
+
+
+# ---- a failure becomes short
+
+
+def test_a_failure_becomes_short():
+    story = next(
+        story
+        for story in map(random_story, range(1000))
+        if len(story.happenings) > 5 and any(h.what == "the Arduino is reset" for h in story.happenings)
+    )
+    short = shortest(story, lambda other: any(h.what == "the Arduino is reset" for h in other.happenings))
+    assert short == Story((Happening(short.happenings[0].at_ms, "the Arduino is reset"),))
+    assert short.happenings[0].at_ms % 100 == 0
+
+
+def test_every_happening_is_in_some_story():
+    assert {h.what for seed in range(200) for h in random_story(seed).happenings} == set(HAPPENINGS)
+
+
+@pytest.mark.slow
+def test_the_command(tmp_path):
+    done = CliRunner().invoke(main, ["random", str(tmp_path / "random.json"), "--drives", "3", "--jobs", "1"])
+    assert done.exit_code == 0, done.output
+    assert "firmware_transitions" in (tmp_path / "random.json").read_text()

@@ -1,0 +1,570 @@
+"""Artifacts that somebody made to harm: none runs, none is staged, none costs much.
+
+Each is staged on a rover in a process of its own, forked from this one, with a limit of memory and of time; what comes
+through is proven there as rover-check@ does it, confined.
+"""
+
+import contextlib
+import io
+import json
+import os
+import pickle
+import resource
+import shutil
+import signal
+import struct
+import subprocess
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from archives import Edit, manifest_with, rewritten, vectors_with
+
+from rover_lib.onboard import artifact, load_policy
+from rover_lib.onboard.confine import confine, memory_mb
+from rover_lib.onboard.errors import ArtifactError, RoverError
+from rover_lib.onboard.host import Host
+from rover_lib.onboard.release import Expected, ReleaseError, Releases, check_signature, pack, sign
+
+MOST_MB, MOST_S = 300.0, 5.0
+EITHER = Expected(modes=("fp32", "static"))
+HARM = "harm"  # what a hostile program writes, in the working folder
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a rover made of an artifact: whether it was staged, what was said, and what that cost."""
+
+    staged: bool
+    sentence: str
+    megabytes: float
+    seconds: float
+
+
+def judged(path: Path, folder: Path, proof: bool = False) -> Outcome:
+    """path: of an artifact, or of a folder of parts. proof: run it, too, if it is staged."""
+    reading, writing = os.pipe()
+    start = time.monotonic()
+    pid = os.fork()
+    if pid == 0:
+        signal.alarm(30)  # of one that waits
+        resource.setrlimit(resource.RLIMIT_CPU, (20, 20))
+        with contextlib.suppress(BaseException):
+            os.close(reading)
+            before_mb, staged, sentence = Host().process_peak_memory_mb(), False, ""
+            try:
+                releases = Releases(folder / "models", expected=EITHER)
+                name = releases.stage(path, unsigned=True).name
+                staged = True
+                if proof:
+                    confine(memory_mb(path, 1))
+                    releases.verify(name)
+            except RoverError as error:
+                sentence = str(error)
+            except BaseException as error:
+                sentence = f"UNFORESEEN {type(error).__name__}: {error}"
+            cost_mb = Host().process_peak_memory_mb() - before_mb
+            os.write(writing, json.dumps([staged, sentence, cost_mb]).encode())
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading, "rb") as pipe:
+        answer = pipe.read()
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    said = json.loads(answer) if answer else [False, f"UNFORESEEN: it ended with {code}", 0.0]
+    return Outcome(*said, time.monotonic() - start)
+
+
+def refused(path: Path, folder: Path, message: str, *, staged: bool = False) -> None:
+    """It is refused with a sentence that has this in it, cheaply, and nothing of it was run."""
+    with contextlib.chdir(folder):
+        outcome = judged(path, folder, proof=staged)
+    assert message in outcome.sentence and "\n" not in outcome.sentence, outcome
+    assert outcome.staged == staged, outcome
+    assert outcome.megabytes < MOST_MB and outcome.seconds < MOST_S, outcome
+    assert not list(folder.rglob(HARM)), outcome
+
+
+def hostile(artifacts, folder: Path, change: dict[str, Edit], add: dict[str, bytes] | None = None) -> Path:
+    return rewritten(artifacts["fp32"], folder / "hostile.pt", change, add)
+
+
+# Operators, and a program of another form
+
+LINES = {  # put before the end of a program, whose answer is y
+    "map a file and write to it": ('torch.add_(torch.from_file("harm", True, 4), 1)', "character '\"'"),
+    "map a file, its name a number": ("h = torch.from_file(7, True, 4)", "found torch.from_file"),
+    "save a tensor to a file": ('torch.save(y, "harm")', "character '\"'"),
+    "save, as an assignment": ("h = torch.save(y, y)", "found torch.save"),
+    "print": ("print(y)", "found print(y)"),
+    "warn": ("h = torch.warn(y, 2)", "found torch.warn"),
+    "raise": ("ops.prim.RaiseException(y)", "found ops.prim.RaiseException(y)"),
+    "loop for ever": ("while True:\n      y = torch.add(y, 0)", "found while True"),
+    "loop for long": ("for i in range(1000000000):\n      y = torch.add(y, 0)", "found for i in range"),
+    "branch": ("if True:\n      y = torch.add(y, 0)", "found if True"),
+    "ask the time": ("h = ops.prim.TimePoint()", "found ops.prim.TimePoint"),
+    "draw a random number": ("h = torch.rand([2])", "found torch.rand"),
+    "take memory at once": ("h = torch.ones([100000, 100000])", "found torch.ones"),
+    "write in place": ("y = torch.mul_(y, 0)", "found torch.mul_"),
+    "resize in place": ("h = torch.resize_(y, [1000000])", "found torch.resize_"),
+    "another library's operator": ("h = ops.rover.open(y)", "found ops.rover.open"),
+    "a quantized operator of others": ("h = ops.quantized.embedding_byte_unpack(y)", "found ops.quantized.embedding"),
+    "start another thread": ("h = fork(y)", "found fork"),
+    "its own method": ("h = (self).forward(y, y)", "found self.forward"),
+    "a method of a tensor": ("h = (y).tolist()", "found y.tolist"),
+    "an attribute of a constant": ("h = CONSTANTS.c0.data", "found CONSTANTS.c0.data"),
+    "a name called torch": ("torch = y", "found a variable called torch"),
+    "a keyword": ("h = torch.add(y, y, alpha=2)", "found torch.add(y, y, alpha=2)"),
+    "a comment, which torch reads as a type": ("h = y # type: int", "character '#'"),
+    "another alphabet": ("h\u00e4 = y", "character"),
+    "an escape": ("h = \\\n    y", "character '\\\\'"),
+    "a size beyond all": ("h = torch.as_strided(y, [100000000000, 1], [0, 0])", "found 100000000000"),
+    "brackets without end": (f"h = {'[' * 3000}{']' * 3000}", "cannot be read"),
+    "two statements in a line": ("h = y; h = y", "character ';'"),
+    "a value that it does not have": ("h = torch.add(y, unknown)", "found unknown"),
+}
+
+
+def line_before_end(line: str) -> Edit:
+    def edit(source: bytes) -> bytes:
+        head, end = source.decode().rstrip().rsplit("    return ", 1)
+        return f"{head}    y = {end}\n    {line}\n    return y\n".encode()
+
+    return edit
+
+
+@pytest.mark.parametrize("what", LINES)
+def test_no_program_of_another_form_is_run(artifacts, tmp_path, what):
+    line, message = LINES[what]
+    path = hostile(artifacts, tmp_path, {".py": line_before_end(line)})
+    refused(path, tmp_path, message)
+
+
+SETSTATE = """
+  def __setstate__(self, state: Dict[str, int]) -> None:
+    torch.save(1, "harm")
+"""
+
+
+PROGRAMS = {
+    "a method that torch.jit.load calls": (lambda s: s + SETSTATE.encode(), "character '\"'"),
+    "a second method": (lambda s: s + b"  def more(self) -> int:\n    return 1\n", "a class with"),
+    "a second class": (lambda s: s + b"class Other(Module):\n  pass\n", "more than a class"),
+    "another kind of class": (lambda s: s.replace(b"(Module)", b"(NamedTuple)"), "more than a class"),
+    "an argument that is a number": (lambda s: s.replace(b"frame: Tensor", b"frame: int"), "no tensor"),
+    "attributes": (lambda s: s.replace(b"__buffers__", b"weights"), "a class with"),
+    "no program": (lambda s: b"", "found 0 programs"),
+    "another encoding": (lambda s: b"\xff\xfe" + s, "character"),
+}
+
+
+@pytest.mark.parametrize("what", PROGRAMS)
+def test_no_class_of_another_form_is_loaded(artifacts, tmp_path, what):
+    edit, message = PROGRAMS[what]
+    refused(hostile(artifacts, tmp_path, {".py": edit}), tmp_path, message)
+
+
+# Pickles: constants of the program, which torch.jit.load makes tensors of
+
+
+class Harmful:
+    def __reduce__(self):
+        return os.system, (f"touch {HARM}",)
+
+
+def swap(old: bytes, new: bytes) -> Edit:
+    def edit(raw: bytes) -> bytes:
+        assert old in raw
+        return raw.replace(old, new, 1)
+
+    return edit
+
+
+NAME, CLASS = b"ctorch._utils\n_rebuild_tensor_v2\n", b"c__torch__.rover_lib.workshop.act"
+PICKLES = {  # by record
+    "a command in data.pkl": ("/data.pkl", lambda raw: pickle.dumps(Harmful(), 2), "found posix.system"),
+    "a command in the constants": ("constants.pkl", swap(NAME, b"cos\nsystem\n"), "found os.system"),
+    "a command in the source positions": (".debug_pkl", lambda raw: pickle.dumps(Harmful(), 2), "posix.system"),
+    "a newer pickle": ("constants.pkl", lambda raw: pickle.dumps((Harmful(),), 4), "a pickle with FRAME"),
+    "a class of others": ("/data.pkl", swap(CLASS, b"c__torch__.harm"), "found __torch__.harm"),
+    "an attribute": ("/data.pkl", swap(b"}(u", b"}(X\1\0\0\0aK\1u"), "found attributes, such as 'a'"),
+    "a tensor larger than its bytes": ("constants.pkl", swap(b"K@K\2t", b"K\xffK\2t"), "a tensor of [255, 2] on 128"),
+    "strides beyond its bytes": ("constants.pkl", swap(b"K\2K\1t", b"M\xff\xffK\1t"), "a tensor of [64, 2] on 128"),
+    "strides before its bytes": ("constants.pkl", swap(b"K\2K\1t", b"J\xff\xff\xff\xffK\1t"), "of another form"),
+    "an offset beyond its bytes": ("constants.pkl", swap(b"Qq\5K\0(", b"Qq\5K\1("), "a tensor of [64, 2] on 128"),
+    "bytes that are not there": ("constants.pkl", swap(b"K\x80tQ", b"J\0\0\0\x7ftQ"), "a tensor without its bytes"),
+    "another device": ("constants.pkl", swap(b"\3\0\0\0cpu", b"\4\0\0\0cuda"), "a tensor without its bytes"),
+    "items of another size": ("constants.pkl", swap(b"FloatStorage", b"DoubleStorage"), "without its bytes"),
+    "room for two billion": ("constants.pkl", swap(NAME + b"q\0", NAME + b"r\0\0\0\x7f"), "LONG_BINPUT"),
+    "an end before the end": ("constants.pkl", lambda raw: raw[: len(raw) // 2], "cannot be read"),
+    "no pickle": ("constants.pkl", lambda raw: b"", "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("what", PICKLES)
+def test_no_pickle_of_another_form_is_read(artifacts, tmp_path, what):
+    record, edit, message = PICKLES[what]
+    refused(hostile(artifacts, tmp_path, {record: edit}), tmp_path, message)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (swap(b"Conv2dPackedParamsBase", b"LinearPackedParamsBase"), "weights of a linear layer in another form"),
+        (
+            swap(b"torch.classes.quantized\nConv2d", b"torch.classes.rover\nConv2d"),
+            "found __torch__.torch.classes.rover",
+        ),
+        (swap(b"ctorch\nper_channel_affine\n", b"ctorch\nFloatStorage\n"), "a quantized tensor of another form"),
+        (swap(b"List[Optional[Tensor]]", b"List[Optional[Future]]"), "found a list of List[Optional[Future]]"),
+    ],
+)
+def test_no_quantized_weights_of_another_form_are_packed(artifacts, tmp_path, edit, message):
+    refused(rewritten(artifacts["static"], tmp_path / "x.pt", {"constants.pkl": edit}), tmp_path, message)
+
+
+# Archives: names, and readers that would see different things
+
+
+def with_bytes(edit: Edit) -> Callable[[Path], None]:
+    return lambda path: path.write_bytes(edit(path.read_bytes())) and None
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["archive/../../harm", "/harm", "archive/model.json", "archive/data/0", "archive/code/__torch__/../x.py",
+     "other/data.pkl", "archive/attributes.pkl", "archive/extra/harm.so", "archive/constants/harm", "archive/"],
+)  # fmt: skip
+def test_no_other_record_is_taken(artifacts, tmp_path, name):
+    refused(hostile(artifacts, tmp_path, {}, {name: b"harm"}), tmp_path, "a record that no artifact has, found")
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("name", ["data.pkl", "constants.pkl", "code/__torch__/rover_lib/workshop/ACT.py"])
+def test_no_record_is_there_twice_whatever_its_case(artifacts, tmp_path, name):
+    change = {"": lambda raw: raw}
+    with zipfile.ZipFile(artifacts["fp32"]) as z:
+        (program,) = [n for n in z.namelist() if n.endswith(".py")]
+    twice = f"archive/{name}" if "code" not in name else program.replace("rover_lib", "Rover_Lib")
+    refused(hostile(artifacts, tmp_path, change, {twice: b"harm"}), tmp_path, "is in it twice")
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        pytest.param(lambda raw: b"\0\0\0\0PTMF" + raw, "does not begin as an archive", id="a phone's format"),
+        pytest.param(lambda raw: raw + b"harm", "does not end as an archive", id="something after it"),
+        pytest.param(lambda raw: raw[:-2] + b"\4\0harm", "does not end as an archive", id="a comment"),
+        pytest.param(lambda raw: raw[:4] + bytes(4096) + raw[4:], "directory is not where it says", id="a gap"),
+        pytest.param(lambda raw: raw[:4] + bytes(60) + raw[-22:], "directory is not where it says", id="no directory"),
+        pytest.param(lambda raw: raw[: len(raw) // 2], "does not end as an archive", id="half of it"),
+        pytest.param(lambda raw: b"", "does not begin as an archive", id="nothing"),
+    ],
+)
+def test_no_other_file_is_taken(artifacts, tmp_path, edit, message):
+    path = hostile(artifacts, tmp_path, {})
+    path.write_bytes(edit(path.read_bytes()))
+    refused(path, tmp_path, message)
+
+
+# Bombs
+
+
+BOMB_MB = 320
+
+
+def deflated(artifacts, folder: Path, name: str) -> Path:
+    """An artifact in which a record is replaced by zeros, that are compressed a thousandfold."""
+    path = hostile(artifacts, folder, {name: lambda raw: None})
+    with (
+        zipfile.ZipFile(artifacts["fp32"]) as z,
+        zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED, compresslevel=1) as new,
+    ):
+        (full,) = [n for n in z.namelist() if n.endswith(name)]
+        with new.open(full, "w", force_zip64=False) as record:
+            for _ in range(BOMB_MB):
+                record.write(bytes(1 << 20))
+    return path
+
+
+@pytest.mark.parametrize("name", ["extra/manifest.json", ".py"])
+def test_a_bomb_is_known_by_its_header(artifacts, tmp_path, name):
+    path = deflated(artifacts, tmp_path, name)
+    assert path.stat().st_size < artifacts["fp32"].stat().st_size + 3e6
+    refused(path, tmp_path, f"unpacks to {BOMB_MB << 20} bytes")
+    # And one whose header lies.
+    path.write_bytes(path.read_bytes().replace(struct.pack("<I", BOMB_MB << 20), struct.pack("<I", 9000)))
+    refused(path, tmp_path, "is compressed" if "manifest" in name else "damaged")
+
+
+def inner_bomb(raw: bytes) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as z:
+        for name in ("state.npy", "chunk.npy", "frame_cam_front.npy"):
+            with z.open(name, "w") as f:
+                np.lib.format.write_array_header_1_0(f, {"descr": "|u1", "fortran_order": False, "shape": (1 << 40,)})
+                for _ in range(BOMB_MB if name == "state.npy" else 1):
+                    f.write(bytes(1 << 20))
+    return out.getvalue()
+
+
+def pickled(raw: bytes) -> bytes:
+    out = io.BytesIO()
+    np.savez(out, state=np.array([Harmful()], object), chunk=np.zeros(1), frame_cam_front=np.zeros(1))
+    return out.getvalue()
+
+
+VECTORS = {
+    "a bomb": (inner_bomb, "too large"),
+    "a pickle": (pickled, "another shape than its manifest says"),
+    "too many": (vectors_with(lambda v: v.update({k: np.repeat(x, 50, 0) for k, x in v.items()})), "too large"),
+    "none": (vectors_with(lambda v: v.update({k: x[:0] for k, x in v.items()})), "another shape"),
+    "other lengths": (vectors_with(lambda v: v.update(state=v["state"][:1])), "do not belong together"),
+    "no answers": (vectors_with(lambda v: v.pop("chunk")), "not readable"),
+    "answers that are no numbers": (vectors_with(lambda v: v["chunk"].fill(np.nan)), "do not belong together"),
+    "a row too many": (vectors_with(lambda v: v.update(chunk=v["chunk"].repeat(2, 1))), "another shape"),
+    "another type": (vectors_with(lambda v: v.update(state=v["state"].astype(float))), "another shape"),
+    "other pictures": (vectors_with(lambda v: v.update(frame_cam_front=v["frame_cam_front"][:, :9])), "another shape"),
+}
+
+
+@pytest.mark.parametrize("what", VECTORS)
+def test_no_parity_vectors_of_another_form_are_read(artifacts, tmp_path, what):
+    edit, message = VECTORS[what]
+    refused(hostile(artifacts, tmp_path, {"parity.npz": edit}), tmp_path, message)
+
+
+def test_many_records_are_not_listed(artifacts, tmp_path):
+    many = {f"archive/constants/{i + 1000}": b"" for i in range(6000)}
+    refused(hostile(artifacts, tmp_path, {}, many), tmp_path, "records are more than an artifact has")
+
+
+def test_a_record_of_gigabytes_is_not_believed(artifacts, tmp_path):
+    path = hostile(artifacts, tmp_path, {})
+    with zipfile.ZipFile(path) as z:
+        size = max(r.file_size for r in z.infolist())
+    path.write_bytes(path.read_bytes().replace(struct.pack("<II", size, size), struct.pack("<II", 4 << 29, 4 << 29)))
+    refused(path, tmp_path, "bytes are more than an artifact has")
+
+
+# Lies of the manifest
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"parity": {"tolerance": {"steering": 1e9, "throttle": 1e9}}}, "steering must be from 0 to 0.001"),
+        ({"parity": {"tolerance": {"steering": 0.0, "throttle": float("nan")}}}, "tolerance of throttle must be"),
+        ({"parity": {"tolerance": {"steering": 0.0, "throttle": "1"}}}, "tolerance of throttle must be"),
+        ({"parity": {"tolerance": {"steering": -1.0, "throttle": 0.0}}}, "tolerance of steering must be"),
+        ({"mode": "static", "parity": {"tolerance": {"steering": 0.5, "throttle": 0}}}, "must be from 0 to 0.3"),
+        ({"mode": "static"}, "its manifest says static, its code is not"),
+        ({"mode": "quick"}, "mode must be one of"),
+        ({"scheme": "ternary"}, "scheme must be one of"),
+        ({"engine": "x86"}, "needs the quantization engine 'x86'"),
+        ({"rate_hz": 0.01}, "rate_hz must be from 5 to 120, found 0.01"),
+        ({"rate_hz": 1e6}, "rate_hz must be from 5 to 120"),
+        ({"rate_hz": float("inf")}, "rate_hz must be from 5 to 120"),
+        ({"rate_hz": True}, "rate_hz must be from 5 to 120"),
+        ({"chunk": 32_000}, "chunk must be from 1 to 256, found 32000"),
+        ({"chunk": True}, "chunk must be from 1 to 256"),
+        ({"weights_mb": -1}, "weights_mb must be from 0"),
+        ({"gmac": float("nan")}, "gmac must be from 0"),
+        ({"cameras": [{"name": "cam_front", "height": 1, "width": 2}]}, "is not a name and a size"),
+        ({"cameras": [{"name": "cam_front", "height": 72_000, "width": 128_000}]}, "is not a name and a size"),
+        ({"cameras": [{"name": "../harm", "height": 72, "width": 128}]}, "is not a name and a size"),
+        ({"cameras": [{"name": "cam_front", "height": 72, "width": 128}] * 2}, "cameras must be names, each once"),
+        ({"cameras": [{"name": "cam_front", "height": 144, "width": 256}]}, "another shape than its manifest says"),
+        ({"action_names": ["throttle", "steering"]}, "this car has steering and throttle"),
+        ({"action_names": ["steering", "throttle"] * 2}, "action_names must be names, each once"),
+        ({"state_names": ["steering\x1b[2J", "throttle"]}, "state_names must be names, each once"),
+        ({"state_names": ["a" * 10_000]}, "state_names must be names"),
+        ({"versions": {"torch": "9.9"}}, "made with torch 9.9"),
+        ({"versions": {}}, "made with torch ?"),
+        ({"checkpoint": "harm"}, "manifest key 'checkpoint'"),
+    ],
+)  # fmt: skip
+def test_a_manifest_does_not_judge_itself(artifacts, tmp_path, values, message):
+    refused(hostile(artifacts, tmp_path, {"manifest.json": manifest_with(**values)}), tmp_path, message)
+
+
+@pytest.mark.parametrize("text", [b"[" * 50_000, b'{"a":' * 10_000, b"[]", b"", b"\xff"])
+def test_a_manifest_that_is_none(artifacts, tmp_path, text):
+    refused(hostile(artifacts, tmp_path, {"manifest.json": lambda raw: text}), tmp_path, "manifest is no")
+
+
+# What only a proof finds: of the right form, so that it is staged, but never used
+
+
+ANSWERS = {
+    "three columns": ("y = torch.cat([y, torch.slice(y, 2, 0, 1)], 2)", "found (1, 32, 3)"),
+    "four columns": ("y = torch.cat([y, y], 2)", "must give 32 times 2 float32, found (1, 32, 4)"),
+    "32,000 rows": ("y = torch.as_strided(y, [1, 32000, 2], [0, 0, 1])", "found (1, 32000, 2)"),
+    "a batch of two": ("y = torch.cat([y, y], 0)", "found (2, 32, 2)"),
+    "one row": ("y = torch.slice(y, 1, 0, 1)", "found (1, 1, 2)"),
+    "no batch": ("y = torch.squeeze(y, 0)", "found (32, 2)"),
+    "doubles": ("y = torch.to(y, 7)", "torch.float64"),
+    "bytes beyond the end": ("y = torch.as_strided(y, [1, 32, 2], [64, 200, 1])", "do not run"),
+    "other answers": ("y = torch.mul(y, 2)", "computes something else here"),
+    "half of a terabyte": ("y = torch.contiguous(torch.as_strided(y, [1, 10000000, 10000], [0, 0, 0]))", "do not run"),
+    "memory that doubles": ("\n    ".join(["y = torch.cat([y, y], 0)"] * 40), "do not run"),
+    "memory that grows": ("\n    ".join([
+        *(f"h{i} = torch.contiguous(torch.as_strided(y, [1000000, 10], [0, 0], {i}))" for i in range(30)),
+        f"y = torch.cat([{', '.join(f'h{i}' for i in range(30))}], 0)",
+    ]), "do not run"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", ANSWERS)
+def test_an_answer_is_what_the_manifest_says(artifacts, tmp_path, what):
+    line, message = ANSWERS[what]
+    path = hostile(artifacts, tmp_path, {".py": line_before_end(line)})
+    refused(path, tmp_path, message, staged=True)
+
+
+# What is no file
+
+
+def a_fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (a_fifo, "not a file"),
+        (lambda path: path.symlink_to("/dev/zero"), "not a file"),
+        (Path.mkdir, "not what 'rover release pack' writes"),
+        (lambda path: path.symlink_to("nothing"), "not found"),
+    ],
+    ids=["a FIFO", "a device", "an empty folder", "nothing"],
+)
+def test_what_is_no_artifact_is_not_waited_for(tmp_path, make, message):
+    make(tmp_path / "x")
+    refused(tmp_path / "x", tmp_path, message)
+
+
+def replaced_by(make: Callable[[Path], object]) -> Callable[[Path], None]:
+    def replace(path: Path) -> None:
+        path.unlink()
+        make(path)
+
+    return replace
+
+
+def describes(**values: object) -> Callable[[Path], None]:
+    return lambda path: path.write_text(json.dumps(json.loads(path.read_text()) | values)) and None
+
+
+PACKED = {
+    "a part that is a FIFO": ("part-0001", replaced_by(a_fifo), "not a file"),
+    "a part without end": ("part-0001", replaced_by(lambda p: p.symlink_to("/dev/zero")), "not a file"),
+    "a part that is larger": ("part-0001", lambda p: p.write_bytes(bytes(50 << 20)), "larger than it can be"),
+    "a description that is a FIFO": ("release.json", replaced_by(a_fifo), "not what 'rover release pack' writes"),
+    "a deep description": (
+        "release.json",
+        lambda p: p.write_text("[" * 90_000),
+        "not what 'rover release pack' writes",
+    ),
+    "a long description": ("release.json", lambda p: p.write_text(" " * 9_000_000), "not what 'rover release pack'"),
+    "a billion parts": ("release.json", describes(parts=10**9, bytes=10**9), "its sizes are none"),
+    "a terabyte": ("release.json", describes(bytes=10**12), "its sizes are none"),
+    "less than nothing": ("release.json", describes(bytes=-1), "its sizes are none"),
+    "fewer bytes than there are": ("release.json", describes(bytes=1000), "larger than it can be"),
+    "another name": ("release.json", describes(name="../../harm"), "its hashes are none"),
+    "a terminal's commands": ("release.json", describes(origin={"file": "\x1b[2J", "host": ""}), "its origin is none"),
+}
+
+
+@pytest.mark.parametrize("what", PACKED)
+def test_no_parts_of_another_form_are_joined(artifacts, tmp_path, monkeypatch, what):
+    monkeypatch.setattr("rover_lib.onboard.release.PART_BYTES", 20 << 20)
+    name, change, message = PACKED[what]
+    pack(artifacts["fp32"], tmp_path / "packed", EITHER)
+    change(tmp_path / "packed" / name)
+    refused(tmp_path / "packed", tmp_path, message)
+
+
+# Signatures
+
+
+def signed_by_another(path: Path, keys: Path) -> None:
+    Path(f"{path}.sig").write_bytes(sign(path, keys / "theirs"))
+
+
+def signed_for_another_purpose(path: Path, keys: Path) -> None:
+    subprocess.run(["ssh-keygen", "-q", "-Y", "sign", "-n", "file", "-f", keys / "ours", path], check=True)
+
+
+def changed_where_no_hash_looks(path: Path, keys: Path) -> None:
+    Path(f"{path}.sig").write_bytes(sign(path, keys / "ours"))
+    other = rewritten(path, path.with_name("other.pt"), {"serialization_id": lambda raw: raw[::-1]})
+    assert artifact.content_hash(other) == artifact.content_hash(path)
+    other.replace(path)
+
+
+def cut_short(path: Path, keys: Path) -> None:
+    Path(f"{path}.sig").write_bytes(sign(path, keys / "ours")[:-60])
+
+
+def a_signature_that_is_a_fifo(path: Path, keys: Path) -> None:
+    os.mkfifo(f"{path}.sig")
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [lambda path, keys: None, signed_by_another, signed_for_another_purpose, changed_where_no_hash_looks, cut_short,
+     a_signature_that_is_a_fifo],
+)  # fmt: skip
+def test_a_rover_takes_only_what_its_own_laptops_signed(artifacts, tmp_path, keys, spoil):
+    path = Path(shutil.copy(artifacts["static"], tmp_path / "x.pt"))
+    spoil(path, keys)
+    releases = Releases(tmp_path / "models", signers=keys / "signers")
+    with pytest.raises(ReleaseError, match=r"not signed.*; deploy it from a laptop that has provisioned this rover"):
+        releases.stage(path)
+    assert not releases.all()
+    Path(f"{path}.sig").unlink(missing_ok=True)
+    Path(f"{path}.sig").write_bytes(sign(path, keys / "ours"))
+    name = releases.stage(path).name
+    check_signature(releases.path_of(name), releases.path_of(name).with_name("policy.pt.sig"), keys / "signers")
+    assert [r.signed for r in releases.all()] == [True]
+
+
+def test_a_rover_without_signers_takes_nothing_unless_it_is_told_to(artifacts, tmp_path, keys):
+    path = Path(shutil.copy(artifacts["static"], tmp_path / "x.pt"))
+    Path(f"{path}.sig").write_bytes(sign(path, keys / "ours"))
+    releases = Releases(tmp_path / "models", signers=tmp_path / "none")
+    with pytest.raises(ReleaseError, match=r"this rover knows no laptop.* or say --unsigned"):
+        releases.stage(path)
+    releases.stage(path, unsigned=True)
+    assert [r.signed for r in releases.all()] == [False]
+
+
+def test_a_key_that_is_none_signs_nothing(artifacts, tmp_path):
+    (tmp_path / "key").write_text("no key")
+    with pytest.raises(ReleaseError, match="cannot be signed"):
+        pack(artifacts["static"], tmp_path / "packed", key=tmp_path / "key")
+    assert not (tmp_path / "packed").exists()
+
+
+# Root
+
+
+def test_root_loads_nothing_unless_there_is_nobody_else(artifacts, monkeypatch):
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.delenv("ROVER_AS_ROOT")
+    with pytest.raises(ArtifactError, match="root does not load artifacts; use another user, on a rover `sudo -u"):
+        load_policy(artifacts["static"])
+
+
+def test_what_is_refused_above_is_of_our_own_form_otherwise(artifacts, tmp_path):
+    """So that a row that is refused is refused for its reason."""
+    for mode in artifacts:
+        load_policy(rewritten(artifacts[mode], tmp_path / f"{mode}.pt", {}))
+    outcome = judged(
+        hostile(artifacts, tmp_path, {".py": line_before_end("y = torch.add(y, 0)")}), tmp_path, proof=True
+    )
+    assert (outcome.staged, outcome.sentence) == (True, "")

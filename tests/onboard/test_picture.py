@@ -1,0 +1,122 @@
+"""Pictures that nobody vouches for: what is refused and at what cost, and what tells a camera from a picture of one."""
+
+import os
+import subprocess
+import sys
+
+import cv2
+import hostile
+import numpy as np
+import pytest
+from hostile import HOSTILE, WHOLE, jpeg, scene
+
+from rover_lib.onboard.picture import PictureError, block_sums, brightness, decode_jpeg, read_jpeg
+
+MOST_MB, MOST_S = 300, 5
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_what_is_not_all_of_a_cameras_picture_is_refused(name):
+    with pytest.raises(PictureError) as refusal:
+        decode_jpeg(HOSTILE[name])
+    assert refusal.value.remedy
+
+
+def test_none_of_them_costs_much(tmp_path):
+    """In a child that may take no more than 300 MB and 5 s beyond what it began with, for any of them."""
+    for i, data in enumerate(HOSTILE.values()):
+        (tmp_path / f"{i:03d}.jpg").write_bytes(data)
+    code = f"""
+import resource, sys, time
+from pathlib import Path
+from rover_lib.onboard.picture import PictureError, read_jpeg
+def most_mb(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+before = most_mb()
+taken = int(Path("/proc/self/statm").read_text().split()[0]) * 4096
+resource.setrlimit(resource.RLIMIT_AS, (taken + {MOST_MB} * 1_000_000,) * 2)
+worst_s = 0
+for path in sorted(Path(sys.argv[1]).iterdir()):
+    begin = time.process_time()
+    try: read_jpeg(path); sys.exit(f"{{path}} was taken")
+    except PictureError: worst_s = max(worst_s, time.process_time() - begin)
+print(most_mb() - before, worst_s)
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    mb, seconds = map(float, done.stdout.split())
+    assert mb < MOST_MB and seconds < MOST_S
+
+
+def test_what_a_camera_may_send_is_decoded_as_opencv_does():
+    for data in (WHOLE, hostile.RESTARTS, jpeg(scene()[:, :, 0]), jpeg(scene(), 30), hostile.progressive(scene())):
+        assert (decode_jpeg(data) == cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)).all()
+    begin = WHOLE.index(b"\xff\xc4")
+    without_tables = WHOLE[:begin] + WHOLE[hostile.SCAN - 14 :]  # as webcams send them
+    assert (decode_jpeg(without_tables) == decode_jpeg(WHOLE)).all()
+
+
+def test_bytes_that_some_webcams_fill_up_with_cost_no_picture():
+    at = hostile.RESTARTS.index(b"\xff\xd1")
+    filled = hostile.RESTARTS[:at] + b"\x11\x22" + hostile.RESTARTS[at:]
+    for data in (filled, WHOLE + bytes(500), WHOLE[:-2] + b"\x12\x34\xff\xd9"):
+        assert decode_jpeg(data).shape == (360, 640, 3)
+
+
+def test_a_file_that_is_none(tmp_path):
+    os.mkfifo(tmp_path / "fifo")
+    with pytest.raises(PictureError, match="no plain file"):
+        read_jpeg(tmp_path / "fifo")
+    with pytest.raises(OSError):
+        read_jpeg(tmp_path / "nothing")
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(PictureError, match=r"too large, found 8\.0 MB"):
+        read_jpeg(tmp_path / "large")
+
+
+def noisy(image, sigma, rng) -> np.ndarray:
+    return np.clip(np.rint(image + rng.normal(0, sigma, image.shape)), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("sigma", "quality"), [(0.25, 30), (0.5, 50), (1, 30), (1, 70), (2, 90)])
+def test_a_sensors_noise_tells_two_pictures_of_the_same_apart(sigma, quality):
+    """Down to a quarter of a grey level, through a JPEG of a bad webcam: a car that stands before a still scene."""
+    rng = np.random.default_rng(0)
+    pictures = [block_sums(decode_jpeg(jpeg(noisy(scene(), sigma, rng), quality))) for _ in range(6)]
+    for i, blocks in enumerate(pictures):
+        for other in pictures[:i]:
+            assert (blocks == other).mean() < 0.6
+
+
+def test_one_pixel_more_or_less_is_the_same_picture():
+    flickers = scene()
+    flickers[119:121, 79:81] = 255  # in four blocks
+    assert 0.95 < (block_sums(flickers) == block_sums(scene())).mean() < 1
+    assert (block_sums(jpeg_again(flickers)) == block_sums(jpeg_again(scene()))).mean() > 0.9
+
+
+def jpeg_again(image) -> np.ndarray:
+    return decode_jpeg(jpeg(image))
+
+
+@pytest.mark.parametrize("size", [(48, 27), (64, 36), (127, 71), (640, 480), (1280, 720)])
+def test_blocks_of_any_size(size):
+    image = scene(size=size)
+    assert block_sums(image).shape == (144,)
+    other = image.copy()
+    other[size[1] // 2, size[0] // 2] ^= 1
+    assert (block_sums(image) != block_sums(other)).sum() == 1
+
+
+def test_contrast_is_of_the_scene_and_not_of_the_noise():
+    rng = np.random.default_rng(0)
+    grey = np.full((360, 640, 3), 128, np.uint8)
+    pixel = grey.copy()
+    pixel[100, 100] = 255
+    for nothing in (grey, pixel, noisy(grey, 8, rng), noisy(grey, 20, rng), np.full_like(grey, 255)):
+        assert brightness(nothing)[1] < 2
+    assert brightness(scene())[1] > 20
+    assert brightness(grey)[0] == 128
+    coloured = grey.copy()
+    coloured[:, :320, 0] = 160
+    assert brightness(coloured)[1] == pytest.approx(16, abs=0.1)
