@@ -3,7 +3,7 @@
     chooser = Chooser(checkpoint, calibration, samples, recordings.action_range())
     scheme, by_observer = chooser.observer(Scheme("static"))
     sensitivity = chooser.sensitivity(scheme)
-    mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=0.2, max_blocks=4)
+    mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=0.2, max_cost_pct=5)
 
 Errors are against FP32, in percent of each action's recorded range. An action that never changes in the recordings is
 not judged: its error is None, and `warnings` says so.
@@ -16,7 +16,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.workshop.act import ACT, blocks, inputs_of, predictions
+from rover_lib.workshop.act import ACT, blocks, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.episodes import Sample
 from rover_lib.workshop.judge import Range, constant_actions, not_judged, pct_of_range, worst
@@ -26,6 +26,9 @@ from rover_lib.workshop.quantize import convert, quantize
 from rover_lib.workshop.scheme import OBSERVERS, Scheme
 
 Errors = dict[str, float | None]  # <action>_mae_pct, None where it is not judged
+# A multiply-accumulate in float against one in INT8, in instructions: 6.08 to 1.44 G of the full policy, counted on an
+# emulated Cortex-A76.
+FLOAT_PER_INT8 = 4.2
 
 
 def mae_pct(actions: Tensor, reference: Tensor, action_range: Mapping[str, Range]) -> Errors:
@@ -90,23 +93,39 @@ class Chooser:
         return table
 
     def mixed(
-        self, scheme: Scheme, sensitivity: Mapping[str, Errors], *, budget_pct: float, max_blocks: int
+        self, scheme: Scheme, sensitivity: Mapping[str, Errors], *, budget_pct: float, max_cost_pct: float
     ) -> tuple[Scheme, list[dict[str, Any]]]:
-        """Leave the most sensitive blocks in float, one more at a time, until every action's error is in the budget.
+        """Leave blocks in float that take much of the error for few instructions, until every action is in the budget.
 
-        Returns the mixed scheme and each step {float_blocks, <action>_mae_pct}; if `max_blocks` do not reach the
-        budget, the best step is taken and the last one shows it.
+        Blocks are tried in the order of squared error taken per instruction added. One that is too dear for what is
+        left of `max_cost_pct`, the instructions that mixed may have more than static, or after which the worse action
+        is not better, stays INT8. Returns the mixed scheme and its steps {float_blocks, cost_pct, <action>_mae_pct},
+        static first; the last is the best within the cost, in the budget or not.
         """
         graph = observed_graph(self.checkpoint, scheme, self.calibration)
-        order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]), reverse=True)
-        trials: list[tuple[Scheme, Errors]] = []
-        for count in range(min(max_blocks, len(order) - 1) + 1):
-            trial = replace(scheme, mode="mixed", float_blocks=tuple(order[:count]))
-            trials.append((trial, self.error(convert(graph, self.checkpoint.config, trial))))
-            if _worst(trials[-1][1]) <= budget_pct:
+        costs = float_costs_pct(self.checkpoint)
+        order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]) ** 2 / costs[block], reverse=True)
+        best = replace(scheme, mode="mixed", float_blocks=())
+        cost, error = 0.0, self.error(convert(graph, self.checkpoint.config, best))
+        steps = [{"float_blocks": [], "cost_pct": cost, **error}]
+        for block in order:
+            if _worst(error) <= budget_pct:
                 break
-        best, _ = min(trials, key=lambda t: max(_worst(t[1]), budget_pct))
-        return best, [{"float_blocks": list(trial.float_blocks), **error} for trial, error in trials]
+            if cost + costs[block] > max_cost_pct or len(best.float_blocks) == len(sensitivity) - 1:
+                continue
+            trial = replace(best, float_blocks=(*best.float_blocks, block))
+            found = self.error(convert(graph, self.checkpoint.config, trial))
+            if _worst(found) < _worst(error):
+                best, cost, error = trial, cost + costs[block], found
+                steps.append({"float_blocks": list(best.float_blocks), "cost_pct": cost, **error})
+        return best, steps
+
+
+def float_costs_pct(checkpoint: Checkpoint) -> dict[str, float]:
+    """What each block adds to the instructions of static INT8 when it is left in float, in percent; computed."""
+    macs = multiply_accumulates(ACT(checkpoint.config, checkpoint.weights))
+    whole = sum(macs.values())
+    return {block: 100 * (FLOAT_PER_INT8 - 1) * macs[block] / whole for block in blocks(checkpoint.config)}
 
 
 def _worst(errors: Errors) -> float:

@@ -152,7 +152,7 @@ def test_figures_leave_out_what_is_not_judged(still):
 @pytest.mark.filterwarnings("error")
 def test_choices_are_drawn_without_what_is_not_judged():
     table = {name: {"steering_mae_pct": 0.5, "throttle_mae_pct": None} for name in ("minmax", "histogram")}
-    steps = [{"float_blocks": [], "steering_mae_pct": 0.5, "throttle_mae_pct": None}]
+    steps = [{"float_blocks": [], "cost_pct": 0.0, "steering_mae_pct": 0.5, "throttle_mae_pct": None}]
     for figure in (plots.errors_by_choice(table, "observers"), plots.sensitivity(table, steps, 1.0)):
         figure.draw_without_rendering()
         words = [t.get_text() for ax in figure.axes for t in (ax.get_legend().get_texts() if ax.get_legend() else ())]

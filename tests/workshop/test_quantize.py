@@ -17,7 +17,7 @@ from rover_lib.workshop import act, observe
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.choose import Chooser
+from rover_lib.workshop.choose import Chooser, float_costs_pct
 from rover_lib.workshop.export import export
 from rover_lib.workshop.observe import Calibration, RangeObserver, calibrate, observed_graph, qconfig_mapping
 from rover_lib.workshop.quantize import quantize
@@ -329,12 +329,18 @@ def test_chooses_by_error(tiny, calibration):
     sensitivity = chooser.sensitivity(scheme)
     assert list(sensitivity) == act.blocks(tiny.config)
     assert all(max(e.values()) > 0 for e in sensitivity.values())  # each block alone does something
-    mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=1e-6, max_blocks=2)
-    assert [len(s["float_blocks"]) for s in steps] == [0, 1, 2] and mixed.mode == "mixed"
-    worst = max(sensitivity, key=lambda b: max(sensitivity[b].values()))
-    assert steps[1]["float_blocks"] == [worst]
-    plain, steps = chooser.mixed(scheme, sensitivity, budget_pct=100, max_blocks=2)
+    costs = float_costs_pct(tiny)
+    assert 0 < sum(costs.values()) <= 100 * 3.2  # all in float, but for the head: 4.2 times the instructions
+    mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=1e-6, max_cost_pct=60)
+    errors = [max(s["steering_mae_pct"], s["throttle_mae_pct"]) for s in steps]
+    assert errors == sorted(errors, reverse=True) and len(set(errors)) == len(errors) > 1
+    assert mixed.mode == "mixed" and list(mixed.float_blocks) == steps[-1]["float_blocks"]
+    assert steps[-1]["cost_pct"] == pytest.approx(sum(costs[b] for b in mixed.float_blocks))
+    assert steps[-1]["cost_pct"] <= 60
+    plain, steps = chooser.mixed(scheme, sensitivity, budget_pct=100, max_cost_pct=60)
     assert plain.float_blocks == () and len(steps) == 1
+    dear, steps = chooser.mixed(scheme, sensitivity, budget_pct=1e-6, max_cost_pct=0)
+    assert dear.float_blocks == () and len(steps) == 1  # nothing is free
 
 
 @pytest.mark.slow
@@ -345,7 +351,7 @@ def test_an_action_that_never_changes_takes_no_part_in_choosing(tiny, calibratio
     assert all(row["throttle_mae_pct"] is None and row["steering_mae_pct"] > 0 for row in table.values())
     assert table[scheme.observer]["steering_mae_pct"] == min(row["steering_mae_pct"] for row in table.values())
     blocks = {"backbone.stem": table["minmax"], "image_project": table["histogram"]}
-    mixed, steps = chooser.mixed(scheme, blocks, budget_pct=100, max_blocks=1)
+    mixed, steps = chooser.mixed(scheme, blocks, budget_pct=100, max_cost_pct=60)
     assert mixed.float_blocks == () and len(steps) == 1 and steps[0]["throttle_mae_pct"] is None
 
 

@@ -99,9 +99,9 @@ def errors_by_choice(
 def sensitivity(
     table: Mapping[str, Mapping[str, float | None]], steps: Sequence[Mapping[str, Any]], budget_pct: float
 ) -> Figure:
-    """Left: each block quantized alone. Right: what leaving the worst ones in float buys.
+    """Left: each block quantized alone. Right: what leaving some of them in float buys, and costs.
 
-    table: {block: {<action>_mae_pct}}; steps: of `choose_mixed`, {float_blocks, <action>_mae_pct}.
+    table: {block: {<action>_mae_pct}}; steps: of `Chooser.mixed`, {float_blocks, cost_pct, <action>_mae_pct}.
     """
     blocks = list(table)
     fig, axes = new_figure(1, 2, height_in=max(3.6, 1.2 + 0.26 * len(blocks)), width_ratios=(1.5, 1))
@@ -112,16 +112,16 @@ def sensitivity(
         name, colour = key.removesuffix("_mae_pct"), action_colour(key, i)
         y = np.arange(len(blocks)) + (i - (len(keys) - 1) / 2) * height
         left.barh(y, [table[b][key] for b in blocks], height, color=colour, label=name)
-        right.plot(range(len(steps)), [s[key] for s in steps], "o-", color=colour, label=name)
+        right.plot([s["cost_pct"] for s in steps], [s[key] for s in steps], "o-", color=colour, label=name)
     left.set_yticks(range(len(blocks)), blocks)
     left.invert_yaxis()
     left.set_xlabel("mean error (% of the recorded range)")
     left.set_title("this block alone in INT8", fontsize=11)
     right.axhline(budget_pct, color=BLACK, ls="--", lw=1, label=f"budget, {budget_pct:g} %")
-    right.set_xticks(range(len(steps)))
-    right.set(xlabel="blocks left in float", ylabel="mean error (% of the recorded range)", ylim=(0, None))
+    right.set(xlabel="more instructions than static (%, computed)", ylabel="mean error (% of the recorded range)")
+    right.set_ylim(0, None)
     right.margins(x=0.15)
-    right.set_title("all others in INT8", fontsize=11)
+    right.set_title("one more block in float at each point", fontsize=11)
     legend(right)
     return fig
 
