@@ -107,7 +107,7 @@ class Chooser:
         order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]) ** 2 / costs[block], reverse=True)
         best = replace(scheme, mode="mixed", float_blocks=())
         cost, error = 0.0, self.error(convert(graph, self.checkpoint.config, best))
-        steps = [{"float_blocks": [], "cost_pct": cost, **error}]
+        steps: list[dict[str, Any]] = [{"float_blocks": [], "cost_pct": cost, **error}]
         for block in order:
             if _worst(error) <= budget_pct:
                 break
