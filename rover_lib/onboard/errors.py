@@ -60,6 +60,10 @@ class ParamsError(RoverError):
     """params.yml or a parameter that makes no sense."""
 
 
+class TrainingError(RoverError):
+    """A training that went wrong, or that cannot go on from what was saved of it."""
+
+
 class WorldError(RoverError):
     """A run in the balloon world that cannot be made."""
 

@@ -5,13 +5,9 @@ the backbone alone with live batch norm, predicting the chunk; the transformer o
 features, computed once; then all together at a tenth of the rate.
 """
 
-from __future__ import annotations
-
-import math
 import shutil
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -24,29 +20,47 @@ from torch import Tensor, nn
 from rover_lib.onboard import preprocess
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.preprocess import normalise, prepare_frame
+from rover_lib.onboard.preprocess import normalise
 from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop import act as act_module
 from rover_lib.workshop import episodes as episodes_module
+from rover_lib.workshop import training as training_module
 from rover_lib.workshop.act import ActConfig, lerobot_act
-from rover_lib.workshop.cache import cached_folder, key_of
-from rover_lib.workshop.episodes import Sample, load_recordings, split
+from rover_lib.workshop.cache import cache_root, cached_folder, key_of
+from rover_lib.workshop.compare import thinned
+from rover_lib.workshop.episodes import load_recordings, split
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.training import (
+    ACTION,
+    IMAGE,
+    IS_PAD,
+    STATE,
+    Frames,
+    Given,
+    Resumable,
+    RowFile,
+    batch_of,
+    descend,
+    error_of,
+    frames_of,
+    in_memory,
+    losses_of,
+    optimiser,
+    policy_loss,
+    recorded_spread,
+    seeded,
+    swapped_states,
+    threads,
+    to_cpu,
+    trainer_config,
+)
 from rover_lib.world import record
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
-IMAGE, STATE, ACTION, IS_PAD = "observation.images.cam_front", "observation.state", "action", "action_is_pad"
-DROPOUT = 0.1  # LeRobot's default
-KL_WEIGHT = 10.0
-WEIGHT_DECAY = 1e-4
-BETAS = (0.9, 0.999)
-GRAD_CLIP = 1.0
-SWAPPED_STATES = 0.5  # the share of samples that get another's state, so that it does not give the action away
 # Below it two threads wait for each other longer than they compute: 40 times slower on a busy machine.
 SMALL_DIM = 256
-STANDING_THROTTLE = 0.01  # below it the car stands, which no frame shows: these states are never swapped
 
 
 @dataclass(frozen=True)
@@ -62,7 +76,7 @@ class Recipe:
     backbone_rate: float = 1e-3
     transformer_rate: float = 5e-4
 
-    def of_steps(self, steps: int) -> Recipe:
+    def of_steps(self, steps: int) -> "Recipe":
         """The same recipe with that many steps in all, at least one in each phase."""
         planned = self.backbone_steps, self.transformer_steps, self.together_steps
         backbone, transformer, together = (max(1, round(steps * p / sum(planned))) for p in planned)
@@ -92,23 +106,6 @@ RECIPES = {
 }
 
 
-@dataclass
-class Frames:
-    """Samples in memory, aligned by row.
-
-    images: (n, height, width, 3) uint8 RGB. states: (n, 2) and chunks: (n, chunk, 2) float32.
-    is_pad: (n, chunk) bool, true where the drive had ended.
-    """
-
-    images: np.ndarray
-    states: np.ndarray
-    chunks: np.ndarray
-    is_pad: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-
 def train(
     episodes_dir: Path | str,
     out_path: Path | str,
@@ -126,8 +123,10 @@ def train(
     The calibration part of params.yml's split is trained on, the choosing part gives best_val_loss, and the
     held-out part is left alone, so that it may judge later.
     Returns out_path, which appears complete or not at all. The same input gives the same weights on one
-    machine; a checkpoint that was made before is taken from the cache.
-    Raises WorldError for an unknown size, device or steps, EpisodeError for recordings that cannot be used.
+    machine, also when it was ended at any moment and started again: it goes on where it was. A checkpoint that was
+    made before is taken from the cache.
+    Raises WorldError for an unknown size, device or steps, EpisodeError for recordings that cannot be used,
+    TrainingError if another process trains the same.
     """
     out_path, episodes_dir = Path(out_path), Path(episodes_dir)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -150,13 +149,25 @@ def train(
         "split": params()["calibration"],
         "names": [episodes_dir.name, out_path.parent.name],
     }
-    key = key_of(made_of, sys.modules[__name__], preprocess, act_module, episodes_module)
+    key = key_of(made_of, sys.modules[__name__], training_module, preprocess, act_module, episodes_module)
+    unfinished = cache_root() / f"training-{key}"
 
     def make(folder: Path) -> None:
-        checkpoint = _train(episodes_dir, out_path, SIZES[size], recipe, seed, torch.device(device), progress)
-        torch.save(checkpoint, folder / "best_model.pth")
+        with Resumable(unfinished, progress) as saved:
+            trained = _train(episodes_dir, SIZES[size], recipe, seed, torch.device(device), saved)
+            config = trainer_config(
+                SIZES[size],
+                learning_rate=recipe.transformer_rate,
+                batch_size=recipe.batch,
+                data_dir=episodes_dir.name,
+                output_dir=out_path.parent.name,
+                device=device,
+                seed=seed,
+            )
+            torch.save({**trained, "config": config}, folder / "best_model.pth")
 
     made = cached_folder("checkpoint", key, make) / "best_model.pth"
+    shutil.rmtree(unfinished, ignore_errors=True)
     with atomic_path(out_path) as temporary:
         shutil.copyfile(made, temporary)
     return out_path
@@ -195,178 +206,59 @@ class _Training:
     """What every phase works with."""
 
     size: ActConfig
-    policy: ACTPolicy
+    policy: "ACTPolicy"
     data: Frames
     recipe: Recipe
     loss_weights: Tensor  # (2,), on the device that is trained on
     rng: np.random.Generator
-    progress: Progress
+    saved: Resumable
+
+    @property
+    def device(self) -> torch.device:
+        return self.loss_weights.device
 
     def rows(self, batch: int) -> np.ndarray:
         return self.rng.choice(len(self.data), min(batch, len(self.data)), replace=False)
 
     def batch(self) -> dict[str, Tensor]:
         """The next one of frames."""
-        return _batch(self.data, self.rows(self.recipe.batch), self.rng, self.loss_weights.device)
+        return batch_of(self.data, self.rows(self.recipe.batch), self.rng, self.device)
 
-    def steps(self, count: int, desc: str) -> Iterable[int]:
-        return self.progress(range(count), desc=desc, total=count)
+    def steps(self, phase: str, count: int, **parts: Any) -> Iterator[int]:
+        return self.saved.steps(phase, count, self.rng, **parts)
 
 
 def _train(
-    episodes_dir: Path,
-    out_path: Path,
-    size: ActConfig,
-    recipe: Recipe,
-    seed: int,
-    device: torch.device,
-    progress: Progress,
+    episodes_dir: Path, size: ActConfig, recipe: Recipe, seed: int, device: torch.device, saved: Resumable
 ) -> dict[str, Any]:
+    """All of the checkpoint but its config."""
     p = params()["calibration"]
-    recordings = load_recordings(episodes_dir, size.chunk, p["sync_s"], progress)
+    recordings = load_recordings(episodes_dir, size.chunk, p["sync_s"], saved.progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
     rng = np.random.default_rng([seed, 77])
-    data = _load(parts.calibration, recipe.samples, size, "reading frames", progress)
-    held_out = _load(parts.choosing, max(8, recipe.samples // 8), size, "reading held-out frames", progress)
-    # errors count in units of what was recorded: throttle's whole range is a tenth of steering's
-    recorded = data.chunks[~data.is_pad]
-    spread = np.maximum(recorded.std(axis=0), 1e-3)
+    data = frames_of(thinned(parts.calibration, recipe.samples), *size.image_sizes[0])
+    data = in_memory(data, "reading frames", saved.progress)
+    held_out = frames_of(thinned(parts.choosing, max(8, recipe.samples // 8)), *size.image_sizes[0])
+    spread = recorded_spread(data)
     loss_weights = torch.from_numpy(1 / spread).to(device)
 
-    with _seeded(seed):
+    with seeded(seed):
         policy = lerobot_act(size)
         with torch.no_grad():  # starts at the mean action, give or take: a fresh head plans wild ones
             policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
-            policy.model.action_head.bias.copy_(torch.from_numpy(recorded.mean(axis=0)))
+            policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
         policy.to(device)
-        training = _Training(size, policy, data, recipe, loss_weights, rng, progress)
+        training = _Training(size, policy, data, recipe, loss_weights, rng, saved)
         _train_backbone(training)
         _train_transformer(training)
         optimizer, scheduler = _train_together(training)
     return {
         "epoch": recipe.together_steps,
         "model_state_dict": {k: v.cpu() for k, v in policy.state_dict().items()},
-        "optimizer_state_dict": _to_cpu(optimizer.state_dict()),
+        "optimizer_state_dict": to_cpu(optimizer.state_dict()),
         "scheduler_state_dict": scheduler.state_dict(),
-        "best_val_loss": np.mean(_losses(policy, held_out, recipe.batch)),
-        "config": _config(size, recipe, seed, device, episodes_dir, out_path),
+        "best_val_loss": np.mean(losses_of(policy, held_out, recipe.batch)),
     }
-
-
-def _config(
-    size: ActConfig, recipe: Recipe, seed: int, device: torch.device, episodes_dir: Path, out_path: Path
-) -> dict[str, Any]:
-    """The trainer's plain dict, key for key. Folders by name only: a checkpoint is shown to others."""
-    ((height, width),) = size.image_sizes
-    return {
-        "image_width": width,
-        "image_height": height,
-        "n_obs_steps": 1,
-        "chunk_size": size.chunk,
-        "n_action_steps": size.chunk,
-        "hidden_size": size.dim,
-        "n_encoder_layers": size.encoder_layers,
-        "n_decoder_layers": size.decoder_layers,
-        "n_heads": size.heads,
-        "feedforward_dim": size.feedforward,
-        "dropout": DROPOUT,
-        "kl_weight": KL_WEIGHT,
-        "vision_encoder": size.backbone,
-        "pretrained_backbone": True,  # as the trainer writes it, whatever the weights came from
-        "learning_rate": recipe.transformer_rate,
-        "weight_decay": WEIGHT_DECAY,
-        "betas": BETAS,
-        "grad_clip": GRAD_CLIP,
-        "num_epochs": 1,
-        "batch_size": recipe.batch,
-        "train_split": 0.75,
-        "data_dir": episodes_dir.name,
-        "output_dir": out_path.parent.name,
-        "device": device.type,
-        "seed": seed,
-        "log_freq": 1,
-        "save_freq": 1,
-        "num_workers": 0,
-    }
-
-
-def _load(samples: tuple[Sample, ...], most: int, size: ActConfig, desc: str, progress: Progress) -> Frames:
-    """At most `most` samples, evenly over all drives, with their frames at the policy's size."""
-    if len(samples) > most:
-        samples = tuple(samples[i] for i in np.linspace(0, len(samples) - 1, most).round().astype(int))
-    images = []
-    for sample in progress(samples, desc=desc, total=len(samples)):
-        images.append(prepare_frame(sample.frame_bgr(), *size.image_sizes[0]))
-    return Frames(
-        np.stack(images),
-        np.stack([s.state for s in samples]).astype(np.float32),
-        np.stack([s.chunk for s in samples]).astype(np.float32),
-        np.stack([s.is_pad for s in samples]),
-    )
-
-
-@contextmanager
-def _seeded(seed: int) -> Iterator[None]:
-    """torch's random numbers follow from the seed inside, and are as before outside."""
-    devices = list(range(torch.cuda.device_count()))
-    with torch.random.fork_rng(devices=devices):
-        torch.manual_seed(seed)
-        yield
-
-
-def _batch(data: Frames, rows: np.ndarray, rng: np.random.Generator, device: torch.device) -> dict[str, Tensor]:
-    """What the policy trains on: light changed, half of the drives mirrored, half of the states swapped."""
-    flipped = rng.random(len(rows)) < 0.5
-    images, states, chunks = data.images[rows], _swapped_states(data, rows, rng), data.chunks[rows].copy()
-    images[flipped] = images[flipped, :, ::-1]
-    states[flipped, 0] *= -1
-    chunks[flipped, :, 0] *= -1
-    gain = rng.uniform(0.8, 1.25, (len(rows), 1, 1, 1)).astype(np.float32)
-    return {
-        IMAGE: torch.from_numpy(normalise(np.minimum(images * gain, 255))).to(device),
-        STATE: torch.from_numpy(states).to(device),
-        ACTION: torch.from_numpy(chunks).to(device),
-        IS_PAD: torch.from_numpy(data.is_pad[rows]).to(device),
-    }
-
-
-def _swapped_states(data: Frames, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    states = data.states[rows].copy()
-    moving = np.flatnonzero(data.states[:, 1] >= STANDING_THROTTLE)
-    if len(moving):
-        swap = (rng.random(len(rows)) < SWAPPED_STATES) & (states[:, 1] >= STANDING_THROTTLE)
-        states[swap] = data.states[rng.choice(moving, swap.sum())]
-    return states
-
-
-def _error(predicted: Tensor, batch: dict[str, Tensor], loss_weights: Tensor) -> Tensor:
-    """Mean absolute error of the actions that were recorded, each in its own unit."""
-    recorded = ~batch[IS_PAD][..., None]
-    error = (predicted - batch[ACTION]).abs() * loss_weights * recorded
-    return error.sum() / (recorded.sum() * loss_weights.numel())
-
-
-def _optimiser(
-    parameters: Iterable[nn.Parameter], rate: float, steps: int
-) -> tuple[torch.optim.AdamW, torch.optim.lr_scheduler.LRScheduler]:
-    optimizer = torch.optim.AdamW(parameters, lr=rate, betas=BETAS, weight_decay=WEIGHT_DECAY)
-    warmup = max(1, steps // 20)
-
-    def share(step: int) -> float:
-        return min(1.0, (step + 1) / warmup) * (0.01 + 0.99 * (1 + math.cos(math.pi * min(1, step / steps))) / 2)
-
-    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, share)
-    return optimizer, scheduler
-
-
-def _descend(loss: Tensor, module: nn.Module, optimizer: torch.optim.Optimizer, scheduler: Any) -> None:
-    if not torch.isfinite(loss):
-        raise WorldError(f"training went wrong: the loss is {loss.item()}", remedy="try another seed")
-    optimizer.zero_grad()
-    loss.backward()
-    nn.utils.clip_grad_norm_(module.parameters(), GRAD_CLIP)
-    optimizer.step()
-    scheduler.step()
 
 
 class _ChunkFromFeatures(nn.Module):
@@ -393,123 +285,80 @@ def _train_backbone(training: _Training) -> None:
 
     resnet = torchvision.models.resnet18(weights=None)
     live = torchvision.models._utils.IntermediateLayerGetter(resnet, {"layer4": "feature_map"})
-    model = _ChunkFromFeatures(live, training.size).to(training.loss_weights.device).train()
-    optimizer, scheduler = _optimiser(model.parameters(), recipe.backbone_rate, recipe.backbone_steps)
-    for _ in training.steps(recipe.backbone_steps, "training the backbone"):
+    model = _ChunkFromFeatures(live, training.size).to(training.device).train()
+    optimizer, scheduler = optimiser(model.parameters(), recipe.backbone_rate, recipe.backbone_steps)
+    parts = {"model": model, "optimizer": optimizer, "scheduler": scheduler}
+    for _ in training.steps("backbone", recipe.backbone_steps, **parts):
         batch = training.batch()
-        _descend(_error(model(batch[IMAGE]), batch, training.loss_weights), model, optimizer, scheduler)
+        loss = error_of(model(batch[IMAGE]), batch, training.loss_weights)
+        training.saved.losses["backbone"].append(descend(loss, model, optimizer, scheduler))
 
     norms = [m for m in live.modules() if isinstance(m, nn.BatchNorm2d)]
     for norm in norms:
         norm.reset_running_stats()
         norm.momentum = None  # a plain mean over the batches below
-    with torch.no_grad():
-        for _ in range(16 if len(data) >= 16 * recipe.batch else 4):
+    batches = 16 if len(data) >= 16 * recipe.batch else 4
+    for _ in training.steps("statistics", batches, backbone=live):
+        with torch.no_grad():
             live(training.batch()[IMAGE])
     weights = {k: v for k, v in live.state_dict().items() if not k.endswith("num_batches_tracked")}
     training.policy.model.backbone.load_state_dict(weights)
 
 
-class _Given(nn.Module):
-    """Stands in for the backbone while the transformer trains: its 'image' is the feature map already."""
-
-    def forward(self, features: Tensor) -> dict[str, Tensor]:
-        return {"feature_map": features}
-
-
 def _train_transformer(training: _Training) -> None:
     """Phase two: all but the backbone, on features computed once, of each frame as it is and mirrored."""
-    policy, data, batch = training.policy, training.data, training.recipe.batch
-    device = training.loss_weights.device
-    backbone = policy.model.backbone.eval()
-    views = {}
-    for name in ("plain", "mirrored"):
-        maps = []
-        with torch.no_grad():
-            firsts = range(0, len(data), batch)
-            for first in training.progress(firsts, desc=f"computing features, {name}", total=len(firsts)):
-                images = data.images[first : first + batch]
-                images = images[:, :, ::-1] if name == "mirrored" else images
-                maps.append(backbone(torch.from_numpy(normalise(images)).to(device))["feature_map"].cpu())
-        views[name] = torch.cat(maps)
-    policy.model.backbone = _Given()
+    policy, backbone = training.policy, training.policy.model.backbone.eval()
+    views = {name: _features(training, name, backbone) for name in ("plain", "mirrored")}
+    policy.model.backbone = Given()
     policy.train()
-    with _threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
+    with threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
         _transformer_steps(training, views)
     policy.model.backbone = backbone
 
 
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+def _features(training: _Training, view: str, backbone: nn.Module) -> RowFile:
+    """The frozen backbone's feature map of every frame, on disk."""
+    data, batch = training.data, training.recipe.batch
+    height, width = data.images[:1].shape[1:3]
+    stride = training.size.stride
+    channels = training.policy.model.encoder_img_feat_input_proj.in_channels
+    rows = RowFile(training.saved.folder / f"{view}.rows", (channels, -(-height // stride), -(-width // stride)))
+    for step in training.steps(f"features, {view}", -(-len(data) // batch), rows=rows):
+        images = data.images[step * batch : (step + 1) * batch]
+        images = images[:, :, ::-1] if view == "mirrored" else images
+        with torch.no_grad():
+            rows.append(backbone(torch.from_numpy(normalise(images)).to(training.device))["feature_map"].cpu())
+    return rows
 
 
-def _transformer_steps(training: _Training, views: dict[str, Tensor]) -> None:
+def _transformer_steps(training: _Training, views: dict[str, RowFile]) -> None:
     policy, data, recipe = training.policy, training.data, training.recipe
-    device = training.loss_weights.device
     parameters = [p for p in policy.parameters() if p.requires_grad]
-    optimizer, scheduler = _optimiser(parameters, recipe.transformer_rate, recipe.transformer_steps)
-    for step in training.steps(recipe.transformer_steps, "training the transformer"):
+    optimizer, scheduler = optimiser(parameters, recipe.transformer_rate, recipe.transformer_steps)
+    parts = {"policy": policy, "optimizer": optimizer, "scheduler": scheduler}
+    for step in training.steps("transformer", recipe.transformer_steps, **parts):
         rows = training.rows(recipe.transformer_batch)
-        states, chunks = _swapped_states(data, rows, training.rng), data.chunks[rows].copy()
+        states, chunks = swapped_states(data, rows, training.rng), data.chunks[rows].copy()
         if step % 2:
             states[:, 0] *= -1
             chunks[:, :, 0] *= -1
         batch = {
-            IMAGE: views["mirrored" if step % 2 else "plain"][rows].to(device),
-            STATE: torch.from_numpy(states).to(device),
-            ACTION: torch.from_numpy(chunks).to(device),
-            IS_PAD: torch.from_numpy(data.is_pad[rows]).to(device),
+            IMAGE: torch.from_numpy(views["mirrored" if step % 2 else "plain"][rows]).to(training.device),
+            STATE: torch.from_numpy(states).to(training.device),
+            ACTION: torch.from_numpy(chunks).to(training.device),
+            IS_PAD: torch.from_numpy(data.is_pad[rows]).to(training.device),
         }
-        _descend(_policy_loss(policy, batch, training.loss_weights), policy, optimizer, scheduler)
-
-
-def _policy_loss(policy: ACTPolicy, batch: dict[str, Tensor], loss_weights: Tensor) -> Tensor:
-    """ACT's loss, as LeRobot's forward has it, with each action in its own unit."""
-    actions, (mean, log_variance) = policy.model({**batch, "observation.images": [batch[IMAGE]]})
-    divergence = -0.5 * (1 + log_variance - mean.pow(2) - log_variance.exp()).sum(-1).mean()
-    return _error(actions, batch, loss_weights) + KL_WEIGHT * divergence
+        loss = policy_loss(policy, batch, training.loss_weights)
+        training.saved.losses["transformer"].append(descend(loss, policy, optimizer, scheduler))
 
 
 def _train_together(training: _Training) -> tuple[torch.optim.Optimizer, Any]:
     """Phase three: all parameters, at a tenth of the rate. Returns what the checkpoint keeps of it."""
     policy, recipe = training.policy, training.recipe
     policy.train()
-    optimizer, scheduler = _optimiser(policy.parameters(), recipe.transformer_rate / 10, recipe.together_steps)
-    for _ in training.steps(recipe.together_steps, "training all together"):
-        loss = _policy_loss(policy, training.batch(), training.loss_weights)
-        _descend(loss, policy, optimizer, scheduler)
+    optimizer, scheduler = optimiser(policy.parameters(), recipe.transformer_rate / 10, recipe.together_steps)
+    parts = {"policy": policy, "optimizer": optimizer, "scheduler": scheduler}
+    for _ in training.steps("all together", recipe.together_steps, **parts):
+        loss = policy_loss(policy, training.batch(), training.loss_weights)
+        training.saved.losses["all together"].append(descend(loss, policy, optimizer, scheduler))
     return optimizer, scheduler
-
-
-def _losses(policy: ACTPolicy, data: Frames, batch: int) -> list[float]:
-    """Mean absolute error per batch, in action units, of what the policy would drive (no latent sampled)."""
-    policy.eval()
-    device = next(policy.parameters()).device
-    losses = []
-    for first in range(0, len(data), batch):
-        rows = slice(first, first + batch)
-        chunks = policy.predict_action_chunk(
-            {
-                IMAGE: torch.from_numpy(normalise(data.images[rows])).to(device),
-                STATE: torch.from_numpy(data.states[rows]).to(device),
-            }
-        )
-        error = np.abs(chunks.cpu().numpy() - data.chunks[rows])[~data.is_pad[rows]]
-        losses.append(float(error.mean()))
-    return losses
-
-
-def _to_cpu(value: Any) -> Any:
-    if isinstance(value, Tensor):
-        return value.cpu()
-    if isinstance(value, dict):
-        return {k: _to_cpu(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return type(value)(_to_cpu(v) for v in value)
-    return value

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from rover_lib.onboard.errors import RoverError, WorldError
+from rover_lib.onboard.errors import RoverError, TrainingError, WorldError
+from rover_lib.workshop import training as training_module
 from rover_lib.workshop.act import lerobot_act
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.compare import LerobotEager
@@ -211,8 +212,8 @@ def test_no_recordings_are_refused(tmp_path):
 
 
 def test_a_loss_that_is_not_finite_ends_the_training(recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr(train_module, "KL_WEIGHT", float("nan"))
-    with pytest.raises(WorldError, match="loss is nan"):
+    monkeypatch.setattr(training_module, "KL_WEIGHT", float("nan"))
+    with pytest.raises(TrainingError, match="not finite, found nan"):
         train(recorded, tmp_path / "best_model.pth", seed=9, steps=3, device="cpu")
     assert not list(tmp_path.iterdir())
 

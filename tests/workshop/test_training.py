@@ -1,0 +1,205 @@
+"""A training that is ended at any moment gives what one gives that was not."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from rover_lib.onboard.errors import EpisodeError, TrainingError
+from rover_lib.workshop.episodes import Sample
+from rover_lib.workshop.training import Resumable, RowFile, descend, frames_of, in_memory, optimiser, seeded
+
+STEPS = 6
+
+
+class Killed(Exception):
+    pass
+
+
+def train(folder: Path, kill_at: int = -1, **options) -> tuple[list[float], torch.Tensor, float]:
+    """Two phases of a small network with dropout. Returns all losses, its weights, and what is drawn after them.
+
+    kill_at: the step, of both phases together, in whose middle it ends; the file of rows has that step's already.
+    """
+    rng = np.random.default_rng(0)
+    made = 0
+    with seeded(0), Resumable(folder, **{"every_s": 0.0, **options}) as saved:
+        model = nn.Sequential(nn.Linear(3, 8), nn.Dropout(0.5), nn.Linear(8, 1))
+        rows = RowFile(folder / "rows", (3,))
+        for _ in saved.steps("features", STEPS, rng, rows=rows):
+            rows.append(rng.normal(size=(2, 3)))
+            made += 1
+            if made == kill_at:
+                raise Killed
+        optimizer, scheduler = optimiser(model.parameters(), 0.1, STEPS)
+        for _ in saved.steps("network", STEPS, rng, model=model, optimizer=optimizer, scheduler=scheduler):
+            x = torch.from_numpy(rows[rng.choice(len(rows), 4)])
+            saved.losses["network"].append(descend(model(x).square().mean(), model, optimizer, scheduler))
+            made += 1
+            if made == kill_at:
+                raise Killed
+        assert len(rows) == 2 * STEPS
+        after = rng.random() + torch.rand(1).item()
+        return saved.losses["network"], torch.cat([p.flatten() for p in model.parameters()]), after
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    return train(tmp_path_factory.mktemp("whole"))
+
+
+@pytest.mark.parametrize("every_s", [0.0, 3.0, 1e9])
+def test_ended_in_any_step_it_gives_the_same_to_the_last_bit(tmp_path, whole, every_s):
+    """every_s by a clock that goes one second a look: saved after each step, after some, at each phase's end."""
+    for kill_at in range(1, 2 * STEPS + 1):
+        ticks = iter(range(10_000))
+        options = {"every_s": every_s, "clock": lambda ticks=ticks: float(next(ticks))}
+        with pytest.raises(Killed):
+            train(tmp_path / str(kill_at), kill_at, **options)
+        losses, weights, after = train(tmp_path / str(kill_at), **options)
+        assert torch.equal(weights, whole[1])
+        assert (losses, after) == (whole[0], whole[2])
+
+
+def test_ended_again_and_again_it_comes_to_its_end(tmp_path, whole):
+    for _ in range(2 * STEPS - 1):
+        with pytest.raises(Killed):
+            train(tmp_path, 2)  # each run makes one step that it can keep
+    assert torch.equal(train(tmp_path)[1], whole[1])
+
+
+def test_what_is_finished_is_not_made_again(tmp_path, whole):
+    train(tmp_path)
+    assert torch.equal(train(tmp_path, kill_at=1)[1], whole[1])
+
+
+def test_saving_takes_a_small_share_of_the_time(tmp_path):
+    """A clock that stands still but for saving, of 10 s each: then 200 s pass until the next."""
+    now, saves = [0.0], []
+
+    class Slow(RowFile):
+        def state_dict(self):
+            now[0] += 10
+            saves.append(now[0])
+            return super().state_dict()
+
+    with Resumable(tmp_path, every_s=1.0, clock=lambda: now[0]) as saved:
+        rows = Slow(tmp_path / "rows", (1,))
+        for _ in saved.steps("slow", 1000, np.random.default_rng(0), rows=rows):
+            now[0] += 1
+    assert np.diff(saves[:-1]).min() >= 200
+
+
+@pytest.mark.slow
+def test_killed_for_real_while_it_saves(tmp_path, whole):
+    """SIGKILL from outside, at moments that nobody chose."""
+    script = "import sys; from test_training import *; print('up', flush=True); [train(Path(sys.argv[1]))]"
+    for wait_s in (0.005, 0.02):
+        env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+        child = subprocess.Popen([sys.executable, "-c", script, tmp_path], stdout=subprocess.PIPE, env=env)
+        assert child.stdout.read(2) == b"up"
+        try:
+            child.wait(wait_s)
+        except subprocess.TimeoutExpired:
+            child.send_signal(signal.SIGKILL)
+        child.communicate()
+    assert torch.equal(train(tmp_path)[1], whole[1])
+
+
+def test_one_bar_over_all_phases_begins_where_the_training_was(tmp_path):
+    bars, ticks = [], []
+
+    def progress(items, **options):
+        bars.append(options)
+        for item in items:
+            ticks.append(item)
+            yield item
+
+    with pytest.raises(Killed):
+        train(tmp_path, kill_at=STEPS + 2)
+    with seeded(0), Resumable(tmp_path, progress, work=100) as saved:
+        for phase, cost in (("features", 10), ("network", 5)):
+            parts = {"rows": RowFile(tmp_path / "rows", (3,))} if phase == "features" else {}
+            for _ in saved.steps(phase, STEPS, np.random.default_rng(0), cost=cost, **parts):
+                pass
+    assert bars == [{"desc": "training, network", "total": 100, "initial": 65}]
+    assert len(ticks) == 25
+
+
+def test_two_processes_do_not_train_the_same(tmp_path):
+    with Resumable(tmp_path), pytest.raises(TrainingError, match="another process"), Resumable(tmp_path):
+        pass
+    with Resumable(tmp_path):
+        pass
+
+
+def test_a_damaged_file_is_named(tmp_path):
+    with pytest.raises(Killed):
+        train(tmp_path, kill_at=2)
+    file = tmp_path / "features.pt"
+    file.write_bytes(file.read_bytes()[:-200])
+    with pytest.raises(TrainingError, match=r"features\.pt.*remove .* from the beginning"):
+        train(tmp_path)
+
+
+def test_rows_that_are_gone_are_named(tmp_path):
+    with pytest.raises(Killed):
+        train(tmp_path, kill_at=2)
+    (tmp_path / "rows").write_bytes(b"")
+    with pytest.raises(TrainingError, match="rows are missing, found 0 of 2"):
+        train(tmp_path)
+
+
+def test_rows_of_another_shape_are_refused(tmp_path):
+    with pytest.raises(TrainingError, match="another shape"):
+        RowFile(tmp_path / "rows", (3,)).append(np.zeros((2, 4)))
+
+
+def test_a_file_of_rows_gives_what_was_appended(tmp_path):
+    given = np.random.default_rng(0).normal(size=(5, 2, 3)).astype(np.float16)
+    rows = RowFile(tmp_path / "rows", (2, 3), np.float16)
+    rows.append(given[:3])
+    rows.append(torch.from_numpy(given[3:]))
+    chosen = np.array([4, 0, 4])
+    assert len(rows) == 5 and rows[chosen].dtype == np.float16
+    assert (rows[chosen] == given[chosen]).all()
+
+
+def test_a_loss_that_is_not_finite_ends_the_training():
+    model = nn.Linear(1, 1)
+    with pytest.raises(TrainingError, match="the loss is not finite, found nan"):
+        descend(model(torch.full((1, 1), float("nan"))).sum(), model, *optimiser(model.parameters(), 0.1, 1))
+
+
+def samples_of(folder: Path, count: int) -> tuple[Sample, ...]:
+    import simplejpeg
+
+    rng = np.random.default_rng(0)
+    samples = []
+    for i in range(count):
+        path = folder / f"{i}.jpg"
+        path.write_bytes(simplejpeg.encode_jpeg(rng.integers(0, 255, (36, 64, 3), np.uint8), colorspace="BGR"))
+        state, chunk = rng.random(2).astype(np.float32), rng.random((4, 2)).astype(np.float32)
+        samples.append(Sample("an episode", path, 0.0, state, chunk, np.zeros(4, bool)))
+    return tuple(samples)
+
+
+def test_frames_read_when_asked_for_are_those_in_memory(tmp_path):
+    read = frames_of(samples_of(tmp_path, 5), 18, 32)
+    held = in_memory(read, "reading")
+    assert held.images.shape == (5, 18, 32, 3)
+    for rows in (np.array([3, 0]), slice(1, 4)):
+        assert (read.images[rows] == held.images[rows]).all()
+
+
+def test_a_frame_that_is_gone_is_named(tmp_path):
+    read = frames_of(samples_of(tmp_path, 2), 18, 32)
+    (tmp_path / "1.jpg").unlink()
+    with pytest.raises(EpisodeError, match=r"1\.jpg: cannot be read"):
+        read.images[np.array([1])]
