@@ -52,6 +52,8 @@ from rover_lib.onboard.stage import write_stage
 from rover_lib.world.standin import REST_US, PinEvent
 
 SLEWED_MS = 2  # of the Arduino's clock, which it slews by, and of pulses that it measured a step off
+TICK_S = 0.04  # one of a drive's, and what it may be late
+KNOWN_S = 0.05  # a pulse is known when it has ended, and was read
 ATTEMPTS = 5  # at a row that this machine spoilt
 FUZZ_LINES = 1_000_000
 
@@ -96,7 +98,7 @@ def _inject(bench: DrivingBench, fault: FaultRow) -> tuple[Observation, int | No
     at_s = fault.inject(bench) or called_s
     bench.wait(fault.watch_s)
     end_s = time.monotonic()
-    bench.wait(0.05)  # a pulse is known when it ends
+    bench.wait(KNOWN_S)
     commands = [c for c in bench.cable.commands if at_s - 1 < c.at_s <= end_s]
     seen = Observation(bench.events, commands, at_s, end_s)
     code = drive.process.poll() if fault.exit_code is None else drive.wait(END_S)
@@ -116,7 +118,9 @@ def _start_with(bench: DrivingBench, fault: FaultRow) -> tuple[Observation, int 
     while drive.running and time.monotonic() < at_s + START_S:
         bench.wait(0.1)
     bench.wait(fault.watch_s)
-    seen = Observation(bench.events, bench.cable.commands, at_s, time.monotonic())
+    end_s = time.monotonic()
+    bench.wait(KNOWN_S)
+    seen = Observation(bench.events, bench.cable.commands, at_s, end_s)
     code, line = drive.wait(0), _line_of(fault.message, drive)
     bench.clear_faults()
     return seen, code, line
@@ -127,7 +131,7 @@ def _spoilt(fault: FaultRow, seen: Observation, gates: Gates) -> bool:
     if seen.stalled_ms() or (fault.expected != REFUSED and not seen.was_driving(gates.throttle_max_us)):
         return True
     must_command = fault.expected == CONTINUES and not fault.until_limit and not fault.starves
-    return must_command and seen.longest_pause_s() > LATE_COMMAND_S
+    return must_command and seen.longest_pause_s() > max(LATE_COMMAND_S, fault.paused_s + TICK_S)
 
 
 def _limits(fault: FaultRow, verdict: Verdict) -> str:

@@ -226,6 +226,8 @@ def test_a_row_that_this_machine_spoilt_is_known():
     paused = replace(steady, commands=commands)  # rover drive did not get its turn
     assert faults._spoilt(fault, paused, GATES)
     assert not faults._spoilt(replace(fault, starves=True), paused, GATES)
+    assert not faults._spoilt(replace(fault, paused_s=0.15), paused, GATES)  # it is the fault itself
+    assert faults._spoilt(replace(fault, paused_s=0.1), paused, GATES)
     assert not faults._spoilt(replace(fault, expected=STOPPED), paused, GATES)
     standing = replace(steady, events=pulses(lambda t: (1456, 120) if t < -0.1 else DRIVEN))
     assert faults._spoilt(replace(fault, expected=STOPPED), standing, GATES)
@@ -274,7 +276,8 @@ def compared(values, **more):
 def test_steps_that_come_out_as_they_went_in():
     for slew in (faults.SLEW_US_PER_MS, {"steering": 1e6, "throttle": 1e6}):
         found = compared(SENT, slew=slew)
-        assert (found["steering_steps"], found["throttle_steps"], found["worst_us"]) == (4, 4, 0)
+        assert (found["steering_steps"], found["throttle_steps"]) == (4, 4)
+        assert found["worst_us"] <= GATES.bytes_us  # the last pulse of the way is as near
         assert found["worst_ms"] < 25
         assert found["pulses"] > 700
 
