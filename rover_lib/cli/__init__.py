@@ -10,7 +10,14 @@ from rover_lib.onboard.cli import Rover
 ROVERS = onboard.main.commands
 # By what a user does, as `rover --help` lists them; inspect, drive and log know more here than on the rover.
 SECTIONS = {
-    "Prepare a policy": (prepare.run, prepare.inspect, prepare.quantize, prepare.compare, ROVERS["benchmark"]),
+    "Prepare a policy": (
+        prepare.run,
+        prepare.inspect,
+        prepare.quantize,
+        prepare.compare,
+        prepare.distill,
+        ROVERS["benchmark"],
+    ),
     "Try it without a car": (world.world,),
     "Set up a rover": (prepare.wheelhouse, ROVERS["release"]),
     "Drive": (ROVERS["doctor"], ROVERS["record"], drive.drive, ROVERS["arm-car"], ROVERS["heartbeat"], drive.log),

@@ -1,5 +1,7 @@
 """Commands that make artifacts of a checkpoint, and look at them."""
 
+import json
+import re
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +11,15 @@ import click
 
 from rover_lib.onboard.cli import AS_JSON, FILE, describe_artifact, show
 from rover_lib.workshop.progress import terminal
+
+
+def _size(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    """WIDTHxHEIGHT as (height, width)."""
+    if value is None:
+        return None
+    if (sizes := re.fullmatch(r"(\d+)x(\d+)", value)) is None:
+        raise click.BadParameter("width and height in pixels are wanted, as in 320x180")
+    return int(sizes[2]), int(sizes[1])
 
 
 @click.command()
@@ -113,6 +124,51 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_jso
     for warning in report.warnings():
         click.echo(f"rover: warning: {warning}", err=True)
     show({name: report.summary(name) for name in others}, as_json)
+
+
+@click.command()
+@click.argument("checkpoint", type=FILE)
+@click.argument("episodes", type=FILE)
+@click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="The student's picture [default: its teacher's].")
+@click.option("--decoder-layers", type=int, help="The first so many stay [default: all].")
+@click.option("--feedforward", type=int, help="Units of a feed-forward that stay [default: all].")
+@click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
+@click.option("--runs-dir", type=FILE, default="runs", show_default=True)
+@click.option("--samples", type=click.IntRange(min=1), help="Frames to learn from [default: params.yml].")
+@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of all phases [default: params.yml].")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
+@AS_JSON
+def distill(
+    checkpoint: Path,
+    episodes: Path,
+    size: tuple[int, int] | None,
+    decoder_layers: int | None,
+    feedforward: int | None,
+    samples: int | None,
+    steps: int | None,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Teach a smaller policy what CHECKPOINT plans on the recordings in EPISODES.
+
+    Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot, and distill.json in the run's folder. Ended at
+    any moment and started again, it goes on where it was.
+    """
+    from rover_lib.onboard.params import params
+    from rover_lib.onboard.stage import read_stage
+    from rover_lib.workshop.distill import Recipe, summary
+    from rover_lib.workshop.distill import distill as teach
+    from rover_lib.workshop.student import StudentShape
+
+    recipe = Recipe(**params()["distill"])
+    recipe = recipe.of_steps(steps) if steps else recipe
+    recipe = replace(recipe, samples=samples) if samples else recipe
+    height, width = size or (None, None)
+    shape = StudentShape(height, width, decoder_layers, feedforward)
+    folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal(), **options)
+    content = read_stage(folder / "distill.json", "distill")
+    click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
 
 
 @click.command()

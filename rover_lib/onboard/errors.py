@@ -48,6 +48,10 @@ class QuantizeError(RoverError):
     """A quantization that changed nothing, or that made a value which cannot be used."""
 
 
+class DistillError(RoverError):
+    """A student that its teacher or the recordings cannot make."""
+
+
 class ArtifactError(RoverError):
     """A policy file that is damaged, of another format, or that this machine cannot run."""
 

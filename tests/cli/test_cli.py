@@ -22,6 +22,7 @@ def rover(*args):
         ["inspect"],
         ["quantize"],
         ["compare"],
+        ["distill"],
         ["benchmark"],
         ["log"],
         ["doctor"],
@@ -58,6 +59,7 @@ def test_inspects_each_kind_of_file(artifacts, tiny_file):
         ["compare", "nothing.pt", "other.pt", "--episodes", "none"],
         ["quantize", "nothing.pth", "none", "-o", "out.pt"],
         ["run", "nothing.pth", "none"],
+        ["distill", "nothing.pth", "none", "--size", "320x180", "--name", "fast"],
         ["world", "train", "none", "out.pth"],
         ["world", "trial", "nothing.pt"],
     ],
@@ -70,6 +72,11 @@ def test_bad_input_is_one_sentence(args, tmp_path, monkeypatch):
     lines = [line for line in result.output.splitlines() if line]
     assert len(lines) == 1 and lines[0].startswith("rover: "), result.output
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []  # nothing half-written
+
+
+def test_a_size_is_width_and_height(tmp_path):
+    result = rover("distill", tmp_path, tmp_path, "--size", "320", "--name", "fast")
+    assert result.exit_code == 2 and "as in 320x180" in result.output
 
 
 def test_debug_shows_the_traceback(tmp_path):

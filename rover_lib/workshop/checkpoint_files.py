@@ -1,0 +1,82 @@
+"""Checkpoints out: a policy's weights as the trainer's best_model.pth, and as LeRobot's pretrained_model/ folder.
+
+`checkpoint` reads both again. `origin` goes into both: where the weights come from, as plain JSON.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rover_lib.onboard.errors import CheckpointError
+from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
+from rover_lib.workshop.training import trainer_config
+
+ORIGIN = "origin.json"  # in LeRobot's folder, whose config.json refuses what it does not know
+EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
+
+
+def write_trainer(
+    path: Path,
+    config: ActConfig,
+    weights: dict[str, Tensor],
+    best_val_loss: float,
+    origin: dict[str, Any],
+    **settings: Any,
+) -> None:
+    """One file in the format of the user's trainer. weights: LeRobot's names without the leading `model.`. settings: of
+    its training, as `training.trainer_config` wants them.
+
+    No optimizer state: it was of another loss. Raises CheckpointError for a policy whose normalisation that format
+    cannot hold: it knows ImageNet's for the picture, and none for states and actions.
+    """
+    if config.image_norm != (imagenet(),) or config.state_norm or config.action_unnorm:
+        raise CheckpointError(
+            f"{path}: the trainer's format has no place for this policy's normalisation",
+            remedy="use LeRobot's folder",
+        )
+    content = {
+        "epoch": 0,
+        "model_state_dict": {f"model.{name}": weight.cpu() for name, weight in weights.items()},
+        "optimizer_state_dict": {},
+        "scheduler_state_dict": {},
+        "best_val_loss": np.float64(best_val_loss),
+        "config": trainer_config(config, **settings) | {"use_vae": config.vae_layers > 0, "origin": origin},
+    }
+    torch.save(content, path)
+
+
+def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], origin: dict[str, Any]) -> None:
+    """A folder that LeRobot's ACTPolicy.from_pretrained and its processors load. weights: as for `write_trainer`."""
+    # here, because it takes ten seconds to import
+    from lerobot.configs.types import NormalizationMode
+    from lerobot.policies.act.processor_act import make_act_pre_post_processors
+
+    policy = lerobot_act(config)
+    policy.model.load_state_dict(weights)
+    normed = {"VISUAL": True, "STATE": config.state_norm is not None, "ACTION": config.action_unnorm is not None}
+    policy.config.normalization_mapping = {
+        kind: NormalizationMode.MEAN_STD if acts else NormalizationMode.IDENTITY for kind, acts in normed.items()
+    }
+    stats = {
+        f"observation.images.{name}": _statistics(norm, (3, 1, 1))
+        for name, norm in zip(config.cameras, config.image_norm, strict=True)
+    }
+    if config.state_norm is not None:
+        stats["observation.state"] = _statistics(config.state_norm, (-1,))
+    if (scaled := config.action_unnorm) is not None:
+        stats["action"] = {"mean": torch.tensor(scaled.shift), "std": torch.tensor(scaled.scale)}
+    folder.mkdir(parents=True, exist_ok=True)
+    policy.save_pretrained(folder)
+    for processor in make_act_pre_post_processors(policy.config, stats):
+        processor.save_pretrained(folder)
+    (folder / ORIGIN).write_text(json.dumps(origin, indent=2) + "\n")
+
+
+def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
+    """Mean and standard deviation whose normalisation, LeRobot's eps included, is x * scale + shift."""
+    scale, shift = torch.tensor(norm.scale, dtype=torch.float64), torch.tensor(norm.shift, dtype=torch.float64)
+    return {"mean": (-shift / scale).float().reshape(shape), "std": (1 / scale - EPS).float().reshape(shape)}

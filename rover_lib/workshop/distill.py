@@ -1,0 +1,446 @@
+"""A smaller policy that is taught by a larger one, on recordings alone.
+
+    folder = distill("best_model.pth", "episodes", "fast", StudentShape(180, 320, decoder_layers=2, feedforward=1600))
+
+The student begins with its teacher's weights (see `student`) and learns in phases: its backbone to see what the teacher
+sees, its transformer on what that backbone sees, then all together at a tenth of the rate. It learns what the teacher
+plans, and a little what was recorded. The run's folder gets best_model.pth, pretrained_model/ and distill.json.
+
+Letters: n samples, B batch, C chunk, A actions.
+"""
+
+import shutil
+import sys
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rover_lib.onboard import preprocess
+from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.policy import ACTION_LIMITS
+from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.stage import atomic_path, sha256_of, write_stage
+from rover_lib.workshop import act, training
+from rover_lib.workshop import lessons as lessons_module
+from rover_lib.workshop import student as student_module
+from rover_lib.workshop.act import ACT, ActConfig, imagenet, multiply_accumulates
+from rover_lib.workshop.cache import cache_root, key_of
+from rover_lib.workshop.checkpoint import Checkpoint, expected_shapes
+from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
+from rover_lib.workshop.compare import thinned
+from rover_lib.workshop.episodes import Sample
+from rover_lib.workshop.judge import Range, not_judged, pct_of_range, shown_pct
+from rover_lib.workshop.lessons import BLOCK, BatchedPolicy, Lessons
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.session import SMALL_GMAC, Opened, load
+from rover_lib.workshop.student import StudentShape, initial_weights, student_config
+from rover_lib.workshop.training import Resumable, descend, optimiser, threads
+
+SMALLEST_RANGE = 0.02  # of an action that hardly changes: errors are a share of its range, which must not be nothing
+LIGHT, COLOUR = (0.8, 1.25), (0.9, 1.1)  # what pictures are multiplied by: all of one, and each of its colours
+STRANGER = 2.0  # times the error of one action for all frames: a teacher that is worse was not trained for this car
+NOBODY_DROVE = "Judged on recordings alone: nobody drove."
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a student is taught: params.yml's section `distill`.
+
+    samples: asked about at most. rate: of the first two phases; the last has a tenth. to_teacher, to_recorded: weights
+    of the two losses, mean absolute errors in units of the recorded range. unit_frames: choose a feed-forward's units.
+    judged_frames: of the held-out episodes, at most.
+    """
+
+    samples: int
+    batch: int
+    backbone_steps: int
+    transformer_steps: int
+    together_steps: int
+    rate: float
+    to_teacher: float
+    to_recorded: float
+    unit_frames: int
+    judged_frames: int
+
+    def of_steps(self, steps: int) -> "Recipe":
+        """The same with that many steps in all, at least one in each phase."""
+        names = ("backbone_steps", "transformer_steps", "together_steps")
+        planned = sum(getattr(self, name) for name in names)
+        return replace(self, **{name: max(1, round(steps * getattr(self, name) / planned)) for name in names})
+
+
+def distill(
+    checkpoint: Path | str,
+    episodes: Path | str,
+    name: str,
+    shape: StudentShape,
+    *,
+    runs_dir: Path | str = "runs",
+    recipe: Recipe | None = None,
+    seed: int = 0,
+    device: str | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Teach a student of that shape what the checkpoint plans on these recordings. Returns the run's folder.
+
+    recipe: params.yml's if None. device: 'cpu', 'cuda' or None for the best there is.
+    Ended at any moment and started again with the same arguments, it goes on and gives the same student. What was
+    in the run's folder before stays until the new is whole.
+    Raises DistillError for a student, a device or recordings that cannot be; CheckpointError, EpisodeError,
+    TrainingError.
+    """
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
+        raise DistillError("device must be cpu, or cuda where torch finds one", found=device, remedy="leave it out")
+    if Path(name).name != name or name.startswith("."):
+        raise DistillError("a run's name must be a plain folder name", found=repr(name))
+    if seed < 0:
+        raise DistillError("a seed must be at least 0", found=seed)
+    recipe = recipe or Recipe(**params()["distill"])
+    opened = load(checkpoint, episodes, progress)
+    teacher = opened.checkpoint
+    config = student_config(teacher, shape)
+    if config == replace(teacher.config, vae_layers=0):
+        raise DistillError("this student would be its teacher", remedy="give it a smaller picture or fewer layers")
+    work = _Work(opened, config, recipe, torch.device(device), seed, progress)
+    with threads(1 if _gmac(config) < SMALL_GMAC else torch.get_num_threads()):
+        taught = _taught(work)
+        return _leave(Path(runs_dir).resolve() / name, work, taught)
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What is to be done. config: the student's."""
+
+    opened: Opened
+    config: ActConfig
+    recipe: Recipe
+    device: torch.device
+    seed: int
+    progress: Progress
+
+    @property
+    def teacher(self) -> Checkpoint:
+        return self.opened.checkpoint
+
+    def rng(self, phase: str) -> np.random.Generator:
+        """Random numbers of a phase, the same in every process."""
+        return np.random.default_rng([self.seed, zlib.crc32(phase.encode())])
+
+    def ranges(self) -> np.ndarray:
+        """(A,) float32: each action's recorded range, in which errors are counted."""
+        ends = np.array(list(self.opened.recordings.action_range().values()), np.float32)
+        return np.maximum(ends[:, 1] - ends[:, 0], SMALLEST_RANGE)
+
+
+def _gmac(config: ActConfig) -> float:
+    """Multiply-accumulates of one inference, in 10^9."""
+    weights = {name: torch.zeros(shape) for name, shape in expected_shapes(config).items()}
+    return sum(multiply_accumulates(ACT(config, weights)).values()) / 1e9
+
+
+# --- teaching ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Taught:
+    """A student: weights by LeRobot's names without the leading `model.`, losses by phase, what `initial_weights` noted
+    of its feed-forwards. folder: where its phases are saved.
+    """
+
+    weights: dict[str, Tensor]
+    losses: dict[str, list[float]]
+    narrowed: list[dict[str, Any]]
+    folder: Path
+
+
+def _taught(work: _Work) -> _Taught:
+    """All phases. What depends on teacher, picture and samples alone stays in the cache, for its next student."""
+    recipe, progress = work.recipe, work.progress
+    samples = thinned(work.opened.parts.calibration, recipe.samples)
+    sees = {
+        "teacher": work.teacher.sha256,
+        "size": work.config.image_sizes,
+        "pictures": [(s.episode, s.frame_path.name, s.frame_path.stat().st_size) for s in samples],
+        "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
+        "recipe": [recipe.batch, recipe.backbone_steps, recipe.rate],
+        "at": [work.device.type, work.seed],
+        "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
+    }
+    sources = [sys.modules[__name__], lessons_module, student_module, training, preprocess, act]
+    folder = cache_root() / f"lessons-{key_of(sees, *sources)}"
+    own = cache_root() / f"student-{key_of(sees | {'student': asdict(work.config), 'whole': asdict(recipe)}, *sources)}"
+    channels = work.teacher.weights["encoder_img_feat_input_proj.weight"].shape[1]
+    with Resumable(folder, progress) as saved:
+        lessons = Lessons.open(folder, samples, work.config, channels, work.rng("states"))
+        room = _Room(work, lessons)
+        lessons.ask(saved, work.teacher, work.rng("teacher"), work.device)
+        _refuse_strangers(room)
+        backbone = _train_backbone(room, saved)
+        losses = dict(saved.losses)
+    with Resumable(own, progress) as saved:
+        weights, narrowed = _start(room, backbone, own)
+        policy = BatchedPolicy(work.config, weights).to(work.device)
+        policy.thaw()
+        _train_transformer(room, policy, saved)
+        _train_together(room, policy, saved)
+        losses |= saved.losses
+    return _Taught(policy.weights(), losses, narrowed, own)
+
+
+class _Room:
+    """Where a student is taught: batches of lessons, and the loss."""
+
+    def __init__(self, work: _Work, lessons: Lessons):
+        self.work, self.lessons = work, lessons
+        self.units = torch.from_numpy(1 / work.ranges()).to(work.device)
+
+    def draw(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """The next samples, (B,), and their views."""
+        count = len(self.lessons)
+        rows = rng.choice(count, min(self.work.recipe.batch, count), replace=False)
+        return rows, rng.integers(2, size=len(rows))
+
+    def pictures(self, rows: np.ndarray, views: np.ndarray, rng: np.random.Generator) -> Tensor:
+        """(B, height, width, 3) uint8 RGB, in another light."""
+        frames = self.lessons.pictures(rows, views)
+        gain = rng.uniform(*LIGHT, (len(rows), 1, 1, 1)) * rng.uniform(*COLOUR, (len(rows), 1, 1, 3))
+        lit = np.minimum(frames * gain.astype(np.float32) + 0.5, 255).astype(np.uint8)
+        return torch.from_numpy(lit).to(self.work.device)
+
+    def states(self, rows: np.ndarray, views: np.ndarray) -> Tensor:
+        return torch.from_numpy(self.lessons.asked[2 * rows + views]).to(self.work.device)
+
+    def loss(self, plans: Tensor, rows: np.ndarray, views: np.ndarray) -> Tensor:
+        """plans: (B, C, A), the student's. Mean absolute errors to the teacher's and to what was recorded, weighted."""
+        recipe, device = self.work.recipe, self.work.device
+        taught = torch.from_numpy(self.lessons.plans[2 * rows + views]).to(device)
+        recorded = torch.from_numpy(self.lessons.recorded(rows, views)).to(device)
+        driven = torch.from_numpy(~self.lessons.data.is_pad[rows]).to(device)[..., None]
+        to_teacher = ((plans - taught).abs() * self.units).mean()
+        to_recorded = ((plans - recorded).abs() * self.units * driven).sum() / (driven.sum() * len(self.units))
+        return recipe.to_teacher * to_teacher + recipe.to_recorded * to_recorded
+
+
+def _refuse_strangers(room: _Room) -> None:
+    """Raise DistillError if the teacher knows nothing of what was driven: then it is another car's, or camera's."""
+    lessons, ranges = room.lessons, room.work.ranges()
+    actions, driven = lessons.data.chunks, ~lessons.data.is_pad
+    constant = (np.abs(actions - np.median(actions[driven], axis=0)) / ranges)[driven].mean(0)
+    as_recorded = (lessons.asked[::2] == lessons.data.states).all(1)  # not with another sample's state
+    plans = lessons.plans[2 * np.arange(len(lessons))]
+    planned = (np.abs(plans - actions) / ranges)[driven & as_recorded[:, None]].mean(0)
+    if (planned > STRANGER * constant).all():
+        pairs = zip(room.work.config.action_names, planned, constant, strict=True)
+        raise DistillError(
+            f"{room.work.teacher.path}: on these recordings its plans are worse than one action for all frames",
+            found=" and ".join(f"{a} {100 * p:.0f} % off instead of {100 * c:.0f} %" for a, p, c in pairs),
+            remedy="give recordings of the car and the camera that it was trained for",
+        )
+
+
+def _train_backbone(room: _Room, saved: Resumable) -> dict[str, Tensor]:
+    """Phase one: the backbone, at the student's picture size, to the teacher's feature map. Then its tokens.
+
+    Returns its weights by LeRobot's names. At the teacher's own size it is the teacher's, as it is.
+    """
+    work, lessons = room.work, room.lessons
+    teacher = work.teacher.at_size(*work.config.image_sizes[0])
+    policy = BatchedPolicy(teacher.config, teacher.weights).to(work.device)
+    policy.thaw()
+    backbone = policy.backbone
+    steps = work.recipe.backbone_steps if work.config.image_sizes != work.teacher.config.image_sizes else 0
+    optimizer, scheduler = optimiser(backbone.parameters(), work.recipe.rate, max(steps, 1))
+    rng = work.rng("backbone")
+    for _ in saved.steps("backbone", steps, rng, backbone=backbone, optimizer=optimizer, scheduler=scheduler):
+        rows, views = room.draw(rng)
+        shown = torch.from_numpy(lessons.maps[2 * rows + views]).to(work.device).float()
+        error = (policy.features(room.pictures(rows, views, rng)) - shown).square().mean() / shown.square().mean()
+        saved.losses["backbone"].append(descend(error, backbone, optimizer, scheduler))
+    lessons.see(saved, policy, work.rng("tokens"))
+    return {f"backbone.{name}": value.detach().cpu().clone() for name, value in backbone.state_dict().items()}
+
+
+def _start(room: _Room, backbone: dict[str, Tensor], folder: Path) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
+    """The student before its transformer learns, and what was noted of its feed-forwards. Kept in the folder."""
+    path = folder / "start.pt"
+    if not path.exists():
+        lessons, teacher = room.lessons, room.work.teacher
+        rows = thinned(range(len(lessons)), room.work.recipe.unit_frames)
+        states = torch.from_numpy(lessons.data.states)
+        inputs = ((states[i][None], torch.from_numpy(lessons.frames[np.array([i])][0])) for i in rows)
+        seeing = replace(teacher, weights=teacher.weights | backbone)
+        with atomic_path(path) as temporary:
+            torch.save(initial_weights(seeing, room.work.config, inputs), temporary)
+    return torch.load(path, weights_only=True)
+
+
+def _train_transformer(room: _Room, policy: BatchedPolicy, saved: Resumable) -> None:
+    """Phase two: all but the backbone, on the tokens that it gave."""
+    recipe, lessons = room.work.recipe, room.lessons
+    optimizer, scheduler = optimiser(policy.model.parameters(), recipe.rate, recipe.transformer_steps)
+    rng = room.work.rng("transformer")
+    steps, model = recipe.transformer_steps, policy.model
+    for _ in saved.steps("transformer", steps, rng, model=model, optimizer=optimizer, scheduler=scheduler):
+        rows, views = room.draw(rng)
+        tokens = torch.from_numpy(lessons.tokens[2 * rows + views]).to(room.work.device).float()
+        loss = room.loss(policy.plan(tokens, room.states(rows, views)), rows, views)
+        saved.losses["transformer"].append(descend(loss, policy.model, optimizer, scheduler))
+
+
+def _train_together(room: _Room, policy: BatchedPolicy, saved: Resumable) -> None:
+    """Phase three: all parameters at a tenth of the rate, on pictures in any light."""
+    recipe = room.work.recipe
+    optimizer, scheduler = optimiser(policy.parameters(), recipe.rate / 10, recipe.together_steps)
+    rng = room.work.rng("together")
+    steps = recipe.together_steps
+    for _ in saved.steps("together", steps, rng, policy=policy, optimizer=optimizer, scheduler=scheduler):
+        rows, views = room.draw(rng)
+        plans = policy(room.pictures(rows, views, rng), room.states(rows, views))
+        saved.losses["together"].append(descend(room.loss(plans, rows, views), policy, optimizer, scheduler))
+
+
+# --- judging ----------------------------------------------------------------------------------------------------------
+
+
+@torch.inference_mode()
+def _plans(work: _Work, config: ActConfig, weights: dict[str, Tensor], samples: Sequence[Sample]) -> np.ndarray:
+    """(n, C, A) float32 of what a policy would drive: clipped to what a pulse can express."""
+    policy = BatchedPolicy(config, weights).to(work.device)
+    plans = []
+    firsts = range(0, len(samples), BLOCK)
+    for first in work.progress(firsts, desc="judging", total=len(firsts)):
+        block = samples[first : first + BLOCK]
+        frames = torch.from_numpy(np.stack([prepare_frame(s.frame_bgr(), *config.image_sizes[0]) for s in block]))
+        states = torch.from_numpy(np.stack([s.state for s in block]).astype(np.float32))
+        plans.append(policy(frames.to(work.device), states.to(work.device)).cpu().numpy())
+    low, high = np.array([ACTION_LIMITS[name] for name in config.action_names], np.float32).T
+    return np.concatenate(plans).clip(low, high)
+
+
+def _errors(
+    plans: np.ndarray, taught: np.ndarray, samples: Sequence[Sample], action_range: dict[str, Range]
+) -> dict[str, float | None]:
+    """teacher_<action>_pct over whole plans and recorded_<action>_pct over the recorded steps. plans: (n, C, A)."""
+    to_teacher = np.abs(plans.astype(np.float64) - taught).mean((0, 1))
+    driven = ~np.stack([s.is_pad for s in samples])
+    to_recorded = np.abs(plans.astype(np.float64) - np.stack([s.chunk for s in samples]))[driven].mean(0)
+    errors = {}
+    for i, (action, recorded) in enumerate(action_range.items()):
+        errors[f"teacher_{action}_pct"] = pct_of_range(to_teacher[i], recorded)
+        errors[f"recorded_{action}_pct"] = pct_of_range(to_recorded[i], recorded)
+    return errors
+
+
+def _row(name: str, config: ActConfig) -> dict[str, Any]:
+    """A policy's shape, as a row of the frontier begins."""
+    ((height, width),) = config.image_sizes
+    return {
+        "name": name,
+        "height": height,
+        "width": width,
+        "decoder_layers": config.decoder_layers,
+        "feedforward": config.feedforward,
+        "qat": False,
+        "gmac": _gmac(config),
+    }
+
+
+def summary(content: dict[str, Any]) -> str:
+    """distill.json as people read it."""
+    metrics = content["metrics"]
+    actions = [key.removeprefix("teacher_").removesuffix("_pct") for key in metrics["students"][0] if "teacher_" in key]
+    lines = [f"errors on held-out episodes, % of the recorded range ({', '.join(actions)})"]
+    for row in metrics["students"]:
+        shape = f"{row['width']}x{row['height']}, {row['decoder_layers']} decoder layer(s) of {row['feedforward']}"
+        pairs = []
+        for to in ("teacher", "recorded"):
+            errors = [shown_pct(row[f"{to}_{action}_pct"]).strip() for action in actions]
+            pairs.append(f"to the {'teacher' if to == 'teacher' else 'recordings'} {', '.join(errors)}")
+        lines.append(f"{row['name']}: {shape}, {row['gmac']:.2f} GMAC; {'; '.join(pairs)}")
+    return "\n".join([*lines, metrics["note"]])
+
+
+# --- what is left in the run's folder ---------------------------------------------------------------------------------
+
+
+def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
+    """Judge the student, and put its files and distill.json into the run's folder, each whole or not at all."""
+    teacher, parts, action_range = work.teacher, work.opened.parts, work.opened.recordings.action_range()
+    held_out = thinned(parts.held_out, work.recipe.judged_frames)
+    choosing = thinned(parts.choosing, work.recipe.judged_frames)
+    plans = {
+        "teacher": _plans(work, teacher.config, teacher.weights, held_out),
+        folder.name: _plans(work, work.config, taught.weights, held_out),
+    }
+    configs = {"teacher": teacher.config, folder.name: work.config}
+    students = [
+        _row(name, configs[name]) | _errors(planned, plans["teacher"], held_out, action_range)
+        for name, planned in plans.items()
+    ]
+    chosen = _plans(work, work.config, taught.weights, choosing)
+    driven = ~np.stack([s.is_pad for s in choosing])
+    loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
+    recipe = asdict(work.recipe) | {"seed": work.seed, "device": work.device.type}
+    origin = {"teacher_sha256": teacher.sha256, "teacher_format": teacher.format, "distilled_by": recipe}
+    new = folder.with_name(f".{folder.name}.distilled")
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir(parents=True)
+    try:
+        files = {"model.safetensors": "pretrained_model/model.safetensors"}
+        write_lerobot(new / "pretrained_model", work.config, taught.weights, origin)
+        if _trainer_can_hold(work.config):
+            settings = {
+                "learning_rate": work.recipe.rate,
+                "batch_size": work.recipe.batch,
+                "data_dir": work.opened.recordings.root.name,
+                "output_dir": folder.name,
+                "device": work.device.type,
+                "seed": work.seed,
+            }
+            write_trainer(new / "best_model.pth", work.config, taught.weights, loss, origin, **settings)
+            files["best_model.pth"] = "best_model.pth"
+        hashes = {name: sha256_of(new / path) for name, path in files.items()}
+        write_stage(
+            new / "distill.json",
+            "distill",
+            params=recipe,
+            metrics={
+                "students": students,
+                "losses": taught.losses,
+                "feed_forward": taught.narrowed,
+                "judged_frames": len(held_out),
+                "held_out_episodes": parts.episodes["held_out"],
+                "warnings": not_judged(action_range),
+                "note": NOBODY_DROVE,
+                "files_sha256": hashes,
+            },
+            inputs={teacher.path.name: teacher.sha256} | work.opened.recordings.hashes(),
+        )
+        _take_place(new, folder)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    shutil.rmtree(taught.folder)
+    return folder
+
+
+def _trainer_can_hold(config: ActConfig) -> bool:
+    return config.image_norm == (imagenet(),) and config.state_norm is None and config.action_unnorm is None
+
+
+def _take_place(new: Path, folder: Path) -> None:
+    """Move what is whole into the run's folder, distill.json last; what was there goes when its successor is there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in sorted(new.iterdir(), key=lambda p: p.name == "distill.json"):
+        place, old = folder / path.name, new / f"{path.name}.old"
+        if place.is_dir():
+            place.rename(old)
+        path.rename(place)

@@ -1,0 +1,176 @@
+"""A smaller policy that begins with its teacher's weights.
+
+    shape = StudentShape(height=180, width=320, decoder_layers=2, feedforward=1600)
+    config = student_config(teacher, shape)
+    weights, notes = initial_weights(teacher, config, inputs)
+
+No weight of ACT depends on the picture's size and positions are relative to it, so backbone, projections and attention
+are taken as they are; of the decoder's layers the first; of every feed-forward the units that matter most. What only
+training by recordings needs, the VAE's encoder, is left out: a student is taught plans.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from rover_lib.onboard.errors import DistillError
+from rover_lib.workshop.act import ACT, ActConfig, FeedForward
+from rover_lib.workshop.checkpoint import Checkpoint
+
+RIDGE = 1e-4  # of the mean square of a unit: keeps `down` near the teacher's where the frames say nothing
+ROWS = 4096  # tokens that are multiplied at once: the sums are double, and memory is small
+
+
+@dataclass(frozen=True)
+class StudentShape:
+    """What of a student's shape may differ from its teacher's; None: as the teacher's."""
+
+    height: int | None = None
+    width: int | None = None
+    decoder_layers: int | None = None
+    feedforward: int | None = None
+
+
+def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
+    """The student's config. Raises DistillError for a student that is larger than its teacher in anything, for a policy
+    that a car's recordings cannot teach; CheckpointError for an image size that the teacher's weights do not run at.
+    """
+    c = teacher.config
+    if len(c.cameras) != 1 or c.state_names != c.action_names or len(c.action_names) != 2:
+        raise DistillError(
+            f"{teacher.path}: only a policy of one camera, steering and throttle can teach from recordings of a car",
+            found=f"{len(c.cameras)} cameras, {len(c.state_names)} states and {len(c.action_names)} actions",
+        )
+    ((height, width),) = c.image_sizes
+    wanted = {
+        "height": (shape.height, height),
+        "width": (shape.width, width),
+        "decoder layers": (shape.decoder_layers, c.decoder_layers),
+        "feed-forward": (shape.feedforward, c.feedforward),
+    }
+    for name, (own, teachers) in wanted.items():
+        if own is not None and not 1 <= own <= teachers:
+            raise DistillError(
+                f"a student's {name} must be from 1 to its teacher's, {teachers}",
+                found=own,
+                remedy="a student is a part of its teacher; train a larger policy on recordings instead",
+            )
+    smaller = teacher.at_size(shape.height or height, shape.width or width).config
+    return replace(
+        smaller,
+        decoder_layers=shape.decoder_layers or c.decoder_layers,
+        feedforward=shape.feedforward or c.feedforward,
+        vae_layers=0,
+    )
+
+
+def initial_weights(
+    teacher: Checkpoint, config: ActConfig, inputs: Iterable[tuple[Tensor, ...]]
+) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
+    """The teacher's weights in the student's shape, by LeRobot's names without the leading `model.`.
+
+    inputs: calibration frames as the student sees them (`act.inputs_of`); they are run only if units must go.
+    Returns the weights, float32 and each with its own memory, and for each feed-forward that lost units
+    {"layer", "units", "of", "error_pct", "error_refit_pct"}: how far its output is off on the frames, in percent of the
+    output's own size, with the units left out and with `down` refitted.
+    """
+    kept = {name: weight.detach().float().clone() for name, weight in teacher.weights.items() if _is_kept(name, config)}
+    if config.feedforward == teacher.config.feedforward:
+        return kept, []
+    notes = []
+    wide = replace(config, feedforward=teacher.config.feedforward)
+    for name, gram in _grams(ACT(wide, teacher.weights), inputs).items():
+        layer, notes_of_layer = _narrowed(kept, name, gram, config.feedforward)
+        kept |= layer
+        notes.append(notes_of_layer)
+    return kept, notes
+
+
+def _is_kept(name: str, config: ActConfig) -> bool:
+    if name.startswith("vae_"):
+        return False
+    part, _, rest = name.partition(".layers.")
+    return part != "decoder" or not rest or int(rest.split(".")[0]) < config.decoder_layers
+
+
+@torch.inference_mode()
+def _grams(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> dict[str, Tensor]:
+    """Of every feed-forward's hidden activations h, and a 1 beside them, the mean of h h^T over all tokens.
+
+    By LeRobot's name of the layer: (units + 1, units + 1) float64. The mean magnitude of a unit that ReLU cuts is its
+    product with the 1; for other activations the root of its mean square stands for it, see `_narrowed`.
+    """
+    sums: dict[str, Tensor] = {}
+    waiting: dict[str, list[Tensor]] = {}
+    counts: dict[str, int] = {}
+
+    def add(name: str) -> None:
+        h = torch.cat(waiting.pop(name)).double()
+        h = torch.cat([h, h.new_ones(len(h), 1)], 1)
+        sums[name] = sums.get(name, 0) + h.T @ h
+        counts[name] = counts.get(name, 0) + len(h)
+
+    def watch(name: str):
+        def hook(_: nn.Module, args: tuple[Tensor]) -> None:
+            rows = waiting.setdefault(name, [])
+            rows.append(args[0][0].clone())
+            if sum(map(len, rows)) >= ROWS:
+                add(name)
+
+        return hook
+
+    hooks = [
+        module.down.register_forward_pre_hook(watch(_lerobots(name)))
+        for name, module in model.named_modules()
+        if isinstance(module, FeedForward)
+    ]
+    try:
+        for x in inputs:
+            model(*x)
+    finally:
+        for h in hooks:
+            h.remove()
+    for name in list(waiting):
+        add(name)
+    if not sums:
+        raise DistillError("choosing units needs frames", found="none", remedy="record more episodes")
+    return {name: total / counts[name] for name, total in sums.items()}
+
+
+def _lerobots(name: str) -> str:
+    """encoder.3.feed_forward -> encoder.layers.3"""
+    part, index, _ = name.split(".")
+    return f"{part}.layers.{index}"
+
+
+def _narrowed(
+    weights: dict[str, Tensor], layer: str, gram: Tensor, units: int
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """One feed-forward with its most important units, and `down` refitted to the output that all of them gave."""
+    down, bias = weights[f"{layer}.linear2.weight"].double(), weights[f"{layer}.linear2.bias"].double()
+    magnitude = gram[-1, :-1].abs() if (gram[-1, :-1] >= 0).all() else gram.diagonal()[:-1].sqrt()
+    best = (magnitude * down.norm(dim=0)).topk(units).indices.sort().values
+    rows = torch.cat([best, torch.tensor([len(gram) - 1])])  # and the 1 that carries the bias
+    whole = torch.cat([down, bias[:, None]], 1).T  # (units + 1, dim)
+    cut = whole[rows]
+    inside = gram[rows][:, rows]
+    # least squares of what is missing, so that where the frames say nothing the teacher's own weights stay
+    ridge = RIDGE * inside.diagonal()[:-1].mean() * torch.eye(len(rows), dtype=gram.dtype)
+    refit = cut + torch.linalg.solve(inside + ridge, gram[rows] @ whole - inside @ cut)
+
+    def error_pct(own: Tensor) -> float:
+        off = -whole.clone()
+        off[rows] += own
+        return 100 * ((off * (gram @ off)).sum() / (whole * (gram @ whole)).sum()).clamp(min=0).sqrt().item()
+
+    made = {
+        f"{layer}.linear1.weight": weights[f"{layer}.linear1.weight"][best].clone(),
+        f"{layer}.linear1.bias": weights[f"{layer}.linear1.bias"][best].clone(),
+        f"{layer}.linear2.weight": refit[:-1].T.float().contiguous(),
+        f"{layer}.linear2.bias": refit[-1].float(),
+    }
+    note = {"layer": layer, "units": units, "of": len(gram) - 1}
+    return made, note | {"error_pct": error_pct(cut), "error_refit_pct": error_pct(refit)}

@@ -1,0 +1,75 @@
+"""What is written is read again as it was: here, and by LeRobot itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.factory import make_pre_post_processors
+from policies import TINY, lerobot_policy, memory_samples
+
+from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
+from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
+
+SETTINGS = {
+    "learning_rate": 1e-4, "batch_size": 4, "data_dir": "episodes", "output_dir": "fast", "device": "cpu", "seed": 0
+}  # fmt: skip
+ORIGIN = {"teacher_sha256": "ab" * 32, "steps": 3}
+
+
+@pytest.fixture(scope="module")
+def weights():
+    policy = lerobot_policy(**TINY, use_vae=False)
+    return {k.removeprefix("model."): v for k, v in policy.state_dict().items()}
+
+
+@pytest.fixture(scope="module")
+def config(tiny):
+    return replace(tiny.config, vae_layers=0)
+
+
+def lerobots_chunk(folder, sample, config):
+    """(C, A) by LeRobot's own classes, its processors included."""
+    policy = ACTPolicy.from_pretrained(folder)
+    before, after = make_pre_post_processors(policy.config, pretrained_path=str(folder))
+    frame = prepare_frame(sample.frame_bgr(), *config.image_sizes[0]).astype(np.float32) / 255
+    observation = {
+        "observation.images.cam_front": torch.from_numpy(frame).permute(2, 0, 1),
+        "observation.state": torch.from_numpy(sample.state),
+    }
+    return after(policy.predict_action_chunk(before(observation)))[0]
+
+
+def test_the_trainers_file(config, weights, tmp_path):
+    write_trainer(tmp_path / "best_model.pth", config, weights, 0.25, ORIGIN, **SETTINGS)
+    read = load_checkpoint(tmp_path / "best_model.pth")
+    assert read.config == config and read.report["best_val_loss"] == 0.25
+    assert read.report["trainer_config"]["origin"] == ORIGIN
+    assert all(torch.equal(read.weights[name], weight) for name, weight in weights.items())
+
+
+@pytest.mark.parametrize(
+    "norms",
+    [{}, {"state_norm": Affine((2.0, 9.0), (-0.1, 0.4)), "action_unnorm": Affine((0.4, 0.02), (0.1, 0.05))}],
+    ids=["raw actions", "normalised"],
+)
+def test_lerobots_folder(config, weights, tmp_path, norms):
+    config = replace(config, **norms)
+    write_lerobot(tmp_path / "pretrained_model", config, weights, ORIGIN)
+    read = load_checkpoint(tmp_path / "pretrained_model")
+    (sample,) = memory_samples(1)
+    expected = predictions(ACT(config, weights), [inputs_of(sample, config)])[0]
+    ours = predictions(ACT(read.config, read.weights), [inputs_of(sample, config)])[0]
+    assert (ours - expected).abs().max() < 1e-5
+    assert (lerobots_chunk(tmp_path / "pretrained_model", sample, config) - expected).abs().max() < 1e-5
+
+
+def test_the_trainers_format_has_no_place_for_normalised_actions(config, weights, tmp_path):
+    normalised = replace(config, action_unnorm=Affine((0.4, 0.02), (0.1, 0.05)))
+    with pytest.raises(CheckpointError, match="no place for this policy's normalisation"):
+        write_trainer(tmp_path / "best_model.pth", normalised, weights, 0.25, ORIGIN, **SETTINGS)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,210 @@
+"""A student is taught on recordings alone, whatever interrupts it."""
+
+import json
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from policies import TINY, lerobot_policy, smooth_frame, trainer_content
+
+from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.recording import EpisodeWriter
+from rover_lib.workshop import distill as distill_module
+from rover_lib.workshop import training
+from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.distill import Recipe, distill, summary
+from rover_lib.workshop.student import StudentShape
+
+SHAPE = StudentShape(54, 96, decoder_layers=1, feedforward=64)
+
+
+def record(root, drives=4, frames=24):
+    """Drives whose steering and throttle change, and whose pictures do."""
+    rng, pwm = np.random.default_rng(0), PwmCalibration()
+    for drive in range(drives):
+        with EpisodeWriter(root / f"episode_{drive}", label="", resolution=(96, 54)) as writer:
+            for i in range(frames + 6):
+                t_s = i / 30
+                pulses = pwm.pulses(0.5 * math.sin(4 * t_s + drive), 0.05 + 0.04 * math.cos(3 * t_s + drive))
+                writer.control(t_s, 500 + 33 * i, pulses.steering_us, pulses.throttle_us, 21316, 1016)
+            for i in range(frames):
+                writer.frame(0.1 + i / 30, smooth_frame(rng, 54, 96))
+    return root
+
+
+@pytest.fixture(scope="module")
+def episodes(tmp_path_factory):
+    return record(tmp_path_factory.mktemp("episodes"))
+
+
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory):
+    """A policy whose plans are of a car's size, and differ from frame to frame."""
+    policy = lerobot_policy(**TINY)
+    with torch.no_grad():
+        policy.model.action_head.weight.mul_(torch.tensor([[0.05], [0.005]]))
+        policy.model.action_head.bias.copy_(torch.tensor([0.0, 0.05]))
+    path = tmp_path_factory.mktemp("teacher") / "best_model.pth"
+    torch.save(trainer_content(policy), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    few = {"samples": 20, "batch": 4, "unit_frames": 8, "judged_frames": 8, "rate": 1e-3}
+    return replace(Recipe(**params()["distill"]), backbone_steps=3, transformer_steps=8, together_steps=3, **few)
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture(scope="module")
+def taught(teacher, episodes, recipe, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("taught")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROVER_CACHE", str(folder / "cache"))
+        return distill(teacher, episodes, "fast", SHAPE, runs_dir=folder, recipe=recipe, device="cpu")
+
+
+def weights_of(folder):
+    return load_checkpoint(folder / "best_model.pth").weights
+
+
+@pytest.mark.slow
+def test_what_is_left_is_one_policy_in_two_formats(taught, teacher):
+    ours, lerobots = load_checkpoint(taught / "best_model.pth"), load_checkpoint(taught / "pretrained_model")
+    assert ours.config.image_sizes == lerobots.config.image_sizes == ((54, 96),)
+    assert (ours.config.decoder_layers, ours.config.feedforward) == (1, 64)
+    assert all(torch.equal(weight, lerobots.weights[name]) for name, weight in ours.weights.items())
+    origin = json.loads((taught / "pretrained_model" / "origin.json").read_text())
+    assert origin == ours.report["trainer_config"]["origin"]
+    assert origin["teacher_sha256"] == load_checkpoint(teacher).sha256
+    assert origin["distilled_by"]["transformer_steps"] == 8
+    assert sorted(p.name for p in taught.iterdir()) == ["best_model.pth", "distill.json", "pretrained_model"]
+
+
+@pytest.mark.slow
+def test_distill_json_judges_it_on_held_out_episodes(taught, episodes):
+    content = json.loads((taught / "distill.json").read_text())
+    of_teacher, of_student = content["metrics"]["students"]
+    assert of_teacher["teacher_steering_pct"] == of_teacher["teacher_throttle_pct"] == 0
+    assert of_student["teacher_steering_pct"] > 0 and of_student["gmac"] < of_teacher["gmac"]
+    assert (of_student["width"], of_student["decoder_layers"], of_student["feedforward"]) == (96, 1, 64)
+    assert {phase: len(losses) for phase, losses in content["metrics"]["losses"].items() if losses} == {
+        "backbone": 3,
+        "transformer": 8,
+        "together": 3,
+    }
+    assert "nobody drove" in content["metrics"]["note"]
+    assert "nobody drove" in summary(content) and "96x54, 1 decoder layer" in summary(content)
+    assert len(content["inputs"]) > 4 * 24
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [2, 5, 9])
+def test_killed_in_the_middle_it_goes_on_and_gives_the_same(
+    teacher, episodes, recipe, taught, tmp_path, monkeypatch, step
+):
+    steps = []
+
+    def dies(*args):
+        steps.append(1)
+        if len(steps) == step:
+            raise KeyboardInterrupt
+        return training.descend(*args)
+
+    monkeypatch.setattr(distill_module, "Resumable", partial(training.Resumable, every_s=0.0))
+    monkeypatch.setattr(training, "SAVING_SHARE", 1e9)  # after every step, however long that takes
+    monkeypatch.setattr(distill_module, "descend", dies)
+    arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
+    with pytest.raises(KeyboardInterrupt):
+        distill(teacher, episodes, "fast", SHAPE, **arguments)
+    assert not (tmp_path / "fast").exists()
+    folder = distill(teacher, episodes, "fast", SHAPE, **arguments)
+    assert len(steps) == 3 + 8 + 3 + 1  # only the step that was interrupted is made again
+    expected = weights_of(taught)
+    assert all(torch.equal(weight, expected[name]) for name, weight in weights_of(folder).items())
+    losses = [json.loads((f / "distill.json").read_text())["metrics"]["losses"] for f in (folder, taught)]
+    assert losses[0] == losses[1]
+
+
+@pytest.mark.slow
+def test_the_next_student_of_the_same_picture_asks_nothing_again(teacher, episodes, recipe, tmp_path, monkeypatch):
+    arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
+    distill(teacher, episodes, "first", replace(SHAPE, decoder_layers=2), **arguments)
+    before = (tmp_path / "first" / "best_model.pth").read_bytes()
+    kinds = []
+    monkeypatch.setattr(
+        distill_module, "descend", lambda loss, module, *rest: kinds.append(1) or training.descend(loss, module, *rest)
+    )
+    distill(teacher, episodes, "second", SHAPE, **arguments)
+    assert len(kinds) == 8 + 3  # no backbone
+    assert (tmp_path / "first" / "best_model.pth").read_bytes() == before
+    assert [p.name.split("-")[0] for p in (tmp_path / "cache").iterdir()] == ["lessons"]
+
+
+@pytest.mark.slow
+def test_it_learns_what_its_teacher_plans(teacher, episodes, recipe, tmp_path):
+    longer = replace(recipe, backbone_steps=1, transformer_steps=60, together_steps=1, to_recorded=0.0)
+    folder = distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path, recipe=longer, device="cpu")
+    losses = json.loads((folder / "distill.json").read_text())["metrics"]["losses"]["transformer"]
+    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:3])
+
+
+@pytest.mark.slow
+def test_what_was_there_stays_until_the_new_is_whole(teacher, episodes, recipe, tmp_path, monkeypatch):
+    (tmp_path / "fast" / "pretrained_model").mkdir(parents=True)
+    (tmp_path / "fast" / "pretrained_model" / "config.json").write_text("old")
+    (tmp_path / "fast" / "policy_static.pt").write_text("of a run")
+    arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
+    with monkeypatch.context() as patch:
+        patch.setattr(distill_module, "write_stage", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            distill(teacher, episodes, "fast", SHAPE, **arguments)
+    assert (tmp_path / "fast" / "pretrained_model" / "config.json").read_text() == "old"
+    assert sorted(p.name for p in (tmp_path / "fast").iterdir()) == ["policy_static.pt", "pretrained_model"]
+    distill(teacher, episodes, "fast", SHAPE, **arguments)
+    assert load_checkpoint(tmp_path / "fast" / "pretrained_model").config.feedforward == 64
+    assert (tmp_path / "fast" / "policy_static.pt").read_text() == "of a run"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cache", "fast"]
+
+
+@pytest.mark.slow
+def test_a_teacher_of_another_car_is_refused(episodes, recipe, tmp_path):
+    policy = lerobot_policy(**TINY)
+    with torch.no_grad():
+        policy.model.action_head.weight.zero_()
+        policy.model.action_head.bias.copy_(torch.tensor([-0.9, 0.6]))
+    torch.save(trainer_content(policy), tmp_path / "best_model.pth")
+    with pytest.raises(DistillError, match="worse than one action for all frames, found steering"):
+        distill(tmp_path / "best_model.pth", episodes, "fast", SHAPE, runs_dir=tmp_path, recipe=recipe, device="cpu")
+    assert not (tmp_path / "fast").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"shape": StudentShape()}, "would be its teacher"),
+        ({"shape": StudentShape(54, 96), "device": "tpu"}, "device must be"),
+        ({"shape": StudentShape(54, 96), "name": "../fast"}, "plain folder name"),
+        ({"shape": StudentShape(54, 96), "seed": -1}, "seed must be"),
+    ],
+)
+def test_what_cannot_be_taught_is_refused(teacher, episodes, tmp_path, options, says):
+    with pytest.raises(DistillError, match=says):
+        distill(teacher, episodes, **{"name": "fast", "runs_dir": tmp_path, **options})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("steps", [1, 10, 1000])
+def test_a_recipe_of_few_steps_keeps_all_phases(recipe, steps):
+    short = recipe.of_steps(steps)
+    phases = short.backbone_steps, short.transformer_steps, short.together_steps
+    assert min(phases) >= 1 and abs(sum(phases) - steps) <= 3
