@@ -23,7 +23,8 @@ help:
 	@echo "make test                                   lint, tests and notebooks, on the demo's run"
 	@echo "make check-release                          what takes an hour and a quiet machine"
 	@echo "make arm NAME=demo [PEERS=1]                count a run's instructions on an emulated Cortex-A76; NAME=full makes"
-	@echo "                                            a policy of the real car's size, PEERS=1 adds other runtimes"
+	@echo "                                            a policy of the real car's size, LEARNED=1 one that has learned to"
+	@echo "                                            drive (an hour or more), PEERS=1 adds other runtimes"
 	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino"
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
@@ -71,7 +72,7 @@ coverage: demo
 
 # NAME=full needs no checkpoint: it makes one. quantize.json is the last that a run of it leaves.
 arm: $(READY)
-	@test '$(NAME)' != full -o -f runs/full/quantize.json || { echo $(LAB) full runs/full; $(LAB) full runs/full; }
+	@test '$(NAME)' != full -o -f runs/full/quantize.json || $(LAB) full runs/full $(if $(LEARNED),--learned)
 	$(LAB) arm 'runs/$(NAME)' $(if $(PEERS),--peers)
 
 faults: $(READY)

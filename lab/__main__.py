@@ -67,14 +67,17 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, as_json: bool
 @click.argument("run_dir", type=FILE)
 @click.option("--samples", type=click.IntRange(min=1), default=64, show_default=True, help="Calibration samples.")
 @click.option("--steps", type=click.IntRange(min=1), default=24, show_default=True, help="Training steps.")
-def full(run_dir: Path, **options: Any) -> None:
+@click.option("--learned", is_flag=True, help="Train it whole instead, as `rover world train --size full` does.")
+def full(run_dir: Path, steps: int, learned: bool, **options: Any) -> None:
     """Make a policy of the real car's size in RUN_DIR, and artifacts of it at several image sizes, for `arm`.
 
-    Real in format, size and ranges, but trained for a few steps only: it does not drive.
+    Real in format, size and ranges, but trained for a few steps only: it does not drive. With --learned it does: that
+    takes an hour or more on two cores, goes on where it was ended, and is done once: the checkpoint stays in the cache.
     """
-    from lab.a76.full import NOTE, full_run
+    from lab.a76.full import LEARNED_NOTE, NOTE, full_run
 
-    click.echo(f"made: {full_run(run_dir, progress=terminal(), **options)} ({NOTE})")
+    made = full_run(run_dir, steps=None if learned else steps, progress=terminal(), **options)
+    click.echo(f"made: {made} ({LEARNED_NOTE if learned else NOTE})")
 
 
 @main.command()

@@ -1,6 +1,7 @@
 """A full-size policy to count, with no checkpoint at hand: real in format, size and ranges, but it cannot drive.
 
-full_run("runs/full")      # some ten minutes; `python -m lab arm runs/full` then counts it
+full_run("runs/full")                  # some ten minutes; `python -m lab arm runs/full` then counts it
+full_run("runs/full", steps=None)      # one that has learned to drive: an hour or more, once
 """
 
 from dataclasses import replace
@@ -18,11 +19,13 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.quantize import quantize
 from rover_lib.workshop.session import Opened, load
 from rover_lib.world.record import record_episodes
-from rover_lib.world.train import make_checkpoint
+from rover_lib.world.train import train
 
 NOTE = "trained for a few steps only, so that activations have real ranges: this policy does not drive"
+LEARNED_NOTE = "trained whole on the balloon world's drives: this policy has learned to drive there"
 STEPS = 24
 DRIVES = 16  # two of them choose, two judge: far more than the 50 frames that judge a count
+LEARNED_DRIVES = 80  # the demo's, so that what was trained on them is in the cache already
 SAMPLES = 64  # calibrate
 CURVE_SAMPLES = 8  # calibrate what is only counted: the count does not depend on the ranges
 CHECKED_FRAMES = 8  # on which an export is checked against its policy
@@ -34,8 +37,8 @@ def full_run(
     run_dir: Path | str,
     *,
     size: str = "full",
-    steps: int = STEPS,
-    drives: int = DRIVES,
+    steps: int | None = STEPS,
+    drives: int | None = None,
     samples: int = SAMPLES,
     sizes: tuple[tuple[int, int], ...] = SIZES,
     curve: tuple[tuple[int, int], ...] = CURVE,
@@ -43,27 +46,30 @@ def full_run(
 ) -> Path:
     """Record drives, train a policy a few steps, and quantize it at several image sizes. Returns run_dir.
 
-    size: 'full' (the user's policy, 360x640), or 'small' to try this out. samples: at most this many frames calibrate.
+    size: 'full' (the user's policy, 360x640), or 'small' to try this out. steps: None for the whole recipe, as `rover
+    world train` has it. drives: 16, or the demo's 80 for the whole recipe. samples: at most this many frames calibrate.
     sizes, curve: further image sizes (height, width) in pixels, of the same weights. progress: called like
     tqdm.tqdm(iterable, desc=, total=).
 
     Leaves what the notebooks leave, as far as counting needs it: episodes, best_model.pth, load.json,
     calibrate.json, calibration.pt, policy_fp32.pt, policy_static.pt and, when all is there, quantize.json; for each of
     `sizes` calibration_<height>x<width>.pt, policy_fp32_<height>x<width>.pt and policy_static_<height>x<width>.pt; for
-    each of `curve` only the last. load.json says that this policy does not drive. Recordings and checkpoint come from
+    each of `curve` only the last. load.json says whether this policy drives. Recordings and checkpoint come from
     the cache if they were made before. Raises WorldError if run_dir holds another kind of run, and what the steps
     raise.
     """
     run_dir = Path(run_dir).resolve()
-    if (run_dir / "load.json").exists() and read_stage(run_dir / "load.json", "load")["metrics"].get("note") != NOTE:
+    note = NOTE if steps else LEARNED_NOTE
+    if (run_dir / "load.json").exists() and read_stage(run_dir / "load.json", "load")["metrics"].get("note") != note:
         raise WorldError(
             f"{run_dir}: holds a run on another checkpoint", remedy="name another folder, or move it away first"
         )
     (run_dir / "quantize.json").unlink(missing_ok=True)
+    drives = drives or (DRIVES if steps else LEARNED_DRIVES)
     episodes = record_episodes(run_dir / "episodes", drives, progress=progress)
-    checkpoint = make_checkpoint(run_dir / "best_model.pth", size, episodes, steps=steps, progress=progress)
+    checkpoint = train(episodes, run_dir / "best_model.pth", size, steps=steps, progress=progress)
     loaded = load(checkpoint, episodes)
-    write_load(run_dir, loaded, NOTE)
+    write_load(run_dir, loaded, note)
     recipe = replace(Recipe.of(params()), samples=samples)
     few = replace(recipe, samples=min(samples, CURVE_SAMPLES))
     modes: dict[str, dict[str, Any]] = {}

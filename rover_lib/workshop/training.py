@@ -152,9 +152,9 @@ class Resumable:
     """A training in phases that goes on where it was, after Ctrl-C, kill -9 or a power cut at any moment.
 
     folder: holds a file per phase; remove it when the training's result is safe. Only one process at a time may train
-    in it. work: what all steps cost together, in the unit of `steps`' cost, for one bar over all phases; without it
-    each phase has its own. every_s: between two saves, more where saving is slow. losses: what the steps put there,
-    by phase; saved with them.
+    in it. work: what all steps cost together, in the unit of `steps`' cost, for one bar over all phases, to be set
+    before the first; without it each phase has its own. every_s: between two saves, more where saving is slow.
+    losses: what the steps put there, by phase; saved with them.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class Resumable:
     ):
         self.folder, self.every_s, self.clock = folder, every_s, clock
         self.losses: dict[str, list[float]] = defaultdict(list)
-        self.progress, self._work = progress, work
+        self.progress, self.work = progress, work
         self._behind = 0  # work that was done by the process before this one
         self._bar: Any = None
         self._ticks: Iterator[None] = iter(())
@@ -202,14 +202,14 @@ class Resumable:
         """
         file = self.folder / f"{phase}.pt"
         done = self._restore(file, phase, rng, parts) if file.exists() else 0
-        if not self._work:
+        if not self.work:
             self._bar = None
             self._behind = 0
         self._behind += done * cost
         saved_s, took_s = self.clock(), 0.0
         for step in range(done, count):
             yield step
-            self._advance(phase, cost, self._work or count * cost)
+            self._advance(phase, cost, self.work or count * cost)
             now_s = self.clock()
             if step + 1 == count or now_s - saved_s >= max(self.every_s, took_s / SAVING_SHARE):
                 self._save(file, phase, step + 1, rng, parts)
@@ -327,11 +327,11 @@ def policy_loss(policy: "ACTPolicy", batch: dict[str, Tensor], loss_weights: Ten
 
 
 def optimiser(
-    parameters: Iterable[nn.Parameter], rate: float, steps: int
+    parameters: Iterable[nn.Parameter], rate: float, steps: int, warmup: int = 0
 ) -> tuple[torch.optim.AdamW, torch.optim.lr_scheduler.LRScheduler]:
-    """AdamW whose rate warms up over a twentieth of the steps and falls to a hundredth along a cosine."""
+    """AdamW whose rate warms up over `warmup` steps, a twentieth of all for 0, and falls to 1/100 along a cosine."""
     optimizer = torch.optim.AdamW(parameters, lr=rate, betas=BETAS, weight_decay=WEIGHT_DECAY)
-    warmup = max(1, steps // 20)
+    warmup = warmup or max(1, steps // 20)
 
     def share(step: int) -> float:
         return min(1.0, (step + 1) / warmup) * (0.01 + 0.99 * (1 + math.cos(math.pi * min(1, step / steps))) / 2)
@@ -360,22 +360,17 @@ class Given(nn.Module):
         return {"feature_map": features}
 
 
-def losses_of(policy: "ACTPolicy", data: Frames, batch: int) -> list[float]:
-    """Mean absolute error per batch, in action units, of what the policy would drive (no latent sampled)."""
+def driving_error(policy: "ACTPolicy", data: Frames, rows: np.ndarray) -> float:
+    """Mean absolute error, in action units, of what the policy would drive on these rows (no latent sampled)."""
     policy.eval()
     device = next(policy.parameters()).device
-    losses = []
-    for first in range(0, len(data), batch):
-        rows = slice(first, first + batch)
-        chunks = policy.predict_action_chunk(
-            {
-                IMAGE: torch.from_numpy(normalise(data.images[rows])).to(device),
-                STATE: torch.from_numpy(data.states[rows]).to(device),
-            }
-        )
-        error = np.abs(chunks.cpu().numpy() - data.chunks[rows])[~data.is_pad[rows]]
-        losses.append(float(error.mean()))
-    return losses
+    chunks = policy.predict_action_chunk(
+        {
+            IMAGE: torch.from_numpy(normalise(data.images[rows])).to(device),
+            STATE: torch.from_numpy(data.states[rows]).to(device),
+        }
+    )
+    return float(np.abs(chunks.cpu().numpy() - data.chunks[rows])[~data.is_pad[rows]].mean())
 
 
 def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:

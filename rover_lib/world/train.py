@@ -3,12 +3,15 @@
 From scratch, without downloads, a ResNet with frozen batch norm learns nothing. So there are three phases:
 the backbone alone with live batch norm, predicting the chunk; the transformer on the frozen backbone's
 features, computed once; then all together at a tenth of the rate.
+
+ACT's positions are relative to the picture and no weight depends on its size. So the real car's policy is trained so at
+a quarter of its pixels, which takes a quarter of the time, and carried to its own size by a few steps there.
 """
 
 import shutil
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,10 +44,10 @@ from rover_lib.workshop.training import (
     RowFile,
     batch_of,
     descend,
+    driving_error,
     error_of,
     frames_of,
     in_memory,
-    losses_of,
     optimiser,
     policy_loss,
     recorded_spread,
@@ -54,41 +57,51 @@ from rover_lib.workshop.training import (
     to_cpu,
     trainer_config,
 )
-from rover_lib.world import record
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
 # Below it two threads wait for each other longer than they compute: 40 times slower on a busy machine.
 SMALL_DIM = 256
+RESNET18_MACS = 37e3  # multiply-accumulates per pixel
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How long and how fast each phase trains. samples: how many of the recordings' are used at most."""
+    """How long and how fast each phase trains.
+
+    samples: how many of the recordings' are used at most; feature_samples: of these, for the transformer. judged: how
+    many others give best_val_loss. at: (height, width) of the pictures until `carry_steps` at the policy's own size.
+    """
 
     backbone_steps: int
     transformer_steps: int
     together_steps: int
     batch: int
     transformer_batch: int
+    together_batch: int
     samples: int
+    feature_samples: int
+    judged: int
     backbone_rate: float = 1e-3
     transformer_rate: float = 5e-4
+    transformer_warmup: int = 0  # steps; 0: a twentieth of them
+    at: tuple[int, int] | None = None
+    carry_steps: int = 0
 
     def of_steps(self, steps: int) -> "Recipe":
-        """The same recipe with that many steps in all, at least one in each phase."""
-        planned = self.backbone_steps, self.transformer_steps, self.together_steps
-        backbone, transformer, together = (max(1, round(steps * p / sum(planned))) for p in planned)
-        # few steps cannot use many frames
+        """The same recipe with that many steps in all, at least one in each phase that it has."""
+        names = "backbone_steps", "transformer_steps", "together_steps", "carry_steps"
+        planned = {name: getattr(self, name) for name in names if getattr(self, name)}
+        shorter = {name: max(1, round(steps * n / sum(planned.values()))) for name, n in planned.items()}
+        # A few steps only show that it runs: of few frames each.
+        sizes = "batch", "transformer_batch", "together_batch"
+        batches = {name: min(getattr(self, name), max(2, steps // 8)) for name in sizes}
         samples = min(self.samples, max(4 * self.batch, steps * self.batch))
-        return Recipe(**{
-            **asdict(self),
-            "backbone_steps": backbone,
-            "transformer_steps": transformer,
-            "together_steps": together,
-            "samples": samples,
-        })  # fmt: skip
+        features = min(self.feature_samples, steps * batches["transformer_batch"])
+        judged = min(self.judged, max(8, steps))
+        counts: dict[str, Any] = {**shorter, **batches}
+        return replace(self, **counts, samples=samples, feature_samples=features, judged=judged, transformer_warmup=0)
 
 
 SIZES = {
@@ -97,13 +110,38 @@ SIZES = {
     ),
     "full": ActConfig(),
 }
+SMALL = Recipe(300, 900, 60, 16, 16, 16, samples=4000, feature_samples=4000, judged=500)
+FULL = Recipe(
+    *(200, 250, 20),
+    *(32, 32, 8),
+    samples=100_000,
+    feature_samples=2400,
+    judged=96,
+    transformer_rate=2e-4,
+    transformer_warmup=75,
+    at=(180, 320),
+    carry_steps=30,
+)
+FULL_GPU = replace(
+    FULL,
+    backbone_steps=1000,
+    transformer_steps=3000,
+    transformer_warmup=300,
+    together_steps=200,
+    together_batch=16,
+    carry_steps=200,
+    feature_samples=6000,
+    judged=500,
+)
 RECIPES = {
-    ("small", "cpu"): Recipe(300, 900, 60, batch=16, transformer_batch=16, samples=4000),
-    ("small", "cuda"): Recipe(300, 900, 60, batch=16, transformer_batch=16, samples=4000),
-    # a processor can only show that it runs: minutes for these few steps
-    ("full", "cpu"): Recipe(20, 30, 10, batch=2, transformer_batch=2, samples=100, transformer_rate=1e-4),
-    ("full", "cuda"): Recipe(1500, 4000, 500, batch=16, transformer_batch=16, samples=4000, transformer_rate=1e-4),
+    ("small", "cpu"): SMALL,
+    ("small", "cuda"): SMALL,
+    ("full", "cpu"): FULL,
+    ("full", "cuda"): FULL_GPU,
 }
+# A cached checkpoint of minutes is made anew with each change of the code that makes it. One of an hour or more is
+# when this is raised: by whoever changes what the same recipe gives.
+FULL_VERSION = 1
 
 
 def train(
@@ -147,9 +185,10 @@ def train(
         "versions": [version(name) for name in ("torch", "lerobot", "torchvision", "numpy")],
         "episodes": {p.relative_to(episodes_dir).as_posix(): sha256_of(p) for p in _files(episodes_dir)},
         "split": params()["calibration"],
-        "names": [episodes_dir.name, out_path.parent.name],
+        "version": FULL_VERSION,
     }
-    key = key_of(made_of, sys.modules[__name__], training_module, preprocess, act_module, episodes_module)
+    sources = sys.modules[__name__], training_module, preprocess, act_module, episodes_module
+    key = key_of(made_of, *(() if size == "full" and steps is None else sources))
     unfinished = cache_root() / f"training-{key}"
 
     def make(folder: Path) -> None:
@@ -159,8 +198,8 @@ def train(
                 SIZES[size],
                 learning_rate=recipe.transformer_rate,
                 batch_size=recipe.batch,
-                data_dir=episodes_dir.name,
-                output_dir=out_path.parent.name,
+                data_dir="episodes",
+                output_dir="checkpoints",
                 device=device,
                 seed=seed,
             )
@@ -173,29 +212,6 @@ def train(
     return out_path
 
 
-def make_checkpoint(
-    out_path: Path | str,
-    size: str = "full",
-    episodes_dir: Path | str | None = None,
-    seed: int = 0,
-    steps: int = 12,
-    progress: Progress = silent,
-) -> Path:
-    """A checkpoint of a few steps: real in format, size and ranges, but it cannot drive.
-
-    episodes_dir: trained on these; without it, on three drives of the expert that are recorded for it.
-    """
-    if episodes_dir is None:
-
-        def make(folder: Path) -> None:
-            for index in range(3):
-                record.record_drive(folder, index, seed)
-
-        key = key_of({"seed": seed, "drives": 3}, record, episodes_module)
-        episodes_dir = cached_folder("drives", key, make)
-    return train(episodes_dir, out_path, size, seed, steps, progress=progress)
-
-
 def _files(episodes_dir: Path) -> list[Path]:
     """All files of the recordings, hidden ones left out."""
     return sorted(p for p in episodes_dir.rglob("*") if p.is_file() and not p.name.startswith("."))
@@ -205,27 +221,32 @@ def _files(episodes_dir: Path) -> list[Path]:
 class _Training:
     """What every phase works with."""
 
-    size: ActConfig
+    size: ActConfig  # as trained first; the policy's own may be larger
     policy: "ACTPolicy"
     data: Frames
     recipe: Recipe
     loss_weights: Tensor  # (2,), on the device that is trained on
     rng: np.random.Generator
     saved: Resumable
+    plan: dict[str, tuple[int, int]]
 
     @property
     def device(self) -> torch.device:
         return self.loss_weights.device
 
-    def rows(self, batch: int) -> np.ndarray:
-        return self.rng.choice(len(self.data), min(batch, len(self.data)), replace=False)
+    def rows(self, batch: int, of: int) -> np.ndarray:
+        return self.rng.choice(of, min(batch, of), replace=False)
 
-    def batch(self) -> dict[str, Tensor]:
+    def batch(self, count: int) -> dict[str, Tensor]:
         """The next one of frames."""
-        return batch_of(self.data, self.rows(self.recipe.batch), self.rng, self.device)
+        return batch_of(self.data, self.rows(count, len(self.data)), self.rng, self.device)
 
-    def steps(self, phase: str, count: int, **parts: Any) -> Iterator[int]:
-        return self.saved.steps(phase, count, self.rng, **parts)
+    def steps(self, phase: str, **parts: Any) -> Iterator[int]:
+        count, cost = self.plan[phase]
+        return self.saved.steps(phase, count, self.rng, cost, **parts)
+
+    def descend(self, phase: str, loss: Tensor, module: nn.Module, optimizer: Any, scheduler: Any) -> None:
+        self.saved.losses[phase].append(descend(loss, module, optimizer, scheduler))
 
 
 def _train(
@@ -236,11 +257,16 @@ def _train(
     recordings = load_recordings(episodes_dir, size.chunk, p["sync_s"], saved.progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
     rng = np.random.default_rng([seed, 77])
-    data = frames_of(thinned(parts.calibration, recipe.samples), *size.image_sizes[0])
-    data = in_memory(data, "reading frames", saved.progress)
-    held_out = frames_of(thinned(parts.choosing, max(8, recipe.samples // 8)), *size.image_sizes[0])
+    first = replace(size, image_sizes=(recipe.at,)) if recipe.at else size
+    samples = thinned(parts.calibration, recipe.samples)
+    data = frames_of(samples, *first.image_sizes[0])
+    if not recipe.at:  # steps are short: reading would take longer
+        data = in_memory(data, "reading frames", saved.progress)
+    judges = frames_of(thinned(parts.choosing, recipe.judged), *size.image_sizes[0])
     spread = recorded_spread(data)
     loss_weights = torch.from_numpy(1 / spread).to(device)
+    plan = _plan(size, first, recipe, len(data), len(judges))
+    saved.work = sum(count * cost for count, cost in plan.values())
 
     with seeded(seed):
         policy = lerobot_act(size)
@@ -248,16 +274,50 @@ def _train(
             policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
             policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
         policy.to(device)
-        training = _Training(size, policy, data, recipe, loss_weights, rng, saved)
+        training = _Training(first, policy, data, recipe, loss_weights, rng, saved, plan)
         _train_backbone(training)
         _train_transformer(training)
-        optimizer, scheduler = _train_together(training)
+        optimizer, scheduler = _train_together(training, "all together")
+        if recipe.at:
+            training = replace(training, data=frames_of(samples, *size.image_sizes[0]))
+            optimizer, scheduler = _train_together(training, "at full size")
+        for step in training.steps("judging"):
+            rows = np.arange(len(judges))[step * recipe.batch : (step + 1) * recipe.batch]
+            saved.losses["judging"].append(driving_error(policy, judges, rows))
     return {
-        "epoch": recipe.together_steps,
+        "epoch": recipe.carry_steps or recipe.together_steps,
         "model_state_dict": {k: v.cpu() for k, v in policy.state_dict().items()},
         "optimizer_state_dict": to_cpu(optimizer.state_dict()),
         "scheduler_state_dict": scheduler.state_dict(),
-        "best_val_loss": np.mean(losses_of(policy, held_out, recipe.batch)),
+        "best_val_loss": np.mean(saved.losses["judging"]),
+    }
+
+
+def _plan(size: ActConfig, first: ActConfig, recipe: Recipe, frames: int, judges: int) -> dict[str, tuple[int, int]]:
+    """Each phase's steps, and what one costs, in 10^9 multiply-accumulates: for the bar, so roughly."""
+
+    def g(config: ActConfig, passes: int, batch: int, backbone: bool = True, transformer: bool = True) -> int:
+        ((height, width),) = config.image_sizes
+        tokens = -(-height // config.stride) * -(-width // config.stride) + 2
+        per_token = 4 * config.dim**2 + 2 * config.dim * config.feedforward
+        seen = config.encoder_layers * tokens + config.vae_layers * (config.chunk + 2)
+        seen += config.decoder_layers * config.chunk
+        macs = backbone * RESNET18_MACS * height * width + transformer * per_token * seen
+        return max(1, round(passes * batch * macs / 1e9))
+
+    batch = recipe.batch
+    features = -(-min(frames, recipe.feature_samples) // batch)
+    forward = g(first, 1, batch, transformer=False)
+    train = 3  # passes: forward, and backward to inputs and to weights
+    return {
+        "backbone": (recipe.backbone_steps, train * forward),
+        "statistics": (16 if frames >= 16 * batch else 4, forward),
+        "features, plain": (features, forward),
+        "features, mirrored": (features, forward),
+        "transformer": (recipe.transformer_steps, g(first, train, recipe.transformer_batch, backbone=False)),
+        "all together": (recipe.together_steps, g(first, train, recipe.together_batch)),
+        "at full size": (recipe.carry_steps, g(size, train, recipe.together_batch)),
+        "judging": (-(-judges // batch), g(size, 1, batch)),
     }
 
 
@@ -280,7 +340,7 @@ class _ChunkFromFeatures(nn.Module):
 
 def _train_backbone(training: _Training) -> None:
     """Phase one: live batch norm; its statistics, measured on the data, become the frozen ones."""
-    recipe, data = training.recipe, training.data
+    recipe = training.recipe
     import torchvision
 
     resnet = torchvision.models.resnet18(weights=None)
@@ -288,19 +348,18 @@ def _train_backbone(training: _Training) -> None:
     model = _ChunkFromFeatures(live, training.size).to(training.device).train()
     optimizer, scheduler = optimiser(model.parameters(), recipe.backbone_rate, recipe.backbone_steps)
     parts = {"model": model, "optimizer": optimizer, "scheduler": scheduler}
-    for _ in training.steps("backbone", recipe.backbone_steps, **parts):
-        batch = training.batch()
+    for _ in training.steps("backbone", **parts):
+        batch = training.batch(recipe.batch)
         loss = error_of(model(batch[IMAGE]), batch, training.loss_weights)
-        training.saved.losses["backbone"].append(descend(loss, model, optimizer, scheduler))
+        training.descend("backbone", loss, model, optimizer, scheduler)
 
     norms = [m for m in live.modules() if isinstance(m, nn.BatchNorm2d)]
     for norm in norms:
         norm.reset_running_stats()
         norm.momentum = None  # a plain mean over the batches below
-    batches = 16 if len(data) >= 16 * recipe.batch else 4
-    for _ in training.steps("statistics", batches, backbone=live):
+    for _ in training.steps("statistics", backbone=live):
         with torch.no_grad():
-            live(training.batch()[IMAGE])
+            live(training.batch(recipe.batch)[IMAGE])
     weights = {k: v for k, v in live.state_dict().items() if not k.endswith("num_batches_tracked")}
     training.policy.model.backbone.load_state_dict(weights)
 
@@ -308,57 +367,57 @@ def _train_backbone(training: _Training) -> None:
 def _train_transformer(training: _Training) -> None:
     """Phase two: all but the backbone, on features computed once, of each frame as it is and mirrored."""
     policy, backbone = training.policy, training.policy.model.backbone.eval()
-    views = {name: _features(training, name, backbone) for name in ("plain", "mirrored")}
+    chosen = np.asarray(thinned(range(len(training.data)), training.recipe.feature_samples))
+    views = {view: _features(training, view, chosen, backbone) for view in ("plain", "mirrored")}
     policy.model.backbone = Given()
     policy.train()
     with threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
-        _transformer_steps(training, views)
+        _transformer_steps(training, chosen, views)
     policy.model.backbone = backbone
 
 
-def _features(training: _Training, view: str, backbone: nn.Module) -> RowFile:
-    """The frozen backbone's feature map of every frame, on disk."""
-    data, batch = training.data, training.recipe.batch
-    height, width = data.images[:1].shape[1:3]
-    stride = training.size.stride
-    channels = training.policy.model.encoder_img_feat_input_proj.in_channels
-    rows = RowFile(training.saved.folder / f"{view}.rows", (channels, -(-height // stride), -(-width // stride)))
-    for step in training.steps(f"features, {view}", -(-len(data) // batch), rows=rows):
-        images = data.images[step * batch : (step + 1) * batch]
+def _features(training: _Training, view: str, chosen: np.ndarray, backbone: nn.Module) -> RowFile:
+    """The frozen backbone's feature map of these rows' frames, on disk."""
+    batch, ((height, width),) = training.recipe.batch, training.size.image_sizes
+    stride, channels = training.size.stride, training.policy.model.encoder_img_feat_input_proj.in_channels
+    maps = RowFile(training.saved.folder / f"{view}.rows", (channels, -(-height // stride), -(-width // stride)))
+    for step in training.steps(f"features, {view}", maps=maps):
+        images = training.data.images[chosen[step * batch : (step + 1) * batch]]
         images = images[:, :, ::-1] if view == "mirrored" else images
         with torch.no_grad():
-            rows.append(backbone(torch.from_numpy(normalise(images)).to(training.device))["feature_map"].cpu())
-    return rows
+            maps.append(backbone(torch.from_numpy(normalise(images)).to(training.device))["feature_map"].cpu())
+    return maps
 
 
-def _transformer_steps(training: _Training, views: dict[str, RowFile]) -> None:
+def _transformer_steps(training: _Training, chosen: np.ndarray, views: dict[str, RowFile]) -> None:
     policy, data, recipe = training.policy, training.data, training.recipe
     parameters = [p for p in policy.parameters() if p.requires_grad]
-    optimizer, scheduler = optimiser(parameters, recipe.transformer_rate, recipe.transformer_steps)
-    parts = {"policy": policy, "optimizer": optimizer, "scheduler": scheduler}
-    for step in training.steps("transformer", recipe.transformer_steps, **parts):
-        rows = training.rows(recipe.transformer_batch)
+    optimizer, scheduler = optimiser(
+        parameters, recipe.transformer_rate, recipe.transformer_steps, recipe.transformer_warmup
+    )
+    for step in training.steps("transformer", policy=policy, optimizer=optimizer, scheduler=scheduler):
+        kept = training.rows(recipe.transformer_batch, len(chosen))
+        rows = chosen[kept]
         states, chunks = swapped_states(data, rows, training.rng), data.chunks[rows].copy()
         if step % 2:
             states[:, 0] *= -1
             chunks[:, :, 0] *= -1
         batch = {
-            IMAGE: torch.from_numpy(views["mirrored" if step % 2 else "plain"][rows]).to(training.device),
+            IMAGE: torch.from_numpy(views["mirrored" if step % 2 else "plain"][kept]).to(training.device),
             STATE: torch.from_numpy(states).to(training.device),
             ACTION: torch.from_numpy(chunks).to(training.device),
             IS_PAD: torch.from_numpy(data.is_pad[rows]).to(training.device),
         }
         loss = policy_loss(policy, batch, training.loss_weights)
-        training.saved.losses["transformer"].append(descend(loss, policy, optimizer, scheduler))
+        training.descend("transformer", loss, policy, optimizer, scheduler)
 
 
-def _train_together(training: _Training) -> tuple[torch.optim.Optimizer, Any]:
+def _train_together(training: _Training, phase: str) -> tuple[torch.optim.Optimizer, Any]:
     """Phase three: all parameters, at a tenth of the rate. Returns what the checkpoint keeps of it."""
     policy, recipe = training.policy, training.recipe
     policy.train()
-    optimizer, scheduler = optimiser(policy.parameters(), recipe.transformer_rate / 10, recipe.together_steps)
-    parts = {"policy": policy, "optimizer": optimizer, "scheduler": scheduler}
-    for _ in training.steps("all together", recipe.together_steps, **parts):
-        loss = policy_loss(policy, training.batch(), training.loss_weights)
-        training.saved.losses["all together"].append(descend(loss, policy, optimizer, scheduler))
+    optimizer, scheduler = optimiser(policy.parameters(), recipe.transformer_rate / 10, training.plan[phase][0])
+    for _ in training.steps(phase, policy=policy, optimizer=optimizer, scheduler=scheduler):
+        loss = policy_loss(policy, training.batch(recipe.together_batch), training.loss_weights)
+        training.descend(phase, loss, policy, optimizer, scheduler)
     return optimizer, scheduler

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from lab.a76.full import NOTE, SIZES, STEPS, full_run
+from lab.a76.full import LEARNED_NOTE, NOTE, SIZES, STEPS, full_run
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
@@ -13,6 +13,7 @@ from rover_lib.workshop.observe import Calibration
 from rover_lib.workshop.quantize import quantize
 from rover_lib.workshop.scheme import Scheme
 from rover_lib.workshop.session import opened
+from rover_lib.world import train as train_module
 
 SIZE = {"size": "small", "drives": 5, "samples": 6, "sizes": ((54, 96),), "curve": ((36, 64),)}
 
@@ -60,6 +61,20 @@ def test_quantize_json_says_how_to_make_it_again(run_dir, suffix):
 def test_what_was_made_before_is_taken_from_the_cache(run_dir, tmp_path):
     again = full_run(tmp_path / "full", steps=5, **SIZE | {"sizes": (), "curve": ()})
     assert sha256_of(again / "best_model.pth") == sha256_of(run_dir / "best_model.pth")
+
+
+def test_the_whole_recipe_is_that_of_the_balloon_world(cache, tmp_path, monkeypatch):
+    """So that a checkpoint that `rover world train` left in the cache is used."""
+    short = train_module.RECIPES["small", "cpu"].of_steps(4)
+    monkeypatch.setitem(train_module.RECIPES, ("small", "cpu"), short)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    run_dir = full_run(tmp_path / "full", steps=None, **SIZE | {"sizes": (), "curve": ()})
+    assert read_stage(run_dir / "load.json", "load")["metrics"]["note"] == LEARNED_NOTE
+    monkeypatch.setattr(train_module, "_train", None)
+    trained = train_module.train(run_dir / "episodes", tmp_path / "mine.pth", "small")
+    assert sha256_of(trained) == sha256_of(run_dir / "best_model.pth")
+    with pytest.raises(WorldError, match="holds a run on another checkpoint"):
+        full_run(run_dir, steps=5, **SIZE)
 
 
 def test_another_run_of_that_name_is_left_alone(tmp_path):
