@@ -397,6 +397,7 @@ def test_torch_that_is_not_there(monkeypatch):
     assert check.verdict == "fail" and "pip install" in check.remedy
 
 
+@pytest.mark.slow
 def test_a_good_artifact(artifacts):
     checks = list(doctor.policy(artifacts["static"]))
     assert verdicts(checks) == {"artifact": "ok", "confinement": "ok", "inference": "ok"}
@@ -404,6 +405,7 @@ def test_a_good_artifact(artifacts):
     assert re.fullmatch(r"\d+ ms", checks[2].found)
 
 
+@pytest.mark.slow
 def test_a_slow_one(artifacts, monkeypatch):
     now = iter(np.arange(0, 100, 0.3))
     monkeypatch.setattr(doctor.time, "perf_counter", lambda: next(now))
@@ -411,6 +413,7 @@ def test_a_slow_one(artifacts, monkeypatch):
     assert check.verdict == "warning" and check.found == "300 ms: the throttle fades from 500 ms of age on"
 
 
+@pytest.mark.slow
 def test_a_damaged_artifact(artifacts, tmp_path, proc):
     data = bytearray(artifacts["static"].read_bytes())
     data[len(data) // 2] ^= 0xFF
@@ -528,6 +531,7 @@ def test_a_desktop_cannot_drive(tmp_path):
     assert {"name", "verdict", "found", "remedy"} == set(found["checks"][0])
 
 
+@pytest.mark.slow
 def test_a_rover_that_drives(tmp_path, artifacts, quick):
     for k in range(60):
         cv2.imwrite(str(tmp_path / f"{k:03d}.jpg"), np.full((90, 160, 3), 100 + k, np.uint8))

@@ -18,6 +18,8 @@ from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
 from rover_lib.onboard.plan import Commanded
 
+pytestmark = pytest.mark.slow  # each starts processes that import torch
+
 FRAME = np.random.default_rng(0).integers(0, 256, (36, 64, 3), np.uint8)
 CHUNK = np.tile(np.array([0.1, 0.05], np.float32), (8, 1))
 

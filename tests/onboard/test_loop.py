@@ -701,6 +701,7 @@ def test_a_real_log_ends(tmp_path, link, clock):
     assert unfinished_drive(log_cut)
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_dead_ends_the_process():
     """In a process, since it ends that; a loop that ticks, or has ended, does not."""
     code = """

@@ -172,6 +172,7 @@ def lose(folder: Path, inodes: set[int]) -> None:
 STEPS = 34  # of a deployment; test_cuts_are_all_of_a_deployment holds it to what is
 
 
+@pytest.mark.slow
 def test_cuts_are_all_of_a_deployment(full, two):
     steps = steps_of(lambda: deploy(full, two[1]))
     assert len(steps) == STEPS, steps

@@ -615,6 +615,7 @@ def wild_folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @QUICK
 @given(content=WILD)
 def test_wild_json(wild_folder, content):

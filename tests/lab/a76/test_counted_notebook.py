@@ -8,6 +8,8 @@ from lab.params import lab_params
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import run as runs
 
+pytestmark = pytest.mark.slow  # each executes a notebook
+
 
 def counted(fewer: float, **changed):
     """What arm.json says of an artifact, as far as the notebook reads it."""

@@ -15,6 +15,8 @@ from rover_lib.workshop.scheme import Scheme
 from rover_lib.workshop.session import opened
 from rover_lib.world import train as train_module
 
+pytestmark = pytest.mark.slow  # each makes a policy of a size that is no toy's
+
 SIZE = {"size": "small", "drives": 5, "samples": 6, "sizes": ((54, 96),), "curve": ((36, 64),)}
 
 
