@@ -44,7 +44,11 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
     """
     from rover_lib.world.train import train as train_policy
 
-    click.echo(f"trained: {train_policy(episodes, output, progress=terminal(), **options)}")
+    try:
+        click.echo(f"trained: {train_policy(episodes, output, progress=terminal(), **options)}")
+    except KeyboardInterrupt:
+        click.echo("\nrover: stopped; the same command goes on where it was", err=True)
+        raise click.exceptions.Exit(130) from None
 
 
 @world.command()

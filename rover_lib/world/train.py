@@ -203,7 +203,8 @@ def train(
                 device=device,
                 seed=seed,
             )
-            torch.save({**trained, "config": config}, folder / "best_model.pth")
+            with atomic_path(folder / "best_model.pth") as temporary:  # on the disk before what it came from is removed
+                torch.save({**trained, "config": config}, temporary)
 
     made = cached_folder("checkpoint", key, make) / "best_model.pth"
     shutil.rmtree(unfinished, ignore_errors=True)

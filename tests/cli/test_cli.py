@@ -79,6 +79,15 @@ def test_a_size_is_width_and_height(tmp_path):
     assert result.exit_code == 2 and "as in 320x180" in result.output
 
 
+def test_a_training_that_is_stopped_says_that_it_goes_on(tmp_path, monkeypatch):
+    def interrupted(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rover_lib.world.train.train", interrupted)
+    result = rover("world", "train", tmp_path, tmp_path / "out.pth")
+    assert result.exit_code == 130 and "the same command goes on where it was" in result.output
+
+
 def test_debug_shows_the_traceback(tmp_path):
     result = rover("--debug", "inspect", tmp_path / "nothing.pt")
     assert result.exit_code == 1 and result.exception is not None
