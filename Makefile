@@ -5,7 +5,8 @@ ROVER := $(VENV)/bin/rover
 LAB := $(VENV)/bin/python -m lab
 READY := $(VENV)/.ready
 # A file of tests, or a notebook, to each core; more processes than four would want more memory than they save time.
-PYTEST := $(VENV)/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+# In the order of the folders: ansible and lab have the longest files, and one of them at the end would run alone.
+PYTEST := $(VENV)/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 NAME ?= mine
 # In a container there may be nobody but root, and what is loaded here was made here; see onboard/confine.py.
 export ROVER_AS_ROOT := 1
