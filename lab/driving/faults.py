@@ -37,7 +37,7 @@ from lab.driving.pins import (
     LATE_COMMAND_S,
     PERIOD_US,
     REFUSED,
-    STEP_US,
+    SLEW_US_PER_MS,
     STOPPED,
     TICK_US,
     Gates,
@@ -47,10 +47,13 @@ from lab.driving.pins import (
 )
 from lab.driving.row import FaultRow
 from lab.driving.rows import FAULTS, KINDS
+from rover_lib.onboard.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.stage import write_stage
 from rover_lib.world.standin import REST_US, PinEvent
 
-ON_THE_WAY = {"steering": 2, "throttle": 10}  # pulses in a row that may be alike there, at most
+SLEWED_MS = 2  # of the Arduino's clock, which it slews by, and of pulses that it measured a step off
+TICK_S = 0.04  # one of a drive's, and what it may be late
+KNOWN_S = 0.05  # a pulse is known when it has ended, and was read
 ATTEMPTS = 5  # at a row that this machine spoilt
 FUZZ_LINES = 1_000_000
 
@@ -95,7 +98,7 @@ def _inject(bench: DrivingBench, fault: FaultRow) -> tuple[Observation, int | No
     at_s = fault.inject(bench) or called_s
     bench.wait(fault.watch_s)
     end_s = time.monotonic()
-    bench.wait(0.05)  # a pulse is known when it ends
+    bench.wait(KNOWN_S)
     commands = [c for c in bench.cable.commands if at_s - 1 < c.at_s <= end_s]
     seen = Observation(bench.events, commands, at_s, end_s)
     code = drive.process.poll() if fault.exit_code is None else drive.wait(END_S)
@@ -115,7 +118,9 @@ def _start_with(bench: DrivingBench, fault: FaultRow) -> tuple[Observation, int 
     while drive.running and time.monotonic() < at_s + START_S:
         bench.wait(0.1)
     bench.wait(fault.watch_s)
-    seen = Observation(bench.events, bench.cable.commands, at_s, time.monotonic())
+    end_s = time.monotonic()
+    bench.wait(KNOWN_S)
+    seen = Observation(bench.events, bench.cable.commands, at_s, end_s)
     code, line = drive.wait(0), _line_of(fault.message, drive)
     bench.clear_faults()
     return seen, code, line
@@ -126,7 +131,7 @@ def _spoilt(fault: FaultRow, seen: Observation, gates: Gates) -> bool:
     if seen.stalled_ms() or (fault.expected != REFUSED and not seen.was_driving(gates.throttle_max_us)):
         return True
     must_command = fault.expected == CONTINUES and not fault.until_limit and not fault.starves
-    return must_command and seen.longest_pause_s() > LATE_COMMAND_S
+    return must_command and seen.longest_pause_s() > max(LATE_COMMAND_S, fault.paused_s + TICK_S)
 
 
 def _limits(fault: FaultRow, verdict: Verdict) -> str:
@@ -165,7 +170,7 @@ def fuzz(lines: int = FUZZ_LINES, seed: int = 1) -> dict[str, Any]:
     return {"lines": lines, "seed": seed, "unsafe_pulses": int(done.returncode != 0), "said": printed}
 
 
-def transmitted_and_replayed(bench: DrivingBench, steps: int = 24, step_s: float = 0.2) -> dict[str, Any]:
+def transmitted_and_replayed(bench: DrivingBench, steps: int = 24, step_s: float = 0.25) -> dict[str, Any]:
     """A transmitter's pulses, recorded by `rover record` and replayed by `rover drive --replay`, on the pins.
 
     worst_us: of all pulses of the replay, against what was transmitted in their place; None if that is another
@@ -205,32 +210,50 @@ def transmitted_and_replayed(bench: DrivingBench, steps: int = 24, step_s: float
 def compare_steps(
     events: Sequence[PinEvent], sent: Sequence[tuple[float, float]], times_s: Sequence[float]
 ) -> dict[str, Any]:
-    """Steps of pulses (steering, throttle; us) that were sent at times, against those on the pins; see above.
-
-    The pulses on the way from one to the next, as many as the firmware's limit to how fast they change asks for, are
-    none.
-    """
+    """Steps of pulses (steering, throttle; us) that were sent at times, against those on the pins; see above."""
     result: dict[str, Any] = {"steps": len(sent), "worst_us": 0.0, "worst_ms": 0.0, "pulses": 0}
     for i, pin in enumerate(PERIOD_US):
-        runs: list[list[PinEvent]] = []
-        for e in events:
-            if e.pin != pin or e.kind != "pulse":
-                continue
-            if not runs or abs(e.pulse_us - runs[-1][0].pulse_us) > 2 * STEP_US:
-                runs.append([])
-            runs[-1].append(e)
-        runs = [run for run in runs if len(run) > ON_THE_WAY[pin]]
-        result[f"{pin}_steps"] = len(runs)
-        if len(runs) != len(sent):
+        pulses = [e for e in events if e.pin == pin and e.kind == "pulse"]
+        off_us, begun_s = _followed(pin, pulses, [step[i] for step in sent])
+        result[f"{pin}_steps"] = len(begun_s) + 1
+        if len(begun_s) + 1 != len(sent):
             return result | {"worst_us": None}
-        for run, pulses in zip(runs, sent, strict=True):
-            # A pin does whole ticks; what simavr adds to an edge is its granularity, not the chip's.
-            widths = {TICK_US[pin] * round(e.pulse_us / TICK_US[pin]) for e in run}
-            result["worst_us"] = max(result["worst_us"], *(abs(us - pulses[i]) for us in widths))
-            result["pulses"] += len(run)
-        begun = np.array([run[0].monotonic_s for run in runs[1:]]) - np.array(times_s[1:])
-        result["worst_ms"] = max(result["worst_ms"], round(float(np.abs(begun - np.median(begun)).max()) * 1e3, 1))
+        result["worst_us"] = max(result["worst_us"], *off_us)
+        result["pulses"] += len(off_us)
+        delays_s = np.array(begun_s) - np.array(times_s[1:])
+        result["worst_ms"] = max(
+            result["worst_ms"], round(float(np.abs(delays_s - np.median(delays_s)).max()) * 1e3, 1)
+        )
     return result
+
+
+def _followed(pin: str, pulses: Sequence[PinEvent], levels: Sequence[float]) -> tuple[list[float], list[float]]:
+    """How far each pulse (us) is from its level, and when each level but the first was set out for.
+
+    The firmware moves a pin no faster than its slew, so pulses on the way from one level to the next are none of
+    either, and are not counted: as long as they only come nearer, and for no longer than that takes.
+    """
+    off_us: list[float] = []
+    begun_s: list[float] = []
+    on_the_way, last = False, levels[0]
+    for e in pulses:
+        # A pin does whole ticks; what simavr adds to an edge is its granularity, not the chip's.
+        us = TICK_US[pin] * round(e.pulse_us / TICK_US[pin])
+        level, after = levels[len(begun_s) : len(begun_s) + 2] if len(begun_s) + 1 < len(levels) else (levels[-1],) * 2
+        if not on_the_way and abs(us - level) > ARDUINO_STEP_US and (us - level) * (after - level) > 0:
+            begun_s.append(e.monotonic_s)
+            on_the_way, last, level = True, level, after
+        if on_the_way:
+            way_us = abs(level - levels[len(begun_s) - 1])
+            most_s = (way_us / SLEW_US_PER_MS[pin] + SLEWED_MS) * 1e-3 + PERIOD_US[pin] * 1e-6
+            nearer = min(last, level) <= us <= max(last, level) and e.monotonic_s - begun_s[-1] <= most_s
+            on_the_way = nearer and abs(us - level) > ARDUINO_STEP_US
+            last = us
+        if not on_the_way:
+            off_us.append(abs(us - level))
+    if on_the_way:
+        off_us.append(abs(last - levels[len(begun_s)]))
+    return off_us, begun_s
 
 
 @dataclass

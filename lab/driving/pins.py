@@ -17,6 +17,7 @@ STOPPED, HUMAN, CONTINUES, REFUSED = "stopped", "human", "continues", "refused"
 NEUTRAL_US = {"steering": 1456, "throttle": 120}
 PERIOD_US = {"steering": 21316, "throttle": 1016}
 TICK_US = {"steering": 0.5, "throttle": 4.0}  # of the pin's timer: all that its hardware can do
+SLEW_US_PER_MS = {"steering": 4.0, "throttle": 2.0}  # how fast the firmware lets the host move a pin
 EDGE_US = 0.5  # an edge in simavr is known to 0.25 us
 STEP_US = ARDUINO_STEP_US + EDGE_US  # of a pulse that the Arduino measured and made again
 COMMAND_US = {"steering": 1.0, "throttle": 2.5}  # half a step of its timer, and an edge

@@ -22,7 +22,7 @@ class FaultRow:
     told_later. method: how it is injected. watch_s: how long it is watched after inject.
     start: of the drive, see Drive. exit_code: of the drive, None: it goes on.
     limits: what makes a `continues` stop after all. until_limit: that happens here.
-    starves: it takes the time of this machine away. human_us: of `human`.
+    starves: it takes the time of this machine away. paused_s: it pauses the drive for that long. human_us: of `human`.
     """
 
     kind: str
@@ -38,6 +38,7 @@ class FaultRow:
     limits: str = ""
     until_limit: bool = False
     starves: bool = False
+    paused_s: float = 0.0
     human_us: tuple[float, float] = REST_US
 
 

@@ -31,6 +31,7 @@ from rover_lib.onboard.recorder import Recorder, room_for
 from rover_lib.onboard.recording import read_controls
 from rover_lib.onboard.service import CHECK_S, NotArmed, Service
 from rover_lib.onboard.servo_link import MISSING, ServoLink, Telemetry
+from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.telemetry import FlightLog, StatusLine
 from rover_lib.onboard.watch import (
     HealthWatch,
@@ -115,10 +116,11 @@ def drive_car(
     artifact = options.artifact.resolve() if options.artifact else None  # another may take its place meanwhile
     if not (controls or car or options.dry_run or options.film):
         _check_no_film(options.camera)
-    until = Until(options.ticks, options.max_seconds)
+    stop = SignalEvent()
+    until = Until(options.ticks, options.max_seconds, stop)
     with ExitStack() as stack:
         log = stack.enter_context(_flight_log(options, settings, report))
-        stack.enter_context(stopped_by_signals(until.stop, log))
+        stack.enter_context(stopped_by_signals(stop, log))
         stack.enter_context(exit_if_hung(report, log))
         if car:
             other = stack.enter_context(car())
@@ -126,7 +128,7 @@ def drive_car(
             stack.callback(lambda: report.world.update(other.summary()))
         service = None
         if options.service and artifact:
-            service = Service(report, until.stop, log.event, model=content_hash(artifact))
+            service = Service(report, stop, log.event, model=content_hash(artifact))
             stack.enter_context(service)
             until = replace(until, over=service.over)
         link = None if options.dry_run else stack.enter_context(ServoLink(options.port))
@@ -136,7 +138,7 @@ def drive_car(
             warnings = _all_of(HealthWatch(report, link), MemoryWatch(report, [os.getpid()]))
             arm: Arm | None = None
             if link and sys.stdin.isatty():
-                arm = partial(arm_when_ready, link.arm, link, until.stop, log.event)
+                arm = partial(arm_when_ready, link.arm, link, stop, log.event)
             hooks = Hooks(arm, warnings)
             with boosted_priority(log):
                 run_loop(ReplayPilot(controls, throttle_limit=limit), hooks=hooks)
@@ -166,7 +168,7 @@ def drive_car(
                 if service and link:
                     arm = partial(service.wait_for_human, this.arm, checks, partial(what_is_missing, link), said=said)
                 elif link and sys.stdin.isatty():
-                    arm = partial(arm_when_ready, this.arm, link, until.stop, log.event, checks)
+                    arm = partial(arm_when_ready, this.arm, link, stop, log.event, checks)
                 else:
                     arm = this.arm
                 hooks = Hooks(arm, warnings, this.record if options.record else None)
@@ -175,7 +177,7 @@ def drive_car(
                 except (DriveFault, TakenOver):
                     if not service:
                         raise
-            if not service or until.stop.is_set():
+            if not service or stop.is_set():
                 return
             said = report.ended
 

@@ -21,6 +21,7 @@ from rover_lib.onboard.camera import Camera
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
 from rover_lib.onboard.recording import EpisodeExists, EpisodeWriter
 from rover_lib.onboard.servo_link import ServoLink
+from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.telemetry import StatusLine
 from rover_lib.onboard.watch import signals
 
@@ -339,7 +340,7 @@ def record_episodes(
     SIGINT ends an episode; a second one, or one in the pause before the next episode, ends it all, and so do SIGTERM,
     SIGHUP and a fault. Raises RoverError if it cannot be begun.
     """
-    stop, leave = threading.Event(), threading.Event()
+    stop, leave = SignalEvent(), SignalEvent()
 
     def on_signal(number: int, _: object) -> None:
         if number != signal.SIGINT or stop.is_set():

@@ -40,6 +40,7 @@ import numpy as np
 from rover_lib.onboard.errors import ParamsError, RoverError
 from rover_lib.onboard.host import Host, throttled_means
 from rover_lib.onboard.servo_link import State
+from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.stage import plain
 
 SCHEMA = 1
@@ -174,7 +175,7 @@ class FlightLog:
         self._ticks: deque[tuple[int, Tick]] = deque(maxlen=QUEUE_TICKS if self.path else 0)
         self._events: deque[Event] = deque(maxlen=QUEUE_EVENTS if self.path else 0)
         self._messages: deque[tuple[int, Event | str]] = deque(maxlen=QUEUE_EVENTS)
-        self._messages_wait = threading.Event()
+        self._messages_wait = SignalEvent()  # event() is called by a signal's handler too
         self._last_messages = False  # no more will come
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []

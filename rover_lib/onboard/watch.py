@@ -18,6 +18,7 @@ from typing import Any
 
 from rover_lib.onboard.loop import Report
 from rover_lib.onboard.servo_link import LinkError, ServoLink, Telemetry
+from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.telemetry import FlightLog
 
 SWITCH_S = 0.0005  # at the latest, other threads give the interpreter back to the loop; not Python's 5 ms
@@ -80,7 +81,7 @@ def schedule(policy: int, priority: int) -> None:
 
 
 @contextlib.contextmanager
-def stopped_by_signals(stop: threading.Event, log: FlightLog) -> Iterator[None]:
+def stopped_by_signals(stop: SignalEvent, log: FlightLog) -> Iterator[None]:
     """SIGTERM, SIGINT and SIGHUP set `stop` inside; a second one does what it did before. For the main thread."""
 
     def on_signal(number: int, frame: FrameType | None) -> None:

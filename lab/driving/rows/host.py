@@ -134,6 +134,7 @@ def _fail_logger(bench: DrivingBench) -> None:
     CONTINUES,
     "missed 2 ticks|missed 3 ticks",
     "SIGSTOP, then SIGCONT",
+    paused_s=0.1,
     limits="as 'host process stopped', after 150 ms",
 )
 def _pause_process_shortly(bench: DrivingBench) -> None:

@@ -226,6 +226,8 @@ def test_a_row_that_this_machine_spoilt_is_known():
     paused = replace(steady, commands=commands)  # rover drive did not get its turn
     assert faults._spoilt(fault, paused, GATES)
     assert not faults._spoilt(replace(fault, starves=True), paused, GATES)
+    assert not faults._spoilt(replace(fault, paused_s=0.15), paused, GATES)  # it is the fault itself
+    assert faults._spoilt(replace(fault, paused_s=0.1), paused, GATES)
     assert not faults._spoilt(replace(fault, expected=STOPPED), paused, GATES)
     standing = replace(steady, events=pulses(lambda t: (1456, 120) if t < -0.1 else DRIVEN))
     assert faults._spoilt(replace(fault, expected=STOPPED), standing, GATES)
@@ -247,22 +249,67 @@ def test_every_row_is_one_of_a_kind_and_there_are_enough():
 # ---- bytes
 
 
-def steps_of(values, step_s=0.2, start=10.0):
+SENT = [(1456, 120), (1600, 236), (1100, 160), (1456, 120)]
+TIMES = [5.0 + 0.25 * i for i in range(len(SENT))]
+
+
+def steps_of(values, slew=faults.SLEW_US_PER_MS, step_s=0.25, start=10.0):
+    """Events of pins that hold each value for step_s, slewing there as the firmware does, in whole microseconds."""
+
     def what(t):
-        return values[min(int((t + AT - start) / step_s), len(values) - 1)]
+        t += AT - start
+        step = min(int(t / step_s), len(values) - 1)
+        ms = int((t - step * step_s) * 1e3) + 1
+        pins = []
+        for pin, before, value in zip(PERIOD_US, values[max(step - 1, 0)], values[step], strict=True):
+            way = min(abs(value - before), slew[pin] * ms)
+            pins.append(before + way if value > before else before - way)
+        return pins
 
     return pulses(what, start, start + step_s * len(values))
 
 
+def compared(values, **more):
+    return faults.compare_steps(steps_of(values, **more), SENT, TIMES)
+
+
 def test_steps_that_come_out_as_they_went_in():
-    sent = [(1456, 120), (1600, 300), (1100, 160), (1456, 120)]
-    times = [5.0 + 0.2 * i for i in range(4)]
-    compared = faults.compare_steps(steps_of(sent), sent, times)
-    assert (compared["steering_steps"], compared["throttle_steps"], compared["worst_us"]) == (4, 4, 0)
-    assert compared["worst_ms"] < 25
-    off = [(1456, 120), (1600, 308), (1100, 160), (1456, 120)]
-    assert faults.compare_steps(steps_of(off), sent, times)["worst_us"] == 8
-    assert faults.compare_steps(steps_of(sent[:2] + sent[3:]), sent, times)["worst_us"] is None
+    for slew in (faults.SLEW_US_PER_MS, {"steering": 1e6, "throttle": 1e6}):
+        found = compared(SENT, slew=slew)
+        assert (found["steering_steps"], found["throttle_steps"]) == (4, 4)
+        assert found["worst_us"] <= GATES.bytes_us  # the last pulse of the way is as near
+        assert found["worst_ms"] < 25
+        assert found["pulses"] > 700
+
+
+@pytest.mark.parametrize(
+    ("values", "worst_us"),
+    [
+        ([SENT[0], (1600, 244), *SENT[2:]], 8),  # too far
+        ([SENT[0], (1600, 228), *SENT[2:]], 8),  # not far enough: it looks as if it were on the way, for too long
+        ([*SENT[:2], SENT[3], SENT[3]], 356),  # a step is missing
+    ],
+)
+def test_steps_that_come_out_otherwise(values, worst_us):
+    assert compared(values)["worst_us"] >= worst_us
+
+
+def test_steps_that_are_slower_than_the_firmware_is_are_found():
+    slow = {pin: limit / 2 for pin, limit in faults.SLEW_US_PER_MS.items()}
+    assert compared(SENT, slew=slow)["worst_us"] > 20
+
+
+def test_a_pulse_the_wrong_way_is_found():
+    events = steps_of(SENT)
+    on_the_way = next(i for i, e in enumerate(events) if e.pin == "throttle" and e.pulse_us > 180)
+    events[on_the_way] = events[on_the_way]._replace(pulse_us=130.0)
+    assert faults.compare_steps(events, SENT, TIMES)["worst_us"] > 50
+
+
+def test_steps_that_do_not_come_to_their_end():
+    assert faults.compare_steps(steps_of(SENT[:3]), SENT, TIMES)["worst_us"] is None
+    events = [e for e in steps_of(SENT) if e.monotonic_s < 10.75 + 0.02]
+    assert faults.compare_steps(events, SENT, TIMES)["worst_us"] > 20
 
 
 # ---- the policy

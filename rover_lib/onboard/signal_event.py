@@ -1,0 +1,47 @@
+"""An event that a signal's handler may set."""
+
+import queue
+import threading
+import time
+
+
+class SignalEvent(threading.Event):
+    """threading.Event that a signal's handler may set, whatever its thread is doing.
+
+    Python's own takes a lock in wait() and in set(), one that its owner cannot take twice: a handler that runs while
+    its thread has the lock would wait for itself, and Ctrl-C would hang the program. Here nothing is locked but in
+    SimpleQueue, whose put() may interrupt itself.
+    """
+
+    def __init__(self) -> None:
+        self._is_set = False
+        self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()  # has something in it while it is set
+
+    def is_set(self) -> bool:
+        return self._is_set
+
+    def set(self) -> None:
+        self._is_set = True
+        self._wake.put(None)
+
+    def clear(self) -> None:
+        self._is_set = False
+        while not self._wake.empty():
+            self._take(0.0)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        end_s = None if timeout is None else time.monotonic() + timeout
+        while not self._is_set:
+            left_s = None if end_s is None else end_s - time.monotonic()
+            if left_s is not None and left_s <= 0:
+                break
+            if self._take(left_s) and self._is_set:
+                self._wake.put(None)  # for whoever waits too
+        return self._is_set
+
+    def _take(self, timeout: float | None) -> bool:
+        try:
+            self._wake.get(timeout=timeout)
+        except queue.Empty:
+            return False
+        return True
