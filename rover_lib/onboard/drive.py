@@ -135,13 +135,16 @@ def drive_car(
         run_loop = partial(drive, link=link, log=log, rate_hz=options.hz, until=until, report=report)
         if controls:
             limit = 1.0 if options.throttle_limit is None else options.throttle_limit
+            replay = ReplayPilot(controls, throttle_limit=limit)
             warnings = _all_of(HealthWatch(report, link), MemoryWatch(report, [os.getpid()]))
             arm: Arm | None = None
-            if link and sys.stdin.isatty():
-                arm = partial(arm_when_ready, link.arm, link, stop, log.event)
+            if link:
+                arm = partial(arm_capped, link, limit, replay.most_throttle, log.event)
+                if sys.stdin.isatty():
+                    arm = partial(arm_when_ready, arm, link, stop, log.event)
             hooks = Hooks(arm, warnings)
             with boosted_priority(log):
-                run_loop(ReplayPilot(controls, throttle_limit=limit), hooks=hooks)
+                run_loop(replay, hooks=hooks)
             return
         if not artifact:
             raise ParamsError("a drive needs an artifact or a replay")
@@ -186,6 +189,23 @@ def what_is_missing(link: ServoLink) -> str:
     """What a human must do before the Arduino can be armed, "" if nothing. Raises LinkError as latest()."""
     telemetry = link.latest()
     return MISSING[telemetry.missing] if telemetry and telemetry.missing != "-" else ""
+
+
+def arm_capped(link: ServoLink, limit: float, most: float, notify: Callable[[str], None]) -> Telemetry:
+    """Arms a car whose Arduino then gives the host no more throttle than `limit`, whatever it asks for.
+
+    limit, most: throttles in [0, 1]; the latter is the most that this drive may ask for, and `notify` is told where the
+    Arduino gives less. Raises LinkError as lower_cap() and arm().
+    """
+    channel = link.calibration.throttle
+    cap_us = link.lower_cap(channel.pulse_us(limit)).cap_us
+    if cap_us < channel.pulse_us(most):
+        cap = channel.action(cap_us) or 0.0
+        notify(
+            f"the Arduino gives at most throttle {cap:.2f} ({cap_us} us), and this drive may ask for {most:.2f}: what "
+            "is above is cut. A cap that another drive has lowered is back after a reset of the Arduino"
+        )
+    return link.arm()
 
 
 def arm_when_ready(
@@ -256,7 +276,8 @@ class _Arming:
             driving.enter_context(boosted_priority(self._log))
             self._planner.renew(self._settings.fade_s)
             self._pilot.check_sight()
-            telemetry = self._link.arm() if self._link else None
+            limit = self._settings.throttle_limit
+            telemetry = arm_capped(self._link, limit, limit, self._log.event) if self._link else None
             self._driving = driving.pop_all()
         return telemetry
 

@@ -179,6 +179,7 @@ class ReplayPilot:
         throttle = (c.throttle.neutral_us, c.throttle.pulse_us(min(c.throttle.high, throttle_limit)))
         self._steering = np.clip(controls.steering_us, *steering)
         self._throttle = np.clip(controls.throttle_us, *throttle)
+        self.most_throttle = c.throttle.action(int(self._throttle.max())) or 0.0
         self._start_s: float | None = None
 
     def ready(self, stop: threading.Event) -> None:

@@ -20,7 +20,7 @@ from click.testing import CliRunner
 from lab.driving.policy import pictures
 from rover_lib.cli import main
 from rover_lib.onboard import service as s
-from rover_lib.onboard.drive import DriveOptions, arm_when_ready, drive_car
+from rover_lib.onboard.drive import DriveOptions, arm_capped, arm_when_ready, drive_car
 from rover_lib.onboard.loop import Report
 from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.pwm import PwmCalibration
@@ -419,6 +419,7 @@ class Link:
     port, hello, garbled, calibration = "fake", None, 0, PwmCalibration()
     opened, missing = 0, "w"
     arms: ClassVar[list[float]] = []
+    caps: ClassVar[list[int]] = []
 
     def __init__(self, port):
         self.state, self.sequence, self.left = State.MANUAL, 0, 10
@@ -438,6 +439,10 @@ class Link:
         self.state, self.left = State.AUTONOMOUS, 10
         return self.latest()
 
+    def lower_cap(self, throttle_us):
+        self.caps.append(throttle_us)
+        return replace(self.latest(), cap_us=min(throttle_us, 200))
+
     def neutral(self):
         return self.latest()
 
@@ -449,6 +454,20 @@ class Link:
 
     def latest(self):
         return replace(STATUS, host_s=time.monotonic(), sequence=self.sequence, state=self.state, missing=self.missing)
+
+
+def test_the_arduino_is_told_what_a_drive_may_use(monkeypatch):
+    """And the human, where it gives less than that: it was cut in silence."""
+    for name in ("arms", "caps"):
+        monkeypatch.setattr(Link, name, [])
+    link, said = Link("port"), []
+    assert arm_capped(link, 0.1, 0.1, said.append).state is State.AUTONOMOUS
+    assert (link.caps, said) == ([179], [])
+    arm_capped(link, 0.2, 0.2, said.append)
+    arm_capped(link, 1.0, 0.13, said.append)  # a replay without a limit, of a slow recording
+    assert link.caps == [179, 238, 711]
+    assert len(said) == 1
+    assert "at most throttle 0.14 (200 us), and this drive may ask for 0.20" in said[0]
 
 
 class Policy:
@@ -497,6 +516,7 @@ def test_after_a_takeover_the_same_process_waits_for_another_request(systemd, tm
     thread.join()
     assert answers == ["driving: armed by a human"] * 2
     assert (Link.opened, len(Link.arms)) == (1, 2)
+    assert Link.caps == [238, 238]  # before each: the Arduino may have been reset meanwhile
     first, second = read_log(tmp_path / "flight.log", 0), read_log(tmp_path / "flight.log", 1)
     assert len(first.ticks["t_s"]) == 10 and 5 <= len(second.ticks["t_s"]) <= 7 and first.drives == 2
     assert first.summary()["missed"] == second.summary()["missed"] == 0
