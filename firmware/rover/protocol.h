@@ -11,7 +11,7 @@ extern "C" {
 #endif
 
 #define PROTOCOL_VERSION 2
-#define FIRMWARE_VERSION "2.0.0" /* rover_lib/onboard/servo_link.py drives no other: change both */
+#define FIRMWARE_VERSION "2.1.0" /* rover_lib/onboard/servo_link.py drives no other: change both */
 
 enum {
     HOST_LINE_MAX = 66,     /* the longest line of the host without its end: five numbers of ten digits */

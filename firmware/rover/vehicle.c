@@ -15,6 +15,7 @@ static void enter(struct vehicle *vehicle, enum state state, enum reason reason)
     vehicle->wanted_us[THROTTLE] = THROTTLE_NEUTRAL_US;
     vehicle->steering_us = STEERING_NEUTRAL_US;
     vehicle->throttle_us = THROTTLE_NEUTRAL_US;
+    vehicle->wary = false;
     vehicle->throttle_moved = 0;
     vehicle->throttle_free = false;
 }
@@ -101,12 +102,13 @@ static char arm(struct vehicle *vehicle, uint32_t now_ms) {
     vehicle->rest_us[STEERING] = vehicle->received[STEERING].pulse_us;
     vehicle->rest_us[THROTTLE] = vehicle->received[THROTTLE].pulse_us;
     vehicle->sides[0].seen = vehicle->sides[1].seen = false;
-    vehicle->commanded_ms = vehicle->slewed_ms = now_ms;
+    vehicle->commanded_ms = vehicle->driven_ms = vehicle->slewed_ms = now_ms;
     enter(vehicle, AUTONOMOUS, ARMED);
     return DONE;
 }
 
-static enum result drive(struct vehicle *vehicle, const struct command *command, uint32_t now_ms) {
+/* in_turn: it is the next after the last one, so that none was lost between them. */
+static enum result drive(struct vehicle *vehicle, const struct command *command, bool in_turn, uint32_t now_ms) {
     if (!within(command->steering_us, STEERING_MIN_US, STEERING_MAX_US) ||
         !within(command->throttle_us, THROTTLE_MIN_US, THROTTLE_MAX_US)) {
         count(&vehicle->out_of_range);
@@ -116,7 +118,14 @@ static enum result drive(struct vehicle *vehicle, const struct command *command,
     vehicle->wanted_us[STEERING] = (uint16_t)command->steering_us;
     bool capped = command->throttle_us > vehicle->cap_us;
     vehicle->wanted_us[THROTTLE] = capped ? vehicle->cap_us : (uint16_t)command->throttle_us;
-    vehicle->commanded_ms = now_ms;
+    /* What it is asked by is as old as what its host has heard: from then on it holds for FRESH_MS and the timeout. */
+    bool fresh = now_ms - command->heard_ms <= FRESH_MS;
+    vehicle->commanded_ms = fresh ? now_ms : command->heard_ms + FRESH_MS;
+    if (in_turn && now_ms - vehicle->driven_ms > PAUSE_MS) {
+        vehicle->wary = true;
+        vehicle->paused_ms = now_ms;
+    }
+    vehicle->driven_ms = now_ms;
     return DONE;
 }
 
@@ -140,6 +149,7 @@ void vehicle_command(struct vehicle *vehicle, const struct command *command, uin
     /* What came too late must not be saved by what comes now. */
     vehicle_tick(vehicle, now_ms);
     uint32_t ahead = command->sequence - vehicle->sequence;
+    bool in_turn = ahead == 1;
     bool old = command->boot != vehicle->boot || !within(ahead, 1, SEQUENCE_WINDOW);
     bool dated = command->kind == COMMAND_ARM || command->kind == COMMAND_DRIVE;
     if (old || (dated && now_ms - command->heard_ms > LATE_MS)) {
@@ -153,7 +163,7 @@ void vehicle_command(struct vehicle *vehicle, const struct command *command, uin
             vehicle->result = arm(vehicle, now_ms);
             break;
         case COMMAND_DRIVE:
-            vehicle->result = (char)drive(vehicle, command, now_ms);
+            vehicle->result = (char)drive(vehicle, command, in_turn, now_ms);
             break;
         case COMMAND_LOWER:
             vehicle->result = (char)lower_cap(vehicle, command->throttle_us);
@@ -178,6 +188,10 @@ void vehicle_tick(struct vehicle *vehicle, uint32_t now_ms) {
             enter(vehicle, STOPPED, NO_SIGNAL);
         else if (now_ms - vehicle->commanded_ms >= COMMAND_TIMEOUT_MS)
             enter(vehicle, STOPPED, TIMEOUT);
+        else if (vehicle->wary && now_ms - vehicle->driven_ms >= WARY_TIMEOUT_MS)
+            enter(vehicle, STOPPED, PAUSES);
+        else if (now_ms - vehicle->paused_ms > WARY_MS)
+            vehicle->wary = false;
     }
     if (vehicle->state == AUTONOMOUS) {
         uint32_t ms = now_ms - vehicle->slewed_ms;

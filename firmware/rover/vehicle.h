@@ -43,13 +43,20 @@ enum {
     LET_GO_MS = 250,
     COMMAND_TIMEOUT_MS = 150,
     LATE_MS = 150,             /* a drive or arm of a host that has not heard from us for longer */
+    FRESH_MS = 50,             /* a drive whose host has heard from us within this holds in full, others for less */
+    /* A host that drove again after a pause this long must not pause again, for so long, for more than so much: it has
+     * no time for the car. At 30 commands a second it has 12 ms to spare then. */
+    PAUSE_MS = 100,
+    WARY_MS = 500,
+    WARY_TIMEOUT_MS = 45,
     SEQUENCE_WINDOW = 65535    /* a sequence number may be ahead of the last by 1 to this, modulo 2^32 */
 };
 
 enum channel { STEERING, THROTTLE };
 enum state { MANUAL = 'M', AUTONOMOUS = 'A', STOPPED = 'S' };
 /* Why the state is what it is. */
-enum reason { AFTER_RESET = 'r', HUMAN = 'h', ARMED = 'a', TIMEOUT = 't', NO_SIGNAL = 's', HOST_NEUTRAL = 'n' };
+enum reason { AFTER_RESET = 'r', HUMAN = 'h', ARMED = 'a', TIMEOUT = 't', PAUSES = 'p', NO_SIGNAL = 's',
+              HOST_NEUTRAL = 'n' };
 /* What became of the last command. */
 enum result {
     NONE_YET = '-',
@@ -90,6 +97,9 @@ struct vehicle {
     uint16_t cap_us;
     uint16_t wanted_us[2];              /* of the last valid drive since arming */
     uint32_t commanded_ms, slewed_ms;
+    uint32_t driven_ms;                 /* when the last valid drive, or else the arming, came */
+    uint32_t paused_ms;                 /* when the one came that ended a pause, while wary */
+    bool wary;
     uint16_t bad_lines, old_commands, out_of_range, lost_bytes; /* stay at 65535 */
 };
 

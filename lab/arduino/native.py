@@ -88,6 +88,9 @@ class Vehicle(ctypes.Structure):
         ("wanted_us", ctypes.c_uint16 * 2),
         ("commanded_ms", ctypes.c_uint32),
         ("slewed_ms", ctypes.c_uint32),
+        ("driven_ms", ctypes.c_uint32),
+        ("paused_ms", ctypes.c_uint32),
+        ("wary", ctypes.c_bool),
         *((name, ctypes.c_uint16) for name in ("bad_lines", "old_commands", "out_of_range", "lost_bytes")),
     )
 

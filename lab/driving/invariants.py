@@ -21,7 +21,7 @@ RESTING_US = 124  # a throttle pulse up to this moves no car
 REST_US = 120 + 32  # the throttle of a hand that rests, as the firmware sees it
 CAP_US = 238
 SLEW_US_PER_MS = {"steering": 4, "throttle": 2}
-VALID_MS = 150 + 150 + 65  # a command may be as old when it comes, holds as long, and its throttle takes time to fall
+VALID_MS = 200 + 65  # a command holds until its host has heard nothing for as long; its throttle takes time to fall
 SIGNAL_MS = 105  # a lost signal, or a moved stick, is known within 100; and a turn of the loop
 DEAD_BAND_US = {"steering": 48 + 8, "throttle": 32 + 8}
 STALE_MS = 1000 + VALID_MS  # drive.stop_s of params.yml, and then the last command
@@ -186,9 +186,9 @@ def _armed_by_people(run: Run) -> str | None:
 
 NAMED = re.compile(
     "took over|before it began|before a human armed|told to stop|transmitter|wiggled|at rest|was reset|no valid command"
-    "|the host asked|took no data|writing failed|reading failed|cannot be opened|no hello|no answer|said nothing"
-    "|no status|not answered|no time|frozen|black|contrast|pictures in a row|no frame|ended after|too old|not finite"
-    "|outside the range|told to fail|fresh plan|plan within|raised in the loop"
+    "|the host asked|the host paused|took no data|writing failed|reading failed|cannot be opened|no hello|no answer"
+    "|said nothing|no status|not answered|no time|frozen|black|contrast|pictures in a row|no frame|ended after|too old"
+    "|not finite|outside the range|told to fail|fresh plan|plan within|raised in the loop"
 )
 UNFORESEEN = re.compile(r"\w+(Error|Exception): (?!raised in the loop)")  # as sentence_of() says it of these
 

@@ -26,12 +26,13 @@ from rover_lib.onboard.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink
 from rover_lib.onboard.telemetry import ARMED, Tick
 
 RATES_HZ = (10.0, 100.0)
+KEEP_S = 0.034  # between commands, also where ticks are rarer: the Arduino takes 100 ms without one for a pause
 RESEND_S = 0.018  # a command takes 3 ms on the wire, a status that is under way 7, its own 7
 SPARE_S = 0.004  # before a deadline nothing is sent again
 READ_S = 0.005  # for the thread that reads the port, after a pause of the whole process
-# A single pause of 150 ms is the Arduino's affair, which stops the car then. Shorter ones it cannot know. Together they
-# may take no more time out of half a second than one: a machine that is busy but healthy misses a tick now and then (4
-# of 55,801 beside builds, README), never several in a row again and again.
+# A single pause of 150 ms is the Arduino's affair, which stops the car then, and so is a second one soon after one of
+# 100 ms. Shorter ones it lets pass. Together they may take no more time out of half a second than one: a machine that
+# is busy but healthy misses a tick now and then (4 of 55,801 beside builds, README), never several again and again.
 LATE_MOST_S = 0.15
 LATE_WITHIN_S = 0.5
 
@@ -254,18 +255,21 @@ class _Loop:
         return f"{who}: steering {order.steering:+.2f}, throttle {order.throttle:.3f}{plan}; {late}"
 
     def _wait(self, deadline: float) -> None:
-        """Until the deadline; a command that the Arduino has not acknowledged meanwhile is sent again."""
+        """Until the deadline; a command that the Arduino has not acknowledged is sent again, and so is an old one."""
         link, last = self.link, self.last
         while link and last and (again := max(self.sent_s + RESEND_S, self.clock())) < deadline - SPARE_S:
             self.sleep(max(0.0, again - self.clock()))
             try:
                 telemetry = link.latest()
                 if telemetry and (telemetry.sequence - self.sequence) % SEQUENCES < SEQUENCES // 2:
-                    break
+                    if (again := self.sent_s + KEEP_S) >= deadline - SPARE_S:
+                        break
+                    self.sleep(max(0.0, again - self.clock()))
+                else:
+                    self.report.resent += 1
                 self._put(link, last)
             except LinkError:  # the next tick looks at it
                 break
-            self.report.resent += 1
         if (left := deadline - self.clock()) > 0:
             self.sleep(left)
 

@@ -27,7 +27,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.pwm import Channel, Pulses, PwmCalibration
 
 PROTOCOL_VERSION = 2
-FIRMWARE_VERSION = "2.0.0"  # what is known of an Arduino is known of this one; firmware/rover/protocol.h has the same
+FIRMWARE_VERSION = "2.1.0"  # what is known of an Arduino is known of this one; firmware/rover/protocol.h has the same
 BAUD = 115200
 LINE_MAX = 128  # of the Arduino's lines
 SEQUENCES = 1 << 32
@@ -65,6 +65,7 @@ REASONS = {
     "h": "the human moved a stick",
     "a": "armed by the host",
     "t": "no valid command for 150 ms",
+    "p": "the host paused again and again",
     "s": "the transmitter's signal was lost",
     "n": "the host asked for neutral",
 }

@@ -36,7 +36,7 @@ static uint32_t sides_ms[2];
 static unsigned at_rest, away;    /* throttle pulses in a row: at rest; not where they were on arming */
 static bool throttle_may_pass;
 static uint32_t wanted_us[2];     /* of the last drive that must count */
-static uint32_t wanted_since_ms;
+static uint32_t wanted_since_ms, wanted_heard_ms;
 static bool wanted;
 static uint32_t cap_us; /* as it was lowered */
 static char before_state;         /* at the last check */
@@ -69,7 +69,8 @@ static void check(void) {
         if (!neutral && (vehicle.steering_us != seen_us[0] || !throttle)) fail("not the human's");
     } else if (vehicle.state == AUTONOMOUS) {
         if (abs(seen_us[0] - rest_us[0]) > 48 || away >= 5) fail("the human was ignored");
-        if (!neutral && !(wanted && now_ms - wanted_since_ms < 150)) fail("nobody asked for it");
+        if (!neutral && !(wanted && now_ms - wanted_since_ms < 150 && now_ms - wanted_heard_ms < 200))
+            fail("nobody asked for it");
         uint32_t ms = before_state == AUTONOMOUS ? now_ms - before_ms : 0;
         int throttle_us = (int)(wanted_us[1] < cap_us ? wanted_us[1] : cap_us);
         if (!neutral && (!on_the_way(before_us[0], vehicle.steering_us, (int)wanted_us[0], 4 * ms) ||
@@ -145,6 +146,7 @@ static void feed(const uint8_t *bytes, int length, const struct command *genuine
                 wanted_us[0] = genuine->steering_us;
                 wanted_us[1] = genuine->throttle_us;
                 wanted_since_ms = now_ms;
+                wanted_heard_ms = command.heard_ms;
             }
             if (genuine && command.kind == COMMAND_LOWER && before != AUTONOMOUS && command.throttle_us < cap_us)
                 cap_us = genuine->throttle_us;

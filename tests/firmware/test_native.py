@@ -55,6 +55,7 @@ def test_random_and_mutated_lines(count):
         ("sparse", "vehicle.c", "[received->oldest] <= SIGNAL_TIMEOUT_MS) cont", "[received->oldest] < 1u << 31) cont"),
         ("replay", "vehicle.c", "!within(ahead, 1, SEQUENCE_WINDOW)", "ahead == 0"),
         ("boot", "vehicle.c", "command->boot != vehicle->boot ||", ""),
+        ("fresh", "vehicle.c", "<= FRESH_MS", "<= LATE_MS"),
         ("timeout", "vehicle.c", ">= COMMAND_TIMEOUT_MS", ">= 400"),
         ("latch", "vehicle.c", "return IGNORED;\n    vehicle->w", "vehicle->state = AUTONOMOUS;\n    vehicle->w"),
         ("signal", "vehicle.c", "if (!received->present ||", "if (true ||"),
@@ -137,7 +138,7 @@ U16 = st.integers(0, 65535)
     st.fixed_dictionaries(
         {
             "state": st.sampled_from("MAS"),
-            "reason": st.sampled_from("rhatsn"),
+            "reason": st.sampled_from("rhatpsn"),
             "result": st.sampled_from("-kirolstw"),
             "sequence": NUMBER,
             **dict.fromkeys(["boot", "steering_us", "throttle_us", "cap_us", "bad_lines", "old_commands"], U16),

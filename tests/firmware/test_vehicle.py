@@ -298,6 +298,16 @@ def test_a_link_that_falls_behind_stops_the_car(armed):
     assert armed.now_ms - begun_ms > 7000
 
 
+@pytest.mark.parametrize(("age_ms", "holds_ms"), [(0, 150), (50, 150), (51, 149), (100, 100), (150, 50)])
+def test_a_command_holds_for_less_the_older_it_is(armed, age_ms, holds_ms):
+    """It was 150 ms from when it came, whatever its age: so a car obeyed for 300 ms what was over."""
+    armed.drive(1456, 150, 500)
+    armed.heard_ms = armed.now_ms - age_ms
+    assert armed.command("D", 1456, 150) == "k"
+    assert moved_after_ms(armed.run(300)) == holds_ms - 1
+    assert armed.status.reason == "t"
+
+
 def test_an_arming_that_waited_in_the_link_arms_nothing(board):
     board.wiggle()
     board.heard_ms = board.now_ms - 500
@@ -308,6 +318,39 @@ def test_an_arming_that_waited_in_the_link_arms_nothing(board):
 def test_who_has_heard_nothing_yet_is_late(armed):
     armed.heard_ms = (armed.now_ms + 1) % (1 << 32)  # from a start of the board that is to come, or that is over
     assert armed.command("D", 1600, 200) == "l"
+
+
+# ---- a host that has no time for the car
+
+
+@pytest.mark.parametrize("phase_ms", range(0, 33, 4))
+def test_a_host_that_pauses_again_and_again_stops_the_car(armed, phase_ms):
+    """110 ms of every 150 drove on, and then stopped after 269 ms. phase_ms: from its last command to its pause."""
+    armed.drive(1456, 200, 495 + phase_ms)
+    pins = armed.run(110)
+    pins += armed.drive(1456, 200, 40)
+    pins += armed.run(300)
+    assert 110 < moved_after_ms(pins) <= 195
+    assert (armed.status.state, armed.status.reason) == (State.STOPPED, "p")
+
+
+@pytest.mark.parametrize("phase_ms", range(0, 33, 4))
+def test_one_pause_is_no_reason_to_stop(armed, phase_ms):
+    for _ in range(3):
+        armed.drive(1456, 200, 495 + phase_ms)
+        assert set(throttles(armed.run(100))) == {200}
+        assert set(throttles(armed.drive(1456, 200, 99) + armed.run(8))) == {200}
+        assert set(throttles(armed.drive(1456, 200, 600))) == {200}
+    assert armed.status.state is State.AUTONOMOUS
+
+
+def test_lines_that_were_lost_are_no_pause(armed):
+    armed.drive(1456, 200, 500)
+    for lost in (3, 3, 2, 3):
+        armed.run(33 * lost)
+        armed.sequence += lost
+        armed.drive(1456, 200, 33)
+    assert armed.status.state is State.AUTONOMOUS
 
 
 # ---- near the wraps of clock and sequence

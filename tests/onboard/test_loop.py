@@ -60,7 +60,7 @@ class Link:
     def __init__(self, clock, acknowledge=lambda n: True):
         self.clock, self.acknowledge = clock, acknowledge
         self.said, self.sent_at, self.status, self.sequence = [], [], STATUS, 0
-        self.hello = Hello(2, "2.0.0", 7, 0, "reset pin")
+        self.hello = Hello(2, "2.1.0", 7, 0, "reset pin")
         self.fails = None
 
     def arm(self):
@@ -352,6 +352,14 @@ def test_the_arduino_has_the_last_word(link, clock, change, raised, match):
         go(Always({3: happens}), link, clock)
     assert len(link.drives) == 3
     assert link.said[-1] == "neutral"
+
+
+def test_the_arduino_hears_from_it_often_enough_at_any_rate(link, clock):
+    """It stops the car for a host that pauses for 100 ms twice, which a host of 10 Hz always does."""
+    report = go(Always(), link, clock, rate_hz=10, until=Until(ticks=20))
+    assert max(np.diff(link.sent_at)) < 0.045
+    assert len(link.drives) == 20 * 3 - 2
+    assert report.resent == 0
 
 
 def test_what_was_not_acknowledged_is_sent_again(clock):

@@ -455,7 +455,7 @@ def arduino():
         n, said = 40, False
         while not done.wait(0.02):
             if n % 25 == 0 or not said:
-                os.write(master, frame("<H 2 2.0.0 7 0 e"))
+                os.write(master, frame("<H 2 2.1.0 7 0 e"))
                 said = True
             os.write(master, status(n))
             n += 1
