@@ -211,9 +211,9 @@ def test_sequence_numbers_go_on_where_the_arduino_was():
     [
         (
             "<H 3 3.0.0 something else",
-            r"firmware 3\.0\.0 \(protocol 3\), this program knows 2\.0\.0 \(protocol 2\); .*make",
+            r"firmware 3\.0\.0 \(protocol 3\), this program knows 2\.1\.0 \(protocol 2\); .*make",
         ),
-        ("<H 2 2.0.1 7 0 e", r"firmware 2\.0\.1 \(protocol 2\), this program knows 2\.0\.0"),
+        ("<H 2 2.0.0 7 0 e", r"firmware 2\.0\.0 \(protocol 2\), this program knows 2\.1\.0"),
         ("<H 1 1.0.0 7 0 e", r"firmware 1\.0\.0 \(protocol 1\)"),
     ],
 )

@@ -60,6 +60,7 @@ def _begin_with_presets(bench: DrivingBench) -> None:
 @FAULTS.add("nobody wiggles the stick", REFUSED, "nobody has just wiggled", "pulses that stay what they are")
 def _no_gesture(bench: DrivingBench) -> None:
     bench.arduino.ready(False)
+    bench.arduino.reset()  # one from before would count for 30 s
 
 
 def _by_human(name: str, sent_us: tuple[float, float], human_us: tuple[float, float]) -> None:
