@@ -28,6 +28,7 @@ from rover_lib.onboard.host import Host, throttled_means
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
+LEAST_ROUNDS = 20  # below it a 95th percentile is the slowest round
 
 
 def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeout_s: float = 300) -> float | None:
@@ -94,9 +95,10 @@ class BenchmarkOptions:
     """How to time policies. Raises ParamsError for what makes no sense.
 
     warmup: inferences of each policy that do not count. iterations: rounds; with duration_s, a soak, rounds until that
-    time is over, with a time series. threads: torch's, 0 for all cores, None as they are. rate_hz: at most this many
-    inferences per second, on absolute deadlines, as a drive makes them; None: as fast as it can. main: the policy whose
-    figures stand at the top level (None: the first). reference: the policy whose p50 the others are compared with.
+    time is over, with a time series. at_most_s: fewer rounds, LEAST_ROUNDS at least, where slow policies would take
+    longer. threads: torch's, 0 for all cores, None as they are. rate_hz: at most this many inferences per second, on
+    absolute deadlines, as a drive makes them; None: as fast as it can. main: the policy whose figures stand at the top
+    level (None: the first). reference: the policy whose p50 the others are compared with.
     memory_alone: measure each artifact's memory in a process of its own (seconds each).
     """
 
@@ -104,6 +106,7 @@ class BenchmarkOptions:
     iterations: int = 100
     threads: int | None = None
     duration_s: float | None = None
+    at_most_s: float | None = None
     rate_hz: float | None = None
     main: str | None = None
     reference: str | None = None
@@ -113,7 +116,11 @@ class BenchmarkOptions:
         if self.warmup < 0 or self.iterations < 1:
             counts = f"{self.warmup} and {self.iterations}"
             raise ParamsError("warmup must be from 0 and iterations from 1", found=counts)
-        for name, value in (("duration_s", self.duration_s), ("rate_hz", self.rate_hz)):
+        for name, value in (
+            ("duration_s", self.duration_s),
+            ("at_most_s", self.at_most_s),
+            ("rate_hz", self.rate_hz),
+        ):
             if value is not None and not 0 < value < math.inf:
                 raise ParamsError(f"{name} must be above 0", found=value)
         if self.threads is not None and self.threads < 0:
@@ -241,6 +248,8 @@ class _Run:
         due_s, tick_s, seen = start_s, start_s + every_s, dict.fromkeys(names, 0)
         for i in rounds:
             if duration_s is not None and self.clocks.wall() - start_s >= duration_s and i > 0:
+                break
+            if options.at_most_s and i >= LEAST_ROUNDS and self.clocks.wall() - start_s >= options.at_most_s:
                 break
             for k in range(len(names)):
                 if rate_hz:

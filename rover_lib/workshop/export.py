@@ -6,6 +6,7 @@ export(quantized, checkpoint, "policy_static.pt", samples, calibration)
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,75 @@ class Parity:
     vectors: int = 3
 
 
+class Exporter:
+    """Writes artifacts of one checkpoint; what FP32 answers to the samples is asked once for all of them.
+
+    samples: recorded observations, of which `parity.vectors`, evenly chosen, become the parity vectors; INT8's largest
+    error is that over all of them. Raises QuantizeError without samples.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, samples: Sequence[Sample], parity: Parity | None = None):
+        if not samples:
+            raise QuantizeError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
+        self.checkpoint, self.parity = checkpoint, parity or Parity()
+        self.float_policy = ACT(checkpoint.config, checkpoint.weights)
+        self.inputs = [inputs_of(s, checkpoint.config) for s in samples]
+        self.stored = np.unique(np.linspace(0, len(samples) - 1, self.parity.vectors).round().astype(int))
+        for i in self.stored:
+            self.inputs[i] = (self.inputs[i][0], _in_blocks(self.inputs[i][1]))
+
+    @cached_property
+    def float_actions(self) -> Tensor:
+        return predictions(self.float_policy, self.inputs)
+
+    @cached_property
+    def gmac(self) -> float:
+        return sum(multiply_accumulates(self.float_policy).values()) / 1e9
+
+    def export(self, policy: ACT | QuantizedPolicy, path: Path | str, calibration: Calibration | None = None) -> str:
+        """Trace, freeze and write the artifact; return its content hash.
+
+        calibration: of a quantized policy, for the manifest. Raises QuantizeError if the traced graph does not give
+        what the policy gave, or anything that is not finite.
+        """
+        checkpoint, parity = self.checkpoint, self.parity
+        config = checkpoint.config
+        module: nn.Module = policy.module if isinstance(policy, QuantizedPolicy) else policy
+        with warnings.catch_warnings(), torch.inference_mode():
+            warnings.simplefilter("ignore")
+            traced = torch.jit.freeze(torch.jit.trace(module, example_inputs(config), check_trace=False).eval())
+        expected = predictions(module, self.inputs)
+        with torch.jit.optimized_execution(False):
+            actions = predictions(traced, self.inputs)
+        if not torch.isfinite(actions).all():
+            raise QuantizeError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
+        allowed = dict.fromkeys(config.action_names, parity.tolerance)
+        if isinstance(policy, QuantizedPolicy):
+            errors = (actions - self.float_actions).abs().amax((0, 1))
+            for name, error in zip(config.action_names, errors, strict=True):
+                allowed[name] = max(parity.tolerance, parity.int8_errors * error.item())
+        gap = (actions - expected).abs().max().item()
+        if gap > max(allowed.values()):
+            raise QuantizeError(f"{path}: the traced graph differs from the policy by {gap:.3g}; nothing was written")
+        vectors = {
+            "state": np.stack([self.inputs[i][0][0].numpy() for i in self.stored]),
+            f"frame_{config.cameras[0]}": np.stack([self.inputs[i][1].numpy() for i in self.stored]),
+            "chunk": np.stack([actions[i].numpy() for i in self.stored]),
+        }
+        manifest = _manifest(policy, checkpoint, calibration) | {
+            "weights_mb": _weights_mb(module),
+            "gmac": self.gmac,
+            "parity": {
+                "tolerance": allowed,
+                "reason": "float parts round differently on another processor, and flipped INT8 roundings grow over "
+                "layers"
+                if isinstance(policy, QuantizedPolicy)
+                else "another processor sums in another order",
+            },
+        }
+        return artifact.save_artifact(path, traced, manifest, vectors)
+
+
 def export(
     policy: ACT | QuantizedPolicy,
     checkpoint: Checkpoint,
@@ -46,57 +116,8 @@ def export(
     calibration: Calibration | None = None,
     parity: Parity | None = None,
 ) -> str:
-    """Trace, freeze and write the artifact; return its content hash.
-
-    samples: recorded observations, of which `parity.vectors`, evenly chosen, become the parity vectors; INT8's largest
-    error is that over all of them. calibration: of a quantized policy, for the manifest. Raises QuantizeError if the
-    traced graph does not give what the policy gave, or anything that is not finite.
-    """
-    parity = parity or Parity()
-    config = checkpoint.config
-    inputs = [inputs_of(s, config) for s in samples]
-    if not inputs:
-        raise QuantizeError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
-    if isinstance(policy, QuantizedPolicy):
-        module: nn.Module = policy.module
-        reference = ACT(config, checkpoint.weights)
-    else:
-        module = reference = policy
-    with warnings.catch_warnings(), torch.inference_mode():
-        warnings.simplefilter("ignore")
-        traced = torch.jit.freeze(torch.jit.trace(module, example_inputs(config), check_trace=False).eval())
-    stored = np.unique(np.linspace(0, len(inputs) - 1, parity.vectors).round().astype(int))
-    for i in stored:
-        inputs[i] = (inputs[i][0], _in_blocks(inputs[i][1]))
-    expected = predictions(module, inputs)
-    with torch.jit.optimized_execution(False):
-        actions = predictions(traced, inputs)
-    if not torch.isfinite(actions).all():
-        raise QuantizeError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
-    allowed = dict.fromkeys(config.action_names, parity.tolerance)
-    if module is not reference:
-        errors = (actions - predictions(reference, inputs)).abs().amax((0, 1))
-        for name, error in zip(config.action_names, errors, strict=True):
-            allowed[name] = max(parity.tolerance, parity.int8_errors * error.item())
-    gap = (actions - expected).abs().max().item()
-    if gap > max(allowed.values()):
-        raise QuantizeError(f"{path}: the traced graph differs from the policy by {gap:.3g}; nothing was written")
-    vectors = {
-        "state": np.stack([inputs[i][0][0].numpy() for i in stored]),
-        f"frame_{config.cameras[0]}": np.stack([inputs[i][1].numpy() for i in stored]),
-        "chunk": np.stack([actions[i].numpy() for i in stored]),
-    }
-    manifest = _manifest(policy, checkpoint, calibration) | {
-        "weights_mb": _weights_mb(module),
-        "gmac": sum(multiply_accumulates(reference).values()) / 1e9,
-        "parity": {
-            "tolerance": allowed,
-            "reason": "another processor sums in another order"
-            if module is reference
-            else "float parts round differently on another processor, and flipped INT8 roundings grow over layers",
-        },
-    }
-    return artifact.save_artifact(path, traced, manifest, vectors)
+    """One artifact, as `Exporter` writes it; returns its content hash."""
+    return Exporter(checkpoint, samples, parity).export(policy, path, calibration)
 
 
 def _manifest(policy: ACT | QuantizedPolicy, checkpoint: Checkpoint, calibration: Calibration | None) -> dict[str, Any]:

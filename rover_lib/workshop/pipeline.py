@@ -22,7 +22,7 @@ from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_bloc
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.episodes import Sample, choose_calibration
-from rover_lib.workshop.export import Parity, export
+from rover_lib.workshop.export import Exporter, Parity, export
 from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.quantize import QuantizedPolicy, quantize
@@ -92,13 +92,14 @@ def export_policies(
 ) -> dict[str, dict[str, Any]]:
     """Write policy_<name>.pt of each policy into `folder`. Returns what quantize.json says of each."""
     described = {}
+    exporter = Exporter(checkpoint, samples, parity)
     for name, policy in policies.items():
         path = Path(folder) / f"policy_{name}.pt"
         if isinstance(policy, QuantizedPolicy):
-            digest = export(policy, checkpoint, path, samples, calibration, parity)
+            digest = exporter.export(policy, path, calibration)
             described[name] = policy.report | {"scheme": asdict(policy.scheme), "content_hash": digest}
         else:
-            described[name] = {"content_hash": export(policy, checkpoint, path, samples, parity=parity)}
+            described[name] = {"content_hash": exporter.export(policy, path)}
     return described
 
 

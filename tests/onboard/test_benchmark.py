@@ -236,6 +236,12 @@ def test_a_rate_is_held_by_absolute_deadlines(machine, bare_host):
     assert metrics["cpu_pct"] == pytest.approx(100 * 0.6 / 2.91 / metrics["cores"])
 
 
+@pytest.mark.parametrize(("took_ms", "rounds"), [(10, 100), (90, 56), (1000, 20)])
+def test_slow_policies_are_timed_less_often_but_often_enough(machine, bare_host, took_ms, rounds):
+    policy = {"a": machine.policy("a", [took_ms])}
+    assert machine.benchmark(policy, bare_host, warmup=0, iterations=100, at_most_s=5)["rounds"] == rounds
+
+
 def test_missed_deadlines_are_counted_and_not_made_up_for(machine, bare_host):
     policy = {"a": machine.policy("a", [10, 10, 350, 10, 10])}
     metrics = machine.benchmark(policy, bare_host, warmup=0, iterations=5, rate_hz=10)
