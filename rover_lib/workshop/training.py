@@ -104,7 +104,7 @@ class RowFile:
         self.path, self.shape, self.dtype = path, shape, np.dtype(dtype)
         self.row_bytes = math.prod(shape) * self.dtype.itemsize
         self._rows = 0  # whatever a process that was killed may have left in the file
-        self._file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC), "r+b", buffering=0)
+        self._file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+b", buffering=0)
 
     def __len__(self) -> int:
         return self._rows
