@@ -8,11 +8,13 @@ start a program, or touch another process, and its memory has a limit. systemd's
 service as a whole, whose loop does need the port.
 """
 
+import contextlib
 import ctypes
 import os
 import platform
 import resource
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 from rover_lib.onboard.errors import ArtifactError
@@ -104,9 +106,7 @@ def confine(limit_mb: float) -> str:
     limit_mb: memory that it may take from now on, so import torch first. Returns why the kernel cannot hold it to the
     rest, or ""; the memory's limit holds in any case.
     """
-    status = Path("/proc/self/status").read_text()
-    has_kib = int(status.partition("VmData:")[2].split()[0])
-    _lower(resource.RLIMIT_DATA, has_kib * 1024 + int(limit_mb * 1e6))
+    _lower(resource.RLIMIT_DATA, _bytes_with(limit_mb))
     _lower(resource.RLIMIT_CORE, 0)
     processor = platform.machine()
     if processor not in PROCESSORS:
@@ -123,12 +123,29 @@ def confine(limit_mb: float) -> str:
     return ""
 
 
+@contextlib.contextmanager
+def less_memory(limit_mb: float) -> Iterator[None]:
+    """Inside, this process may take that much more memory; what would take more is a MemoryError."""
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    _lower(resource.RLIMIT_DATA, _bytes_with(limit_mb), hard=before[1])
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+
+
+def _bytes_with(limit_mb: float) -> int:
+    """Of this process's data, once it has taken that much more."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.partition("VmData:")[2].split()[0]) * 1024 + int(limit_mb * 1e6)
+
+
 def open_no_more() -> None:
     """From now on this process opens no file at all, for reading neither."""
     _lower(resource.RLIMIT_NOFILE, 0)
 
 
-def _lower(limit: int, value: int) -> None:
-    hard = resource.getrlimit(limit)[1]
-    value = value if hard == resource.RLIM_INFINITY else min(value, hard)
-    resource.setrlimit(limit, (value, value))
+def _lower(limit: int, value: int, hard: int | None = None) -> None:
+    most = resource.getrlimit(limit)[1]
+    value = value if most == resource.RLIM_INFINITY else min(value, most)
+    resource.setrlimit(limit, (value, value if hard is None else hard))

@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from rover_lib.onboard.artifact import check_artifact, content_hash, read_manifest, read_parity
+from rover_lib.onboard.confine import less_memory
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.stage import open_plain, sha256_of
 from rover_lib.onboard.torchscript import ARCHIVE_BYTES, open_archive, read_record
@@ -52,6 +53,7 @@ HISTORY = 100
 LOCK_TRIES, LOCK_S = 5, 0.05
 SANDBOX = "rover-check@{}.service"
 
+STAGE_MB = 400  # that staging may take, whoever asks for it: an artifact is a stranger's until it is staged
 ENGINE = "qnnpack"  # of a Pi
 MAY_DIFFER = ("mode", "chunk", "camera")  # torch, engine and actions may not: this rover could not drive by them
 CODE_OF_MODE = {"static": b"ops.quantized.conv2d", "mixed": b"ops.quantized.conv2d", "dynamic": b"linear_dynamic"}
@@ -370,7 +372,7 @@ class Releases:
         ReleaseError, ArtifactError.
         """
         source = Path(source)
-        with _disk_errors_explained(), self._exclusively():
+        with _disk_errors_explained(), _memory_limited(source), self._exclusively():
             if not source.exists():
                 raise ReleaseError(
                     f"{source}: not found", remedy="stage takes an artifact, or the folder that pack wrote"
@@ -645,6 +647,17 @@ def sandboxed(name: str) -> None:
             or f"exit code {started.returncode}"
         )
         raise ReleaseError(f"{unit}: {why}")
+
+
+@contextlib.contextmanager
+def _memory_limited(source: Path) -> Iterator[None]:
+    try:
+        with less_memory(STAGE_MB):
+            yield
+    except MemoryError:
+        raise ReleaseError(
+            f"{source}: staging it would take more than {STAGE_MB} MB of memory", remedy="is it an artifact of ours?"
+        ) from None
 
 
 @contextlib.contextmanager

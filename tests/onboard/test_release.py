@@ -4,6 +4,7 @@ import errno
 import fcntl
 import json
 import os
+import resource
 import shutil
 import signal
 import stat
@@ -754,6 +755,15 @@ def test_bad_input_ends_in_a_sentence(two, signed, tmp_path):
     ]:
         result = rover(*command)
         assert result.exit_code == 1 and sentence in result.output and "Traceback" not in result.output, result.output
+
+
+def test_staging_takes_no_more_memory_than_it_may(two, tmp_path, monkeypatch):
+    """Whoever asks for it: a deployment does so as root, in no unit of systemd's."""
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    monkeypatch.setattr("rover_lib.onboard.release.inspect_artifact", lambda *_: bytearray(10**9))
+    result = rover("--models", tmp_path / "models", "stage", "--unsigned", two[0])
+    assert "staging it would take more than 400 MB of memory" in result.output
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
 
 
 UNIT = """#!/bin/sh
