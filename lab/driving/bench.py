@@ -106,6 +106,7 @@ class Drive(RoverCommand):
     def __init__(self, bench: "DrivingBench", start: str):
         self.start = start
         self._marked = 0
+        self._folder = bench.folder
         self.log = bench.disk / "flight.log" if start == "disk" else bench.folder / "flight.log"
         env: dict[str, str] = {}
         code = "from lab.driving.policy import obey_pictures; obey_pictures(); "
@@ -127,13 +128,17 @@ class Drive(RoverCommand):
         return children
 
     def messages(self, since_s: float | None = None) -> list[str]:
-        """Its flight log's events since a time [default: its start], then its stderr's lines, those since the mark."""
+        """Its flight log's events since a time [default: its start], then its stderr's lines, those since the mark.
+
+        Without the bench's folder, which has another name each time.
+        """
         events = []
         with contextlib.suppress(LogError):
             flight = read_log(self.log)
             start_s = flight.header.get("start_monotonic_s", 0.0)
             events = [str(e) for e in flight.events if since_s is None or start_s + e.t_s >= since_s]
-        return events + self.errors()[0 if since_s is None else self._marked :]
+        lines = events + self.errors()[0 if since_s is None else self._marked :]
+        return [line.replace(f"{self._folder}/", "") for line in lines]
 
     def mark(self) -> None:
         """What it has printed on stderr until now is from before the fault."""
