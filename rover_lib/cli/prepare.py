@@ -136,6 +136,7 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_jso
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
 @click.option("--samples", type=click.IntRange(min=1), help="Frames to learn from [default: params.yml].")
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of all phases [default: params.yml].")
+@click.option("--qat", is_flag=True, help="Train it for INT8 at the end. With no other shape: CHECKPOINT itself.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
 @AS_JSON

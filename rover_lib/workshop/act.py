@@ -141,7 +141,7 @@ class Weights:
         self.tensors, self.prefix = tensors, prefix
 
     def __getitem__(self, name: str) -> Tensor:
-        return self.tensors[self.prefix + name].detach().float()
+        return self.tensors[self.prefix + name].float()
 
     def __contains__(self, name: str) -> bool:
         return any(k.startswith(self.prefix + name) for k in self.tensors)
@@ -167,11 +167,15 @@ def layer_norm(w: Weights) -> nn.LayerNorm:
 
 def folded_conv(w: Weights, bn: Weights, stride: int, padding: int, dilation: int = 1) -> nn.Conv2d:
     """A convolution without bias and the frozen batch norm behind it, as one convolution."""
-    weight = w["weight"]
+    weight, bias = folded(w, bn)
     out_channels, in_channels, size, _ = weight.shape
+    return _load(nn.Conv2d(in_channels, out_channels, size, stride, padding, dilation, device="meta"), weight, bias)
+
+
+def folded(w: Weights, bn: Weights) -> tuple[Tensor, Tensor]:
+    """Weight and bias of `folded_conv`."""
     gain = bn["weight"] * (bn["running_var"] + 1e-5).rsqrt()  # eps of torchvision's FrozenBatchNorm2d
-    conv = nn.Conv2d(in_channels, out_channels, size, stride, padding, dilation, device="meta")
-    return _load(conv, weight * gain[:, None, None, None], bn["bias"] - bn["running_mean"] * gain)
+    return w["weight"] * gain[:, None, None, None], bn["bias"] - bn["running_mean"] * gain
 
 
 class Pixels(nn.Module):
@@ -244,15 +248,20 @@ def column_scale(norm: Affine) -> tuple[float, int]:
 
 def column_conv(conv: nn.Conv2d, norm: Affine) -> nn.Conv2d:
     """The stem's convolution of normalised pixels, as one of `Columns`."""
+    assert conv.bias is not None
+    weight, bias = of_columns(conv.weight, conv.bias, norm)
+    out_channels, in_channels, _, _ = weight.shape
+    return _load(nn.Conv2d(in_channels, out_channels, (7, 1), (2, 1), device="meta"), weight, bias)
+
+
+def of_columns(weight: Tensor, bias: Tensor, norm: Affine) -> tuple[Tensor, Tensor]:
+    """Weight and bias of `column_conv`."""
     scale, zero_pixel = column_scale(norm)
     pixel_scale = torch.tensor(norm.scale) / 255
-    weight = conv.weight * (pixel_scale / scale)[None, :, None, None]  # (out, 3, 7, 7)
-    windows = F.pad(weight.permute(0, 2, 3, 1), (0, 0, 0, 1)).flatten(2)  # (out, 7, 24): as pixels lie in a row
     offset = pixel_scale * zero_pixel + torch.tensor(norm.shift)
-    assert conv.bias is not None
-    bias = conv.bias + (conv.weight.sum((2, 3)) * offset).sum(1)
-    columns = nn.Conv2d(windows.shape[2], windows.shape[0], (7, 1), (2, 1), device="meta")
-    return _load(columns, windows.transpose(1, 2)[..., None], bias)
+    of_pixels = weight * (pixel_scale / scale).to(weight.device)[None, :, None, None]  # (out, 3, 7, 7)
+    windows = F.pad(of_pixels.permute(0, 2, 3, 1), (0, 0, 0, 1)).flatten(2)  # (out, 7, 24): as pixels lie in a row
+    return windows.transpose(1, 2)[..., None], bias + (weight.sum((2, 3)) * offset.to(weight.device)).sum(1)
 
 
 def fits_columns(config: ActConfig) -> bool:

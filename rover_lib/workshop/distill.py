@@ -4,7 +4,8 @@
 
 The student begins with its teacher's weights (see `student`) and learns in phases: its backbone to see what the teacher
 sees, its transformer on what that backbone sees, then all together at a tenth of the rate. It learns what the teacher
-plans, and a little what was recorded. The run's folder gets best_model.pth, pretrained_model/ and distill.json.
+plans, and a little what was recorded. With qat it then learns on, rounded as its export rounds it (see `fake_quant`).
+The run's folder gets best_model.pth, pretrained_model/ and distill.json.
 
 Letters: n samples, B batch, C chunk, A actions.
 """
@@ -30,16 +31,22 @@ from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path, sha256_of, write_stage
 from rover_lib.workshop import act, training
 from rover_lib.workshop import lessons as lessons_module
+from rover_lib.workshop import pipeline as quantization
 from rover_lib.workshop import student as student_module
-from rover_lib.workshop.act import ACT, ActConfig, imagenet, multiply_accumulates
+from rover_lib.workshop.act import ACT, ActConfig, imagenet, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint import Checkpoint, expected_shapes
 from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
-from rover_lib.workshop.compare import thinned
+from rover_lib.workshop.choose import Chooser
+from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.episodes import Sample
-from rover_lib.workshop.judge import Range, not_judged, pct_of_range, shown_pct
+from rover_lib.workshop.fake_quant import RoundedPolicy
+from rover_lib.workshop.judge import Range, not_judged, pct_of_range, shown_pct, worst
 from rover_lib.workshop.lessons import BLOCK, BatchedPolicy, Lessons
+from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.quantize import quantize
+from rover_lib.workshop.scheme import Scheme
 from rover_lib.workshop.session import SMALL_GMAC, Opened, load
 from rover_lib.workshop.student import StudentShape, initial_weights, student_config
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
@@ -54,7 +61,7 @@ NOBODY_DROVE = "Judged on recordings alone: nobody drove."
 class Recipe:
     """How a student is taught: params.yml's section `distill`.
 
-    samples: asked about at most. rate: of the first two phases; the last has a tenth. to_teacher, to_recorded: weights
+    samples: asked about at most. rate: of the first two phases; the third has a tenth. to_teacher, to_recorded: weights
     of the two losses, mean absolute errors in units of the recorded range. unit_frames: choose a feed-forward's units.
     judged_frames: of the held-out episodes, at most.
     """
@@ -64,7 +71,9 @@ class Recipe:
     backbone_steps: int
     transformer_steps: int
     together_steps: int
+    qat_steps: int
     rate: float
+    qat_rate: float
     to_teacher: float
     to_recorded: float
     unit_frames: int
@@ -72,7 +81,7 @@ class Recipe:
 
     def of_steps(self, steps: int) -> "Recipe":
         """The same with that many steps in all, at least one in each phase."""
-        names = ("backbone_steps", "transformer_steps", "together_steps")
+        names = ("backbone_steps", "transformer_steps", "together_steps", "qat_steps")
         planned = sum(getattr(self, name) for name in names)
         return replace(self, **{name: max(1, round(steps * getattr(self, name) / planned)) for name in names})
 
@@ -85,13 +94,15 @@ def distill(
     *,
     runs_dir: Path | str = "runs",
     recipe: Recipe | None = None,
+    qat: bool = False,
     seed: int = 0,
     device: str | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Teach a student of that shape what the checkpoint plans on these recordings. Returns the run's folder.
 
-    recipe: params.yml's if None. device: 'cpu', 'cuda' or None for the best there is.
+    recipe: params.yml's if None. qat: quantization-aware training at the end; then the student may have its
+    teacher's own shape, and that is all that is done. device: 'cpu', 'cuda' or None for the best there is.
     Ended at any moment and started again with the same arguments, it goes on and gives the same student. What was
     in the run's folder before stays until the new is whole.
     Raises DistillError for a student, a device or recordings that cannot be; CheckpointError, EpisodeError,
@@ -108,9 +119,10 @@ def distill(
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint
     config = student_config(teacher, shape)
-    if config == replace(teacher.config, vae_layers=0):
-        raise DistillError("this student would be its teacher", remedy="give it a smaller picture or fewer layers")
-    work = _Work(opened, config, recipe, torch.device(device), seed, progress)
+    work = _Work(opened, config, recipe, qat, torch.device(device), seed, progress)
+    if work.is_teacher and not qat:
+        remedy = "give it a smaller picture or fewer layers, or train it for INT8 with --qat"
+        raise DistillError("this student would be its teacher", remedy=remedy)
     with threads(1 if _gmac(config) < SMALL_GMAC else torch.get_num_threads()):
         taught = _taught(work)
         return _leave(Path(runs_dir).resolve() / name, work, taught)
@@ -123,6 +135,7 @@ class _Work:
     opened: Opened
     config: ActConfig
     recipe: Recipe
+    qat: bool
     device: torch.device
     seed: int
     progress: Progress
@@ -130,6 +143,11 @@ class _Work:
     @property
     def teacher(self) -> Checkpoint:
         return self.opened.checkpoint
+
+    @property
+    def is_teacher(self) -> bool:
+        """Whether the student has its teacher's shape: then there is only rounding to learn."""
+        return self.config == replace(self.teacher.config, vae_layers=0)
 
     def rng(self, phase: str) -> np.random.Generator:
         """Random numbers of a phase, the same in every process."""
@@ -159,6 +177,7 @@ class _Taught:
     weights: dict[str, Tensor]
     losses: dict[str, list[float]]
     narrowed: list[dict[str, Any]]
+    unrounded: dict[str, Tensor] | None  # the weights before quantization-aware training
     folder: Path
 
 
@@ -177,7 +196,8 @@ def _taught(work: _Work) -> _Taught:
     }
     sources = [sys.modules[__name__], lessons_module, student_module, training, preprocess, act]
     folder = cache_root() / f"lessons-{key_of(sees, *sources)}"
-    own = cache_root() / f"student-{key_of(sees | {'student': asdict(work.config), 'whole': asdict(recipe)}, *sources)}"
+    whole = sees | {"student": asdict(work.config), "whole": asdict(recipe), "qat": work.qat}
+    own = cache_root() / f"student-{key_of(whole, *sources)}"
     channels = work.teacher.weights["encoder_img_feat_input_proj.weight"].shape[1]
     with Resumable(folder, progress) as saved:
         lessons = Lessons.open(folder, samples, work.config, channels, work.rng("states"))
@@ -190,10 +210,15 @@ def _taught(work: _Work) -> _Taught:
         weights, narrowed = _start(room, backbone, own)
         policy = BatchedPolicy(work.config, weights).to(work.device)
         policy.thaw()
-        _train_transformer(room, policy, saved)
-        _train_together(room, policy, saved)
+        unrounded = None
+        if not work.is_teacher:
+            _train_transformer(room, policy, saved)
+            _train_together(room, policy, saved)
+        if work.qat:
+            unrounded = policy.weights()
+            _train_rounded(room, policy, saved, own)
         losses |= saved.losses
-    return _Taught(policy.weights(), losses, narrowed, own)
+    return _Taught(policy.weights(), losses, narrowed, unrounded, own)
 
 
 class _Room:
@@ -265,7 +290,8 @@ def _train_backbone(room: _Room, saved: Resumable) -> dict[str, Tensor]:
         shown = torch.from_numpy(lessons.maps[2 * rows + views]).to(work.device).float()
         error = (policy.features(room.pictures(rows, views, rng)) - shown).square().mean() / shown.square().mean()
         saved.losses["backbone"].append(descend(error, backbone, optimizer, scheduler))
-    lessons.see(saved, policy, work.rng("tokens"))
+    if not work.is_teacher:
+        lessons.see(saved, policy, work.rng("tokens"))
     return {f"backbone.{name}": value.detach().cpu().clone() for name, value in backbone.state_dict().items()}
 
 
@@ -308,6 +334,47 @@ def _train_together(room: _Room, policy: BatchedPolicy, saved: Resumable) -> Non
         saved.losses["together"].append(descend(room.loss(plans, rows, views), policy, optimizer, scheduler))
 
 
+def _train_rounded(room: _Room, policy: BatchedPolicy, saved: Resumable, folder: Path) -> None:
+    """Phase four: as INT8 the student learns to plan what it planned before, in float, on the very same pictures.
+
+    Nothing else, so that all that it changes is what rounding costs. Rounded by the ranges that it has before.
+    """
+    work, recipe = room.work, room.work.recipe
+    path, student = folder / "ranges.pt", _checkpoint(work, policy.weights())  # as it was before this phase
+    if not path.exists():
+        calibration, scheme = _calibrated(work, student)
+        with atomic_path(path) as temporary:
+            torch.save({"calibration": calibration.__dict__, "scheme": asdict(scheme)}, temporary)
+    kept = torch.load(path, weights_only=True)
+    rounded = RoundedPolicy(student, Scheme(**kept["scheme"]), Calibration(**kept["calibration"])).to(work.device)
+    exact = BatchedPolicy(work.config, student.weights).to(work.device)
+    optimizer, scheduler = optimiser(policy.parameters(), recipe.qat_rate, recipe.qat_steps)
+    rng, steps = work.rng("qat"), recipe.qat_steps
+    for _ in saved.steps("qat", steps, rng, policy=policy, optimizer=optimizer, scheduler=scheduler):
+        rows, views = room.draw(rng)
+        pictures, states = room.pictures(rows, views, rng), room.states(rows, views)
+        with torch.no_grad():
+            wanted = exact(pictures, states)
+        off = ((rounded(policy.named_weights(), pictures, states) - wanted).abs() * room.units).mean()
+        saved.losses["qat"].append(descend(off, policy, optimizer, scheduler))
+
+
+def _checkpoint(work: _Work, weights: dict[str, Tensor]) -> Checkpoint:
+    """The student as quantization wants it, before it is a file."""
+    return Checkpoint(Path("student"), "trainer", work.config, weights, "not written yet", {})
+
+
+def _calibrated(work: _Work, student: Checkpoint) -> tuple[Calibration, Scheme]:
+    """Calibration, and static INT8 with the observer that loses least: as a run of the student would have them."""
+    p, parts = params(), work.opened.parts
+    how = quantization.Recipe.of(p)
+    samples, _ = how.choose(parts.calibration)
+    calibration = calibrate(student, samples, smooth=how.scheme.smooth, progress=work.progress)
+    choosing = thinned(parts.choosing, quantization.CHOOSING_FRAMES)
+    chooser = Chooser(student, calibration, choosing, work.opened.recordings.action_range())
+    return calibration, chooser.observer(how.scheme, p["quantization"]["observers"], work.progress)[0]
+
+
 # --- judging ----------------------------------------------------------------------------------------------------------
 
 
@@ -340,7 +407,27 @@ def _errors(
     return errors
 
 
-def _row(name: str, config: ActConfig) -> dict[str, Any]:
+def _int8_errors(
+    work: _Work, weights: dict[str, Tensor], samples: Sequence[Sample], taught: np.ndarray
+) -> dict[str, float | None]:
+    """Of static INT8, on the samples: int8_<action>_pct to its own FP32, int8_teacher_<action>_pct to the teacher.
+
+    weights: the student's. taught: (n, C, A) of the teacher.
+    """
+    student = _checkpoint(work, weights)
+    calibration, scheme = _calibrated(work, student)
+    inputs = [inputs_of(s, work.config) for s in samples]
+    exact = predictions(ACT(work.config, weights), inputs)
+    rounded = predictions(quantize(student, scheme, calibration).module, inputs)
+    errors: dict[str, float | None] = {}
+    for i, (action, recorded) in enumerate(work.opened.recordings.action_range().items()):
+        for name, other in (("int8", exact), ("int8_teacher", torch.from_numpy(taught))):
+            off = (rounded[..., i] - other[..., i]).abs().mean().item()
+            errors[f"{name}_{action}_pct"] = pct_of_range(off, recorded)
+    return errors
+
+
+def _row(name: str, config: ActConfig, qat: bool) -> dict[str, Any]:
     """A policy's shape, as a row of the frontier begins."""
     ((height, width),) = config.image_sizes
     return {
@@ -349,7 +436,7 @@ def _row(name: str, config: ActConfig) -> dict[str, Any]:
         "width": width,
         "decoder_layers": config.decoder_layers,
         "feedforward": config.feedforward,
-        "qat": False,
+        "qat": qat,
         "gmac": _gmac(config),
     }
 
@@ -366,6 +453,18 @@ def summary(content: dict[str, Any]) -> str:
             errors = [shown_pct(row[f"{to}_{action}_pct"]).strip() for action in actions]
             pairs.append(f"to the {'teacher' if to == 'teacher' else 'recordings'} {', '.join(errors)}")
         lines.append(f"{row['name']}: {shape}, {row['gmac']:.2f} GMAC; {'; '.join(pairs)}")
+    for title, errors in (("before quantization-aware training", metrics["before_qat"]), ("", metrics["students"][1])):
+        if errors:
+            own, teachers = (
+                ", ".join(shown_pct(errors[f"{name}_{action}_pct"]).strip() for action in actions)
+                for name in ("int8", "int8_teacher")
+            )
+            lines.append(f"in INT8{f', {title}' if title else ''}: to its own FP32 {own}; to the teacher {teachers}")
+    for row in metrics["gates"]:
+        if row["passed"] is False:
+            lines.append(
+                f"INT8 loses {row['found']:.1f} % of the recorded range, more than {row['limit']} %: train with --qat"
+            )
     return "\n".join([*lines, metrics["note"]])
 
 
@@ -383,9 +482,12 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
     }
     configs = {"teacher": teacher.config, folder.name: work.config}
     students = [
-        _row(name, configs[name]) | _errors(planned, plans["teacher"], held_out, action_range)
+        _row(name, configs[name], work.qat and name != "teacher")
+        | _errors(planned, plans["teacher"], held_out, action_range)
         for name, planned in plans.items()
     ]
+    students[1] |= _int8_errors(work, taught.weights, held_out, plans["teacher"])
+    unrounded = taught.unrounded and _int8_errors(work, taught.unrounded, held_out, plans["teacher"])
     chosen = _plans(work, work.config, taught.weights, choosing)
     driven = ~np.stack([s.is_pad for s in choosing])
     loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
@@ -417,6 +519,8 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
                 "students": students,
                 "losses": taught.losses,
                 "feed_forward": taught.narrowed,
+                "before_qat": unrounded,
+                "gates": [_quantization_gate(students[1])],
                 "judged_frames": len(held_out),
                 "held_out_episodes": parts.episodes["held_out"],
                 "warnings": not_judged(action_range),
@@ -430,6 +534,13 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
         shutil.rmtree(new, ignore_errors=True)
     shutil.rmtree(taught.folder)
     return folder
+
+
+def _quantization_gate(student: dict[str, Any]) -> dict[str, Any]:
+    """The original's rule: a policy that loses more by INT8 wants quantization-aware training."""
+    loss = worst(v for k, v in student.items() if k.startswith("int8_") and not k.startswith("int8_teacher_"))
+    limit = params()["gates"]["original"]["accuracy_loss_pct"]
+    return gate("INT8 accuracy_loss_pct, or else --qat", loss, "<=", limit)
 
 
 def _trainer_can_hold(config: ActConfig) -> bool:

@@ -62,10 +62,14 @@ class BatchedPolicy(nn.Module):
                     delattr(norm, name)
                     norm.register_parameter(name, nn.Parameter(value))
 
+    def named_weights(self) -> dict[str, Tensor]:
+        """By LeRobot's names without the leading `model.`, as they are trained."""
+        of_model, of_backbone = (m.state_dict(keep_vars=True) for m in (self.model, self.backbone))
+        return {**of_model, **{f"backbone.{name}": value for name, value in of_backbone.items()}}
+
     def weights(self) -> dict[str, Tensor]:
-        """By LeRobot's names without the leading `model.`, on the processor, each with its own memory."""
-        named = dict(self.model.state_dict()) | {f"backbone.{k}": v for k, v in self.backbone.state_dict().items()}
-        return {k: v.detach().cpu().clone() for k, v in named.items()}
+        """The same on the processor, each with its own memory."""
+        return {name: value.detach().cpu().clone() for name, value in self.named_weights().items()}
 
     def features(self, frames: Tensor) -> Tensor:
         """frames: (B, height, width, 3) uint8 RGB -> (B, D, h, w)."""

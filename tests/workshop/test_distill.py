@@ -57,7 +57,8 @@ def teacher(tmp_path_factory):
 @pytest.fixture(scope="module")
 def recipe():
     few = {"samples": 20, "batch": 4, "unit_frames": 8, "judged_frames": 8, "rate": 1e-3}
-    return replace(Recipe(**params()["distill"]), backbone_steps=3, transformer_steps=8, together_steps=3, **few)
+    steps = {"backbone_steps": 3, "transformer_steps": 8, "together_steps": 3, "qat_steps": 3}
+    return Recipe(**{**params()["distill"], **steps, **few})
 
 
 @pytest.fixture(autouse=True)
@@ -108,7 +109,7 @@ def test_distill_json_judges_it_on_held_out_episodes(taught, episodes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", [2, 5, 9])
+@pytest.mark.parametrize("step", [2, 9])
 def test_killed_in_the_middle_it_goes_on_and_gives_the_same(
     teacher, episodes, recipe, taught, tmp_path, monkeypatch, step
 ):
@@ -133,6 +134,45 @@ def test_killed_in_the_middle_it_goes_on_and_gives_the_same(
     assert all(torch.equal(weight, expected[name]) for name, weight in weights_of(folder).items())
     losses = [json.loads((f / "distill.json").read_text())["metrics"]["losses"] for f in (folder, taught)]
     assert losses[0] == losses[1]
+
+
+@pytest.mark.slow
+def test_the_teacher_itself_learns_to_be_int8(teacher, episodes, recipe, tmp_path, monkeypatch):
+    """And nothing else; killed in the middle, too."""
+    steps = []
+
+    def dies(*args):
+        steps.append(1)
+        if len(steps) == 2:
+            raise KeyboardInterrupt
+        return training.descend(*args)
+
+    arguments = {"qat": True, "runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
+    with monkeypatch.context() as patch:
+        patch.setattr(distill_module, "Resumable", partial(training.Resumable, every_s=0.0))
+        patch.setattr(training, "SAVING_SHARE", 1e9)
+        patch.setattr(distill_module, "descend", dies)
+        with pytest.raises(KeyboardInterrupt):
+            distill(teacher, episodes, "int8", StudentShape(), **arguments)
+        folder = distill(teacher, episodes, "int8", StudentShape(), **arguments)
+    assert len(steps) == 3 + 1
+    metrics = json.loads((folder / "distill.json").read_text())["metrics"]
+    assert {phase for phase, losses in metrics["losses"].items() if losses} == {"qat"}
+    of_teacher, of_student = metrics["students"]
+    assert of_student["qat"] and not of_teacher["qat"]
+    assert load_checkpoint(folder / "best_model.pth").config == replace(load_checkpoint(teacher).config, vae_layers=0)
+    for errors in (of_student, metrics["before_qat"]):
+        assert errors["int8_steering_pct"] > 0 and errors["int8_teacher_throttle_pct"] > 0
+    assert "before quantization-aware training" in summary({"metrics": metrics})
+
+
+@pytest.mark.slow
+def test_what_loses_much_by_int8_is_told_of_qat(taught):
+    content = json.loads((taught / "distill.json").read_text())
+    (row,) = content["metrics"]["gates"]
+    assert row["limit"] == 5 and "--qat" in row["gate"] and row["passed"] == (row["found"] <= 5)
+    row |= {"found": 7.25, "passed": False}
+    assert "INT8 loses 7.2 % of the recorded range, more than 5 %: train with --qat" in summary(content)
 
 
 @pytest.mark.slow
@@ -206,5 +246,5 @@ def test_what_cannot_be_taught_is_refused(teacher, episodes, tmp_path, options, 
 @pytest.mark.parametrize("steps", [1, 10, 1000])
 def test_a_recipe_of_few_steps_keeps_all_phases(recipe, steps):
     short = recipe.of_steps(steps)
-    phases = short.backbone_steps, short.transformer_steps, short.together_steps
-    assert min(phases) >= 1 and abs(sum(phases) - steps) <= 3
+    phases = short.backbone_steps, short.transformer_steps, short.together_steps, short.qat_steps
+    assert min(phases) >= 1 and abs(sum(phases) - steps) <= 4
