@@ -10,6 +10,7 @@ import torch
 from rover_lib.onboard.artifact import check_artifact, read_manifest, read_parity
 from rover_lib.onboard.confine import refuse_root
 from rover_lib.onboard.errors import ArtifactError, PolicyError
+from rover_lib.onboard.memory import give_back_packed_weights
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.torchscript import unknown_operators
 
@@ -125,7 +126,14 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
             remedy="do not load it; quantize again",
         )
     policy = Policy(path, module, manifest)
-    check_parity(policy)
+    vectors = read_parity(path)
+    chunks = _predict(policy, vectors)
+    _check_differences(policy, chunks, vectors)
+    if give_back_packed_weights(module) and not np.array_equal(_predict(policy, vectors), chunks):
+        raise ArtifactError(
+            f"{path}: predicts something else once the memory of its original weights was given back",
+            remedy="do not drive with it; report this, with the version of torch",
+        )
     return policy
 
 
@@ -138,9 +146,14 @@ def check_parity(policy: Policy) -> dict[str, float]:
     LayerNorm) round differently and each flipped rounding grows over the layers.
     """
     vectors = read_parity(policy.path)
+    return _check_differences(policy, _predict(policy, vectors), vectors)
+
+
+def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(n, chunk, A) float32: the policy's answers to the parity vectors."""
     frames = [vectors[f"frame_{c}"] for c in policy.cameras]
     try:
-        chunks = [policy.run(s, [f[i] for f in frames]) for i, s in enumerate(vectors["state"])]
+        return np.stack([policy.run(s, [f[i] for f in frames]) for i, s in enumerate(vectors["state"])])
     except PolicyError as e:
         raise ArtifactError(e.what, found=e.found, remedy=e.remedy) from None
     except (IndexError, RuntimeError) as e:
@@ -148,7 +161,10 @@ def check_parity(policy: Policy) -> dict[str, float]:
             f"{policy.path}: its parity vectors do not run ({' '.join(str(e).split())[-200:]})",
             remedy="quantize again",
         ) from None
-    difference = np.abs(np.stack(chunks) - vectors["chunk"]).max((0, 1))
+
+
+def _check_differences(policy: Policy, chunks: np.ndarray, vectors: Mapping[str, np.ndarray]) -> dict[str, float]:
+    difference = np.abs(chunks - vectors["chunk"]).max((0, 1))
     tolerance = policy.manifest["parity"]["tolerance"]
     result = {name: float(d) for name, d in zip(policy.action_names, difference, strict=True)}
     for name, d in result.items():

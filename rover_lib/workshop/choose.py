@@ -9,14 +9,16 @@ Errors are against FP32, in percent of each action's recorded range. An action t
 not judged: its error is None, and `warnings` says so.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import torch
 from torch import Tensor, nn
+from torch.fx import GraphModule, Interpreter, Node
 
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.workshop.act import ACT, blocks, inputs_of, multiply_accumulates, predictions
+from rover_lib.workshop.act import ACT, block_of, blocks, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.episodes import Sample
 from rover_lib.workshop.judge import Range, constant_actions, not_judged, pct_of_range, worst
@@ -86,10 +88,12 @@ class Chooser:
     def sensitivity(self, scheme: Scheme, progress: Progress = silent) -> dict[str, Errors]:
         """Each block quantized alone, everything else in float: {block: errors}."""
         graph = observed_graph(self.checkpoint, scheme, self.calibration)
-        config = self.checkpoint.config
+        config, plain = self.checkpoint.config, replace(scheme, float_blocks=())
+        before = _BeforeBlocks(graph, blocks(config), self.inputs)
         table = {}
         for block in progress(blocks(config), desc="blocks"):
-            table[block] = self.error(convert(graph, config, replace(scheme, float_blocks=()), only=[block]))
+            actions = before.predictions(convert(graph, config, plain, only=[block]), block)
+            table[block] = mae_pct(actions, self.reference, self.action_range)
         return table
 
     def mixed(
@@ -119,6 +123,79 @@ class Chooser:
                 best, cost, error = trial, cost + costs[block], found
                 steps.append({"float_blocks": list(best.float_blocks), "cost_pct": cost, **error})
         return best, steps
+
+
+class _BeforeBlocks:
+    """The float values that enter each block, once for every input: where one block alone is INT8, all before it is
+    float and need not run again.
+
+    graph: observed. inputs: of the policy.
+    """
+
+    @torch.inference_mode()
+    def __init__(self, graph: GraphModule, names: Sequence[str], inputs: Sequence[tuple[Tensor, ...]]):
+        nodes = list(graph.graph.nodes)
+        # The first block's input is quantized by what makes the columns of pixels, which is before the block.
+        self.known = {node.name for node in nodes}
+        self.cut = {block: _beginning(nodes, block) for block in names[1:]}
+        kept = {node.name for first in self.cut.values() for node in _used_from(nodes, first)}
+        self.inputs, self.values = inputs, []
+        for x in inputs:
+            run = _Keeping(graph, kept)
+            run.run(*x)
+            self.values.append(run.values)
+
+    @torch.inference_mode()
+    def predictions(self, converted: GraphModule, block: str) -> Tensor:
+        """(n, C, A) of raw actions: `act.predictions` of a policy of which this block alone was converted."""
+        if block not in self.cut:
+            return predictions(converted, self.inputs)
+        nodes = list(converted.graph.nodes)
+        cut = next(i for i, n in enumerate(nodes) if n.name not in self.known or _in_block(n, block))
+        actions = []
+        for values in self.values:
+            # what is done is not run again; of it, only what is still used has a value
+            done = {node: values.get(node.name) for node in nodes[:cut]}
+            actions.append(Interpreter(converted).run(*self.inputs[0], initial_env=done))
+        return torch.cat(actions)
+
+
+class _Keeping(Interpreter):
+    """Runs a graph and keeps some of its values, by their nodes' names."""
+
+    def __init__(self, graph: GraphModule, names: Container[str]):
+        super().__init__(graph)
+        self.names, self.values = names, dict[str, Any]()
+
+    def run_node(self, node: Node) -> Any:
+        value = super().run_node(node)
+        if node.name in self.names:
+            self.values[node.name] = value
+        return value
+
+
+def _in_block(node: Node, block: str) -> bool:
+    return node.op == "call_module" and block_of(str(node.target)) == block
+
+
+def _is_observer(node: Node) -> bool:
+    return node.op == "call_module" and str(node.target).startswith("activation_post_process")
+
+
+def _beginning(nodes: Sequence[Node], block: str) -> int:
+    """Where the first node of a block is, or the first observer of what it takes: that becomes its quantization."""
+    first = [i for i, node in enumerate(nodes) if _in_block(node, block)]
+    taken = {source for i in first for source in nodes[i].all_input_nodes if _is_observer(source)}
+    return min(first + [i for i, node in enumerate(nodes) if node in taken])
+
+
+def _used_from(nodes: Sequence[Node], first: int) -> list[Node]:
+    """The nodes before the `first` whose values it or a later one takes; an observer passes on what it takes."""
+    used = set()
+    for node in nodes[first:]:
+        for source in node.all_input_nodes:
+            used.add(source.all_input_nodes[0] if _is_observer(source) else source)
+    return [node for node in nodes[:first] if node in used]
 
 
 def float_costs_pct(checkpoint: Checkpoint) -> dict[str, float]:

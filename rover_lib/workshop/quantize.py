@@ -203,11 +203,16 @@ def backbone_of(quantized: QuantizedPolicy) -> nn.Module:
     return module
 
 
-def convert(prepared: GraphModule, config: ActConfig, scheme: Scheme, only: Iterable[str] | None = None):
+def convert(prepared: GraphModule, config: ActConfig, scheme: Scheme, only: Iterable[str] | None = None) -> GraphModule:
+    """The observed graph with its blocks in INT8: all but the scheme's float blocks, or `only` those.
+
+    What stays float shares its weights with `prepared`, which is as before.
+    """
+    shared = {id(p): p for p in prepared.parameters()}  # conversion reads them and makes its own
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         converted = convert_fx(
-            copy.deepcopy(prepared),
+            copy.deepcopy(prepared, shared),
             qconfig_mapping=qconfig_mapping(config, scheme, only),
             backend_config=get_qnnpack_backend_config(),
         )

@@ -1,6 +1,7 @@
 """The artifact alone: what it holds, what it refuses, and that it drives without the workshop."""
 
 import io
+import mmap
 import shutil
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from archives import manifest_with, rewritten, vectors_with
 from policies import memory_samples
 
 import rover_lib
-from rover_lib.onboard import artifact, load_policy
+from rover_lib.onboard import artifact, load_policy, memory
 from rover_lib.onboard.errors import ArtifactError, FrameError, PolicyError
 from rover_lib.onboard.policy import check_parity
 
@@ -93,6 +94,37 @@ def test_a_prediction_that_is_not_finite_never_comes_out(artifacts, monkeypatch)
     monkeypatch.setattr(policy, "_module", lambda *x: torch.full((1, 32, 2), torch.nan))
     with pytest.raises(PolicyError, match="NaN"):
         policy.predict_chunk(FRAME, STATE)
+
+
+def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(artifacts, monkeypatch):
+    asked, (state, frame) = [], (np.full(2, 0.1, np.float32), 255 - FRAME)
+    monkeypatch.setattr("rover_lib.onboard.policy.give_back_packed_weights", lambda module: asked.append(module) or 0)
+    policy = load_policy(artifacts["static"])
+    before = policy.predict_chunk(frame, state)
+    (module,) = asked
+    weights = list(memory._originals(module.graph))
+    total = sum(w.untyped_storage().nbytes() for w in weights)
+    assert all(w.int_repr().any() for w in weights)
+    given = memory.give_back_packed_weights(module)
+    assert 0.9 * total < given <= total  # all but the ends that are no whole page
+    largest = max(weights, key=torch.Tensor.numel)
+    assert largest.numel() > 1e6 and largest.int_repr().count_nonzero() <= 2 * mmap.PAGESIZE  # the ends
+    assert np.array_equal(policy.predict_chunk(frame, state), before)
+
+
+def test_nothing_is_given_back_where_nothing_is_packed(artifacts):
+    for mode in ("fp32", "dynamic"):
+        assert memory.give_back_packed_weights(torch.jit.load(artifacts[mode])) == 0
+
+
+def test_refuses_a_policy_that_changes_when_memory_is_given_back(artifacts, monkeypatch):
+    def take_what_is_used(module):
+        bias = next(n.output().toIValue() for n in module.graph.nodes() if str(n.output().type()) == "Tensor")
+        bias.zero_()
+        return bias.nbytes
+
+    monkeypatch.setattr("rover_lib.onboard.policy.give_back_packed_weights", take_what_is_used)
+    assert "once the memory of its original weights was given back; do not drive" in refused(artifacts["static"])
 
 
 def refused(path) -> str:

@@ -329,6 +329,9 @@ def test_chooses_by_error(tiny, calibration):
     sensitivity = chooser.sensitivity(scheme)
     assert list(sensitivity) == act.blocks(tiny.config)
     assert all(max(e.values()) > 0 for e in sensitivity.values())  # each block alone does something
+    graph = observed_graph(tiny, scheme, calibration)
+    for block, error in sensitivity.items():  # what is before a block is not run again: the same as running all of it
+        assert chooser.error(q.convert(graph, tiny.config, replace(scheme, float_blocks=()), only=[block])) == error
     costs = float_costs_pct(tiny)
     assert 0 < sum(costs.values()) <= 100 * 3.2  # all in float, but for the head: 4.2 times the instructions
     mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=1e-6, max_cost_pct=60)
