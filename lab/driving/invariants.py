@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from lab.driving.virtual import HELD, LIVE, Hand, Seen
+from rover_lib.onboard.service import REQUEST_S
 
 # What firmware/README.md and params.yml promise, in numbers of our own.
 RESTING_US = 124  # a throttle pulse up to this moves no car
@@ -26,7 +27,7 @@ SIGNAL_MS = 105  # a lost signal, or a moved stick, is known within 100; and a t
 DEAD_BAND_US = {"steering": 48 + 8, "throttle": 32 + 8}
 STALE_MS = 1000 + VALID_MS  # drive.stop_s of params.yml, and then the last command
 BLIND_MS = 250  # of driving by pictures that show nothing new
-ASKED_MS = 1000  # from the operator's request to autonomous
+ASKED_MS = 1000 * REQUEST_S + 200  # from the operator's request to autonomous, the line's way included
 GESTURE_MS = 30_000
 ENDED_MS = 1700  # from a stop to the end of the drive: a silent link, and neutral unanswered twice, take 0.5 s each
 
@@ -199,7 +200,10 @@ def _told(run: Run) -> str | None:
     for _, ms, words in seen.drives:
         if words is not None and (UNFORESEEN.match(words) or not NAMED.search(words)):
             return f"the drive that ended at {ms} ms says {words!r}"
+    refused = [ms for ms, text in seen.log if text.startswith("not armed")]
     for left in run.left:
+        if any(left - ENDED_MS <= ms <= left + ENDED_MS for ms in refused):
+            continue  # the answer to arming was lost: the firmware heard no command and stopped, no drive had begun
         for begin, end, words in seen.drives:
             late = end - left > ENDED_MS + seen.paused_ms
             if begin <= left < end and late and words is not None:  # None: the next start tells of it

@@ -349,6 +349,10 @@ KEPT: dict[str, tuple[Story, str]] = {  # stories that once broke an invariant, 
         Story((H(2400, "from the Arduino: latency_ms", 617, 20), H(3000, "an exception in the loop"))),
         "has not answered",
     ),
+    "asked for, and then the process is stopped": (
+        Story((H(1200, "the process is stopped", for_ms=2300),), service=True),
+        "before a human armed",
+    ),
 }
 
 

@@ -20,7 +20,7 @@ from rover_lib.onboard.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Order, PolicyPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
-from rover_lib.onboard.service import NotArmed
+from rover_lib.onboard.service import NotArmed, check_age
 from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink
 
 RATE_HZ = 30.0
@@ -268,12 +268,12 @@ class Process:
         world.alive = True
         self.eyes = Eyes(world)
         self.planner = VirtualPlanner(world, self.eyes, self.commanded)
-        self._service, self._asked = service, False
+        self._service, self._asked, self._asked_ms = service, False, 0
         self._log = _Log(world)
 
     def ask(self) -> None:
         """The operator asks for the car to be armed."""
-        self._asked = True
+        self._asked, self._asked_ms = True, self.world.now_ms
         self.world.seen.asked.append(self.world.now_ms)
 
     def run(self) -> None:
@@ -338,6 +338,8 @@ class Process:
             try:
                 self.planner.renew(_settings().fade_s)
                 pilot.check_sight()
+                if self._service:
+                    check_age((world.now_ms - self._asked_ms) / 1000)
                 telemetry = link.arm()
             except RoverError as error:
                 if not self._service:

@@ -169,6 +169,7 @@ def drive_car(
             with arming(pilot) as this:
                 report.clear()
                 if service and link:
+                    this.still_wanted = service.check_request
                     arm = partial(service.wait_for_human, this.arm, checks, partial(what_is_missing, link), said=said)
                 elif link and sys.stdin.isatty():
                     arm = partial(arm_when_ready, this.arm, link, stop, log.event, checks)
@@ -191,11 +192,18 @@ def what_is_missing(link: ServoLink) -> str:
     return MISSING[telemetry.missing] if telemetry and telemetry.missing != "-" else ""
 
 
-def arm_capped(link: ServoLink, limit: float, most: float, notify: Callable[[str], None]) -> Telemetry:
+def arm_capped(
+    link: ServoLink,
+    limit: float,
+    most: float,
+    notify: Callable[[str], None],
+    still_wanted: Callable[[], object] = lambda: None,
+) -> Telemetry:
     """Arms a car whose Arduino then gives the host no more throttle than `limit`, whatever it asks for.
 
     limit, most: throttles in [0, 1]; the latter is the most that this drive may ask for, and `notify` is told where the
-    Arduino gives less. Raises LinkError as lower_cap() and arm().
+    Arduino gives less. still_wanted: raises where nobody wants the car armed any more. Raises what that does, and
+    LinkError as lower_cap() and arm().
     """
     channel = link.calibration.throttle
     cap_us = link.lower_cap(channel.pulse_us(limit)).cap_us
@@ -205,6 +213,7 @@ def arm_capped(link: ServoLink, limit: float, most: float, notify: Callable[[str
             f"the Arduino gives at most throttle {cap:.2f} ({cap_us} us), and this drive may ask for {most:.2f}: what "
             "is above is cut. A cap that another drive has lowered is back after a reset of the Arduino"
         )
+    still_wanted()
     return link.arm()
 
 
@@ -235,8 +244,10 @@ class _Arming:
     """Arms the car with a camera that sees and a fresh plan, at the boosted priority, recorded; where that is refused,
     all of it is undone.
 
-    A context manager: leaving it ends what arming began.
+    A context manager: leaving it ends what arming began. still_wanted: see arm_capped().
     """
+
+    still_wanted: Callable[[], object] = staticmethod(lambda: None)
 
     def __init__(
         self,
@@ -277,7 +288,9 @@ class _Arming:
             self._planner.renew(self._settings.fade_s)
             self._pilot.check_sight()
             limit = self._settings.throttle_limit
-            telemetry = arm_capped(self._link, limit, limit, self._log.event) if self._link else None
+            telemetry = None
+            if self._link:
+                telemetry = arm_capped(self._link, limit, limit, self._log.event, self.still_wanted)
             self._driving = driving.pop_all()
         return telemetry
 

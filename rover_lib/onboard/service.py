@@ -56,6 +56,7 @@ CHECK_S = 0.1  # between checks while disarmed
 FEED_S = 0.25  # WatchdogSec is 2 s
 FINISH_S = 80.0  # an episode on a slow card; TimeoutStopSec is 90 s then
 STATUS_S = 1.0
+REQUEST_S = 2.0  # how old a request to arm may be: a fresh plan within 0.8 s, an episode's folder, the Arduino's cap
 ARMED_S = 10.0  # a fresh plan comes within 0.8 s, the Arduino answers within 0.5, an episode's folder is made
 QUESTION_BYTES = 4096
 PERSONS = 1000  # users from here on are people; the service's own is not
@@ -81,6 +82,14 @@ class Request:
     def __post_init__(self) -> None:
         if not all(value is None or 0 < value < math.inf for value in vars(self).values()):
             raise ValueError(f"seconds above 0, not {self}")
+
+
+def check_age(age_s: float) -> None:
+    """Raises NotArmed for a request to arm that is too old: who asked may be elsewhere with eyes and hands by now."""
+    if not age_s <= REQUEST_S:  # nor is NaN
+        raise NotArmed(
+            f"{age_s:.1f} s have passed since the car was asked for, at most {REQUEST_S:g} may", remedy="ask again"
+        )
 
 
 class Service:
@@ -111,10 +120,11 @@ class Service:
             threading.Thread(target=self._feed, name="watchdog", daemon=True),
             threading.Thread(target=self._listen, name="operators", daemon=True),
         ]
-        self._turn = threading.Condition()  # guards the four below
+        self._turn = threading.Condition()  # guards the five below
         self._ticket = ""  # of the next attempt; none: nobody can ask for one now
         self._request: Request | None = None  # of the attempt, and of the drive
         self._asked = False
+        self._asked_s = 0.0
         self._answer: dict[str, Any] | None = None
         self._armed_s = self._heard_s = 0.0
 
@@ -154,9 +164,10 @@ class Service:
     ) -> "Telemetry | None":
         """Ready: waits until a human arms the car and the Arduino agrees; what arm() returned.
 
-        checks: what must go on working meanwhile; each raises if it does not. missing: what must be done before the car
-        can be armed, "" if nothing; requests are refused with it. said: how the drive before this ended. Raises
-        NotArmed when told to stop, and what a check raises.
+        arm: calls check_request() just before the Arduino is told. checks: what must go on working meanwhile; each
+        raises if it does not. missing: what must be done before the car can be armed, "" if nothing; requests are
+        refused with it. said: how the drive before this ended. Raises NotArmed when told to stop, and what a check
+        raises.
         """
         checks = tuple(checks)
         first, self._state, self._text = not self._rounds, DISARMED, ""
@@ -194,6 +205,10 @@ class Service:
             return telemetry
         raise NotArmed("told to stop before a human armed the car")
 
+    def check_request(self) -> None:
+        """For who arms, just before the Arduino is told: raises NotArmed where the operator asked too long ago."""
+        check_age(self._clock() - self._asked_s)
+
     def over(self) -> str | None:
         """For the loop: why this drive is over by what was requested, None if it is not."""
         request, now = self._request or Request(), self._clock()
@@ -228,11 +243,15 @@ class Service:
                     answer = self._answer_to(**json.loads(connection.recv(QUESTION_BYTES)))
                     connection.send(json.dumps(answer).encode())
 
-    def _answer_to(self, ask: str, model: str = "", ticket: str = "", **limits: float | None) -> dict[str, Any]:
+    def _answer_to(
+        self, ask: str, model: str = "", ticket: str = "", asked_s: float | None = None, **limits: float | None
+    ) -> dict[str, Any]:
+        """asked_s: by the operator's own clock, time.monotonic() too; this process may have been stopped since."""
         if ask == "heartbeat":
             self._heard_s = self._clock()
         if ask != "arm":
             return {"text": self._text, "missing": self._missing, "model": self._model, "ticket": self._ticket}
+        now_s = self._clock()
         request = Request(**{name: None if value is None else float(value) for name, value in limits.items()})
         with self._turn:
             if not self._ticket:
@@ -241,6 +260,7 @@ class Service:
                 text = "the request names another model, or the service was started or tried again meanwhile: ask anew"
                 return {"armed": False, "text": text}
             self._ticket, self._request, self._asked, self._answer = "", request, True, None
+            self._asked_s = min(float(asked_s if asked_s is not None else now_s), now_s)
             self._turn.notify_all()
             while not self._done.is_set():
                 if self._turn.wait_for(lambda: self._answer, FEED_S):
@@ -359,7 +379,8 @@ def arm_car(
             notify(told := now["missing"])
         time.sleep(CHECK_S)
         now = ask_service(unit, ask="state")
-    answer = ask_service(unit, ask="arm", model=state["model"], ticket=state["ticket"], **vars(request))
+    asked = {"model": state["model"], "ticket": state["ticket"], "asked_s": time.monotonic()}
+    answer = ask_service(unit, ask="arm", **asked, **vars(request))
     if not answer["armed"]:
         raise ServiceError(f"{unit} did not arm: {answer['text']}", remedy="'rover doctor' says what it needs")
     return answer["text"]

@@ -1,5 +1,6 @@
 """The drive as a service: what systemd hears, and who arms."""
 
+import math
 import os
 import signal
 import socket
@@ -175,6 +176,31 @@ def test_one_request_is_one_attempt(systemd):
     assert len(calls) == 1
     assert [answer["armed"] for answer in answers] == [False, False]
     assert any("ask anew" in answer["text"] or "not ready" in answer["text"] for answer in answers)
+
+
+@pytest.mark.parametrize("old", [{"asked_s": -1e9}, {"asked_s": math.nan}, {}])
+def test_an_operator_who_asked_long_ago_is_asked_again(systemd, old):
+    """The camera was slow, or this process was stopped: the car must not set off when nobody expects it any more."""
+    stop, calls, answers, now = threading.Event(), [], [], [100.0]
+
+    def arm():
+        if not old:
+            now[0] += s.REQUEST_S + 0.1  # arming itself takes too long
+        service.check_request()
+        calls.append(1)
+
+    def ask() -> None:
+        ticket = s.ask_service(ask="state")["ticket"]
+        answers.append(s.ask_service(ask="arm", model="ab12", ticket=ticket, **old))
+        stop.set()
+
+    with served(stop, clock=lambda: now[0]) as service:
+        thread = beside(systemd, ask)
+        with pytest.raises(s.NotArmed, match="told to stop"):
+            service.wait_for_human(arm)
+        thread.join()
+    assert not calls and not answers[0]["armed"]
+    assert "have passed since the car was asked for, at most 2 may; ask again" in answers[0]["text"]
 
 
 def test_a_request_names_the_model_that_it_arms(systemd):
@@ -468,6 +494,10 @@ def test_the_arduino_is_told_what_a_drive_may_use(monkeypatch):
     assert link.caps == [179, 238, 711]
     assert len(said) == 1
     assert "at most throttle 0.14 (200 us), and this drive may ask for 0.20" in said[0]
+    armed_before = len(link.arms)
+    with pytest.raises(s.NotArmed, match=r"3\.0 s have passed"):
+        arm_capped(link, 0.1, 0.1, said.append, lambda: s.check_age(3.0))
+    assert len(link.arms) == armed_before
 
 
 class Policy:
