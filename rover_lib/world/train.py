@@ -278,10 +278,12 @@ def _train(
         training = _Training(first, policy, data, recipe, loss_weights, rng, saved, plan)
         _train_backbone(training)
         _train_transformer(training)
-        optimizer, scheduler = _train_together(training, "all together")
+        last = "all together"
         if recipe.at:
+            _train_together(training, last)  # its optimiser is not kept: it is twice as large as the policy
             training = replace(training, data=frames_of(samples, *size.image_sizes[0]))
-            optimizer, scheduler = _train_together(training, "at full size")
+            last = "at full size"
+        optimizer, scheduler = _train_together(training, last)
         for step in training.steps("judging"):
             rows = np.arange(len(judges))[step * recipe.batch : (step + 1) * recipe.batch]
             saved.losses["judging"].append(driving_error(policy, judges, rows))
