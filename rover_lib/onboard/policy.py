@@ -10,7 +10,7 @@ import torch
 from rover_lib.onboard.artifact import check_artifact, read_manifest, read_parity
 from rover_lib.onboard.confine import refuse_root
 from rover_lib.onboard.errors import ArtifactError, PolicyError
-from rover_lib.onboard.memory import give_back_packed_weights
+from rover_lib.onboard.memory import give_back_freed, give_back_packed_weights
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.torchscript import unknown_operators
 
@@ -134,6 +134,7 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
             f"{path}: predicts something else once the memory of its original weights was given back",
             remedy="do not drive with it; report this, with the version of torch",
         )
+    give_back_freed()
     return policy
 
 
