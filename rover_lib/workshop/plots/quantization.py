@@ -118,10 +118,10 @@ def sensitivity(
     left.set_xlabel("mean error (% of the recorded range)")
     left.set_title("this block alone in INT8", fontsize=11)
     right.axhline(budget_pct, color=BLACK, ls="--", lw=1, label=f"budget, {budget_pct:g} %")
-    right.set(xlabel="more instructions than static (%, computed)", ylabel="mean error (% of the recorded range)")
+    right.set(xlabel="more instructions (%, computed)", ylabel="mean error (% of the recorded range)")
     right.set_ylim(0, None)
     right.margins(x=0.15)
-    right.set_title("one more block in float at each point", fontsize=11)
+    right.set_title("blocks left in float, one by one", fontsize=11)
     legend(right)
     return fig
 
