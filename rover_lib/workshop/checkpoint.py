@@ -224,7 +224,11 @@ def _no_archive(path: Path, error: Exception) -> CheckpointError:
                 f"{path}: in torch's format of before 1.6, which has neither checksums nor bounds",
                 remedy="load it with torch.load(path, weights_only=True) and save that again with torch.save",
             )
-    if zipfile.is_zipfile(path):
+    try:
+        archive = zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:  # an archive whose end says what no archive of torch's does
+        archive = True
+    if archive:
         return CheckpointError(f"{path}: damaged ({_reason(error)})", remedy=COPY_AGAIN)
     return CheckpointError(
         f"{path}: not a torch checkpoint of this decade, or cut short ({_reason(error)})", remedy=COPY_AGAIN
