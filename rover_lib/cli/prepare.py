@@ -49,12 +49,12 @@ def inspect(file: Path, as_json: bool) -> None:
     """Say what FILE is: an artifact, a checkpoint, or a folder of recordings."""
     if file.is_file() and _is_scripted(file):
         return show(describe_artifact(file), as_json)
-    if file.is_dir() and not (file / "config.json").exists():
+    from rover_lib.workshop.checkpoint import lerobot_folder, load_checkpoint
+
+    if file.is_dir() and not lerobot_folder(file):
         from rover_lib.workshop.episodes import load_recordings
 
         return show({"recordings": load_recordings(file, progress=terminal()).summary()}, as_json)
-    from rover_lib.workshop.checkpoint import load_checkpoint
-
     checkpoint = load_checkpoint(file)
     return show({"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}, as_json)
 

@@ -1,4 +1,4 @@
-"""Checkpoints in: the trainer's best_model.pth or LeRobot's pretrained_model/ folder, checked before they are used.
+"""Checkpoints in: the trainer's best_model.pth or what `lerobot-train` leaves, checked before they are used.
 
 Nothing in a file is ever executed: pickles are read with weights_only=True, and what that refuses is refused by name.
 Nothing is built from a number that a file only claims: every size is bounded first, by what the file's own bytes can
@@ -10,7 +10,7 @@ import re
 import stat
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -49,6 +49,16 @@ REPORTED = 1000  # entries of the trainer's config, in the report
 COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
 IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole?"
+
+# What LeRobot calls its files. By a processor's: where its statistics lay before 0.4, and the step that normalises.
+PRETRAINED = "pretrained_model"
+ADAPTER = "adapter_config.json"
+PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
+STEPS = {
+    PREPROCESSOR: ("normalize_inputs.buffer_", "normalizer_processor"),
+    POSTPROCESSOR: ("unnormalize_outputs.buffer_", "unnormalizer_processor"),
+}
+BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
 SQUEEZED = 0.05  # of the aspect ratio: 432x240 for 640x360 is 0.013
@@ -98,14 +108,15 @@ class Checkpoint:
 
 
 def load_checkpoint(path: Path | str) -> Checkpoint:
-    """Read and check a checkpoint: a trainer's .pth file, or a LeRobot folder with config.json and model.safetensors.
+    """Read and check a checkpoint: a trainer's .pth file, or a LeRobot folder with config.json and model.safetensors,
+    which may also be given by the output folder of `lerobot-train` (its last checkpoint is read) or a checkpoint of it.
 
     Raises CheckpointError, in one sentence, for a file that is missing, damaged, needs to run code, or whose config and
     weights do not agree, and for policies that this project cannot run.
     """
     path = Path(path)
     if path.is_dir():
-        return _load_lerobot(path)
+        return _load_lerobot(lerobot_folder(path) or path)
     if not path.is_file():
         what = "neither a file nor a folder" if path.exists() else "not found"
         raise CheckpointError(
@@ -153,6 +164,7 @@ def _load_trainer(path: Path) -> Checkpoint:
         image_norm=(imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
     )
     extra = {
+        "normalisation_from": {"in": "ImageNet's, as the trainer does", "out": "none, as the trainer does"},
         "epoch": _reported(content.get("epoch")),
         "best_val_loss": _loss(path, content.get("best_val_loss")),
         "optimizer_mb": _tensor_bytes(content.get("optimizer_state_dict")) / 1e6,
@@ -303,14 +315,44 @@ def _bytes(tensor: Tensor) -> int:
 # --- LeRobot's folder -----------------------------------------------------------------------------------------------
 
 
+def lerobot_folder(path: Path) -> Path | None:
+    """The folder with a policy's config that `path` is or holds, as `lerobot-train` arranges them; None without one.
+
+    Raises CheckpointError for an output folder that has steps but none that is said to be the last.
+    """
+    for inner in ("", PRETRAINED, f"last/{PRETRAINED}", f"checkpoints/last/{PRETRAINED}"):
+        if any((path / inner / name).exists() for name in ("config.json", ADAPTER)):
+            return path / inner
+    for steps in (path / "checkpoints", path):
+        if found := sorted(p.parent.name for p in steps.glob(f"*/{PRETRAINED}")):
+            raise CheckpointError(
+                f"{steps}: which of its checkpoints is the last is not said",
+                found=listed(found),
+                remedy=f"give one of them, as in {steps / found[-1]}",
+            )
+    return None
+
+
 def _load_lerobot(folder: Path) -> Checkpoint:
-    raw = _read_json(folder / "config.json")
+    raw = {} if (folder / ADAPTER).exists() else _read_json(folder / "config.json")
+    if not raw or raw.get("use_peft"):
+        raise CheckpointError(
+            f"{folder}: a PEFT adapter, which holds changes to another policy's weights and no policy",
+            remedy="merge it into its policy (PEFT's merge_and_unload) and save that",
+        )
     if raw.get("type") != "act":
         raise CheckpointError(
-            f"{folder}/config.json: policy type is {shown(raw.get('type'))}", remedy="only 'act' is known here"
+            f"{folder}/config.json: policy type is {shown(raw.get('type'))}",
+            remedy="only 'act' is known here"
+            if raw.get("type")
+            else "only 'act' is known here; if it is one from before 2025, convert it by LeRobot's "
+            "lerobot.processor.migrate_policy_normalization",
         )
     file = folder / "model.safetensors"
-    weights = _named_weights(file, _read_safetensors(file), file.stat().st_size)
+    _refuse_shards(folder, file)
+    state = _read_safetensors(file)
+    buffers = {name: state.pop(name) for name in list(state) if name.startswith(BUFFERS)}
+    weights = _named_weights(file, state, file.stat().st_size)
     inputs, outputs = (_features(folder, raw, key) for key in ("input_features", "output_features"))
     sizes: dict[str, tuple[int, int]] = {}
     for name, (kind, shape) in inputs.items():
@@ -344,8 +386,9 @@ def _load_lerobot(folder: Path) -> Checkpoint:
     _one_observation(folder, raw)
     keys = ("chunk_size", "dim_model", "n_heads", "dim_feedforward", "n_encoder_layers", "n_decoder_layers")
     chunk, dim, heads, feedforward, n_encoder, n_decoder = (_positive(folder, raw, k) for k in keys)
-    inner = Normaliser(folder, "policy_preprocessor.json", "normalizer_processor")
-    outer = Normaliser(folder, "policy_postprocessor.json", "unnormalizer_processor")
+    asked = raw.get("normalization_mapping", dict.fromkeys(("VISUAL", "STATE", "ACTION"), "MEAN_STD"))
+    inner = Normaliser(folder, PREPROCESSOR, asked, buffers)
+    outer = Normaliser(folder, POSTPROCESSOR, asked, buffers)
     states, actions = inputs["observation.state"][1], outputs["action"][1]
     config = _config_from(
         folder,
@@ -375,7 +418,7 @@ def _load_lerobot(folder: Path) -> Checkpoint:
                 f"{folder}: config and weights do not agree ('{name}' has shape {shape}, the weights are for {size})",
                 remedy=COPY_AGAIN,
             )
-    extra = {"optimizer_mb": 0.0, "normalisation": {"in": inner.modes, "out": outer.modes}}
+    extra = {"optimizer_mb": 0.0, "normalisation_from": {"in": inner.source, "out": outer.source}}
     return _checked(folder, "lerobot", config, weights, sha256_of(file), file.stat().st_size, extra)
 
 
@@ -397,20 +440,58 @@ def _features(folder: Path, raw: Mapping[str, Any], key: str) -> dict[str, tuple
     return checked
 
 
-class Normaliser:
-    """One of LeRobot's processor files: what it does to each feature, as an Affine.
+def _refuse_shards(folder: Path, file: Path) -> None:
+    """Raise CheckpointError for weights in pieces: torch's distributed format (DCP), or an index of safetensors."""
+    if file.exists():
+        return
+    checkpoint = folder.parent if folder.name == PRETRAINED else folder
+    pieces = [
+        p for place in (folder, checkpoint) for pattern in ("*.distcp", "*/*.distcp") for p in place.glob(pattern)
+    ]
+    if pieces or file.with_suffix(".safetensors.index.json").exists():
+        what = "a sharded checkpoint (DCP)" if pieces else "weights in several files"
+        raise CheckpointError(
+            f"{folder}: {what}, and no model.safetensors",
+            remedy="merge them where it was trained, and save the policy by its save_pretrained",
+        )
 
-    Older checkpoints have no processor files; then nothing is normalised, as LeRobot would.
+
+class Normaliser:
+    """What LeRobot does to each feature, in or out, as an Affine.
+
+    A processor file says it; before LeRobot 0.4 the config and buffers beside the weights did. A feature whose mode is
+    not IDENTITY and that has no statistics is refused: LeRobot 0.4 then normalised nothing, without a word, and what a
+    policy gives in standard deviations would have become a servo's pulse.
+
+    asked: the config's normalization_mapping. buffers: the weights' names that begin with BUFFERS.
     """
 
-    def __init__(self, folder: Path, file: str, step_name: str):
+    def __init__(self, folder: Path, file: str, asked: Any, buffers: Mapping[str, Tensor]):
         self.where = folder / file
-        self.modes: dict[str, str] = {}
+        self.modes, self.eps = asked, 1e-8
         self.stats: dict[str, Tensor] = {}
-        self.eps = 1e-8
-        if not self.where.exists():
-            return
+        self.features: list[str] | None = None  # those that the processor's step names; the others it leaves alone
+        prefix, step_name = STEPS[file]
+        self.old = not self.where.exists()
+        if self.old:
+            self.stats = {k.removeprefix(prefix): v for k, v in buffers.items() if k.startswith(prefix)}
+            self.where = folder / "config.json"
+        else:
+            self._read_steps(folder, step_name)
+        self.source = f"{file}, LeRobot's processor"
+        if self.old:
+            self.source = "the weights' file, as LeRobot did before 0.4" if self.stats else "config.json: IDENTITY"
+        texts = isinstance(self.modes, dict) and all(isinstance(v, str) for v in self.modes.values())
+        if not texts or not isinstance(self.eps, (int, float)) or not 0 <= self.eps <= 1:
+            raise CheckpointError(
+                f"{self.where}: a norm_map of texts and an eps from 0 to 1 are expected",
+                found=f"{shown(self.modes)} and {shown(self.eps)}",
+                remedy=COPY_AGAIN,
+            )
+
+    def _read_steps(self, folder: Path, step_name: str) -> None:
         known = {"rename_observations_processor", "to_batch_processor", "device_processor", step_name}
+        count = 0
         for step in self._steps():
             config = step["config"]
             if renames := config.get("rename_map"):
@@ -423,16 +504,19 @@ class Normaliser:
                     remedy="train without it, or do in the recordings what it does",
                 )
             if step["registry_name"] == step_name:
+                count += 1
                 self.modes, self.eps = config.get("norm_map", {}), config.get("eps", 1e-8)
+                features = config.get("features")
+                self.features = list(features) if isinstance(features, dict) else []
+                if config.get("normalize_observation_keys") is not None:
+                    raise CheckpointError(
+                        f"{self.where}: normalises some of the observations only (normalize_observation_keys)",
+                        remedy="give the others IDENTITY, or train without it",
+                    )
                 if state := step.get("state_file"):
                     self.stats = self._read_statistics(folder, state)
-        texts = isinstance(self.modes, dict) and all(isinstance(v, str) for v in self.modes.values())
-        if not texts or not isinstance(self.eps, (int, float)) or not 0 <= self.eps <= 1:
-            raise CheckpointError(
-                f"{self.where}: a norm_map of texts and an eps from 0 to 1 are expected",
-                found=f"{shown(self.modes)} and {shown(self.eps)}",
-                remedy=COPY_AGAIN,
-            )
+        if count > 1:
+            raise CheckpointError(f"{self.where}: normalises {count} times", remedy="train with one such step")
 
     def _steps(self) -> list[dict[str, Any]]:
         """The processor's steps, each with a name and a config."""
@@ -456,10 +540,14 @@ class Normaliser:
 
     def affine(self, key: str, kind: str, size: int, inverse: bool = False) -> Affine | None:
         """LeRobot's _apply_transform as scale and shift; None where it leaves the feature alone."""
-        mode = self.modes.get(kind, "IDENTITY")
-        stats = {k.removeprefix(f"{key}."): v for k, v in self.stats.items() if k.startswith(f"{key}.")}
-        if mode == "IDENTITY" or not stats:
+        mode = self.modes.get(kind)
+        if mode == "IDENTITY":
             return None
+        name = key.replace(".", "_") if self.old else key
+        stats = {k.removeprefix(f"{name}."): v for k, v in self.stats.items() if k.startswith(f"{name}.")}
+        left_out = not inverse and self.features is not None and key not in self.features
+        if mode is None or not stats or left_out:
+            raise self._would_be_raw(key, kind, mode, stats)
         pairs = {
             "MEAN_STD": ("mean", "std"),
             "MIN_MAX": ("min", "max"),
@@ -490,10 +578,26 @@ class Normaliser:
             scale, shift = (b, a) if inverse else (1 / (b + self.eps), -a / (b + self.eps))
         else:
             span = torch.where(a == b, torch.full_like(a, self.eps), b - a)
+            if self.old:
+                span = b - a if inverse else b - a + self.eps
             scale, shift = (span / 2, a + span / 2) if inverse else (2 / span, -2 * a / span - 1)
         if not (torch.isfinite(scale).all() and torch.isfinite(shift).all()):
             raise CheckpointError(f"{self.where}: statistics of '{key}' are not finite", remedy="compute them again")
         return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
+
+    def _would_be_raw(self, key: str, kind: str, mode: str | None, stats: Mapping[str, Tensor]) -> CheckpointError:
+        """What to say of a feature that LeRobot would leave as it is without having been told to."""
+        remedy = (
+            "copy the folder again from where it was trained, with all policy_preprocessor* and policy_postprocessor* "
+            "files, or say IDENTITY where it was trained on raw values"
+        )
+        if mode is None:
+            return CheckpointError(f"{self.where}: no normalisation mode for '{key}' ({kind})", remedy=remedy)
+        needs = f"no statistics of '{key}', whose mode is {shown(mode)}"
+        if stats:
+            needs = f"'{key}' is not among the features that it normalises, and its mode is {shown(mode)}"
+        beside = "no processor file beside it, and " if self.old and not self.stats else ""
+        return CheckpointError(f"{self.where}: {beside}{needs}", remedy=remedy)
 
 
 def _of_folder(path: Path, most_bytes: int | None = None) -> Path:
@@ -744,6 +848,25 @@ def _resnet_shapes(name: str) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
+def normalisation(c: ActConfig) -> dict[str, str]:
+    """What happens to each input before the policy sees it, and to its output before it is an action, in words."""
+
+    def numbers(values: Iterable[float]) -> str:
+        return f"({', '.join(f'{v:.4g}' for v in values)})"
+
+    def taken(name: str, norm: Affine | None) -> str:
+        if norm is None or (set(norm.scale), set(norm.shift)) == ({1.0}, {0.0}):
+            return f"{name}, as it is"
+        centre = numbers(-b / a for a, b in zip(norm.scale, norm.shift, strict=True))
+        return f"({name} - {centre}) / {numbers(1 / a for a in norm.scale)}"
+
+    words = {name: taken("pixel / 255", norm) for name, norm in zip(c.cameras, c.image_norm, strict=True)}
+    words["state"] = taken("state", c.state_norm)
+    out = c.action_unnorm
+    words["action"] = "output, as it is" if out is None else f"output * {numbers(out.scale)} + {numbers(out.shift)}"
+    return words
+
+
 def _checked(
     path: Path,
     kind: str,
@@ -784,6 +907,7 @@ def _checked(
         "parameters_acting": acts,
         "parameters_by_part": parts,
         "int8_floor_mb": acts / 1e6,
+        "normalisation": normalisation(config),
         **extra,
     }
     return Checkpoint(path, kind, config, weights, sha256, report)

@@ -9,19 +9,23 @@ import time
 import zipfile
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from lerobot.configs.types import NormalizationMode
+from lerobot.policies.act.processor_act import make_act_pre_post_processors
+from lerobot.processor.migrate_policy_normalization import extract_normalization_stats
 from policies import TINY, lerobot_policy, memory_samples, trainer_content
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.act import ACT, inputs_of
-from rover_lib.workshop.checkpoint import PICKLE_BYTES, expected_shapes, load_checkpoint
+from rover_lib.workshop.checkpoint import PICKLE_BYTES, expected_shapes, lerobot_folder, load_checkpoint
 from rover_lib.workshop.compare import LerobotEager
 
 
@@ -162,7 +166,9 @@ def edit(path, change):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda c: c.update(type="diffusion"), "'diffusion'"),
+        *((lambda c, t=t: c.update(type=t), f"policy type is '{t}'") for t in ("diffusion", "pi0", "smolvla", "vqbet")),
+        (lambda c: c.pop("type"), "migrate_policy_normalization"),
+        (lambda c: c.update(use_peft=True), "a PEFT adapter"),
         (lambda c: c.update(feedforward_activation="glu"), "'glu'"),
         (lambda c: c.update(replace_final_stride_with_dilation=True), "resnet50"),
         (lambda c: c.update(input_features={}), "no camera"),
@@ -429,7 +435,8 @@ def small_folder(tmp_path_factory):
               "input_features": features, "output_features": {"action": {"type": "ACTION", "shape": [2]}}}  # fmt: skip
     (path / "config.json").write_text(json.dumps(config))
     save_file({k: v.clone() for k, v in small()["model_state_dict"].items()}, path / "model.safetensors")
-    norm = {"norm_map": {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MIN_MAX"}, "eps": 1e-8}
+    norm = {"norm_map": {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MIN_MAX"}, "eps": 1e-8,
+            "features": features}  # fmt: skip
     for file, name in (
         ("policy_preprocessor", "normalizer_processor"),
         ("policy_postprocessor", "unnormalizer_processor"),
@@ -530,6 +537,158 @@ def test_a_header_that_lies_is_refused(copied, content, says):
 
 def test_features_that_the_weights_do_not_have_are_refused(copied):
     edit(copied / "config.json", lambda c: c["input_features"]["observation.state"].update(shape=[3]))
+    edit(copied / "config.json", lambda c: c.update(normalization_mapping=RAW))
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
         (copied / name).unlink()
     assert "'observation.state' has shape [3], the weights are for 2" in refused(copied)
+
+
+# ---- normalisation: never left out without a word ---------------------------------------------------------------
+
+RAW = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
+INNER, OUTER = "policy_preprocessor.json", "policy_postprocessor.json"
+ONLY_WEIGHTS = "config and weights do not agree (missing: "  # what is left to say of the small folder
+
+
+def in_step(change):
+    """To an edit of a processor file: of its normaliser."""
+    return lambda content: change(content["steps"][0])
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "says"),
+    [
+        (INNER, in_step(lambda s: s["config"]["norm_map"].pop("STATE")), "no normalisation mode for 'observation."),
+        (INNER, in_step(lambda s: s["config"]["norm_map"].update(VISUAL="MEAN_STD")),
+         "no statistics of 'observation.images.front', whose mode is 'MEAN_STD'"),
+        (INNER, in_step(lambda s: s["config"]["features"].pop("observation.state")),
+         "'observation.state' is not among the features that it normalises"),
+        (INNER, in_step(lambda s: s["config"].update(normalize_observation_keys=[])), "some of the observations only"),
+        (INNER, in_step(lambda s: s.pop("state_file")), "no statistics of 'observation.state'"),
+        (OUTER, in_step(lambda s: s.pop("state_file")), "no statistics of 'action', whose mode is 'MIN_MAX'"),
+        (OUTER, lambda c: c["steps"].clear(), "no statistics of 'action', whose mode is 'MEAN_STD'"),
+        (OUTER, lambda c: c["steps"].append(c["steps"][0]), "normalises 2 times"),
+    ],
+)  # fmt: skip
+def test_a_feature_that_would_be_left_raw_is_refused(copied, file, change, says):
+    edit(copied / file, change)
+    assert says in str(refused_quickly(copied))
+
+
+@pytest.mark.parametrize("feature", ["observation.state", "action"])
+def test_statistics_of_one_feature_missing(copied, feature):
+    stats = load_file(copied / "stats.safetensors")
+    save_file({k: v for k, v in stats.items() if not k.startswith(feature)}, copied / "stats.safetensors")
+    assert f"no statistics of '{feature}'" in str(refused_quickly(copied))
+    for file in (INNER, OUTER):
+        edit(copied / file, in_step(lambda s: s["config"].update(norm_map=RAW)))
+    assert ONLY_WEIGHTS in str(refused_quickly(copied))
+
+
+@pytest.mark.parametrize("missing", [(INNER,), (OUTER,), (INNER, OUTER)])
+def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copied, missing):
+    for file in missing:
+        (copied / file).unlink()
+    error = refused_quickly(copied)
+    assert "no processor file beside it" in error.what and "policy_preprocessor*" in error.remedy
+    edit(copied / "config.json", lambda c: c.update(normalization_mapping=RAW))
+    assert ONLY_WEIGHTS in str(refused_quickly(copied))
+
+
+def normalised(policy, mode):
+    """LeRobot's processors for a policy whose inputs and outputs are all normalised by `mode`, and the statistics."""
+    policy.config.normalization_mapping = dict.fromkeys(RAW, NormalizationMode(mode))
+    low, high = torch.tensor([-0.3, 0.1]), torch.tensor([0.9, 0.4])
+    numbers = {"mean": (low + high) / 2, "std": high - low, "min": low, "max": high}
+    colours = {"mean": (0.5, 0.4, 0.3), "std": (0.2, 0.3, 0.25), "min": (0.0, 0.1, 0.05), "max": (1.0, 0.9, 0.95)}
+    stats = {
+        "observation.images.cam_front": {k: torch.tensor(v)[:, None, None] for k, v in colours.items()},
+        "observation.state": numbers,
+        "action": numbers,
+    }
+    return *make_act_pre_post_processors(policy.config, stats), stats
+
+
+def check_is(checkpoint, policy, inner, outer):
+    """The same actions as LeRobot's own, processors included: 1e-5 of the largest."""
+    (sample,) = memory_samples(1)
+    frame, state = cv2.cvtColor(sample.picture, cv2.COLOR_BGR2RGB), torch.from_numpy(sample.state)
+    raw = {
+        "observation.images.cam_front": torch.from_numpy(frame).permute(2, 0, 1).float() / 255,
+        "observation.state": state,
+    }
+    with torch.inference_mode():
+        expected = outer(policy.predict_action_chunk(inner(raw))[0])
+        ours = ACT(checkpoint.config, checkpoint.weights)(state[None], torch.from_numpy(frame))[0]
+    assert (ours - expected).abs().max() < 1e-5 * expected.abs().max()
+    assert expected.std() > 1e-3
+
+
+@pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX"])
+def test_statistics_in_the_weights_are_read_as_lerobot_did_before_processors(mode, tmp_path):
+    policy = lerobot_policy(**TINY)
+    inner, outer, stats = normalised(policy, mode)
+    policy.save_pretrained(tmp_path)
+    with pytest.raises(CheckpointError, match="no processor file beside it"):
+        load_checkpoint(tmp_path)
+    kept = ("mean", "std") if mode == "MEAN_STD" else ("min", "max")
+    weights = load_file(tmp_path / "model.safetensors")
+    for part, keys in (
+        ("normalize_inputs", [k for k in stats if k != "action"]),
+        ("normalize_targets", ["action"]),
+        ("unnormalize_outputs", ["action"]),
+    ):
+        for key in keys:
+            name = f"{part}.buffer_{key.replace('.', '_')}"
+            weights |= {f"{name}.{stat}": stats[key][stat].clone() for stat in kept}
+    save_file(weights, tmp_path / "model.safetensors")
+    checkpoint = load_checkpoint(tmp_path)
+    check_is(checkpoint, policy, inner, outer)
+    assert checkpoint.report["normalisation_from"]["out"] == "the weights' file, as LeRobot did before 0.4"
+    theirs = extract_normalization_stats(weights)["action"]  # LeRobot's own migration finds the same
+    assert all(torch.equal(theirs[stat], stats["action"][stat]) for stat in kept)
+    weights[f"unnormalize_outputs.buffer_action.{kept[0]}"] = torch.full((2,), torch.inf)  # LeRobot's for: never set
+    save_file(weights, tmp_path / "model.safetensors")
+    assert "not finite" in str(refused_quickly(tmp_path))
+
+
+def test_what_lerobot_train_leaves_is_found(tmp_path):
+    policy = lerobot_policy(**TINY)
+    inner, outer, _ = normalised(policy, "MEAN_STD")
+    folder = tmp_path / "out/checkpoints/000020/pretrained_model"
+    for part in (policy, inner, outer):
+        part.save_pretrained(folder)
+    with pytest.raises(CheckpointError, match="which of its checkpoints is the last is not said, found 000020"):
+        load_checkpoint(tmp_path / "out")  # copied by what leaves links out
+    (tmp_path / "out/checkpoints/last").symlink_to("000020")
+    assert lerobot_folder(tmp_path) is None
+    for place in ("out", "out/checkpoints", "out/checkpoints/last", "out/checkpoints/last/pretrained_model"):
+        assert lerobot_folder(tmp_path / place).resolve() == folder
+    checkpoint = load_checkpoint(tmp_path / "out")
+    check_is(checkpoint, policy, inner, outer)
+    words = checkpoint.report["normalisation"]
+    assert words["state"] == "(state - (0.3, 0.25)) / (1.2, 0.3)"
+    assert words["action"] == "output * (1.2, 0.3) + (0.3, 0.25)"
+    result = CliRunner().invoke(main, ["inspect", str(tmp_path / "out")])
+    assert result.exit_code == 0 and "output * (1.2, 0.3) + (0.3, 0.25)" in result.output
+
+
+def test_a_trainers_normalisation_is_said(tiny):
+    assert tiny.report["normalisation"] == {
+        "cam_front": "(pixel / 255 - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)",
+        "state": "state, as it is",
+        "action": "output, as it is",
+    }
+
+
+def test_weights_in_pieces_and_adapters_are_refused_by_their_names(copied):
+    (copied / "model.safetensors").unlink()
+    (copied / "model.safetensors.index.json").write_text("{}")
+    assert "weights in several files" in str(refused_quickly(copied))
+    (copied / "model").mkdir()
+    (copied / "model/__0_0.distcp").write_bytes(b"x")
+    assert "a sharded checkpoint (DCP)" in str(refused_quickly(copied))
+    (copied / "adapter_config.json").write_text("{}")
+    assert "a PEFT adapter" in str(refused_quickly(copied))
+    (copied / "config.json").unlink()
+    assert "a PEFT adapter" in str(refused_quickly(copied))

@@ -125,12 +125,14 @@ def test_its_gradients_lead_to_what_float_plans(tiny, rounded, batch):
     "shape", [{"pre_norm": True}, {"feedforward_activation": "gelu"}, {"vision_backbone": "resnet50"}]
 )
 def test_other_shapes(shape, tmp_path):
+    from test_act import saved
+
     policy = lerobot_policy(**TINY, **shape)
     if "vision_backbone" in shape:
         torch.save(trainer_content(policy), tmp_path / "best_model.pth")
         checkpoint = load_checkpoint(tmp_path / "best_model.pth")
     else:
-        policy.save_pretrained(tmp_path)
+        saved(policy, tmp_path)
         checkpoint = load_checkpoint(tmp_path)
     calibration = calibrate(checkpoint, memory_samples(4))
     rounded = RoundedPolicy(checkpoint, Scheme("static"), calibration)
