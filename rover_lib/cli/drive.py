@@ -18,9 +18,9 @@ from rover_lib.onboard.cli import FILE, LOG_DRIVE, drive_options, run_drive, sum
 def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **options: Any) -> None:
     """Drive ARTIFACT: arms the car once camera, plan and Arduino are ready, and stops it whatever fails.
 
-    Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP); 1 could not begin;
-    2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start; with --service,
-    which waits disarmed after each drive, another request.
+    Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could
+    not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start; with
+    --service, which waits disarmed after each drive, another request.
     """
     from rover_lib.world.car import VirtualCar
 

@@ -144,9 +144,9 @@ DRIVE_OPTIONS = (
 def drive(ctx: click.Context, **options: Any) -> None:
     """Drive ARTIFACT: arms the car once camera, plan and Arduino are ready, and stops it whatever fails.
 
-    Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP); 1 could not begin;
-    2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start; with --service,
-    which waits disarmed after each drive, another request.
+    Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could
+    not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start; with
+    --service, which waits disarmed after each drive, another request.
     """
     ctx.exit(run_drive(**options))
 
@@ -199,8 +199,8 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
 def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -> None:
     """Record a human who drives with the transmitter: episode folders in OUT_DIR, to train and calibrate with.
 
-    Ctrl-C, SIGTERM and SIGHUP end an episode, and it is kept. Exit code 1 if a fault ended it; what was recorded until
-    then is kept too.
+    Ctrl-C, SIGTERM, SIGHUP and SIGQUIT end an episode, and it is kept. Exit code 1 if a fault ended it; what was
+    recorded until then is kept too.
     """
     from rover_lib.onboard.recorder import record_episodes
 

@@ -338,7 +338,7 @@ def record_episodes(
 
     options: of record(), for each.
     SIGINT ends an episode; a second one, or one in the pause before the next episode, ends it all, and so do SIGTERM,
-    SIGHUP and a fault. Raises RoverError if it cannot be begun.
+    SIGHUP, SIGQUIT and a fault. Raises RoverError if it cannot be begun.
     """
     stop, leave = SignalEvent(), SignalEvent()
 

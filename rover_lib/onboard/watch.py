@@ -32,7 +32,8 @@ REPEAT_AFTER = 3  # seconds after which a warning that still holds is repeated
 CLOCK_SET_S = 1.0
 SETTLED_S = 60.0  # memory is watched for growth from here on
 TAIL_BYTES = 1 << 16
-SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+# All that ask a program to end. A script's `&` starts it with SIGINT and SIGQUIT ignored, and such a drive must still end.
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 
 
 @contextlib.contextmanager
@@ -82,7 +83,7 @@ def schedule(policy: int, priority: int) -> None:
 
 @contextlib.contextmanager
 def stopped_by_signals(stop: SignalEvent, log: FlightLog) -> Iterator[None]:
-    """SIGTERM, SIGINT and SIGHUP set `stop` inside; a second one does what it did before. For the main thread."""
+    """SIGNALS set `stop` inside; a second one does what it did before. For the main thread."""
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         log.event(f"{signal.Signals(number).name}: stopping")
@@ -95,7 +96,7 @@ def stopped_by_signals(stop: SignalEvent, log: FlightLog) -> Iterator[None]:
 
 @contextlib.contextmanager
 def signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[dict[int, Any]]:
-    """SIGTERM, SIGINT and SIGHUP go to `handler` inside, and where they went before afterwards; gives the latter."""
+    """SIGNALS go to `handler` inside, and where they went before afterwards; gives the latter."""
     before: dict[int, Any] = {number: signal.signal(number, handler) for number in SIGNALS}
     try:
         yield before

@@ -10,6 +10,7 @@ Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions,
 
 import math
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeVar
 
@@ -81,9 +82,10 @@ class ActConfig:
     state_norm: Affine | None = None
     action_unnorm: Affine | None = None
 
-    @property
-    def stride(self) -> int:
-        return 16 if self.dilation else 32
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        """(h, w) of the feature map of a picture of that size."""
+        stride = 16 if self.dilation else 32
+        return -(-height // stride), -(-width // stride)
 
 
 def lerobot_act(c: ActConfig) -> "ACTPolicy":
@@ -546,7 +548,7 @@ class ACT(nn.Module):
         self.q_pos: Tensor
         self.register_buffer("latent", w["encoder_latent_input_proj.bias"][None, None])
         pos = [w["encoder_1d_feature_pos_embed.weight"]]
-        pos += [positions_2d(config.dim, -(-h // config.stride), -(-v // config.stride)) for h, v in config.image_sizes]
+        pos += [positions_2d(config.dim, *config.grid(*size)) for size in config.image_sizes]
         self.register_buffer("pos", torch.cat(pos)[None])  # (1, T, D)
         self.register_buffer("q_pos", w["decoder_pos_embed.weight"][None])  # (1, C, D)
         self.encoder = nn.ModuleList(
@@ -596,7 +598,6 @@ def block_of(module_name: str) -> str:
 def multiply_accumulates(model: ACT) -> dict[str, int]:
     """Multiply-accumulates of one inference, by block, attention's two products counted with their block."""
     counts: dict[str, int] = {}
-    hooks = []
 
     def add(name: str, n: int) -> None:
         counts[block_of(name)] = counts.get(block_of(name), 0) + n
@@ -613,13 +614,11 @@ def multiply_accumulates(model: ACT) -> dict[str, int]:
 
         return hook
 
-    for name, module in model.named_modules():
-        if isinstance(module, (nn.Conv2d, nn.Linear, Attention)):
-            hooks.append(module.register_forward_hook(watch(name)))
-    with torch.inference_mode():
+    with ExitStack() as hooks, torch.inference_mode():
+        for name, module in model.named_modules():
+            if isinstance(module, (nn.Conv2d, nn.Linear, Attention)):
+                hooks.enter_context(module.register_forward_hook(watch(name)))
         model(*example_inputs(model.config))
-    for h in hooks:
-        h.remove()
     return counts
 
 

@@ -86,20 +86,14 @@ class BatchedPolicy(nn.Module):
         return self.plan(self.features(frames), states)
 
 
-def grid_of(config: ActConfig) -> tuple[int, int]:
-    """(h, w) of the feature map of the one camera."""
-    ((height, width),) = config.image_sizes
-    return -(-height // config.stride), -(-width // config.stride)
-
-
 @dataclass(frozen=True, eq=False)
 class Lessons:
     """n samples, each seen in two views. Files have a row per sample, or two: 2 * sample + view.
 
-    data: what was recorded of them. asked: (2 n, 2) float32, the states that
-    the teacher is asked with. frames: rows of (height, width, 3) uint8 RGB at the student's size, one per sample, as
-    they are. maps: two rows of (D, h, w) float16, the teacher's feature map pooled to the student's grid. plans: two
-    rows of (C, A) float32. tokens: two rows of (D, h, w) float16, the student's own map; empty until `see`.
+    data: what was recorded of them. asked: (2 n, 2) float32, the states that the teacher is asked with. frames: rows of
+    (height, width, 3) uint8 RGB at the student's size, one per sample, as they are. maps: two rows of (D, h, w)
+    float16, the teacher's feature map pooled to the student's grid. plans: two rows of (C, A) float32. tokens: two rows
+    of (D, h, w) float16, the student's own map; empty until `see`.
     """
 
     samples: tuple[Sample, ...]
@@ -118,6 +112,7 @@ class Lessons:
         folder.mkdir(parents=True, exist_ok=True)
         (size,) = config.image_sizes
         data = frames_of(samples, *size)
+        grid = config.grid(*size)
         rows = np.arange(len(data))
         asked = np.stack([swapped_states(data, rows, rng) for _ in VIEWS], 1)
         asked[:, MIRRORED] *= MIRROR
@@ -126,9 +121,9 @@ class Lessons:
             data,
             asked.reshape(-1, 2),
             RowFile(folder / "frames", (*size, 3), np.uint8),
-            RowFile(folder / "maps", (channels, *grid_of(config)), np.float16),
+            RowFile(folder / "maps", (channels, *grid), np.float16),
             RowFile(folder / "plans", data.chunks.shape[1:]),
-            RowFile(folder / "tokens", (channels, *grid_of(config)), np.float16),
+            RowFile(folder / "tokens", (channels, *grid), np.float16),
         )
 
     def __len__(self) -> int:

@@ -11,6 +11,7 @@ import copy
 import time
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -116,16 +117,15 @@ def check_fast(module: nn.Module, example: tuple[Tensor, ...]) -> None:
         return hook
 
     static = int8_layers(module)
-    hooks = [m.register_forward_pre_hook(watch(n)) for n, m in static.items()]
-    try:
-        module(*example)
-    except RuntimeError as e:
-        # torch refuses some of these itself, without saying where; the hook of that layer has just run.
-        if not slow:
-            raise QuantizeError(f"the quantized policy does not run: {str(e).splitlines()[0][:200]}") from None
-    finally:
-        for h in hooks:
-            h.remove()
+    with ExitStack() as hooks:
+        for n, m in static.items():
+            hooks.enter_context(m.register_forward_pre_hook(watch(n)))
+        try:
+            module(*example)
+        except RuntimeError as e:
+            # torch refuses some of these itself, without saying where; the hook of that layer has just run.
+            if not slow:
+                raise QuantizeError(f"the quantized policy does not run: {str(e).splitlines()[0][:200]}") from None
     if slow:
         listed = "; ".join(f"{name}: {reason}" for name, reason in list(slow.items())[:5])
         raise QuantizeError(f"{len(slow)} of {len(static)} layers would miss the fast kernels: {listed}")
@@ -267,16 +267,14 @@ def inspect_layers(
 
         return hook
 
-    hooks = [prepared.get_submodule(n).register_forward_hook(keep(n)) for n in layers]
-    hooks += [m.register_forward_hook(measure(n, m)) for n, m in layers.items()]
-    try:
+    with ExitStack() as hooks:
+        for n, m in layers.items():
+            hooks.enter_context(prepared.get_submodule(n).register_forward_hook(keep(n)))
+            hooks.enter_context(m.register_forward_hook(measure(n, m)))
         for s in samples:
             x = inputs_of(s, checkpoint.config)
             prepared(*x)
             quantized.module(*x)
-    finally:
-        for h in hooks:
-            h.remove()
     return [
         {
             "name": n,

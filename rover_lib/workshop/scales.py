@@ -5,6 +5,7 @@ channel scales move it into the weights, which have a scale per channel. In floa
 """
 
 from collections.abc import Iterable
+from contextlib import ExitStack
 
 import torch
 from torch import Tensor, nn
@@ -27,7 +28,6 @@ def projections(model: ACT) -> dict[str, Projection]:
 def channel_maxima(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> Maxima:
     """The largest magnitude per channel at each projection's input and output: {name: {in_max, out_max}}."""
     maxima: Maxima = {}
-    hooks = []
 
     def watch(name: str):
         def hook(_: nn.Module, args: tuple[Tensor], out: Tensor) -> None:
@@ -38,14 +38,11 @@ def channel_maxima(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> Maxima:
 
         return hook
 
-    for name, m in projections(model).items():
-        hooks.append(m.register_forward_hook(watch(name)))
-    try:
+    with ExitStack() as hooks:
+        for name, m in projections(model).items():
+            hooks.enter_context(m.register_forward_hook(watch(name)))
         for x in inputs:
             model(*x)
-    finally:
-        for h in hooks:
-            h.remove()
     return {name: {key: t.clone() for key, t in seen.items()} for name, seen in maxima.items()}
 
 

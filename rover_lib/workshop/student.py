@@ -10,6 +10,7 @@ training by recordings needs, the VAE's encoder, is left out: a student is taugh
 """
 
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -122,17 +123,12 @@ def _grams(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> dict[str, Tensor
 
         return hook
 
-    hooks = [
-        module.down.register_forward_pre_hook(watch(_lerobots(name)))
-        for name, module in model.named_modules()
-        if isinstance(module, FeedForward)
-    ]
-    try:
+    with ExitStack() as hooks:
+        for name, module in model.named_modules():
+            if isinstance(module, FeedForward):
+                hooks.enter_context(module.down.register_forward_pre_hook(watch(_lerobots(name))))
         for x in inputs:
             model(*x)
-    finally:
-        for h in hooks:
-            h.remove()
     for name in list(waiting):
         add(name)
     if not sums:

@@ -8,6 +8,7 @@ ACT's positions are relative to the picture and no weight depends on its size. S
 a quarter of its pixels, which takes a quarter of the time, and carried to its own size by a few steps there.
 """
 
+import math
 import shutil
 import sys
 from collections.abc import Iterator
@@ -301,7 +302,7 @@ def _plan(size: ActConfig, first: ActConfig, recipe: Recipe, frames: int, judges
 
     def g(config: ActConfig, passes: int, batch: int, backbone: bool = True, transformer: bool = True) -> int:
         ((height, width),) = config.image_sizes
-        tokens = -(-height // config.stride) * -(-width // config.stride) + 2
+        tokens = math.prod(config.grid(height, width)) + 2
         per_token = 4 * config.dim**2 + 2 * config.dim * config.feedforward
         seen = config.encoder_layers * tokens + config.vae_layers * (config.chunk + 2)
         seen += config.decoder_layers * config.chunk
@@ -330,9 +331,8 @@ class _ChunkFromFeatures(nn.Module):
     def __init__(self, backbone: nn.Module, size: ActConfig, features: int = 512, width_after: int = 32):
         super().__init__()
         self.backbone, self.chunk = backbone, size.chunk
-        ((height, width),) = size.image_sizes
         convolution = nn.Conv2d(features, width_after, 1)
-        last = nn.Linear(width_after * -(-height // size.stride) * -(-width // size.stride), 2 * size.chunk)
+        last = nn.Linear(width_after * math.prod(size.grid(*size.image_sizes[0])), 2 * size.chunk)
         nn.init.zeros_(last.weight)  # from "no action": actions are small, and an untrained head's are not
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(convolution, nn.ReLU(), nn.Flatten(), last)
@@ -381,9 +381,9 @@ def _train_transformer(training: _Training) -> None:
 
 def _features(training: _Training, view: str, chosen: np.ndarray, backbone: nn.Module) -> RowFile:
     """The frozen backbone's feature map of these rows' frames, on disk."""
-    batch, ((height, width),) = training.recipe.batch, training.size.image_sizes
-    stride, channels = training.size.stride, training.policy.model.encoder_img_feat_input_proj.in_channels
-    maps = RowFile(training.saved.folder / f"{view}.rows", (channels, -(-height // stride), -(-width // stride)))
+    batch, (size,) = training.recipe.batch, training.size.image_sizes
+    channels = training.policy.model.encoder_img_feat_input_proj.in_channels
+    maps = RowFile(training.saved.folder / f"{view}.rows", (channels, *training.size.grid(*size)))
     for step in training.steps(f"features, {view}", maps=maps):
         images = training.data.images[chosen[step * batch : (step + 1) * batch]]
         images = images[:, :, ::-1] if view == "mirrored" else images

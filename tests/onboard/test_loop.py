@@ -580,15 +580,23 @@ def test_a_replay_stops_in_a_hole_of_the_recording(link, clock):
 # ---- signals, files, memory
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_signals_ask_it_to_stop(number):
-    stop, log, before = threading.Event(), Log(), signal.getsignal(number)
-    with stopped_by_signals(stop, log):
-        os.kill(os.getpid(), number)
-        time.sleep(0.01)
-        assert stop.is_set()
-    assert log.events == [f"{number.name}: stopping"]
-    assert signal.getsignal(number) is before
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])
+@pytest.mark.parametrize("ignored", [False, True])
+def test_signals_ask_it_to_stop(number, ignored):
+    """Ignored, as a script's & starts its programs: today's shells do so with SIGINT and SIGQUIT, nohup with SIGHUP."""
+    earlier = signal.getsignal(number)
+    try:
+        if ignored:
+            signal.signal(number, signal.SIG_IGN)
+        stop, log, before = threading.Event(), Log(), signal.getsignal(number)
+        with stopped_by_signals(stop, log):
+            os.kill(os.getpid(), number)
+            time.sleep(0.01)
+            assert stop.is_set()
+        assert log.events == [f"{number.name}: stopping"]
+        assert signal.getsignal(number) is before
+    finally:
+        signal.signal(number, earlier)
 
 
 def test_an_artifact_that_changes_is_noticed_once(tmp_path):

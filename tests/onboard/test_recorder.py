@@ -507,7 +507,7 @@ def recording_in(out):
     return len(list(out.glob(".episode_*/frames/*.jpg"))) > 10
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_signals_end_an_episode_properly(tmp_path, arduino, pictures, number):
     out = tmp_path / "out"
     more = () if number == signal.SIGINT else ("--episodes", "2")  # they end all, and not one after the other

@@ -89,6 +89,15 @@ def beside(systemd: Systemd, *actions) -> threading.Thread:
     return thread
 
 
+def waits_unarmed(systemd: Systemd, stop: threading.Event, action) -> None:
+    """A service that nothing arms while the action runs beside it, which sets stop at its end."""
+    with served(stop) as service:
+        thread = beside(systemd, action)
+        with pytest.raises(s.NotArmed):
+            service.wait_for_human(lambda: pytest.fail("armed"))
+        thread.join()
+
+
 def human(**limits) -> str:
     """Arms, and returns what the service says then, or why it did not."""
     try:
@@ -215,11 +224,7 @@ def test_a_request_names_the_model_that_it_arms(systemd):
             answers.append(s.ask_service(**{"ask": "arm", "model": "ab12", "ticket": state["ticket"], **wrong}))
         stop.set()
 
-    with served(stop) as service:
-        thread = beside(systemd, operator)
-        with pytest.raises(s.NotArmed):
-            service.wait_for_human(lambda: pytest.fail("armed"))
-        thread.join()
+    waits_unarmed(systemd, stop, operator)
     assert len(answers) == 3 and not any(answer["armed"] for answer in answers)
 
 
@@ -238,11 +243,7 @@ def test_nonsense_arms_nothing(systemd, tmp_path, nonsense):
         assert s.ask_service(ask="state")["text"] == "disarmed: waiting for a human to arm it"  # it still answers
         stop.set()
 
-    with served(stop) as service:
-        thread = beside(systemd, talk)
-        with pytest.raises(s.NotArmed):
-            service.wait_for_human(lambda: pytest.fail("armed"))
-        thread.join()
+    waits_unarmed(systemd, stop, talk)
 
 
 def test_says_what_is_missing_and_refuses_until_then(systemd):

@@ -69,6 +69,15 @@ def test_a_garbled_status_says_nothing(data):
     assert parse(good[:at] + bytes([good[at] ^ flip]) + good[at + 1 :], 0) is None
 
 
+FIELDS = {
+    "boot": 7, "ms": 999, "sequence": 0, "result": "k", "state": "M", "reason": "r", "missing": "-",
+    "steering_us": 1456, "throttle_us": 120, "cap_us": 238,
+}  # fmt: skip
+STATUS_LINE = (
+    "<S {boot} {ms} {sequence} {result} {state} {reason} {missing} {steering_us} {throttle_us} {cap_us} - - - - 0 0 0 0"
+)
+
+
 class Board:
     """The other end of a pty: says what it is told to, and records what the host says."""
 
@@ -95,22 +104,11 @@ class Board:
         if not self._closing:
             os.write(self.master, line(body))
 
-    def status(
-        self,
-        state="M",
-        reason="r",
-        result="k",
-        missing="-",
-        sequence=None,
-        boot=7,
-        steering_us=1456,
-        throttle_us=120,
-        cap_us=238,
-        ms=999,
-    ):
-        sequence = self.sequence if sequence is None else sequence
-        pulses = f"{steering_us} {throttle_us} {cap_us} - - - -"
-        self.say(f"<S {boot} {ms} {sequence} {result} {state} {reason} {missing} {pulses} 0 0 0 0")
+    def status(self, state="M", reason="r", result="k", **fields):
+        """Say a status line; fields: of the line, see FIELDS."""
+        said = {"state": state, "reason": reason, "result": result, "sequence": self.sequence}
+        assert fields.keys() <= FIELDS.keys()
+        self.say(STATUS_LINE.format(**FIELDS | said | fields))
 
     @property
     def sequence(self):

@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 
 from lab.driving.bench import DrivingBench
 from lab.driving.pins import CONTINUES, STOPPED
@@ -40,10 +39,8 @@ def _raise_in_loop(bench: DrivingBench) -> None:
 @FAULTS.add(
     "host process stopped", STOPPED, "no valid command for 150 ms|said nothing for", "SIGSTOP, after 1 s SIGCONT"
 )
-def _pause_process(bench: DrivingBench) -> float:
-    at_s = time.monotonic()
+def _pause_process(bench: DrivingBench) -> None:
     _pause(bench, 1.0)
-    return at_s
 
 
 def _pause(bench: DrivingBench, seconds: float) -> None:
@@ -58,12 +55,10 @@ def _pause(bench: DrivingBench, seconds: float) -> None:
     "the host paused again and again|had no time for its ticks",
     "SIGSTOP for 110 ms of every 150",
 )
-def _stutter(bench: DrivingBench) -> float:
-    at_s = time.monotonic()
+def _stutter(bench: DrivingBench) -> None:
     for _ in range(8):
         _pause(bench, 0.11)
         bench.wait(0.04)
-    return at_s
 
 
 @FAULTS.add(

@@ -17,8 +17,8 @@ def _by_signal(name: str, number: int, message: str, **more: Any) -> None:
 _by_signal("SIGTERM", signal.SIGTERM, "SIGTERM: stopping", exit_code=0)
 _by_signal("SIGINT", signal.SIGINT, "SIGINT: stopping", exit_code=0)
 _by_signal("SIGHUP", signal.SIGHUP, "SIGHUP: stopping", exit_code=0)
+_by_signal("SIGQUIT", signal.SIGQUIT, "SIGQUIT: stopping", exit_code=0)
 _by_signal("SIGKILL", signal.SIGKILL, "the drive before this one", exit_code=-signal.SIGKILL, told_later=True)
-_by_signal("SIGQUIT", signal.SIGQUIT, "the drive before this one", exit_code=-signal.SIGQUIT, told_later=True)
 _by_signal("SIGUSR1", signal.SIGUSR1, "the drive before this one", exit_code=-signal.SIGUSR1, told_later=True)
 
 

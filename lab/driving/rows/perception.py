@@ -3,8 +3,6 @@
 Time stamps that are old or stand still are no rows: a FIFO has none. tests/onboard/test_camera.py has them.
 """
 
-import time
-
 import numpy as np
 
 from lab.driving.bench import DrivingBench
@@ -85,15 +83,13 @@ def _resize(bench: DrivingBench) -> None:
     watch_s=0.1,
     limits="as 'camera gives no more frames', when none comes for longer than that",
 )
-def _frames_late(bench: DrivingBench) -> float:
-    at_s = time.monotonic()
+def _frames_late(bench: DrivingBench) -> None:
     bench.feed.pause()
     bench.wait(0.3)
     bench.feed.late_s = 0.12
     bench.show(PLAIN)
     bench.wait(1.5)
     bench.feed.late_s = 0.0
-    return at_s
 
 
 @FAULTS.add(

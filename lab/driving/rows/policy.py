@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 
 from lab.driving.bench import DrivingBench
 from lab.driving.pins import CONTINUES, REFUSED, STOPPED
@@ -38,13 +37,11 @@ def _kill_inference(bench: DrivingBench) -> None:
     "the picture tells the policy to",
     limits="as 'inference hangs', when it is longer",
 )
-def _slow_inference(bench: DrivingBench) -> float:
-    at_s = time.monotonic()
+def _slow_inference(bench: DrivingBench) -> None:
     bench.show(SLOW)
     bench.wait(0.05)
     bench.show(PLAIN)
     bench.wait(0.5)
-    return at_s
 
 
 @FAULTS.add(

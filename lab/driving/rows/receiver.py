@@ -1,7 +1,5 @@
 """The transmitter and the human who holds it, as the receiver hears them."""
 
-import time
-
 from lab.driving.bench import DrivingBench
 from lab.driving.pins import HUMAN, NEUTRAL_US, REFUSED, STOPPED
 from lab.driving.row import FaultKind
@@ -38,12 +36,10 @@ def _lose_steering(bench: DrivingBench) -> None:
     "transmitter's signal was lost",
     "no pulses for 0.3 s, then 400 us of throttle that nobody sends",
 )
-def _presets(bench: DrivingBench) -> float:
-    at_s = time.monotonic()
+def _presets(bench: DrivingBench) -> None:
     bench.arduino.transmitter(0, 0)
     bench.wait(0.3)
     bench.arduino.transmitter(REST_US[0], 400)
-    return at_s
 
 
 @FAULTS.add(
