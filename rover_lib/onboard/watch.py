@@ -32,7 +32,7 @@ REPEAT_AFTER = 3  # seconds after which a warning that still holds is repeated
 CLOCK_SET_S = 1.0
 SETTLED_S = 60.0  # memory is watched for growth from here on
 TAIL_BYTES = 1 << 16
-# All that ask a program to end. A script's `&` starts it with SIGINT and SIGQUIT ignored, and such a drive must still end.
+# All that ask a program to end. A script's & starts it with SIGINT and SIGQUIT ignored; such a drive must still end.
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 
 
