@@ -11,7 +11,7 @@ NAME ?= mine
 # In a container there may be nobody but root, and what is loaded here was made here; see onboard/confine.py.
 export ROVER_AS_ROOT := 1
 
-.PHONY: help demo run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks clean
+.PHONY: help demo run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks tables clean
 
 help:
 	@echo "make demo                                   record, train, quantize, compare, benchmark and drive in the balloon world"
@@ -30,7 +30,8 @@ help:
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count, into the committed notebooks,"
-	@echo "                                            and the JSON behind them into results/"
+	@echo "                                            and the JSON behind them into results/, and README's tables from it"
+	@echo "make tables                                 README's tables alone"
 
 # uv installs the CUDA build of torch, gigabytes that its wheel insists on, in a minute where pip takes several.
 $(READY): pyproject.toml
@@ -103,6 +104,10 @@ lab: $(READY)
 
 notebooks: demo
 	$(VENV)/bin/python -m rover_lib.workshop.publish
+	$(MAKE) tables
+
+tables: $(READY)
+	$(VENV)/bin/python -m rover_lib.workshop.tables
 
 clean:
 	rm -rf $(VENV) runs

@@ -69,14 +69,15 @@ def publish(
 
 
 def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEBOOKS) -> list[Path]:
-    """Publish the demo; of runs/full its count, and of the laboratory its reports, where they are there."""
+    """Publish the demo and its count; of runs/full its count; of the laboratory its reports: where they are there."""
     runs_dir, notebooks_dir = Path(runs_dir), Path(notebooks_dir)
     written = publish(runs_dir / "demo", notebooks_dir, (*NAMES, "07_drive"))
     if (runs_dir / "full" / "06_arm.ipynb").is_file():
         written += publish(runs_dir / "full", notebooks_dir, ("06_arm",))
-    reports = [runs_dir / name for name in OF_LABORATORY if (runs_dir / name).is_file()]
-    folder = notebooks_dir.resolve().parent / "results" / "lab"
-    return written + _write({folder / path.name: _result(path) for path in reports})
+    results = notebooks_dir.resolve().parent / "results"
+    reports = {runs_dir / name: results / "lab" / name for name in OF_LABORATORY}
+    reports[runs_dir / "demo" / "arm.json"] = results / "demo" / "arm.json"  # notebook 06 shows the full size's count
+    return written + _write({target: _result(path) for path, target in reports.items() if path.is_file()})
 
 
 def _write(texts: dict[Path, str]) -> list[Path]:

@@ -1,0 +1,165 @@
+"""README's tables of results, from the JSON in results/: each number there is written by this, and by nobody's hand.
+
+    python -m rover_lib.workshop.tables        # what `make tables` does
+
+A table stands in README between `<!-- table NAME, by make tables -->` and `<!-- end -->`; what has no JSON yet, as a
+count that was not made, is an empty field.
+"""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.stage import atomic_path
+
+README = Path(__file__).parents[2] / "README.md"
+MODES = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed"}
+BEST = "static"
+PLACE = re.compile(r"(<!-- table (\w+), by make tables -->\n)(.*?)(<!-- end -->)", re.S)
+
+Row = tuple[str, ...]
+
+
+class TableError(RoverError):
+    """README or results/ without what a table needs."""
+
+
+def update(readme: Path = README, results: Path | None = None) -> bool:
+    """Write README's tables anew; returns whether it has changed. Raises TableError, and writes nothing then."""
+    old = readme.read_text()
+    new = written(old, results or readme.parent / "results")
+    if new != old:
+        with atomic_path(readme) as temporary:
+            temporary.write_text(new)
+    return new != old
+
+
+def written(text: str, results: Path) -> str:
+    """The text with its tables as results, a folder such as results/, has them. Raises TableError."""
+    names = [match[2] for match in PLACE.finditer(text)]
+    if sorted(names) != sorted(TABLES):
+        raise TableError("README must have each table once", found=names or "none", remedy=f"mark {sorted(TABLES)}")
+
+    def place(match: re.Match[str]) -> str:
+        header, *rows = TABLES[match[2]](results)
+        lines = [header, ("---",) * len(header), *rows]
+        return match[1] + "".join(map(_line, lines)) + match[4]
+
+    return PLACE.sub(place, text)
+
+
+def _line(fields: Row) -> str:
+    return "|" + "".join(f" {field} |" if field else " |" for field in fields) + "\n"
+
+
+def _demo(results: Path) -> list[Row]:
+    """The demo's policy in each mode."""
+    compared = _metrics(results / "demo", "compare")
+    timed = _metrics(results / "demo", "benchmark-*")["artifacts"]
+    counted = _metrics(results / "demo", "arm", {"artifacts": {}})["artifacts"]
+    fp32, modes = compared["fp32"], {"fp32": compared["fp32"]} | compared["modes"]
+
+    def row(what: str, text: Callable[[str], str | None]) -> Row:
+        return what, *(_strong(text(mode) or "", mode == BEST) for mode in MODES)
+
+    def error(action: str) -> Callable[[str], str | None]:
+        return lambda mode: _of(modes[mode], f"{action}_mae_pct", ".2f")
+
+    def microseconds(mode: str) -> str | None:
+        steering, throttle = (_of(modes[mode], f"{a}_mae_us", d) for a, d in (("steering", ".1f"), ("throttle", ".2f")))
+        return f"{steering} / {throttle}" if steering and throttle else None
+
+    low, high = (f"{fp32['trials'] * fp32[f'hits_wilson_{end}']:.1f}".removesuffix(".0") for end in ("low", "high"))
+    of = f"of {fp32['trials']} (95 % interval of FP32's {low} to {high})"
+    return [
+        ("", *MODES.values()),
+        row("artifact, MB", lambda mode: _of(modes[mode], "size_mb", ".1f")),
+        row(f"balloons hit, {of}", lambda mode: _of(modes[mode], "hits", "d")),
+        row("steering error, % of the recorded range", error("steering")),
+        row("throttle error, % of the recorded range", error("throttle")),
+        row("the same in microseconds of pulse (an Arduino resolves 4)", microseconds),
+        row("times as fast as LeRobot's eager FP32, by p50", lambda mode: _of(timed[mode], "speedup", ".1f")),
+        row(
+            "instructions of an inference, 10^9, *counted on an emulated Cortex-A76* (`make arm NAME=demo`)",
+            lambda mode: _of(counted.get(f"policy_{mode}", {}), "instructions_g", ".3f"),
+        ),
+        row(
+            "time that a Pi 5 cannot beat, ms, *computed*",
+            lambda mode: _of(timed[mode], "floor_ms", ".1f") if mode in ("fp32", BEST) else None,
+        ),
+    ]
+
+
+def _faults(results: Path) -> list[Row]:
+    """What was done to a driving car, and what became of it."""
+    report = _metrics(results / "lab", "faults")
+    of = {e: [f for f in report["faults"] if f["expected"] == e] for e in ("stopped", "continues", "refused", "human")}
+
+    def right(expected: str) -> str:
+        return f"{sum(not f['wrong'] for f in of[expected])} of {len(of[expected])}"
+
+    worst, takeover = (report["summary"][key] for key in ("worst_stopped_after_ms", "takeover_ms"))
+    return [
+        ("what", "figure"),
+        (
+            "faults in a driving car that end in a stopped car, from the fault to throttle off",
+            f"{right('stopped')}, at most {worst:.0f} ms",
+        ),
+        ("faults that are ridden through, or until the plan's age stops the car", right("continues")),
+        ("faults from before the start, with which the car is never armed", right("refused")),
+        ("human takes over by a stick, until the pins are the human's", f"at most {takeover:.0f} ms, by design 46"),
+        ("pulses recorded, replayed and measured again", f"within {report['bytes']['worst_us']:.0f} us"),
+        ("drives with random faults in virtual time that broke a rule of safety", _random(results)),
+    ]
+
+
+def _random(results: Path) -> str:
+    report = _metrics(results / "lab", "random")
+    return f"{len(report['broken'])} of {report['drives']:,}"
+
+
+def _drives(results: Path) -> list[Row]:
+    """Hits of the demo's policy when its plans are late, and when the car is pushed."""
+    rows = [
+        r
+        for r in _metrics(results / "demo", "drive")["rows"]
+        if r["compensate"] and r["ensemble"] is None and r["hits"]
+    ]
+    alone, pushed = ({r["latency_ms"]: r for r in rows if bool(r["pushes"]) == way} for way in (False, True))
+    latencies = sorted(alone.keys() & pushed.keys())
+    trials = rows[0]["trials"]
+    return [
+        (f"balloons hit of {trials}, with plans that take", *(f"{latency:.0f} ms" for latency in latencies)),
+        ("left alone", *(str(alone[latency]["hits"]) for latency in latencies)),
+        ("pushed on its way", *(str(pushed[latency]["hits"]) for latency in latencies)),
+    ]
+
+
+TABLES: dict[str, Callable[[Path], list[Row]]] = {"demo": _demo, "faults": _faults, "drives": _drives}
+
+
+def _metrics(folder: Path, stage: str, otherwise: dict[str, Any] | None = None) -> dict[str, Any]:
+    """A stage's metrics. Raises TableError if it is not there and there is nothing otherwise."""
+    paths = sorted(folder.glob(f"{stage}.json"))
+    if not paths and otherwise is not None:
+        return otherwise
+    if len(paths) != 1:
+        found = [path.name for path in paths] or "none"
+        raise TableError(f"{folder.name}/{stage}.json must be there once", found=found, remedy="make notebooks")
+    return json.loads(paths[0].read_text())["metrics"]
+
+
+def _of(values: Mapping[str, Any], key: str, form: str) -> str | None:
+    value = values.get(key)
+    return None if value is None else format(value, form)
+
+
+def _strong(text: str, strong: bool) -> str:
+    return f"**{text}**" if strong and text else text
+
+
+if __name__ == "__main__":
+    print("README.md: written" if update() else "README.md: as it was")
