@@ -58,7 +58,7 @@ def test_inspects_each_kind_of_file(artifacts, tiny_file):
         ["benchmark", "nothing.pt"],
         ["compare", "nothing.pt", "other.pt", "--episodes", "none"],
         ["quantize", "nothing.pth", "none", "-o", "out.pt"],
-        ["run", "nothing.pth", "none"],
+        pytest.param(["run", "nothing.pth", "none"], marks=pytest.mark.slow),  # starts a kernel
         ["distill", "nothing.pth", "none", "--size", "320x180", "--name", "fast"],
         ["world", "train", "none", "out.pth"],
         ["world", "trial", "nothing.pt"],

@@ -30,6 +30,8 @@ from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.host import Host
 from rover_lib.onboard.release import Expected, ReleaseError, Releases, check_signature, pack, sign
 
+pytestmark = pytest.mark.slow  # each has a process of its own, and there are 140
+
 MOST_MB, MOST_S = 300.0, 5.0
 EITHER = Expected(modes=("fp32", "static"))
 HARM = "harm"  # what a hostile program writes, in the working folder

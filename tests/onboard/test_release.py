@@ -376,6 +376,7 @@ def test_a_wrong_hash(releases, two):
 # Artifacts that must not drive
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes, sentence",
     [
@@ -594,6 +595,7 @@ def test_sha256sum_agrees(releases):
     assert subprocess.run(["sha256sum", "--check", "--quiet", "policy.pt.sha256"], cwd=folder).returncode == 0
 
 
+@pytest.mark.slow
 def test_a_history_that_is_no_history(releases, two):
     for content in ("", "{", "[1, null]", '{"a": 1}', '["../.."]', "[" * 90_000, " " * 1_000_000):
         (releases.models / "history.json").write_text(content)
@@ -608,6 +610,7 @@ def test_a_history_that_is_no_history(releases, two):
     ],
 )
 @pytest.mark.parametrize("n", range(1, 7))
+@pytest.mark.slow
 def test_a_disk_that_is_full_or_dying_at_some_step(releases, two, n, number, says):
     old, count = releases.current, 0
 

@@ -328,6 +328,7 @@ def feeds(lines: list[str]) -> int:
     return lines.count("WATCHDOG=1")
 
 
+@pytest.mark.slow
 def test_the_watchdog_hears_of_ticks_that_happened_only(systemd):
     report = Report()
     with served(report=report) as service:
