@@ -1,16 +1,21 @@
 """Commands that make artifacts of a checkpoint, and look at them."""
 
+import functools
 import json
 import re
 import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from rover_lib.onboard.cli import AS_JSON, FILE, describe_artifact, show
 from rover_lib.workshop.progress import terminal
+
+if TYPE_CHECKING:
+    from rover_lib.workshop.samples import Source
 
 
 def _size(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -22,9 +27,31 @@ def _size(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int
     return int(sizes[2]), int(sizes[1])
 
 
+ACTION_NAMES = click.option(
+    "--action-names", default="", help="What a LeRobotDataset's actions are, in their order, if it does not say it."
+)
+CAMERA = click.option("--camera", default="", help="Which of a LeRobotDataset's cameras is the car's.")
+
+
+def with_source(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose `episodes` is a Source: where they are, and what a user says of them."""
+
+    @ACTION_NAMES
+    @CAMERA
+    @functools.wraps(command)
+    def called(*args: Any, episodes: Path, action_names: str, camera: str, **options: Any) -> None:
+        from rover_lib.workshop.samples import Source
+
+        return command(*args, episodes=Source.of(episodes, action_names, camera), **options)
+
+    return called
+
+
 @click.command()
 @click.argument("checkpoint", type=FILE)
 @click.argument("episodes", type=FILE)
+@ACTION_NAMES
+@CAMERA
 @click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
 @click.option("--samples", type=click.IntRange(min=1), help="Calibration samples [default: params.yml].")
@@ -33,6 +60,7 @@ def _size(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int
 def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     """Load, calibrate, quantize, compare and benchmark CHECKPOINT with the recordings in EPISODES.
 
+    EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command.
     Executes the five notebooks; reports, artifacts, figures and the executed notebooks are left in the run's folder.
     """
     from rover_lib.workshop.run import run as run_notebooks
@@ -43,10 +71,12 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
 
 
 @click.command()
-@click.argument("file", type=FILE)
+@click.argument("episodes", metavar="FILE", type=FILE)
 @AS_JSON
-def inspect(file: Path, as_json: bool) -> None:
-    """Say what FILE is: an artifact, a checkpoint, or a folder of recordings."""
+@with_source
+def inspect(episodes: "Source", as_json: bool) -> None:
+    """Say what FILE is: an artifact, a checkpoint, a folder of recordings, or a LeRobotDataset."""
+    file = episodes.path
     if file.is_file() and _is_scripted(file):
         return show(describe_artifact(file), as_json)
     from rover_lib.workshop.checkpoint import lerobot_folder, load_checkpoint
@@ -54,7 +84,7 @@ def inspect(file: Path, as_json: bool) -> None:
     if file.is_dir() and not lerobot_folder(file):
         from rover_lib.workshop.episodes import load_recordings
 
-        return show({"recordings": load_recordings(file, progress=terminal()).summary()}, as_json)
+        return show({"recordings": load_recordings(episodes, progress=terminal()).summary()}, as_json)
     checkpoint = load_checkpoint(file)
     return show({"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}, as_json)
 
@@ -79,7 +109,8 @@ def _is_scripted(file: Path) -> bool:
 )
 @click.option("--float-block", "float_blocks", multiple=True, help="A block to leave in float; makes static mixed.")
 @click.option("--samples", type=click.IntRange(min=1), help="Calibration samples [default: params.yml].")
-def quantize(checkpoint: Path, episodes: Path, output: Path, mode: str, samples: int | None, **how: Any) -> None:
+@with_source
+def quantize(checkpoint: Path, episodes: "Source", output: Path, mode: str, samples: int | None, **how: Any) -> None:
     """Quantize CHECKPOINT, calibrated on the recordings in EPISODES, to one artifact.
 
     `rover run` does this for all modes, chooses the observer and the blocks by measurement, and compares.
@@ -104,7 +135,8 @@ def quantize(checkpoint: Path, episodes: Path, output: Path, mode: str, samples:
 @click.argument("artifacts", type=FILE, nargs=-1, required=True)
 @click.option("--episodes", type=FILE, required=True, help="Recordings; their held-out part judges.")
 @AS_JSON
-def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_json: bool) -> None:
+@with_source
+def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as_json: bool) -> None:
     """Compare ARTIFACTS with REFERENCE (the FP32 artifact) on recorded frames.
 
     Errors are shares of the recorded range and microseconds of servo pulse.
@@ -140,9 +172,10 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: Path, as_jso
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
 @AS_JSON
+@with_source
 def distill(
     checkpoint: Path,
-    episodes: Path,
+    episodes: "Source",
     size: tuple[int, int] | None,
     decoder_layers: int | None,
     feedforward: int | None,

@@ -24,6 +24,7 @@ from torch import Tensor
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, Affine, imagenet
+from rover_lib.workshop.samples import Layout
 from rover_lib.workshop.untrusted import LARGEST, listed, shown
 
 TRAINER_KEYS = {  # of the trainer's config: what the shape of the policy needs
@@ -52,6 +53,7 @@ IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole?"
 
 # What LeRobot calls its files. By a processor's: where its statistics lay before 0.4, and the step that normalises.
 PRETRAINED = "pretrained_model"
+ORIGIN = "origin.json"  # which we leave in a folder of that format: its config.json refuses what it does not know
 ADAPTER = "adapter_config.json"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 STEPS = {
@@ -105,6 +107,62 @@ class Checkpoint:
                 remedy="choose one that squeezes the picture by less than 5 %",
             )
         return replace(self, config=replace(self.config, image_sizes=((height, width),)))
+
+    def recorded_as(self, layout: Layout) -> "Checkpoint":
+        """The same policy, speaking of states and actions as the recordings do.
+
+        LeRobot's checkpoints say neither what their numbers are, nor in what order, nor how many plans' steps make a
+        second: the dataset that they were trained on does. So their weights are put into the recordings' order. The
+        trainer's files, and what we write, are always of [steering, throttle], 30 times a second.
+
+        Raises CheckpointError for another count of states or actions than recorded, and for one of those policies if
+        the recordings have another rate.
+        """
+        c, rate_hz = self.config, layout.rate_hz
+        if rate_hz is None:  # our own recordings
+            return self
+        has, recorded = (len(c.state_names), len(c.action_names)), (len(layout.state_names), len(layout.action_names))
+        if has != recorded:
+            raise CheckpointError(
+                f"{self.path}: a policy of {has[0]} states and {has[1]} actions",
+                found=f"recordings of {recorded[0]} and {recorded[1]}",
+                remedy="give the dataset that it was trained on",
+            )
+        if self.format != "lerobot" or self.report["written_here"]:
+            if rate_hz != c.rate_hz:
+                raise CheckpointError(
+                    f"{self.path}: plans {c.rate_hz:g} steps a second",
+                    found=f"recordings of {rate_hz:g} frames a second",
+                    remedy="give recordings of that rate",
+                )
+            return self
+
+        def taken(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
+            return norm and Affine(tuple(norm.scale[i] for i in order), tuple(norm.shift[i] for i in order))
+
+        states, actions = list(layout.state_order), list(layout.action_order)
+        weights = dict(self.weights)
+        for name, order, axis in (
+            ("encoder_robot_state_input_proj.weight", states, 1),
+            ("vae_encoder_robot_state_input_proj.weight", states, 1),
+            ("vae_encoder_action_input_proj.weight", actions, 1),
+            ("action_head.weight", actions, 0),
+            ("action_head.bias", actions, 0),
+        ):
+            if name in weights:
+                weights[name] = weights[name].index_select(axis, torch.tensor(order))
+        config = replace(
+            c,
+            cameras=(layout.camera,) if len(c.cameras) == 1 else c.cameras,
+            state_names=layout.state_names,
+            action_names=layout.action_names,
+            rate_hz=rate_hz,
+            state_norm=taken(c.state_norm, layout.state_order),
+            action_unnorm=taken(c.action_unnorm, layout.action_order),
+        )
+        return replace(
+            self, config=config, weights=weights, report=self.report | {"normalisation": normalisation(config)}
+        )
 
 
 def load_checkpoint(path: Path | str) -> Checkpoint:
@@ -418,7 +476,11 @@ def _load_lerobot(folder: Path) -> Checkpoint:
                 f"{folder}: config and weights do not agree ('{name}' has shape {shape}, the weights are for {size})",
                 remedy=COPY_AGAIN,
             )
-    extra = {"optimizer_mb": 0.0, "normalisation_from": {"in": inner.source, "out": outer.source}}
+    extra = {
+        "optimizer_mb": 0.0,
+        "normalisation_from": {"in": inner.source, "out": outer.source},
+        "written_here": (folder / ORIGIN).exists(),
+    }
     return _checked(folder, "lerobot", config, weights, sha256_of(file), file.stat().st_size, extra)
 
 

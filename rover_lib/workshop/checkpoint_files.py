@@ -13,9 +13,9 @@ from torch import Tensor
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
+from rover_lib.workshop.checkpoint import ORIGIN
 from rover_lib.workshop.training import trainer_config
 
-ORIGIN = "origin.json"  # in LeRobot's folder, whose config.json refuses what it does not know
 EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
 
 

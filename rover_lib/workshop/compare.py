@@ -314,13 +314,12 @@ def metrics(
 
 
 def _plain_worst(worst: WorstFrame) -> dict[str, Any]:
-    path = getattr(worst.sample, "frame_path", None)
     return {
         "mode": worst.mode,
         "action": worst.action,
         "error_pct": worst.error_pct,
         "episode": getattr(worst.sample, "episode", None),
-        "frame": path.name if path else None,
+        "frame": getattr(worst.sample, "frame_name", None),
         "fp32": worst.reference,
         "int8": worst.other,
     }

@@ -46,6 +46,7 @@ from rover_lib.workshop.lessons import BLOCK, BatchedPolicy, Lessons
 from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.quantize import quantize
+from rover_lib.workshop.samples import Source
 from rover_lib.workshop.scheme import Scheme
 from rover_lib.workshop.session import SMALL_GMAC, Opened, load
 from rover_lib.workshop.student import StudentShape, initial_weights, student_config
@@ -88,7 +89,7 @@ class Recipe:
 
 def distill(
     checkpoint: Path | str,
-    episodes: Path | str,
+    episodes: Path | str | Source,
     name: str,
     shape: StudentShape,
     *,

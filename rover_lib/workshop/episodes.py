@@ -35,11 +35,9 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.picture import PictureError, read_jpeg
 from rover_lib.onboard.pwm import NEUTRAL, PwmCalibration
 from rover_lib.onboard.recording import (
     BURST_MIN,
-    CHANNELS,
     CONTROL_FIELDS,
     FRAME_FIELDS,
     arduino_step_s,
@@ -47,115 +45,16 @@ from rover_lib.onboard.recording import (
     no_pulse,
     number_of,
 )
-from rover_lib.onboard.stage import sha256_of
+from rover_lib.workshop import lerobot_dataset
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source, relative
 from rover_lib.workshop.untrusted import listed, shown
 
-ACTION_NAMES = CHANNELS
 DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged, two in a row are a hole in time
 HOLE_S = 0.5  # and so is this, whatever is usual: no camera of a moving car is that slow
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 DISAGREES = 1e-3  # recorded action against the one computed from its pulse; the recordings hold 5e-5
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Something wrong in a recording: `count` times `kind` in `file` (relative to the root), with the first
-    in words.
-    """
-
-    file: str
-    kind: str
-    count: int
-    note: str
-
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """One training or calibration pair.
-
-    time_s: seconds since the episode's first frame. state: (2,) float32, the previous frame's [steering,
-    throttle]. chunk: (chunk, 2) float32, this frame's action and the following ones. is_pad: (chunk,) bool,
-    True past the end.
-    """
-
-    episode: str
-    frame_path: Path
-    time_s: float
-    state: np.ndarray
-    chunk: np.ndarray
-    is_pad: np.ndarray
-
-    def frame_bgr(self) -> np.ndarray:
-        """The picture, (h, w, 3) uint8 BGR. Raises EpisodeError if it is gone, or no whole JPEG of a camera's size."""
-        try:
-            return read_jpeg(self.frame_path)
-        except OSError as e:
-            raise EpisodeError(
-                f"{self.frame_path}: cannot be read ({e.strerror})", remedy="restore it or load again"
-            ) from None
-        except PictureError as e:
-            raise EpisodeError(
-                f"{self.frame_path}: {e.what}", found=e.found, remedy="delete it or record the episode again"
-            ) from None
-
-
-@dataclass(frozen=True, eq=False)
-class Episode:
-    """One drive. frames and controls: how many were listed; duration_s: first to last frame."""
-
-    id: str
-    path: Path
-    label: str
-    duration_s: float
-    frames: int
-    controls: int
-    samples: tuple[Sample, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Recordings:
-    """All usable episodes below `root`, and what was wrong with the rest."""
-
-    root: Path
-    episodes: tuple[Episode, ...]
-    faults: tuple[Fault, ...]
-
-    @property
-    def samples(self) -> tuple[Sample, ...]:
-        """Every episode's samples, in order."""
-        return tuple(s for e in self.episodes for s in e.samples)
-
-    def action_range(self) -> dict[str, tuple[float, float]]:
-        """Smallest and largest recorded value of each action: what errors are given as a share of."""
-        actions = np.concatenate([s.chunk for s in self.samples])  # padding repeats values that are in it anyway
-        return {n: (float(actions[:, i].min()), float(actions[:, i].max())) for i, n in enumerate(ACTION_NAMES)}
-
-    def hashes(self) -> dict[str, str]:
-        """SHA-256 of every file that the samples came from, by its path relative to `root`."""
-        hashes = {}
-        for episode in self.episodes:
-            used = [p for name in DATA_FILES if (p := episode.path / name).is_file()]
-            for path in used + [s.frame_path for s in episode.samples]:
-                try:
-                    hashes[_relative(path, self.root)] = sha256_of(path)
-                except OSError as e:
-                    raise EpisodeError(f"{path}: cannot be read any more ({e.strerror})", remedy="load again") from None
-        return hashes
-
-    def summary(self) -> dict[str, Any]:
-        """Counts, ranges and faults as plain JSON types, for load.json."""
-        return {
-            "episodes": len(self.episodes),
-            "frames": sum(e.frames for e in self.episodes),
-            "controls": sum(e.controls for e in self.episodes),
-            "samples": len(self.samples),
-            "duration_s": sum(e.duration_s for e in self.episodes),
-            "labels": sorted({e.label for e in self.episodes}),
-            "action_range": {name: list(ends) for name, ends in self.action_range().items()},
-            "faults": [{"file": f.file, "kind": f.kind, "count": f.count, "note": f.note} for f in self.faults],
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +81,7 @@ class _Faults:
 
     def add(self, path: Path, kind: str, note: str, count: int = 1) -> None:
         if count:
-            entry = self.counted.setdefault((_relative(path, self.root), kind), [0, note])
+            entry = self.counted.setdefault((relative(path, self.root), kind), [0, note])
             entry[0] += count
 
     def listed(self) -> tuple[Fault, ...]:
@@ -209,22 +108,31 @@ class _Frame:
 
 
 def load_recordings(
-    root: Path | str,
+    root: Path | str | Source,
     chunk: int = 32,
     sync_s: float = 0.05,
     progress: Progress = silent,
     pwm: PwmCalibration | None = None,
 ) -> Recordings:
-    """Read every episode folder below `root` (or `root` itself, if it is one).
+    """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset.
 
     chunk: actions per sample. sync_s: how far a control may be from its frame. Faults are counted and skipped;
     pictures are only checked for their ends here and decoded in `Sample.frame_bgr`. Raises EpisodeError when
     nothing usable is left, with the most frequent reasons.
     """
-    root = Path(root)
-    root = root if root.name else root.resolve()  # "." has no name to give an episode
+    source = Source.of(root)
+    root = source.path
     if chunk < 1 or not sync_s > 0:
         raise EpisodeError("chunk must be at least 1 and sync_s above 0", found=f"{chunk} and {sync_s}")
+    if lerobot_dataset.is_dataset(root):
+        return lerobot_dataset.load_dataset(source, chunk, progress)
+    if source.action_names not in ((), ACTION_NAMES):
+        raise EpisodeError(
+            f"{root}: recordings of this project name their actions themselves",
+            found=f"--action-names {','.join(source.action_names)}",
+            remedy="leave it out",
+        )
+    root = root if root.name else root.resolve()  # "." has no name to give an episode
     pwm = pwm or PwmCalibration()
     try:
         if any((root / name).exists() for name in DATA_FILES):
@@ -233,7 +141,8 @@ def load_recordings(
             folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and p.is_dir())
     except OSError as e:
         raise EpisodeError(
-            f"{root}: no folder of episodes ({e.strerror})", remedy="give the folder with episode_* in it"
+            f"{root}: no folder of episodes ({e.strerror})",
+            remedy="give the folder with episode_* in it, or a LeRobotDataset's (with meta/info.json)",
         ) from None
     if not folders:
         raise EpisodeError(
@@ -254,21 +163,11 @@ def load_recordings(
             f"{root}: no usable sample in {len(folders)} episode folder(s) ({worst or 'they are empty'})",
             remedy="record again, or copy the whole folders, frames included",
         )
-    return Recordings(root, episodes, faults.listed())
-
-
-def _relative(path: Path, root: Path) -> str:
-    try:
-        return path.relative_to(root).as_posix()
-    except ValueError:
-        return path.name
+    return Recordings(root, episodes, faults.listed(), source)
 
 
 def _load_episode(folder: Path, chunk: int, sync_s: float, pwm: PwmCalibration, faults: _Faults) -> Episode | None:
     """One folder's episode, or None with a fault that says why."""
-    if folder.is_symlink() and not _inside(folder, folder.parent):
-        faults.add(folder, "path_leaves_folder", "the episode is a link to somewhere else")
-        return None
     try:
         present = any((folder / name).exists() for name in DATA_FILES)
     except OSError as e:
@@ -301,6 +200,7 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, pwm: PwmCalibration, 
         frames=len(tables["frame_samples"][1]),
         controls=len(tables["control_samples"][1]),
         samples=samples,
+        files=tuple(p for name in DATA_FILES if (p := folder / name).is_file()),
     )
 
 

@@ -118,7 +118,13 @@ def write_load(run_dir: Path | str, loaded: Opened, note: str = "") -> None:
     }
     if note:
         metrics["note"] = note
-    given = {"checkpoint": checkpoint.path.resolve(), "episodes": recordings.root.resolve()}
+    source = recordings.source
+    given = {
+        "checkpoint": checkpoint.path.resolve(),
+        "episodes": recordings.root.resolve(),
+        "action_names": ",".join(source.action_names),
+        "camera": source.camera,
+    }
     inputs = {checkpoint.path.name: checkpoint.sha256} | recordings.hashes()
     write_stage(Path(run_dir) / "load.json", "load", params=given, metrics=metrics, inputs=inputs)
 
@@ -140,7 +146,8 @@ def write_calibrate(
         "ranges": calibration.ranges,
         "episodes": sorted({s.episode for s in samples}),
     }
-    inputs = {f"{s.episode}/{s.frame_path.name}": sha256_of(s.frame_path) for s in samples}
+    digests = {path: sha256_of(path) for path in {s.frame_path for s in samples}}  # a video holds many frames
+    inputs = {f"{s.episode}/{s.frame_path.name}": digests[s.frame_path] for s in samples}
     inputs["checkpoint"] = checkpoint.sha256
     given = {"samples": recipe.samples, "seed": recipe.seed, "smooth": recipe.scheme.smooth}
     write_stage(Path(run_dir) / "calibrate.json", "calibrate", params=given, metrics=metrics, inputs=inputs)

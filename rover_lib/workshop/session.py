@@ -3,17 +3,18 @@
 Apart from `run`, so that a kernel need not import what only executing notebooks needs.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import EpisodeError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.samples import ACTION_NAMES, Source
 
 SMALL_GMAC = 1.0  # below this a second thread costs more, on a busy machine, than it brings
 
@@ -27,12 +28,27 @@ class Opened:
     parts: Split
 
 
-def load(checkpoint: Path | str, episodes: Path | str, progress: Progress = silent) -> Opened:
-    """Read a checkpoint and its recordings, and part them as params.yml says. Raises CheckpointError, EpisodeError."""
+def load(checkpoint: Path | str, episodes: Path | str | Source, progress: Progress = silent) -> Opened:
+    """Read a checkpoint and its recordings, and part them as params.yml says.
+
+    Of a LeRobotDataset the policy's own camera is read, if nobody chose another, and a LeRobot policy gets the order
+    and the rate of the numbers that it was trained on. Raises CheckpointError, and EpisodeError also for recordings of
+    what is no car.
+    """
     p = params()["calibration"]
     policy = load_checkpoint(checkpoint)
-    recordings = load_recordings(episodes, policy.config.chunk, p["sync_s"], progress)
-    return Opened(policy, recordings, split(recordings, p["held_out_share"], p["seed"]))
+    source = Source.of(episodes)
+    if policy.format == "lerobot" and not source.camera and len(policy.config.cameras) == 1:
+        source = replace(source, camera=policy.config.cameras[0])  # the trainer's file does not say what it is called
+    recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
+    layout = recordings.layout
+    for what, names in (("state", layout.state_names), ("action", layout.action_names)):
+        if names != ACTION_NAMES:
+            raise EpisodeError(
+                f"{recordings.root}: the {what} is {list(names)}, a rover's is {list(ACTION_NAMES)}",
+                remedy="if it is one by another name, say so: --action-names, in the order of its numbers",
+            )
+    return Opened(policy.recorded_as(layout), recordings, split(recordings, p["held_out_share"], p["seed"]))
 
 
 def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:
@@ -43,7 +59,9 @@ def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:
     stage = read_stage(Path(run_dir) / "load.json", "load")
     if sum(stage["metrics"]["checkpoint"]["macs_by_block"].values()) < SMALL_GMAC * 1e9:
         torch.set_num_threads(1)
-    again = load(stage["params"]["checkpoint"], stage["params"]["episodes"], progress)
+    given = stage["params"]
+    source = Source.of(given["episodes"], given.get("action_names", ""), given.get("camera", ""))
+    again = load(given["checkpoint"], source, progress)
     if again.checkpoint.sha256 != stage["metrics"]["checkpoint"]["sha256"]:
         raise RoverError(
             f"{again.checkpoint.path}: is not what notebook 01 loaded any more", remedy="run notebook 01 again"

@@ -517,8 +517,10 @@ def test_links_instead_of_data(tmp_path):
     (tmp_path / "mine/.episode_20260106_000000.tmp").mkdir()  # a recorder at work
     (tmp_path / "mine/notes.txt").write_text("x")
     recordings = load(tmp_path / "mine")
-    assert [e.id for e in recordings.episodes] == ["episode_20260101_000000"]
-    assert kinds(recordings) == {"path_leaves_folder": 2, "absent": 2, "nothing_usable": 1, "no_data": 1}
+    # a linked episode is its owner's choice; what a recording's own files point to is not
+    assert [e.id for e in recordings.episodes] == ["episode_20260101_000000", "episode_20260103_000000"]
+    assert len(recordings.episodes[0].samples) == len(recordings.episodes[1].samples)
+    assert kinds(recordings) == {"path_leaves_folder": 1, "absent": 2, "nothing_usable": 1, "no_data": 1}
 
 
 @pytest.mark.parametrize("make", ["nothing", "file", "empty", "strangers"])

@@ -1,0 +1,300 @@
+"""LeRobotDataset v3 as recordings: read by LeRobot's own loader, images or video, and checked before it is used.
+
+    recordings = load_dataset(Source(Path("my_dataset"), ("throttle", "steering")), chunk=32)
+
+What its numbers mean is read from the names of its features, and said by the user where they have none; it is never
+guessed, because a throttle in the place of a steering angle trains, calibrates and compares without any complaint.
+"""
+
+import json
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.policy import ACTION_LIMITS
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.samples import ACTION_NAMES, Episode, Layout, Recordings, Sample, Source
+from rover_lib.workshop.untrusted import listed, shown
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+INFO = Path("meta/info.json")
+INFO_BYTES = 5_000_000  # LeRobot's: some kB
+CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
+BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
+STATE, ACTION, CAMERA = "observation.state", "action", "observation.images."
+COPY_AGAIN = "copy the whole dataset again"
+UNEVEN = 0.1  # of the time between two frames
+
+
+def is_dataset(root: Path) -> bool:
+    """Whether a folder is a LeRobotDataset, of whatever version."""
+    return (root / INFO).is_file()
+
+
+@dataclass(frozen=True, eq=False)
+class _Pictures:
+    """One camera of a dataset, opened once for all of its samples. size: (height, width)."""
+
+    dataset: "LeRobotDataset"
+    key: str
+    size: tuple[int, int]
+
+    def frame_bgr(self, row: int, path: Path) -> np.ndarray:
+        with _said_of(path, f"its frame {row} cannot be decoded"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of torchvision, about the decoder that LeRobot has chosen
+            pixels = self.dataset[row][self.key]  # (3, h, w) float32 in [0, 1]
+        frame = (pixels * 255).round().byte().permute(1, 2, 0).numpy()  # uint8 / 255 times 255: exact
+        if frame.shape != (*self.size, 3):
+            raise EpisodeError(
+                f"{path}: its frame {row} has another shape than meta/info.json says, {(*self.size, 3)}",
+                found=frame.shape,
+                remedy="record pictures of one size in one dataset",
+            )
+        return np.ascontiguousarray(frame[..., ::-1])
+
+
+@dataclass(frozen=True, eq=False)
+class LerobotSample(Sample):
+    """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file."""
+
+    pictures: _Pictures
+    row: int  # in the whole dataset
+
+    @property
+    def frame_name(self) -> str:
+        return f"frame {self.row}"
+
+    def frame_bgr(self) -> np.ndarray:
+        """The picture, (h, w, 3) uint8 BGR: LeRobot's own item. Raises EpisodeError if it cannot be decoded."""
+        return self.pictures.frame_bgr(self.row, self.frame_path)
+
+
+def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Recordings:
+    """Read a LeRobotDataset v3 folder.
+
+    chunk: actions per sample, padded at an episode's end with its last one. Each frame is a sample, with the state
+    that was recorded with it. Raises EpisodeError, in one sentence, for another version, for what is damaged or
+    missing, for numbers that no rover can mean, and where it is not said which camera and which numbers are the car's.
+    """
+    root = source.path
+    info = _read_info(root)
+    layout, key = _layout(root, info, source)
+    dataset = _opened(root)
+    columns = _columns(root, dataset, layout)
+    pictures = _Pictures(dataset, key, _picture_size(root, key, info["features"][key]))
+    _check_rate(root, columns, float(info["fps"]))
+    number = columns["episode_index"]
+    starts = np.flatnonzero(np.diff(number, prepend=-1))
+    episodes = []
+    for rows in progress(np.split(np.arange(len(number)), starts[1:]), desc="reading episodes", total=len(starts)):
+        episodes.append(_episode(root, pictures, columns, rows, chunk))
+    last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
+    for sample in last.values():  # a file that was cut lacks its end
+        sample.frame_bgr()
+    return Recordings(root, tuple(episodes), (), source, layout)
+
+
+def _read_info(root: Path) -> dict[str, Any]:
+    path = root / INFO
+    try:
+        if path.stat().st_size > INFO_BYTES:
+            raise EpisodeError(f"{path}: is larger than any that LeRobot writes", remedy=COPY_AGAIN)
+        info = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as e:
+        raise EpisodeError(f"{path}: not readable as JSON ({shown(str(e))})", remedy=COPY_AGAIN) from None
+    version = info.get("codebase_version") if isinstance(info, dict) else None
+    if not isinstance(version, str) or not version.startswith("v"):
+        raise EpisodeError(f"{path}: says no version of LeRobot's format", found=shown(version), remedy=COPY_AGAIN)
+    if version.startswith(("v1", "v2")):
+        raise EpisodeError(
+            f"{root}: a LeRobotDataset {version}, only v3 is read",
+            remedy=f"convert it once by LeRobot's own '{CONVERTER} --repo-id=... --root={root}'",
+        )
+    if not version.startswith("v3"):
+        raise EpisodeError(f"{root}: a LeRobotDataset {shown(version)}, only v3 is known here")
+    features, fps = info.get("features"), info.get("fps")
+    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
+        raise EpisodeError(f"{path}: says no frames a second", found=shown(fps), remedy=COPY_AGAIN)
+    if not isinstance(features, dict) or not all(_is_feature(f) for f in features.values()):
+        raise EpisodeError(f"{path}: its features are no objects with a dtype and a shape", remedy=COPY_AGAIN)
+    return info
+
+
+def _is_feature(feature: Any) -> bool:
+    shape = feature.get("shape") if isinstance(feature, dict) else None
+    return isinstance(shape, list) and all(isinstance(n, int) and 0 < n <= 10_000 for n in shape)
+
+
+def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, str]:
+    """Which camera and which numbers are whose, and the camera's whole name."""
+    features = info["features"]
+    cameras = {k.removeprefix(CAMERA): k for k, f in features.items() if f.get("dtype") in ("image", "video")}
+    if not cameras:
+        raise EpisodeError(f"{root}: has no camera", found=listed(features), remedy="record one that sees")
+    camera = source.camera or (next(iter(cameras)) if len(cameras) == 1 else "")
+    if camera not in cameras:
+        what = f"has no camera {shown(camera)}" if camera else f"has {len(cameras)} cameras"
+        raise EpisodeError(f"{root}: {what}", found=listed(cameras), remedy="say which is the car's: --camera NAME")
+    for key in (STATE, ACTION):
+        if key not in features or len(features[key]["shape"]) != 1:
+            found = features[key]["shape"] if key in features else listed(features)
+            raise EpisodeError(f"{root}: has no '{key}' that is a row of numbers", found=found, remedy="record one")
+    actions, action_order = _named(root, features, ACTION, source.action_names)
+    states, state_order = _named(root, features, STATE, _names(features[STATE]) or source.action_names)
+    layout = Layout(camera, states, actions, float(info["fps"]), state_order, action_order)
+    return layout, cameras[camera]
+
+
+def _named(
+    root: Path, features: Mapping[str, Any], key: str, said: tuple[str, ...]
+) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Names of a feature's numbers, and their columns: a car's as [steering, throttle], others as they lie."""
+    (size,) = features[key]["shape"]
+    names = said or _names(features[key])
+    if not names:
+        raise EpisodeError(
+            f"{root}: '{key}' does not say which of its {size} numbers is what",
+            remedy=f"say it once, in the order of its numbers: --action-names {','.join(ACTION_NAMES)}",
+        )
+    if len(names) != size or len(set(names)) != size:
+        raise EpisodeError(
+            f"{root}: '{key}' has {size} numbers, their names are {listed(names)}",
+            remedy="name each once: --action-names with commas between",
+        )
+    if set(names) == set(ACTION_NAMES):
+        return ACTION_NAMES, tuple(names.index(name) for name in ACTION_NAMES)
+    return names, tuple(range(size))
+
+
+def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    """The names in a feature, in each of the forms in which LeRobot's users write them; none where there are none."""
+    names = feature.get("names")
+    if isinstance(names, dict) and names and all(type(v) is int for v in names.values()):
+        names = sorted(names, key=names.__getitem__)  # by column
+    elif isinstance(names, dict) and len(names) == 1:
+        (names,) = names.values()  # {"motors": [...]}
+    if isinstance(names, list) and names and all(isinstance(n, str) for n in names):
+        return tuple(names)
+    return ()
+
+
+def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:
+    shape = list(feature["shape"])
+    if len(shape) == 3 and 3 in (shape[0], shape[2]):
+        return (shape[0], shape[1]) if shape[2] == 3 else (shape[1], shape[2])
+    raise EpisodeError(f"{root}: '{key}' is no camera in colour", found=shape, remedy="choose another: --camera NAME")
+
+
+def _opened(root: Path) -> "LeRobotDataset":
+    """LeRobot's own loader on a local folder. It would fetch what is missing there: here that is an error."""
+    # here, because it takes seconds that our own recordings need not wait for
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
+
+    class Local(LeRobotDataset):
+        def download(self, download_videos: bool = True) -> None:
+            raise FileNotFoundError("frames of some of its episodes are not there")
+
+    for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
+        if not list(root.glob(pattern)):
+            raise EpisodeError(f"{root}: has no {pattern}", remedy=COPY_AGAIN)
+    given = {"repo_id": f"local/{root.resolve().name}", "root": root, "revision": "local"}
+    with _said_of(root, "LeRobot cannot read it"):
+        meta = LeRobotDatasetMetadata(**given)
+        for key in meta.video_keys:
+            for number in range(meta.total_episodes):
+                if not (video := root / meta.get_video_file_path(number, key)).is_file():
+                    raise EpisodeError(f"{video}: not there", remedy=COPY_AGAIN)
+        return Local(**given, video_backend=BACKEND)
+
+
+@contextmanager
+def _said_of(path: Path, what: str) -> Iterator[None]:
+    """Whatever a loader says of a file, in one sentence."""
+    try:
+        yield
+    except EpisodeError:
+        raise
+    except Exception as e:  # of parquet, mp4, datasets and LeRobot, each with types of its own
+        cause = e.__cause__ or e  # datasets wraps what pyarrow said
+        reason = " ".join(str(cause).split())[:160]
+        text = f"{type(cause).__name__}: {reason}" if reason else type(cause).__name__
+        raise EpisodeError(f"{path}: {what} ({text})", remedy=COPY_AGAIN) from None
+
+
+def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
+    """All frames' numbers, in their order: state (n, S) and action (n, A) float32 by the layout's names, and times."""
+    names = [STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index"]
+    with _said_of(root, "its numbers cannot be read"):
+        columns = dataset.hf_dataset.select_columns(names).with_format("numpy")[:]
+        for key, order in ((STATE, layout.state_order), (ACTION, layout.action_order)):
+            rows = np.stack(list(columns[key])).astype(np.float32).reshape(len(columns[key]), -1)
+            columns[key] = np.ascontiguousarray(rows[:, list(order)])
+    for key, labels in ((STATE, layout.state_names), (ACTION, layout.action_names)):
+        for i, name in enumerate(labels):
+            low, high = ACTION_LIMITS.get(name, (-np.inf, np.inf)) if key == ACTION else (-np.inf, np.inf)
+            values = columns[key][:, i]
+            if wrong := np.flatnonzero(~np.isfinite(values) | (values < low) | (values > high)).tolist():
+                raise EpisodeError(
+                    f"{root}: {name} of '{key}' is {values[wrong[0]]:g} in frame {wrong[0]} and {len(wrong) - 1} more, "
+                    f"a rover's lies from {low:g} to {high:g}",
+                    remedy="are the names in the right order (--action-names), and the numbers in our units?",
+                )
+    return columns
+
+
+def _check_rate(root: Path, columns: Mapping[str, np.ndarray], fps: float) -> None:
+    """Raise EpisodeError for frames that do not come `fps` a second: the steps of a plan would not be what they say."""
+    times_s, number = columns["timestamp"].astype(np.float64), columns["episode_index"]
+    steps_s = np.diff(times_s)[number[1:] == number[:-1]]
+    if len(odd := steps_s[np.abs(steps_s * fps - 1) > UNEVEN]):
+        raise EpisodeError(
+            f"{root}: meta/info.json says {fps:g} frames a second, but {len(odd)} frames come at another rate",
+            found=f"{odd[0]:.4f} s after the one before",
+            remedy="correct the rate, or record again",
+        )
+
+
+def _episode(
+    root: Path, pictures: _Pictures, columns: Mapping[str, np.ndarray], rows: np.ndarray, chunk: int
+) -> Episode:
+    """rows: of the whole dataset, those of one episode."""
+    meta, first, n = pictures.dataset.meta, int(rows[0]), len(rows)
+    number = int(columns["episode_index"][first])
+    name, data = f"episode_{number:06d}", root / meta.get_data_file_path(number)
+    video = pictures.key in meta.video_keys
+    holds = root / meta.get_video_file_path(number, pictures.key) if video else data
+    index = np.arange(n)[:, None] + np.arange(chunk)
+    actions, pads = columns[ACTION][rows], index >= n
+    chunks = actions[np.minimum(index, n - 1)]
+    samples = tuple(
+        LerobotSample(
+            episode=name,
+            frame_path=holds,
+            time_s=float(columns["timestamp"][row] - columns["timestamp"][first]),
+            state=columns[STATE][row].copy(),
+            chunk=chunks[k].copy(),
+            is_pad=pads[k].copy(),
+            pictures=pictures,
+            row=int(row),
+        )
+        for k, row in enumerate(rows)
+    )
+    task = meta.tasks.index[meta.tasks["task_index"] == columns["task_index"][first]]
+    return Episode(
+        id=name,
+        path=root,
+        label=str(task[0]) if len(task) else "",
+        duration_s=samples[-1].time_s,
+        frames=n,
+        controls=n,
+        samples=samples,
+        files=(root / INFO, data),
+    )

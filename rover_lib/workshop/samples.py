@@ -1,0 +1,180 @@
+"""What a recording becomes, whoever wrote it: samples by episode, where they are from, and what was wrong.
+
+`episodes` reads our own recordings and `lerobot_dataset` LeRobot's; behind them nobody asks which of the two it was.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.picture import PictureError, read_jpeg
+from rover_lib.onboard.recording import CHANNELS
+from rover_lib.onboard.stage import sha256_of
+
+ACTION_NAMES = CHANNELS
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where recordings are, and what a user says of a dataset that does not say it itself.
+
+    action_names: in the order of its numbers, and of its state's where that is unnamed too. camera: the policy's.
+    """
+
+    path: Path
+    action_names: tuple[str, ...] = ()
+    camera: str = ""
+
+    @classmethod
+    def of(cls, path: "Path | str | Source", action_names: str = "", camera: str = "") -> "Source":
+        """action_names: with commas between, as on a command line. A source stays what it is."""
+        if isinstance(path, Source):
+            return path
+        return cls(Path(path), tuple(name.strip() for name in action_names.split(",") if name.strip()), camera)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which camera and which numbers the samples have.
+
+    rate_hz: frames a second, None where a recording says nothing of it. state_order, action_order: the file's columns,
+    in the order of the names; a car's are always [steering, throttle] here, in whatever order they were recorded.
+    """
+
+    camera: str = "the car's"
+    state_names: tuple[str, ...] = ACTION_NAMES
+    action_names: tuple[str, ...] = ACTION_NAMES
+    rate_hz: float | None = None
+    state_order: tuple[int, ...] = (0, 1)
+    action_order: tuple[int, ...] = (0, 1)
+
+    def words(self) -> str:
+        """A line for a user, who should find his own car in it."""
+
+        def columns(names: tuple[str, ...], order: tuple[int, ...]) -> str:
+            swapped = list(order) != sorted(order)
+            return ", ".join(f"{n} (column {i})" if swapped else n for n, i in zip(names, order, strict=True))
+
+        rate = f", {self.rate_hz:g} frames a second" if self.rate_hz else ""
+        state, action = columns(self.state_names, self.state_order), columns(self.action_names, self.action_order)
+        return f"camera: {self.camera}; state: {state}; action: {action}{rate}"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something wrong in a recording: `count` times `kind` in `file` (relative to the root), with the first
+    in words.
+    """
+
+    file: str
+    kind: str
+    count: int
+    note: str
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One training or calibration pair.
+
+    time_s: seconds since the episode's first frame. state: (S,) float32, in our recordings the previous frame's
+    [steering, throttle]. chunk: (chunk, A) float32, this frame's action and the following ones. is_pad: (chunk,)
+    bool, True past the end.
+    """
+
+    episode: str
+    frame_path: Path  # the file that holds the picture, alone or among others
+    time_s: float
+    state: np.ndarray
+    chunk: np.ndarray
+    is_pad: np.ndarray
+
+    @property
+    def frame_name(self) -> str:
+        """What to call the picture within its episode."""
+        return self.frame_path.name
+
+    def frame_bgr(self) -> np.ndarray:
+        """The picture, (h, w, 3) uint8 BGR. Raises EpisodeError if it is gone, or no whole JPEG of a camera's size."""
+        try:
+            return read_jpeg(self.frame_path)
+        except OSError as e:
+            raise EpisodeError(
+                f"{self.frame_path}: cannot be read ({e.strerror})", remedy="restore it or load again"
+            ) from None
+        except PictureError as e:
+            raise EpisodeError(
+                f"{self.frame_path}: {e.what}", found=e.found, remedy="delete it or record the episode again"
+            ) from None
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One drive. frames and controls: how many were listed; duration_s: first to last frame."""
+
+    id: str
+    path: Path
+    label: str
+    duration_s: float
+    frames: int
+    controls: int
+    samples: tuple[Sample, ...]
+    files: tuple[Path, ...]  # that the numbers came from
+
+
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """All usable episodes below `root`, and what was wrong with the rest."""
+
+    root: Path
+    episodes: tuple[Episode, ...]
+    faults: tuple[Fault, ...]
+    source: Source
+    layout: Layout = Layout()
+
+    @property
+    def samples(self) -> tuple[Sample, ...]:
+        """Every episode's samples, in order."""
+        return tuple(s for e in self.episodes for s in e.samples)
+
+    def action_range(self) -> dict[str, tuple[float, float]]:
+        """Smallest and largest recorded value of each action: what errors are given as a share of."""
+        actions = np.concatenate([s.chunk for s in self.samples])  # padding repeats values that are in it anyway
+        return {
+            n: (float(actions[:, i].min()), float(actions[:, i].max())) for i, n in enumerate(self.layout.action_names)
+        }
+
+    def hashes(self) -> dict[str, str]:
+        """SHA-256 of every file that the samples came from, by its path relative to `root`."""
+        files = {path: None for e in self.episodes for path in (*e.files, *(s.frame_path for s in e.samples))}
+        hashes = {}
+        for path in files:
+            try:
+                hashes[relative(path, self.root)] = sha256_of(path)
+            except OSError as e:
+                raise EpisodeError(f"{path}: cannot be read any more ({e.strerror})", remedy="load again") from None
+        return hashes
+
+    def summary(self) -> dict[str, Any]:
+        """Counts, ranges and faults as plain JSON types, for load.json."""
+        return {
+            "episodes": len(self.episodes),
+            "frames": sum(e.frames for e in self.episodes),
+            "controls": sum(e.controls for e in self.episodes),
+            "samples": len(self.samples),
+            "duration_s": sum(e.duration_s for e in self.episodes),
+            "layout": self.layout.words(),
+            "labels": sorted({e.label for e in self.episodes}),
+            "action_range": {name: list(ends) for name, ends in self.action_range().items()},
+            "faults": [{"file": f.file, "kind": f.kind, "count": f.count, "note": f.note} for f in self.faults],
+        }
+
+
+def relative(path: Path, root: Path) -> str:
+    """A file's path as reports name it."""
+    try:
+        return path.relative_to(root).as_posix()
+    except ValueError:
+        return path.name

@@ -1,0 +1,328 @@
+"""LeRobotDatasets, made by LeRobot's own writer: every number and pixel as its own items have them, or one sentence."""
+
+import functools
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+from policies import TINY, lerobot_policy, memory_samples, smooth_frame
+
+from rover_lib.cli import main
+from rover_lib.onboard.errors import CheckpointError, EpisodeError
+from rover_lib.onboard.policy import load_policy
+from rover_lib.workshop.act import ACT, inputs_of, predictions
+from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint_files import write_lerobot
+from rover_lib.workshop.episodes import load_recordings, split
+from rover_lib.workshop.samples import Layout, Source
+from rover_lib.workshop.session import load
+
+CHUNK, FPS, SIZE = 8, 20, (72, 128)
+CAR, SWAPPED = ("steering", "throttle"), ("throttle", "steering")
+EPISODES, FRAMES = 3, 10
+
+# ---- what is refused before LeRobot is asked: quick ---------------------------------------------------------------
+
+
+def info(**changes):
+    """meta/info.json of a dataset without data."""
+    features = {
+        "observation.images.front": {"dtype": "image", "shape": [*SIZE, 3], "names": ["height", "width", "channels"]},
+        "observation.state": {"dtype": "float32", "shape": [2], "names": CAR},
+        "action": {"dtype": "float32", "shape": [2], "names": CAR},
+    }
+    return {"codebase_version": "v3.0", "fps": FPS, "features": features, "total_episodes": 1} | changes
+
+
+def written(root, content):
+    (root / "meta").mkdir(parents=True, exist_ok=True)
+    (root / "meta/info.json").write_text(content if isinstance(content, str) else json.dumps(content))
+    return root
+
+
+def refused(source, **options) -> str:
+    with pytest.raises(EpisodeError) as e:
+        load_recordings(source, CHUNK, **options)
+    message = str(e.value)
+    assert "\n" not in message and len(message) < 500
+    return message
+
+
+def features(**changes):
+    """An edit of info()'s features: None removes one."""
+    named = {"front": "observation.images.front", "state": "observation.state", "left": "observation.images.left"}
+    content = info()
+    for name, change in changes.items():
+        content["features"][named.get(name, name)] = change
+    content["features"] = {k: v for k, v in content["features"].items() if v is not None}
+    return content
+
+
+TWO = {"dtype": "float32", "shape": [2], "names": None}
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (
+            info(codebase_version="v2.1"),
+            "only v3 is read; convert it once by LeRobot's own 'python -m lerobot.datasets",
+        ),
+        (info(codebase_version="v4.0"), "only v3 is known here"),
+        (info(codebase_version=3), "says no version"),
+        (info(fps=0), "says no frames a second"),
+        (info(features=[]), "no objects with a dtype and a shape"),
+        ("{", "not readable as JSON"),
+        ("[" * 100_000, "not readable as JSON"),
+        ("[]", "says no version"),
+        (features(front=None), "has no camera, found"),
+        (features(left=info()["features"]["observation.images.front"]), "has 2 cameras, found front, left"),
+        (features(action=None), "has no 'action'"),
+        (features(state={"dtype": "float32", "shape": [2, 2]}), "has no 'observation.state' that is a row of numbers"),
+        (features(action=TWO), "'action' does not say which of its 2 numbers is what"),
+        (features(state=TWO), "'observation.state' does not say which of its 2 numbers is what"),
+        (features(action=TWO | {"names": ["steering"]}), "has 2 numbers, their names are steering"),
+        (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
+        (features(), "has no meta/tasks.parquet"),
+    ],
+)
+def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
+    assert says in refused(written(tmp_path, content))
+
+
+def test_a_camera_that_is_not_there_is_refused(tmp_path):
+    assert "has no camera 'left', found front" in refused(Source.of(written(tmp_path, info()), camera="left"))
+
+
+def test_our_own_recordings_say_their_names_themselves(tmp_path):
+    (tmp_path / "episode_20260101_120000").mkdir()
+    assert "name their actions themselves" in refused(Source.of(tmp_path, "throttle,steering"))
+
+
+# ---- what LeRobot's writer made ------------------------------------------------------------------------------------
+
+
+def make(root, kind="image", actions=CAR, states=CAR, fps=FPS, value=None):
+    """EPISODES of FRAMES by LeRobot's writer. actions, states: the features' names. value: of every action."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    shape = {"dtype": "float32", "shape": (2,)}
+    made = LeRobotDataset.create(
+        "local/made",
+        fps,
+        {
+            "observation.images.cam_front": {
+                "dtype": kind,
+                "shape": (*SIZE, 3),
+                "names": ["height", "width", "channels"],
+            },
+            "observation.state": shape | {"names": list(states)},
+            "action": shape | {"names": list(actions)},
+        },
+        root=root,
+        use_videos=kind == "video",
+        video_backend="pyav",
+    )
+    rng = np.random.default_rng(0)
+    for episode in range(EPISODES):
+        for _ in range(FRAMES + episode):
+            row = {
+                "observation.images.cam_front": smooth_frame(rng, *SIZE),
+                "observation.state": rng.uniform(0, 0.5, 2).astype(np.float32),
+                "action": rng.uniform(0, 0.5, 2).astype(np.float32) if value is None else np.float32(value),
+                "task": f"hit the {episode}. balloon",
+            }
+            made.add_frame(row)
+        made.save_episode()
+    made.finalize()
+    return root
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory):
+    """Makes each kind once; LeRobot's tables go into a cache of this module's."""
+    import datasets as huggingface
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(huggingface.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
+        yield functools.cache(
+            lambda kind="image", **options: make(tmp_path_factory.mktemp("made") / kind, kind, **options)
+        )
+
+
+@pytest.fixture
+def copied(datasets, tmp_path):
+    """A function that copies one of them, to be damaged."""
+    return lambda kind="image": shutil.copytree(datasets(kind), tmp_path / kind)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["image", "video"])
+def test_frames_states_and_chunks_are_lerobots_own_items(datasets, kind):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root = datasets(kind)
+    steps = {"action": [i / FPS for i in range(CHUNK)]}
+    theirs = LeRobotDataset("local/made", root, delta_timestamps=steps, video_backend="pyav")
+    recordings = load_recordings(root, CHUNK)
+    assert len(recordings.samples) == len(theirs) == EPISODES * FRAMES + 3
+    for sample, item in zip(recordings.samples, theirs, strict=True):
+        assert np.array_equal(sample.state, item["observation.state"].numpy())
+        assert np.array_equal(sample.chunk, item["action"].numpy())
+        assert np.array_equal(sample.is_pad, item["action_is_pad"].numpy())
+        assert sample.time_s == pytest.approx(item["timestamp"].item())
+        rgb = torch.from_numpy(np.ascontiguousarray(sample.frame_bgr()[..., ::-1])).permute(2, 0, 1).float() / 255
+        assert torch.equal(rgb, item["observation.images.cam_front"])
+        assert sample.state.dtype == sample.chunk.dtype == np.float32
+    assert [e.label for e in recordings.episodes] == [f"hit the {i}. balloon" for i in range(EPISODES)]
+    assert [e.frames for e in recordings.episodes] == [FRAMES, FRAMES + 1, FRAMES + 2]
+    assert recordings.layout == Layout("cam_front", rate_hz=FPS)
+    assert json.dumps(recordings.summary()) and "camera: cam_front; state: steering, thr" in recordings.layout.words()
+    assert set(recordings.hashes()) == {
+        "meta/info.json",
+        "data/chunk-000/file-000.parquet",
+        *(["videos/observation.images.cam_front/chunk-000/file-000.mp4"] if kind == "video" else []),
+    }
+    assert len(split(recordings).held_out) >= FRAMES
+
+
+@pytest.mark.slow
+def test_names_decide_the_order_or_the_user_does(datasets, tmp_path):
+    straight = load_recordings(datasets(), CHUNK).samples[5]
+    swapped = {"state": straight.state[::-1], "chunk": straight.chunk[:, ::-1]}
+    for names in (list(SWAPPED), {"motors": SWAPPED}, {"steering": 1, "throttle": 0}):
+        content = json.loads((datasets() / "meta/info.json").read_text())
+        for key in ("action", "observation.state"):
+            content["features"][key]["names"] = names
+        other = shutil.copytree(datasets(), tmp_path / "other", dirs_exist_ok=True)
+        written(other, content)
+        recordings = load_recordings(other, CHUNK)
+        assert recordings.layout.action_names == CAR and recordings.layout.action_order == (1, 0)
+        assert "action: steering (column 1), throttle (column 0)" in recordings.layout.words()
+        for part, expected in swapped.items():
+            assert np.array_equal(getattr(recordings.samples[5], part), expected)
+    for key in ("action", "observation.state"):
+        content["features"][key]["names"] = None
+    written(other, content)
+    assert "--action-names steering,throttle" in refused(other)
+    for said, part in (("throttle, steering", swapped["chunk"]), ("steering,throttle", straight.chunk)):
+        assert np.array_equal(load_recordings(Source.of(other, said), CHUNK).samples[5].chunk, part)
+    result = CliRunner().invoke(main, ["inspect", str(other), "--action-names", "throttle,steering"])
+    assert result.exit_code == 0 and "steering (column 1)" in result.output
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "file", "damage", "says"),
+    [
+        ("image", "data/chunk-000/file-000.parquet", cut, "LeRobot cannot read it"),
+        ("image", "data/chunk-000/file-000.parquet", lambda p: p.unlink(), "has no data/*/*.parquet"),
+        ("image", "meta/episodes/chunk-000/file-000.parquet", cut, "LeRobot cannot read it"),
+        ("video", "videos/observation.images.cam_front/chunk-000/file-000.mp4", cut, "cannot be decoded"),
+        ("video", "videos/observation.images.cam_front/chunk-000/file-000.mp4", lambda p: p.unlink(), "mp4: not there"),
+        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.update(fps=30)), "30 frames a second, but 30 frames"),
+        ("image", "meta/info.json",
+         lambda p: edit(p, lambda c: c["features"]["action"].update(shape=[3])), "has 3 numbers, their names are"),
+        ("image", "meta/info.json",
+         lambda p: edit(p, lambda c: c["features"]["action"].update(shape=[3], names=["a", "b", "c"])),
+         "LeRobot cannot read it (TypeError: Couldn't cast array"),
+        ("image", "meta/info.json",
+         lambda p: edit(p, lambda c: c["features"]["observation.images.cam_front"].update(shape=[36, 64, 3])),
+         "has another shape than meta/info.json says"),
+    ],
+)  # fmt: skip
+def test_damage_is_a_sentence(copied, kind, file, damage, says):
+    root = copied(kind)
+    damage(root / file)
+    assert says in refused(root)
+
+
+def edit(path, change):
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [(0.1, -0.5), (1500, 0.1), (np.nan, 0.1)])
+def test_numbers_that_no_rover_has_are_refused(datasets, value):
+    assert "a rover's lies from" in refused(datasets(value=value))
+
+
+# ---- policies that were trained on one -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A LeRobot policy of two numbers that its dataset calls [throttle, steering], with statistics of both."""
+    from test_checkpoint import normalised
+
+    folder = tmp_path_factory.mktemp("trained")
+    policy = lerobot_policy(**TINY)
+    inner, outer, _ = normalised(policy, "MEAN_STD")
+    for part in (policy, inner, outer):
+        part.save_pretrained(folder)
+    return folder
+
+
+def planned(checkpoint, sample):
+    return predictions(ACT(checkpoint.config, checkpoint.weights), [inputs_of(sample, checkpoint.config)])[0].numpy()
+
+
+def test_a_policy_is_put_into_the_recordings_order(trained, tmp_path):
+    policy = load_checkpoint(trained)
+    swapped = Layout("cam_front", rate_hz=20.0, state_order=(1, 0), action_order=(1, 0))
+    other = policy.recorded_as(swapped)
+    (sample,) = memory_samples(1)
+    expected = planned(policy, sample)[:, ::-1]
+    found = planned(other, replace_state(sample, sample.state[::-1]))
+    assert np.abs(found - expected).max() < 1e-6 < np.abs(found - expected[:, ::-1]).max()
+    assert other.config.rate_hz == 20 and other.report["normalisation"]["state"] == "(state - (0.25, 0.3)) / (0.3, 1.2)"
+    # what we write is in our order, and is not turned again
+    write_lerobot(tmp_path / "ours", replace(other.config, rate_hz=30.0), other.weights, {})
+    again = load_checkpoint(tmp_path / "ours").recorded_as(replace(swapped, rate_hz=30.0))
+    assert np.abs(planned(again, replace_state(sample, sample.state[::-1])) - expected).max() < 1e-5
+
+
+def replace_state(sample, state):
+    return replace(sample, state=np.ascontiguousarray(state))
+
+
+def test_a_policy_of_other_numbers_or_another_rate_is_refused(trained, tiny):
+    arm = Layout("cam_front", tuple("abcdef"), tuple("abcdef"), 30.0, tuple(range(6)), tuple(range(6)))
+    with pytest.raises(CheckpointError, match="2 states and 2 actions, found recordings of 6 and 6"):
+        load_checkpoint(trained).recorded_as(arm)
+    with pytest.raises(CheckpointError, match="30 steps a second, found recordings of 20 frames a second"):
+        tiny.recorded_as(Layout("cam_front", rate_hz=20.0))
+    assert tiny.recorded_as(Layout("front", rate_hz=30.0)) is tiny
+
+
+@pytest.mark.slow
+def test_from_a_dataset_to_an_artifact(datasets, trained, tmp_path):
+    root, artifact = datasets("video", actions=SWAPPED, states=SWAPPED), tmp_path / "policy.pt"
+    loaded = load(trained, root)
+    assert loaded.checkpoint.config.rate_hz == FPS and loaded.recordings.source.camera == "cam_front"
+    options = ["--mode", "fp32", "-o", str(artifact)]
+    result = CliRunner().invoke(main, ["quantize", str(trained), str(root), *options], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    policy = load_policy(artifact)
+    assert policy.rate_hz == FPS and policy.manifest["cameras"][0]["name"] == "cam_front"
+    sample = loaded.recordings.samples[0]
+    expected = planned(loaded.checkpoint, sample)
+    assert np.abs(policy.predict_chunk(sample.frame_bgr(), sample.state) - expected.clip([-1, 0], 1)).max() < 1e-5
+    result = CliRunner().invoke(main, ["quantize", str(trained), str(root), "--camera", "left", *options])
+    assert result.exit_code == 1 and "has no camera 'left', found cam_front" in result.output
+
+
+@pytest.mark.slow
+def test_what_is_no_car_is_not_calibrated_for_one(datasets, trained):
+    with pytest.raises(EpisodeError, match=r"the action is \['left', 'right'\], a rover's is"):
+        load(trained, datasets(actions=("left", "right")))
