@@ -16,6 +16,7 @@ SECTIONS = {
         prepare.quantize,
         prepare.compare,
         prepare.distill,
+        prepare.export_dataset,
         ROVERS["benchmark"],
     ),
     "Try it without a car": (world.world,),

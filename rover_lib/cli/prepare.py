@@ -205,6 +205,24 @@ def distill(
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
 
 
+@click.command("export-dataset")
+@click.argument("episodes", type=FILE)
+@click.argument("out", type=FILE)
+@click.option("--video", is_flag=True, help="AV1 video, far smaller and not equal to the last bit [default: images].")
+@AS_JSON
+def export_dataset(episodes: Path, out: Path, video: bool, as_json: bool) -> None:
+    """Write our recordings in EPISODES as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.
+
+    What is repaired in them or left out is printed, and kept in OUT/rover_export.json.
+    """
+    from rover_lib.workshop.export_dataset import REPORT
+    from rover_lib.workshop.export_dataset import export_dataset as write
+
+    report = write(episodes, out, video=video, progress=terminal())
+    del report["episodes_are"]  # long, and in the file
+    show({"exported": report | {"report": str(out / REPORT)}}, as_json)
+
+
 @click.command()
 @click.argument("folder", type=FILE, default="wheels")
 @click.option("--python", "pythons", multiple=True, help="A Pi's Python [default: 3.11 and 3.13].")

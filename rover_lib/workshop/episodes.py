@@ -516,6 +516,7 @@ def _make_samples(
                     state=state.copy(),
                     chunk=chunks[k].copy(),
                     is_pad=pads[k].copy(),
+                    row=i,
                 )
             )
     faults.add(folder, "frame_without_state", "the previous frame's action is not known", unknown_state)

@@ -66,7 +66,6 @@ class LerobotSample(Sample):
     """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file."""
 
     pictures: _Pictures
-    row: int  # in the whole dataset
 
     @property
     def frame_name(self) -> str:

@@ -90,6 +90,7 @@ class Sample:
     state: np.ndarray
     chunk: np.ndarray
     is_pad: np.ndarray
+    row: int  # of the frame: in its episode, or in the whole of a LeRobotDataset
 
     @property
     def frame_name(self) -> str:

@@ -23,6 +23,7 @@ def rover(*args):
         ["quantize"],
         ["compare"],
         ["distill"],
+        ["export-dataset"],
         ["benchmark"],
         ["log"],
         ["doctor"],
@@ -60,6 +61,7 @@ def test_inspects_each_kind_of_file(artifacts, tiny_file):
         ["quantize", "nothing.pth", "none", "-o", "out.pt"],
         pytest.param(["run", "nothing.pth", "none"], marks=pytest.mark.slow),  # starts a kernel
         ["distill", "nothing.pth", "none", "--size", "320x180", "--name", "fast"],
+        ["export-dataset", "none", "out"],
         ["world", "train", "none", "out.pth"],
         ["world", "trial", "nothing.pt"],
     ],

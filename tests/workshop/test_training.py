@@ -186,7 +186,7 @@ def samples_of(folder: Path, count: int) -> tuple[Sample, ...]:
         path = folder / f"{i}.jpg"
         path.write_bytes(simplejpeg.encode_jpeg(rng.integers(0, 255, (36, 64, 3), np.uint8), colorspace="BGR"))
         state, chunk = rng.random(2).astype(np.float32), rng.random((4, 2)).astype(np.float32)
-        samples.append(Sample("an episode", path, 0.0, state, chunk, np.zeros(4, bool)))
+        samples.append(Sample("an episode", path, 0.0, state, chunk, np.zeros(4, bool), len(samples)))
     return tuple(samples)
 
 

@@ -1,0 +1,167 @@
+"""Our recordings as a LeRobotDataset v3, for `lerobot-train` and LeRobot's own tools.
+
+    report = export_dataset("episodes", "my_dataset")
+
+A row of that format is a picture, the state before it and the action at it, at a fixed rate; an episode has no holes.
+So what our reader repairs (readings that came in a burst, single lost pulses) is repaired in it, and where a frame must
+be left out (a picture that is not whole, a hole in time, no measured pulse), the episode ends and another begins. Each
+is counted in the report, which stays in the dataset's folder. Read again, it gives the samples of the recordings.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.params import params
+from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.lerobot_dataset import ACTION, BACKEND, CAMERA, STATE
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.samples import ACTION_NAMES, Episode, Recordings, Sample
+
+NAME = "cam_front"  # of the camera, as in the trainer's policies
+REPORT = "rover_export.json"
+SHORTEST = 2  # rows of an episode: of one there is no spread to normalise by
+OTHER_RATE = 0.2  # of the usual time between two frames
+
+
+def export_dataset(
+    episodes: Path | str, out: Path | str, *, video: bool = False, progress: Progress = silent
+) -> dict[str, Any]:
+    """Write all usable samples below `episodes` to `out`, a new folder, and return what was written and left out.
+
+    video: AV1, LeRobot's usual, far smaller and not equal to the last bit; else PNG in parquet, which is. The folder
+    appears when it is whole. Raises EpisodeError for recordings that cannot be used, of several rates or picture
+    sizes, and for a folder that is there.
+    """
+    out = Path(out)
+    if out.exists():
+        raise EpisodeError(f"{out}: is there already", remedy="give a new folder, or remove it")
+    recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
+    if recordings.layout.rate_hz is not None:
+        raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
+    rate_hz = _rate_hz(recordings)
+    new = out.with_name(f".{out.name}.new")
+    shutil.rmtree(new, ignore_errors=True)
+    try:
+        report = _write(recordings, new, rate_hz, video, progress)
+        (new / REPORT).write_text(json.dumps(report, indent=2) + "\n")
+        new.rename(out)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    return report
+
+
+def _rate_hz(recordings: Recordings) -> int:
+    """Frames a second, by the usual time between two; a rate belongs to a whole dataset."""
+    steps_s = {e.id: _step_s(e) for e in recordings.episodes if len(e.samples) > 1}
+    if not steps_s:
+        raise EpisodeError(f"{recordings.root}: no episode of two frames", remedy="record longer ones")
+    usual_s = float(np.median(list(steps_s.values())))
+    if odd := {name: s for name, s in steps_s.items() if abs(s / usual_s - 1) > OTHER_RATE}:
+        name, step_s = next(iter(odd.items()))
+        raise EpisodeError(
+            f"{recordings.root}: most episodes have {1 / usual_s:.1f} frames a second, {len(odd)} have another rate",
+            found=f"{1 / step_s:.1f} in {name}",
+            remedy="export those of each rate by themselves",
+        )
+    return max(round(1 / usual_s), 1)
+
+
+def _step_s(episode: Episode) -> float:
+    return float(np.median(np.diff([s.time_s for s in episode.samples])))
+
+
+def _runs(samples: tuple[Sample, ...]) -> Iterator[list[Sample]]:
+    """Samples whose frames follow each other without one left out, and whose chunks know of each other."""
+    run = [samples[0]]
+    for before, after in pairwise(samples):
+        if after.row == before.row + 1 and not before.is_pad[1]:
+            run.append(after)
+        else:
+            yield run
+            run = [after]
+    yield run
+
+
+def _write(recordings: Recordings, root: Path, rate_hz: int, video: bool, progress: Progress) -> dict[str, Any]:
+    os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder tells its settings otherwise, once an episode
+    # here, because it takes seconds that nothing else of the command line need wait for
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.datasets.utils import SuppressProgressBars
+
+    first = recordings.samples[0].frame_bgr()
+    numbers = {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)}
+    picture = {"dtype": "video" if video else "image", "shape": first.shape, "names": ["height", "width", "channels"]}
+    dataset = LeRobotDataset.create(
+        repo_id=f"local/{root.name.strip('.').removesuffix('.new')}",
+        fps=rate_hz,
+        features={f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers},
+        root=root,
+        robot_type="rover",
+        use_videos=video,
+        video_backend=BACKEND,
+    )
+    written, short, broken = 0, 0, 0
+    origins: list[str] = []
+    with SuppressProgressBars():
+        for episode in progress(recordings.episodes, desc="exporting", total=len(recordings.episodes)):
+            for run in _runs(episode.samples):
+                for rows, unread in _readable(run, first.shape):
+                    broken += unread
+                    if len(rows) < SHORTEST:
+                        short += len(rows)
+                        continue
+                    for sample, frame in rows:
+                        dataset.add_frame(
+                            {
+                                f"{CAMERA}{NAME}": frame,
+                                STATE: sample.state,
+                                ACTION: sample.chunk[0],
+                                "task": episode.label or "drive",
+                            }
+                        )
+                    dataset.save_episode()
+                    written += len(rows)
+                    origins.append(f"{episode.id} from frame {rows[0][0].row}")
+        dataset.finalize()
+    if not written:
+        raise EpisodeError(f"{recordings.root}: no two whole frames in a row", remedy="record again")
+    return {
+        "dataset": "LeRobotDataset v3, " + ("AV1 video" if video else "images, as they were recorded"),
+        "episodes": len(origins),
+        "frames": written,
+        "frames_a_second": rate_hz,
+        "recorded_episodes": len(recordings.episodes),
+        "left_out_pictures_not_whole": broken,
+        "left_out_too_short": short,
+        "repaired_or_left_out_while_reading": [asdict(fault) for fault in recordings.faults],
+        "episodes_are": origins,
+    }
+
+
+def _readable(run: list[Sample], shape: tuple[int, ...]) -> Iterator[tuple[list[tuple[Sample, np.ndarray]], int]]:
+    """The run in parts between pictures that cannot be decoded, with RGB frames; and how many those were."""
+    rows: list[tuple[Sample, np.ndarray]] = []
+    for sample in run:
+        try:
+            frame = sample.frame_bgr()
+        except EpisodeError:
+            yield rows, 1
+            rows = []
+            continue
+        if frame.shape != shape:
+            raise EpisodeError(
+                f"{sample.frame_path}: a picture of {frame.shape[1]}x{frame.shape[0]} among those of "
+                f"{shape[1]}x{shape[0]}",
+                remedy="export the episodes of each size by themselves",
+            )
+        rows.append((sample, np.ascontiguousarray(frame[..., ::-1])))
+    yield rows, 0

@@ -1,0 +1,125 @@
+"""Our recordings as a LeRobotDataset: LeRobot reads them back equal, and so do we."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from test_episodes import edit, load, record
+
+from rover_lib.cli import main
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.workshop.export_dataset import export_dataset
+
+CHUNK = 8  # as test_episodes' load
+
+# AV1 of tiny pictures and LeRobot's import: seconds
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path, monkeypatch):
+    import datasets
+
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    for second in range(3):
+        record(tmp_path / "mine", f"episode_20260101_12000{second}", frames=20)
+    return tmp_path / "mine"
+
+
+def check_equal(found, expected, pixels=0):
+    assert len(found) == len(expected) > 0
+    for ours, theirs in zip(found, expected, strict=True):
+        assert np.array_equal(ours.state, theirs.state)
+        assert np.array_equal(ours.chunk, theirs.chunk)
+        assert np.array_equal(ours.is_pad, theirs.is_pad)
+        assert np.abs(ours.frame_bgr().astype(int) - theirs.frame_bgr()).max() <= pixels
+
+
+def test_lerobot_reads_it_back_and_so_do_we(recorded, tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    report = export_dataset(recorded, tmp_path / "out")
+    original = load(recorded)
+    assert (report["episodes"], report["frames"], report["frames_a_second"]) == (3, 60, 30)
+    theirs = LeRobotDataset("local/out", tmp_path / "out", video_backend="pyav")
+    assert theirs.meta.robot_type == "rover" and theirs.num_episodes == 3
+    for sample, item in zip(original.samples, theirs, strict=True):
+        assert np.array_equal(item["observation.state"].numpy(), sample.state)
+        assert np.array_equal(item["action"].numpy(), sample.chunk[0])
+        pixels = (item["observation.images.cam_front"] * 255).round().byte().permute(1, 2, 0).numpy()
+        assert np.array_equal(pixels[..., ::-1], sample.frame_bgr()) and item["task"] == "hit red balloon"
+    again = load(tmp_path / "out")
+    check_equal(again.samples, original.samples)
+    assert again.layout.action_names == ("steering", "throttle") and again.layout.rate_hz == 30
+    assert again.action_range() == original.action_range()
+
+
+def test_as_video(recorded, tmp_path):
+    result = CliRunner().invoke(main, ["export-dataset", str(recorded), str(tmp_path / "out"), "--video", "--json"])
+    assert result.exit_code == 0, result.output
+    assert list((tmp_path / "out").rglob("*.mp4"))
+    check_equal(load(tmp_path / "out").samples, load(recorded).samples, pixels=6)  # of one colour each: AV1 is close
+
+
+def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
+    first = recorded / "episode_20260101_120000"
+
+    def change(content):
+        controls = content["control_samples"]
+        for k, control in enumerate(controls[:10]):  # they waited in a buffer
+            control["system_timestamp"] = controls[10]["system_timestamp"] - 0.0003 * (10 - k)
+        controls[4].update(throttle_raw_us=0, throttle_period_us=0, throttle_normalized=0.0)
+
+    edit(first, change)
+    (first / "frames/frame_000008.jpg").unlink()
+    whole = (first / "frames/frame_000015.jpg").read_bytes()
+    (first / "frames/frame_000015.jpg").write_bytes(whole[:200] + bytes(60) + whole[260:])  # seen when decoded
+    report = export_dataset(recorded, tmp_path / "out")
+    kinds = {f["kind"]: f["count"] for f in report["repaired_or_left_out_while_reading"]}
+    assert kinds == {"serial_burst": 10, "throttle_zero_period": 1, "frame_missing": 1}
+    assert (report["episodes"], report["frames"], report["left_out_pictures_not_whole"]) == (5, 58, 1)
+    assert report["episodes_are"][:3] == [f"episode_20260101_120000 from frame {n}" for n in (0, 8, 15)]
+    assert json.loads((tmp_path / "out/rover_export.json").read_text()) == report
+    original = [s for s in load(recorded).samples if not (s.episode == first.name and s.row == 14)]
+    again = load(tmp_path / "out").samples
+    for ours, theirs in zip(again, original, strict=True):
+        assert np.array_equal(ours.state, theirs.state) and np.array_equal(ours.chunk[0], theirs.chunk[0])
+    check_equal(again[18:], original[18:])  # the last two episodes, and no end of the first one
+
+
+def refused(episodes, out) -> str:
+    with pytest.raises(EpisodeError) as e:
+        export_dataset(episodes, out)
+    assert "\n" not in str(e.value) and [p for p in out.parent.glob(f".{out.name}*")] == []
+    return str(e.value)
+
+
+def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
+    (tmp_path / "there").mkdir()
+    assert "is there already" in refused(recorded, tmp_path / "there")
+    other = record(tmp_path / "mixed", "episode_20260101_120000", frames=20)
+    slow = record(tmp_path / "mixed", "episode_20260101_120001", frames=20)
+    record(tmp_path / "mixed", "episode_20260101_120002", frames=20)
+
+    def slower(content):
+        for frame in content["frame_samples"]:
+            frame["timestamp"] = 1000.1 + 2 * (frame["timestamp"] - 1000.1)
+
+    edit(slow, slower)
+    assert "1 have another rate, found 15.0 in episode_20260101_120001" in refused(tmp_path / "mixed", tmp_path / "out")
+    shutil.rmtree(slow)
+    shutil.copy(wide(tmp_path), other / "frames/frame_000003.jpg")
+    assert "a picture of 64x18 among those of 32x18" in refused(tmp_path / "mixed", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def wide(folder):
+    cv2.imwrite(str(folder / "wide.jpg"), np.full((18, 64, 3), 99, np.uint8))
+    return folder / "wide.jpg"
