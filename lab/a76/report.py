@@ -4,6 +4,7 @@ import re
 from typing import Any
 
 from lab.a76.count import Counted
+from rover_lib.onboard.floor import PI5_SEEN_GMAC_PER_S
 from rover_lib.workshop.compare import gate
 from rover_lib.workshop.judge import worst
 
@@ -12,9 +13,8 @@ STATIC = "policy_static"
 SDOT_MACS = 16  # multiply-accumulates of one SDOT: the floor is as if nothing else ran
 
 PI5_CORES, PI5_GHZ, SIMD_PER_CYCLE = 4, 2.4, 2
-PUBLISHED_GMAC_PER_S = 207  # ResNet18 at 224x224 in INT8, ExecuTorch with XNNPACK, 8.75 ms p50 on a Pi 5
 LOOP_PER_SDOT = 80 / 64  # instructions of XNNPACK's inner loop per SDOT, counted here
-IPC_SEEN = PUBLISHED_GMAC_PER_S / SDOT_MACS / (PI5_CORES * PI5_GHZ) * LOOP_PER_SDOT
+IPC_SEEN = PI5_SEEN_GMAC_PER_S / SDOT_MACS / (PI5_CORES * PI5_GHZ) * LOOP_PER_SDOT
 PREDICTED = (
     f"low: SIMD instructions / ({SIMD_PER_CYCLE} per cycle x {PI5_CORES} cores x {PI5_GHZ} GHz); "
     f"high: all instructions / ({IPC_SEEN:.2f} per cycle x {PI5_CORES} cores x {PI5_GHZ} GHz)"

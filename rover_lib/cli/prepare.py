@@ -162,14 +162,14 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
 @click.argument("checkpoint", type=FILE)
 @click.argument("episodes", type=FILE)
 @click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="The student's picture [default: its teacher's].")
-@click.option("--decoder-layers", type=int, help="The first so many stay [default: all].")
-@click.option("--feedforward", type=int, help="Units of a feed-forward that stay [default: all].")
+@click.option("--decoder-layers", type=int, metavar="N", help="Keep only the first N decoder layers [default: all].")
+@click.option("--feedforward", type=int, metavar="N", help="Keep the N best units of each feed-forward [default: all].")
 @click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
 @click.option("--samples", type=click.IntRange(min=1), help="Frames to learn from [default: params.yml].")
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of all phases [default: params.yml].")
 @click.option("--qat", is_flag=True, help="Train it for INT8 at the end. With no other shape: CHECKPOINT itself.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]")
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
 @AS_JSON
 @with_source
@@ -181,6 +181,7 @@ def distill(
     feedforward: int | None,
     samples: int | None,
     steps: int | None,
+    seed: int | None,
     as_json: bool,
     **options: Any,
 ) -> None:
@@ -197,7 +198,8 @@ def distill(
 
     recipe = Recipe(**params()["distill"])
     recipe = recipe.of_steps(steps) if steps else recipe
-    recipe = replace(recipe, samples=samples) if samples else recipe
+    given = {"samples": samples, "seed": seed}
+    recipe = replace(recipe, **{name: value for name, value in given.items() if value is not None})
     height, width = size or (None, None)
     shape = StudentShape(height, width, decoder_layers, feedforward)
     folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal(), **options)

@@ -84,3 +84,31 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
     execute("07_drive", run_dir, worlds=worlds)
     content = read_stage(run_dir / "drive.json", "drive")
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
+
+
+@world.command()
+@click.argument("teacher_run", type=FILE)
+@click.argument("student_runs", type=FILE, nargs=-1, required=True)
+@click.option("--episodes", type=FILE, help="Recordings to judge with [default: those of TEACHER_RUN].")
+@click.option(
+    "--worlds", type=click.IntRange(min=0), default=200, show_default=True, help="0 for a real car's policy: no drives."
+)
+@AS_JSON
+def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, **options: Any) -> None:
+    """Judge the students that `rover distill` left in STUDENT_RUNS beside the teacher in TEACHER_RUN.
+
+    Each folder has a policy_static.pt, and arm.json where it was counted. They drive through the same worlds, left
+    alone and pushed, each as late as computed for it. Leaves distill.json and the executed notebook 08 in TEACHER_RUN,
+    and says which student may take its teacher's place. Ended at any moment, the same command goes on where it was.
+    """
+    from rover_lib.workshop.run import execute
+    from rover_lib.world.frontier import sentences, table
+    from rover_lib.world.students import measured
+
+    content = measured(teacher_run, student_runs, progress=terminal(), **options)
+    given = {"students": [str(run.resolve()) for run in student_runs], "worlds": options["worlds"]}
+    episodes = str(options["episodes"].resolve()) if options["episodes"] else ""
+    execute("08_distill", teacher_run, **given, episodes=episodes)
+    if as_json:
+        return click.echo(json.dumps(content, indent=2))
+    click.echo("\n".join([table(content["metrics"]), "", *sentences(content["metrics"])]))

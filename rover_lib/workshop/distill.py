@@ -64,7 +64,7 @@ class Recipe:
 
     samples: asked about at most. rate: of the first two phases; the third has a tenth. to_teacher, to_recorded: weights
     of the two losses, mean absolute errors in units of the recorded range. unit_frames: choose a feed-forward's units.
-    judged_frames: of the held-out episodes, at most.
+    judged_frames: of the held-out episodes, at most. seed: of all that is drawn.
     """
 
     samples: int
@@ -79,6 +79,7 @@ class Recipe:
     to_recorded: float
     unit_frames: int
     judged_frames: int
+    seed: int
 
     def of_steps(self, steps: int) -> "Recipe":
         """The same with that many steps in all, at least one in each phase."""
@@ -96,7 +97,6 @@ def distill(
     runs_dir: Path | str = "runs",
     recipe: Recipe | None = None,
     qat: bool = False,
-    seed: int = 0,
     device: str | None = None,
     progress: Progress = silent,
 ) -> Path:
@@ -114,13 +114,13 @@ def distill(
         raise DistillError("device must be cpu, or cuda where torch finds one", found=device, remedy="leave it out")
     if Path(name).name != name or name.startswith("."):
         raise DistillError("a run's name must be a plain folder name", found=repr(name))
-    if seed < 0:
-        raise DistillError("a seed must be at least 0", found=seed)
     recipe = recipe or Recipe(**params()["distill"])
+    if recipe.seed < 0:
+        raise DistillError("a seed must be at least 0", found=recipe.seed)
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint
     config = student_config(teacher, shape)
-    work = _Work(opened, config, recipe, qat, torch.device(device), seed, progress)
+    work = _Work(opened, config, recipe, qat, torch.device(device), progress)
     if work.is_teacher and not qat:
         remedy = "give it a smaller picture or fewer layers, or train it for INT8 with --qat"
         raise DistillError("this student would be its teacher", remedy=remedy)
@@ -138,7 +138,6 @@ class _Work:
     recipe: Recipe
     qat: bool
     device: torch.device
-    seed: int
     progress: Progress
 
     @property
@@ -152,7 +151,7 @@ class _Work:
 
     def rng(self, phase: str) -> np.random.Generator:
         """Random numbers of a phase, the same in every process."""
-        return np.random.default_rng([self.seed, zlib.crc32(phase.encode())])
+        return np.random.default_rng([self.recipe.seed, zlib.crc32(phase.encode())])
 
     def ranges(self) -> np.ndarray:
         """(A,) float32: each action's recorded range, in which errors are counted."""
@@ -192,7 +191,7 @@ def _taught(work: _Work) -> _Taught:
         "pictures": [(s.episode, s.frame_path.name, s.frame_path.stat().st_size) for s in samples],
         "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
         "recipe": [recipe.batch, recipe.backbone_steps, recipe.rate],
-        "at": [work.device.type, work.seed],
+        "at": [work.device.type, recipe.seed],
         "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
     }
     sources = [sys.modules[__name__], lessons_module, student_module, training, preprocess, act]
@@ -394,7 +393,7 @@ def _plans(work: _Work, config: ActConfig, weights: dict[str, Tensor], samples: 
     return np.concatenate(plans).clip(low, high)
 
 
-def _errors(
+def errors_of(
     plans: np.ndarray, taught: np.ndarray, samples: Sequence[Sample], action_range: dict[str, Range]
 ) -> dict[str, float | None]:
     """teacher_<action>_pct over whole plans and recorded_<action>_pct over the recorded steps. plans: (n, C, A)."""
@@ -484,7 +483,7 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
     configs = {"teacher": teacher.config, folder.name: work.config}
     students = [
         _row(name, configs[name], work.qat and name != "teacher")
-        | _errors(planned, plans["teacher"], held_out, action_range)
+        | errors_of(planned, plans["teacher"], held_out, action_range)
         for name, planned in plans.items()
     ]
     students[1] |= _int8_errors(work, taught.weights, held_out, plans["teacher"])
@@ -492,7 +491,7 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
     chosen = _plans(work, work.config, taught.weights, choosing)
     driven = ~np.stack([s.is_pad for s in choosing])
     loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
-    recipe = asdict(work.recipe) | {"seed": work.seed, "device": work.device.type}
+    recipe = asdict(work.recipe) | {"device": work.device.type}
     origin = {"teacher_sha256": teacher.sha256, "teacher_format": teacher.format, "distilled_by": recipe}
     new = folder.with_name(f".{folder.name}.distilled")
     shutil.rmtree(new, ignore_errors=True)
@@ -507,7 +506,7 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
                 "data_dir": work.opened.recordings.root.name,
                 "output_dir": folder.name,
                 "device": work.device.type,
-                "seed": work.seed,
+                "seed": work.recipe.seed,
             }
             write_trainer(new / "best_model.pth", work.config, taught.weights, loss, origin, **settings)
             files["best_model.pth"] = "best_model.pth"

@@ -30,6 +30,7 @@ RESULTS_OF = {  # stages that a notebook leaves
     "05_benchmark": "benchmark-*",
     "06_arm": "arm",
     "07_drive": "drive",
+    "08_distill": "distill",
 }
 OF_LABORATORY = ("faults.json", "random.json", "pi-fast.json", "pi.json")  # in runs/, where make leaves them
 IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
@@ -69,11 +70,14 @@ def publish(
 
 
 def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEBOOKS) -> list[Path]:
-    """Publish the demo and its count; of runs/full its count; of the laboratory its reports: where they are there."""
+    """Publish the demo, its count and its student; of runs/full its count and its students; of the laboratory its
+    reports: where they are there.
+    """
     runs_dir, notebooks_dir = Path(runs_dir), Path(notebooks_dir)
-    written = publish(runs_dir / "demo", notebooks_dir, (*NAMES, "07_drive"))
-    if (runs_dir / "full" / "06_arm.ipynb").is_file():
-        written += publish(runs_dir / "full", notebooks_dir, ("06_arm",))
+    written = publish(runs_dir / "demo", notebooks_dir, (*NAMES, "07_drive", "08_distill"))
+    of_full = tuple(name for name in ("06_arm", "08_distill") if (runs_dir / "full" / f"{name}.ipynb").is_file())
+    if of_full:
+        written += publish(runs_dir / "full", notebooks_dir, of_full)
     results = notebooks_dir.resolve().parent / "results"
     reports = {runs_dir / name: results / "lab" / name for name in OF_LABORATORY}
     reports[runs_dir / "demo" / "arm.json"] = results / "demo" / "arm.json"  # notebook 06 shows the full size's count

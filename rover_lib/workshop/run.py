@@ -28,7 +28,8 @@ from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
-AFTERWARDS = ("06_arm", "07_drive")  # of a run that is there: what `rover arm` and `rover world latency` execute
+# Of a run that is there: what `make arm`, `rover world latency` and `rover world students` execute.
+AFTERWARDS = ("06_arm", "07_drive", "08_distill")
 KERNEL_ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",  # rover_lib/__init__.py says why; a cell may import torch before it
     # Both are known, and noise in a stored output: QNNPACK ignores reduce_range, tqdm misses widgets.
@@ -123,6 +124,8 @@ def _own(folder: Path) -> list[Path]:
     """What a run leaves in its folder, and what was made of its artifacts later: none of it is of another run's."""
     stages = ("load", "calibrate", "quantize", "compare", "arm", "parts", "drive", f"benchmark-{socket.gethostname()}")
     names = [*(f"{s}.json" for s in stages), *(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures"]
+    if (folder / "08_distill.ipynb").exists():  # a teacher's; a student's distill.json is of what its run begins with
+        names.append("distill.json")
     own = [folder / n for n in names] + [*folder.glob("calibration*.pt"), *folder.glob("policy_*.pt")]
     return [path for path in own if path.exists()]
 

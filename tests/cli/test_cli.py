@@ -32,6 +32,7 @@ def rover(*args):
         ["world", "train"],
         ["world", "trial"],
         ["world", "latency"],
+        ["world", "students"],
         ["wheelhouse"],
         ["drive"],
         ["record"],
@@ -64,6 +65,7 @@ def test_inspects_each_kind_of_file(artifacts, tiny_file):
         ["export-dataset", "none", "out"],
         ["world", "train", "none", "out.pth"],
         ["world", "trial", "nothing.pt"],
+        ["world", "students", "nothing", "none"],
     ],
     ids=" ".join,
 )

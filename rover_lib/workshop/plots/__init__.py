@@ -26,4 +26,5 @@ from rover_lib.workshop.plots.recordings import (
     observer_ranges,
     work_per_block,
 )
+from rover_lib.workshop.plots.students import frontier, losses
 from rover_lib.workshop.plots.style import save

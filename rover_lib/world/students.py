@@ -1,0 +1,349 @@
+"""Can a smaller policy drive the same? A teacher and its students, judged on recordings and driven side by side.
+
+    content = measured("runs/full", ["runs/fast", "runs/faster"])
+
+All that is said is of the artifact that would drive the car, a run's policy_static.pt. What was driven or planned once
+stays in the cache, by the artifact's content, so that whoever is ended goes on, and another student costs only itself.
+"""
+
+import json
+import os
+import queue
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+
+from rover_lib.onboard import loop, pilot, plan, preprocess
+from rover_lib.onboard.artifact import content_hash, read_manifest
+from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.floor import PI5_SEEN_GMAC_PER_S
+from rover_lib.onboard.params import params
+from rover_lib.onboard.plan import Settings
+from rover_lib.onboard.policy import Policy, load_policy
+from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+from rover_lib.workshop.cache import cache_root, key_of
+from rover_lib.workshop.compare import GATED, thinned
+from rover_lib.workshop.distill import errors_of
+from rover_lib.workshop.episodes import load_recordings, split
+from rover_lib.workshop.judge import not_judged
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.samples import Recordings, Sample, Source
+from rover_lib.world import latency, trial, world
+from rover_lib.world.frontier import NOBODY_DROVE, recommendation
+from rover_lib.world.latency import SEED, Condition, drive_late
+from rover_lib.world.trial import run_trials, wilson_interval
+
+K = TypeVar("K")
+V = TypeVar("V")
+WORLDS, PUSHES = 200, 4
+HELD_OUT_FRAMES = 300
+TEACHER = "teacher"
+ARTIFACT = f"policy_{GATED}.pt"
+COUNTED = (
+    "Pushed at the high end of the time computed from counted instructions: what such kernels were seen to reach; "
+    "the low end is what no program can beat."
+)
+ESTIMATED = (
+    f"Pushed at an estimate, as the teacher's instructions are not counted: multiply-accumulates at "
+    f"{PI5_SEEN_GMAC_PER_S:g} G a second, the rate that such kernels were seen to reach."
+)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run's static artifact. shape: of a row of distill.json; counts: of arm.json, None where it was not counted."""
+
+    name: str
+    artifact: Path
+    manifest: dict[str, Any]
+    shape: dict[str, Any]
+    counts: dict[str, Any] | None
+
+    @property
+    def computed_ms(self) -> list[float] | None:
+        """Low and high."""
+        return [self.counts["computed_pi5_ms"][end] for end in ("low", "high")] if self.counts else None
+
+    @property
+    def estimated_ms(self) -> float:
+        return 1e3 * self.manifest["gmac"] / PI5_SEEN_GMAC_PER_S
+
+
+def measured(
+    run_dir: Path | str,
+    students: Sequence[Path | str],
+    *,
+    episodes: Path | str | None = None,
+    worlds: int = WORLDS,
+    held_out_frames: int = HELD_OUT_FRAMES,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """A teacher's run and its students' runs side by side: the content of distill.json in the teacher's folder.
+
+    students: folders that `rover distill` left, each with a policy_static.pt. episodes: the recordings to judge with,
+    those of the teacher's run if None. worlds: driven twice by each, left alone as `run_trials` does, and pushed at
+    the latency computed for it; 0 where there is no world, as for a real car's policy: then nobody drives.
+    held_out_frames: at most.
+    Sets torch to one thread. Raises DistillError for runs that do not belong together or lack a file, and
+    what reading them raises.
+    """
+    folder, p = Path(run_dir).resolve(), params()
+    runs = _runs(folder, [Path(student).resolve() for student in students])
+    source = _source_of(folder, episodes)
+    recordings = load_recordings(source, runs[0].manifest["chunk"], p["calibration"]["sync_s"], progress)
+    parts = split(recordings, p["calibration"]["held_out_share"], p["calibration"]["seed"])
+    samples = thinned(parts.held_out, held_out_frames)
+    counted = runs[0].counts is not None
+    rows = []
+    for run, errors in zip(runs, _errors(folder, runs, samples, recordings, progress), strict=True):
+        pushed_ms = (run.computed_ms[1] if run.computed_ms else None) if counted else run.estimated_ms
+        rows.append(_row(run) | errors | _drives(run, worlds, pushed_ms, progress))
+    notes = [COUNTED if counted else ESTIMATED] if worlds else [NOBODY_DROVE]
+    if missing := [run.name for run in runs if run.counts is None]:
+        notes.append(f"Not counted, or another artifact was: {', '.join(missing)}. `make arm` counts.")
+    metrics = {
+        "students": rows,
+        "recommendation": recommendation(rows, p["students"]),
+        "limits": p["students"],
+        "latency": "counted" if counted else "estimated",
+        "judged_frames": len(samples),
+        "held_out_episodes": parts.episodes["held_out"],
+        "warnings": not_judged(recordings.action_range()),
+        "notes": notes,
+    }
+    how = {
+        "worlds": worlds,
+        "seed": SEED,
+        "pushes": PUSHES,
+        "drive": p["drive"],
+        "students": [r.name for r in runs[1:]],
+    }
+    inputs = {f"{run.name}/{ARTIFACT}": sha256_of(run.artifact) for run in runs}
+    return write_stage(folder / "distill.json", "distill", params=how, metrics=metrics, inputs=inputs)
+
+
+# --- which runs -------------------------------------------------------------------------------------------------------
+
+
+def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
+    """The teacher's run and its students', the teacher first, in proof that they belong together."""
+    names = [student.name for student in students]
+    if not names or len({*names, TEACHER}) <= len(names):
+        raise DistillError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
+    taught = [_distilled(student) for student in students]
+    if (own := folder / "distill.json").is_file() and "losses" in read_stage(own, "distill")["metrics"]:
+        raise DistillError(
+            f"{folder}: was distilled itself, and its distill.json would be lost", remedy="begin with its own teacher"
+        )
+    manifest = read_manifest(_artifact_of(folder))
+    runs = [_Run(TEACHER, folder / ARTIFACT, manifest, taught[0]["metrics"]["students"][0], _counts(folder))]
+    for student, content in zip(students, taught, strict=True):
+        if manifest["checkpoint"]["sha256"] not in content["inputs"].values():
+            raise DistillError(f"{student}: is a student of another checkpoint than {folder / ARTIFACT} is made of")
+        own_manifest = read_manifest(_artifact_of(student))
+        if own_manifest["checkpoint"]["sha256"] not in content["metrics"]["files_sha256"].values():
+            raise DistillError(
+                f"{student / ARTIFACT}: is not made of the student that was distilled there",
+                remedy="'rover quantize' or 'rover run' makes it anew",
+            )
+        runs.append(
+            _Run(
+                student.name,
+                student / ARTIFACT,
+                own_manifest,
+                content["metrics"]["students"][1],
+                _counts(student),
+            )
+        )
+    return runs
+
+
+def _distilled(student: Path) -> dict[str, Any]:
+    """The distill.json that `rover distill` left."""
+    if not (student / "distill.json").is_file():
+        raise DistillError(f"{student}: no distill.json in it", remedy="'rover distill' makes a student")
+    content = read_stage(student / "distill.json", "distill")
+    if "losses" not in content["metrics"]:
+        raise DistillError(f"{student}: is a teacher's run, not a student's", remedy="give the teacher first")
+    return content
+
+
+def _artifact_of(run_dir: Path) -> Path:
+    if not (path := run_dir / ARTIFACT).is_file():
+        raise DistillError(f"{path}: not there", remedy="'rover quantize' or 'rover run' makes it")
+    return path
+
+
+def _counts(run_dir: Path) -> dict[str, Any] | None:
+    """What arm.json says of policy_static.pt; None if it was not counted, or was another file then."""
+    if not (path := run_dir / "arm.json").is_file():
+        return None
+    arm = read_stage(path, "arm")
+    same = arm["inputs"].get(ARTIFACT) == sha256_of(run_dir / ARTIFACT)
+    return arm["metrics"]["artifacts"][Path(ARTIFACT).stem] if same else None
+
+
+def _source_of(run_dir: Path, episodes: Path | str | None) -> Source:
+    """What the teacher's run loaded, or other recordings, read as those were."""
+    if (run_dir / "load.json").is_file():
+        given = read_stage(run_dir / "load.json", "load")["params"]
+        return Source.of(episodes or given["episodes"], given.get("action_names", ""), given.get("camera", ""))
+    if not episodes:
+        raise DistillError(f"{run_dir}: says nothing of its recordings", remedy="give --episodes")
+    return Source.of(episodes)
+
+
+def _row(run: _Run) -> dict[str, Any]:
+    (camera,) = run.manifest["cameras"]
+    return {
+        "name": run.name,
+        "height": camera["height"],
+        "width": camera["width"],
+        **{key: run.shape[key] for key in ("decoder_layers", "feedforward", "qat")},
+        "gmac": run.manifest["gmac"],
+        "instructions_g": run.counts and run.counts["instructions_g"],
+        "simd_g": run.counts and run.counts["simd_g"],
+        "size_mb": run.artifact.stat().st_size / 1e6,
+        "computed_ms": run.computed_ms,
+    }
+
+
+def _everywhere(artifact: Path, asked: Sequence[K], do: Callable[[Policy, K], V]) -> Iterator[tuple[K, V]]:
+    """(question, answer) of each, as they come: a policy in one thread on each core.
+
+    Not one policy on all cores: torch's second thread, once it was there, spins between inferences, which costs several
+    times what it brings to a small policy.
+    """
+    free: queue.SimpleQueue[Policy] = queue.SimpleQueue()
+    cores = min(os.cpu_count() or 1, len(asked))
+    for _ in range(cores):
+        free.put(load_policy(artifact, threads=1))
+
+    def one(question: K) -> tuple[K, V]:
+        policy = free.get()
+        try:
+            return question, do(policy, question)
+        finally:
+            free.put(policy)
+
+    with ThreadPoolExecutor(max(cores, 1)) as pool:
+        running = [pool.submit(one, question) for question in asked]
+        try:
+            for future in as_completed(running):
+                yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+# --- on recordings ----------------------------------------------------------------------------------------------------
+
+
+def _errors(
+    folder: Path, runs: Sequence[_Run], samples: Sequence[Sample], recordings: Recordings, progress: Progress
+) -> list[dict[str, float | None]]:
+    """Of each artifact: to the plans of the teacher's policy_fp32.pt, and to the recordings."""
+    reference = folder / "policy_fp32.pt"
+    if not reference.is_file():
+        remedy = f"'rover quantize CHECKPOINT EPISODES --mode fp32 -o {reference}' makes it"
+        raise DistillError(f"{reference}: the teacher as it was trained is not there", remedy=remedy)
+    taught = _plans(reference, f"{TEACHER} in float", samples, progress)
+    planned = [_plans(run.artifact, run.name, samples, progress) for run in runs]
+    return [errors_of(plans, taught, samples, recordings.action_range()) for plans in planned]
+
+
+def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progress) -> np.ndarray:
+    """(n, C, A) float32 of what an artifact plans on the samples. Kept in the cache."""
+    frames = [(str(s.frame_path), s.frame_path.stat().st_size, s.frame_name, s.state.tolist()) for s in samples]
+    key = key_of({"artifact": content_hash(artifact), "frames": frames, "torch": torch.__version__}, preprocess)
+    path = cache_root() / f"plans-{key}.npy"
+    if not path.exists():
+        every = _everywhere(artifact, range(len(samples)), lambda policy, i: _plan(policy, samples[i]))
+        planned = dict(progress(every, desc=f"judging {name}", total=len(samples)))
+        with atomic_path(path) as temporary:
+            np.save(temporary, np.stack([planned[i] for i in range(len(samples))]))
+    return np.load(path)
+
+
+def _plan(policy: Policy, sample: Sample) -> np.ndarray:
+    return policy.predict_chunk(sample.frame_bgr(), sample.state)
+
+
+# --- in worlds --------------------------------------------------------------------------------------------------------
+
+Drive = Callable[[Policy, int], str]  # through the world of a seed; returns the outcome
+
+
+def _left_alone(policy: Policy, seed: int) -> str:
+    return run_trials(policy, worlds=1, seed=seed, keep_frames=0).per_world[0].outcome
+
+
+def _pushed(policy: Policy, seed: int, *, condition: Condition) -> str:
+    return drive_late(policy, seed, condition).outcome
+
+
+def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress) -> dict[str, Any]:
+    """A row's hits, of drives left alone and pushed; null where nobody drove. pushed_ms: None where it is not known."""
+    how = params()["drive"]
+    asked: dict[str, Drive] = {}
+    if worlds:
+        asked[""] = _left_alone
+        if pushed_ms is not None:
+            condition = Condition(pushed_ms / 1e3, Settings.of(how), PUSHES)
+            asked["pushed_"] = partial(_pushed, condition=condition)
+    sources = [world, trial, latency, loop, pilot, plan, preprocess]
+    alike = {"artifact": content_hash(run.artifact), "torch": torch.__version__, "drive": how, "pushes": PUSHES}
+    files = {}
+    for name in asked:
+        key = key_of(alike | {"how": name, "latency_ms": pushed_ms if name else None}, *sources)
+        files[name] = cache_root() / f"drives-{key}.jsonl"
+    found = _driven(run, asked, files, range(SEED, SEED + worlds), progress)
+    row: dict[str, Any] = {"pushed_latency_ms": pushed_ms if worlds else None}
+    for name in ("", "pushed_"):
+        missed = [seed for seed, outcome in found[name].items() if outcome != "hit"] if name in found else None
+        hits = None if missed is None else worlds - len(missed)
+        low, high = (None, None) if hits is None else wilson_interval(hits, worlds)
+        row |= {
+            f"{name}hits": hits,
+            f"{name}trials": None if hits is None else worlds,
+            f"{name}hits_wilson_low": low,
+            f"{name}hits_wilson_high": high,
+            f"{name}missed": missed,
+        }
+    return row
+
+
+def _driven(
+    run: _Run, asked: Mapping[str, Drive], files: Mapping[str, Path], seeds: range, progress: Progress
+) -> dict[str, dict[int, str]]:
+    """Outcomes by seed of each kind of drive. What a file has is not driven again, and a drive that ends is in it."""
+    kept = {name: _read(path) for name, path in files.items()}
+    missing = [(name, seed) for name in asked for seed in seeds if seed not in kept[name]]
+    driven = _everywhere(run.artifact, missing, lambda policy, drive: asked[drive[0]](policy, drive[1]))
+    for (name, seed), outcome in progress(driven, desc=f"driving {run.name}", total=len(missing)) if missing else ():
+        kept[name][seed] = outcome
+        _append(files[name], {"seed": seed, "outcome": outcome})
+    return {name: {seed: kept[name][seed] for seed in seeds} for name in asked}
+
+
+def _read(path: Path) -> dict[int, str]:
+    """Outcomes by seed. A line that a kill tore is none."""
+    drives = {}
+    for line in path.read_text().splitlines() if path.exists() else ():
+        try:
+            drive = json.loads(line)
+        except ValueError:
+            continue
+        drives[int(drive["seed"])] = str(drive["outcome"])
+    return drives
+
+
+def _append(path: Path, drive: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        file.write("\n" + json.dumps(drive) + "\n")  # begins with one, in case the last was torn

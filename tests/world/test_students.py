@@ -1,0 +1,260 @@
+"""A teacher and its students side by side: rows, what is kept, and what is refused."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rover_lib.cli import main
+from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from rover_lib.workshop import plots
+from rover_lib.workshop import run as runs
+from rover_lib.world import students
+from rover_lib.world.latency import SEED
+from rover_lib.world.students import measured
+
+
+class Policy:
+    """Plans the same always, so much off; hits where its seed is large enough."""
+
+    chunk = 32
+
+    def __init__(self, path, threads):
+        assert threads == 1
+        self.given = json.loads(path.read_text())
+
+    def predict_chunk(self, frame_bgr, state):
+        return np.full((self.chunk, 2), self.given["off"], np.float32)
+
+
+def artifact(path, checkpoint, off=0.0, misses=0, gmac=15.0, height=360):
+    """An artifact as the tests read it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    camera = {"name": "cam_front", "height": height, "width": 640}
+    given = {"checkpoint": {"sha256": checkpoint}, "gmac": gmac, "cameras": [camera], "chunk": 32}
+    path.write_text(json.dumps(given | {"off": off, "misses": misses}))
+
+
+def shape(name, layers):
+    return {"name": name, "decoder_layers": layers, "feedforward": 1600, "qat": False}
+
+
+def distilled(folder, teacher="teacher's", own="student's"):
+    found = {"students": [shape("teacher", 7), shape(folder.name, 2)], "losses": {"together": [2.0, 1.0]}}
+    found["files_sha256"] = {"best_model.pth": own}
+    write_stage(folder / "distill.json", "distill", params={}, metrics=found, inputs={"best_model.pth": teacher})
+
+
+def counted(folder, low_ms, high_ms):
+    counts = {
+        "instructions_g": high_ms / 60,
+        "simd_g": low_ms / 60,
+        "computed_pi5_ms": {"low": low_ms, "high": high_ms},
+    }
+    inputs = {"policy_static.pt": sha256_of(folder / "policy_static.pt")}
+    metrics = {"artifacts": {"policy_static": counts}}
+    write_stage(folder / "arm.json", "arm", params={}, metrics=metrics, inputs=inputs)
+
+
+@pytest.fixture
+def made(tmp_path, recorded, monkeypatch):
+    """A teacher's run and a student's, and the drives that were driven: (off, kind, seed, latency)."""
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(students, "load_policy", Policy)
+    monkeypatch.setattr(students, "content_hash", sha256_of)
+    monkeypatch.setattr(students, "read_manifest", lambda path: json.loads(path.read_text()))
+    driven = []
+
+    def drives(policy, seed, condition=None):
+        driven.append((policy.given["off"], seed, condition and condition.latency_s))
+        return "hit" if seed >= SEED + policy.given["misses"] else "left"
+
+    monkeypatch.setattr(students, "_left_alone", drives)
+    monkeypatch.setattr(students, "_pushed", drives)
+    teacher, student = tmp_path / "full", tmp_path / "fast"
+    artifact(teacher / "policy_fp32.pt", "teacher's")
+    artifact(teacher / "policy_static.pt", "teacher's", off=0.001)
+    artifact(student / "policy_static.pt", "student's", off=0.002, misses=1, gmac=3.0, height=180)
+    distilled(student)
+    write_stage(teacher / "load.json", "load", params={"episodes": str(recorded)}, metrics={})
+    return SimpleNamespace(teacher=teacher, student=student, driven=driven)
+
+
+KEYS = [
+    "name",
+    "height",
+    "width",
+    "decoder_layers",
+    "feedforward",
+    "qat",
+    "instructions_g",
+    "simd_g",
+    "size_mb",
+    "computed_ms",
+    "teacher_steering_pct",
+    "teacher_throttle_pct",
+    "recorded_steering_pct",
+    "recorded_throttle_pct",
+    "hits",
+    "trials",
+    "pushed_hits",
+    "pushed_trials",
+    "pushed_latency_ms",
+]
+
+
+def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
+    counted(made.teacher, 56, 90)
+    counted(made.student, 13, 20)
+    content = measured(made.teacher, [made.student], worlds=3)
+    assert content == read_stage(made.teacher / "distill.json", "distill")
+    teacher, student = content["metrics"]["students"]
+    assert set(KEYS) <= set(teacher) and set(teacher) == set(student)
+    assert (teacher["name"], teacher["decoder_layers"], teacher["computed_ms"]) == ("teacher", 7, [56, 90])
+    assert (student["name"], student["height"], student["decoder_layers"]) == ("fast", 180, 2)
+    assert (student["hits"], student["trials"], student["missed"]) == (2, 3, [SEED])
+    assert (student["pushed_hits"], student["pushed_latency_ms"]) == (2, 20)
+    assert teacher["hits"] == teacher["pushed_hits"] == 3 and teacher["hits_wilson_high"] == 1
+    assert 0 < teacher["teacher_throttle_pct"] < student["teacher_throttle_pct"]  # to FP32, which is 0 off
+    assert student["teacher_throttle_pct"] == pytest.approx(2 * teacher["teacher_throttle_pct"], rel=1e-3)
+    assert {late for *_, late in made.driven} == {None, 0.09, 0.02}
+    assert content["metrics"]["latency"] == "counted" and content["metrics"]["recommendation"]["name"] == "teacher"
+    assert {p.name for p in made.teacher.iterdir()} == {
+        "arm.json", "distill.json", "load.json", "policy_fp32.pt", "policy_static.pt",
+    }  # fmt: skip
+
+
+def test_without_counts_all_are_estimated_alike_and_it_is_said(made):
+    counted(made.student, 13, 20)
+    found = measured(made.teacher, [made.student], worlds=1)["metrics"]
+    late = [row["pushed_latency_ms"] for row in found["students"]]
+    assert late == pytest.approx([15e3 / 207, 3e3 / 207])
+    assert found["latency"] == "estimated" and found["students"][0]["instructions_g"] is None
+    assert (
+        "at an estimate" in found["notes"][0] and "Not counted, or another artifact was: teacher." in found["notes"][1]
+    )
+
+
+def test_a_student_that_is_not_counted_is_not_pushed(made):
+    counted(made.teacher, 56, 90)
+    counted(made.student, 13, 20)
+    artifact(made.student / "policy_static.pt", "student's", off=0.003)  # another one than was counted
+    row = measured(made.teacher, [made.student], worlds=1)["metrics"]["students"][1]
+    assert row["pushed_trials"] is row["pushed_latency_ms"] is row["instructions_g"] is None and row["hits"] == 1
+
+
+def test_what_was_driven_once_is_kept(made):
+    measured(made.teacher, [made.student], worlds=2)
+    assert len(made.driven) == 8
+    first = read_stage(made.teacher / "distill.json", "distill")["metrics"]
+    made.driven.clear()
+    assert measured(made.teacher, [made.student], worlds=2)["metrics"] == first and not made.driven
+    measured(made.teacher, [made.student], worlds=3)  # one more world for each
+    assert len(made.driven) == 4 and {seed for _, seed, _ in made.driven} == {SEED + 2}
+    made.driven.clear()
+    artifact(made.student / "policy_static.pt", "student's", off=0.004)
+    measured(made.teacher, [made.student], worlds=3)
+    assert len(made.driven) == 6 and {off for off, *_ in made.driven} == {0.004}
+
+
+def test_a_kill_costs_the_drives_that_had_not_ended(made, monkeypatch):
+    whole, append = [], students._append
+
+    def dies(path, drive):
+        if len(whole) == 3:
+            with path.open("a") as file:
+                file.write('{"seed": 10')  # and tears a line
+            raise KeyboardInterrupt
+        whole.append(drive)
+        append(path, drive)
+
+    monkeypatch.setattr(students, "_append", dies)
+    with pytest.raises(KeyboardInterrupt):
+        measured(made.teacher, [made.student], worlds=3)
+    assert not (made.teacher / "distill.json").exists()
+    monkeypatch.setattr(students, "_append", append)
+    made.driven.clear()
+    rows = measured(made.teacher, [made.student], worlds=3)["metrics"]["students"]
+    assert len(made.driven) == 12 - 3 and [row["hits"] for row in rows] == [3, 2]
+
+
+def test_where_there_is_no_world_nobody_drives(made):
+    found = measured(made.teacher, [made.student], worlds=0)["metrics"]
+    assert not made.driven and found["notes"][0].startswith("Nobody drove")
+    assert all(row["hits"] is row["trials"] is row["pushed_latency_ms"] is None for row in found["students"])
+    assert plots.frontier(found["students"], "teacher").axes and len(plots.frontier(found["students"], "").axes) == 2
+
+
+@pytest.mark.slow
+def test_rows_are_drawn(made):
+    counted(made.teacher, 56, 90)
+    counted(made.student, 13, 20)
+    rows = measured(made.teacher, [made.student], worlds=3)["metrics"]["students"]
+    work, hits, errors = plots.frontier(rows, "fast").axes
+    assert [label.get_text().split("\n")[0] for label in work.get_yticklabels()] == ["teacher", "fast"]
+    assert {"13 to 20", "56 to 90"} <= {text.get_text() for text in work.texts}
+    assert "2, 20 ms late" in {text.get_text() for text in hits.texts} and len(errors.patches) == 8
+    rows = [row | {"computed_ms": None, "recorded_throttle_pct": None} for row in rows]
+    work, _, errors = plots.frontier(rows, "fast").axes
+    assert "multiply-accumulates" in work.get_xlabel() and len(errors.patches) == 4
+
+
+def test_losses_are_drawn_in_a_panel_for_each_phase():
+    one, other = {"backbone": [], "together": list(np.linspace(1, 0, 100))}, {"together": [1.0], "qat": [0.2, 0.1]}
+    figure = plots.losses({"one": one, "other": other})
+    assert [ax.get_title() for ax in figure.axes] == ["together", "qat"]
+    x, y = figure.axes[0].lines[0].get_data()
+    assert len(x) == 40 and np.allclose(y, 1 - (x - 1) / 99)
+
+
+def moved(made, name):
+    return made.student.rename(made.student.with_name(name))
+
+
+@pytest.mark.parametrize(
+    ("breaks", "says"),
+    [
+        (lambda made: moved(made, "teacher"), "none is 'teacher'"),
+        (lambda made: (made.student / "distill.json").unlink() or made.student, "no distill.json in it"),
+        (lambda made: made.teacher, "no distill.json in it"),
+        (lambda made: (made.student / "policy_static.pt").unlink() or made.student, r"policy_static\.pt: not there"),
+        (lambda made: (made.teacher / "policy_fp32.pt").unlink() or made.student, "--mode fp32 -o"),
+        (lambda made: (made.teacher / "load.json").unlink() or made.student, "give --episodes"),
+        (lambda made: distilled(made.student, teacher="another") or made.student, "a student of another checkpoint"),
+        (lambda made: distilled(made.student, own="another") or made.student, "not made of the student"),
+        (lambda made: distilled(made.teacher) or made.student, "was distilled itself"),
+    ],
+)
+def test_what_does_not_belong_together_is_refused(made, breaks, says):
+    student = breaks(made)
+    before = {p: p.read_bytes() for p in made.teacher.iterdir()}
+    with pytest.raises(DistillError, match=says):
+        measured(made.teacher, [student], worlds=1)
+    assert {p: p.read_bytes() for p in made.teacher.iterdir()} == before
+    with pytest.raises(DistillError, match="names of their own"):
+        measured(made.teacher, [student, student], worlds=1)
+
+
+def test_the_teachers_report_is_replaced_and_is_no_students(made):
+    measured(made.teacher, [made.student], worlds=1)
+    measured(made.teacher, [made.student], worlds=2)
+    with pytest.raises(DistillError, match="is a teacher's run, not a student's"):
+        measured(made.student, [made.teacher], worlds=1)
+
+
+def test_the_command_drives_and_executes_the_notebook(made, monkeypatch):
+    executed = []
+    monkeypatch.setattr(runs, "execute", lambda name, folder, **given: executed.append((name, folder, given)))
+    command = ["world", "students", str(made.teacher), str(made.student), "--worlds", "2"]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0, result.output
+    assert "stay with the teacher" in result.output and "fast: 640x180, 2 decoder layers of 1600" in result.output
+    given = {"students": [str(made.student)], "worlds": 2, "episodes": ""}
+    assert executed == [("08_distill", made.teacher, given)]
+    result = CliRunner().invoke(main, [*command, "--json"])
+    assert json.loads(result.output)["metrics"]["students"][1]["trials"] == 2
+    result = CliRunner().invoke(main, ["world", "students", str(made.teacher), str(made.teacher)])
+    assert result.exit_code == 1 and "Traceback" not in result.output
