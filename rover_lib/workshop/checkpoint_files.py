@@ -19,6 +19,11 @@ from rover_lib.workshop.training import trainer_config
 EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
 
 
+def trainer_can_hold(config: ActConfig) -> bool:
+    """Whether the trainer's format has a place for this policy's normalisation: ImageNet's of one camera, no other."""
+    return config.image_norm == (imagenet(),) and config.state_norm is None and config.action_unnorm is None
+
+
 def write_trainer(
     path: Path,
     config: ActConfig,
@@ -33,7 +38,7 @@ def write_trainer(
     No optimizer state: it was of another loss. Raises CheckpointError for a policy whose normalisation that format
     cannot hold: it knows ImageNet's for the picture, and none for states and actions.
     """
-    if config.image_norm != (imagenet(),) or config.state_norm or config.action_unnorm:
+    if not trainer_can_hold(config):
         raise CheckpointError(
             f"{path}: the trainer's format has no place for this policy's normalisation",
             remedy="use LeRobot's folder",

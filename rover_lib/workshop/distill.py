@@ -33,10 +33,10 @@ from rover_lib.workshop import act, training
 from rover_lib.workshop import lessons as lessons_module
 from rover_lib.workshop import pipeline as quantization
 from rover_lib.workshop import student as student_module
-from rover_lib.workshop.act import ACT, ActConfig, imagenet, inputs_of, multiply_accumulates, predictions
+from rover_lib.workshop.act import ACT, ActConfig, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint import Checkpoint, expected_shapes
-from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
+from rover_lib.workshop.checkpoint_files import trainer_can_hold, write_lerobot, write_trainer
 from rover_lib.workshop.choose import Chooser
 from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.episodes import Sample
@@ -292,7 +292,7 @@ def _train_backbone(room: _Room, saved: Resumable) -> dict[str, Tensor]:
         saved.losses["backbone"].append(descend(error, backbone, optimizer, scheduler))
     if not work.is_teacher:
         lessons.see(saved, policy, work.rng("tokens"))
-    return {f"backbone.{name}": value.detach().cpu().clone() for name, value in backbone.state_dict().items()}
+    return {name: value for name, value in policy.weights().items() if name.startswith("backbone.")}
 
 
 def _start(room: _Room, backbone: dict[str, Tensor], folder: Path) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
@@ -499,7 +499,7 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
     try:
         files = {"model.safetensors": "pretrained_model/model.safetensors"}
         write_lerobot(new / "pretrained_model", work.config, taught.weights, origin)
-        if _trainer_can_hold(work.config):
+        if trainer_can_hold(work.config):
             settings = {
                 "learning_rate": work.recipe.rate,
                 "batch_size": work.recipe.batch,
@@ -541,10 +541,6 @@ def _quantization_gate(student: dict[str, Any]) -> dict[str, Any]:
     loss = worst(v for k, v in student.items() if k.startswith("int8_") and not k.startswith("int8_teacher_"))
     limit = params()["gates"]["original"]["accuracy_loss_pct"]
     return gate("INT8 accuracy_loss_pct, or else --qat", loss, "<=", limit)
-
-
-def _trainer_can_hold(config: ActConfig) -> bool:
-    return config.image_norm == (imagenet(),) and config.state_norm is None and config.action_unnorm is None
 
 
 def _take_place(new: Path, folder: Path) -> None:
