@@ -139,13 +139,15 @@ def quantize(checkpoint: Path, episodes: "Source", output: Path, mode: str, samp
 def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as_json: bool) -> None:
     """Compare ARTIFACTS with REFERENCE (the FP32 artifact) on recorded frames.
 
-    Errors are shares of the recorded range and microseconds of servo pulse.
+    Errors are shares of the recorded range and microseconds of servo pulse. A REFERENCE that copies its state and does
+    not look at its camera is warned of.
     """
     from rover_lib.onboard.artifact import distinct_names
     from rover_lib.onboard.params import params
     from rover_lib.onboard.policy import load_policy
     from rover_lib.workshop import compare as c
     from rover_lib.workshop.episodes import load_recordings, split
+    from rover_lib.workshop.looking import look
 
     p = params()["calibration"]
     fp32 = load_policy(reference)
@@ -153,7 +155,7 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
     held_out = split(recordings, p["held_out_share"], p["seed"]).held_out
     others = {name: load_policy(path) for name, path in distinct_names(artifacts, drop="policy_").items()}
     report = c.fidelity(fp32, others, held_out, recordings.action_range(), terminal())
-    for warning in report.warnings():
+    for warning in report.warnings() + look(fp32, report, progress=terminal()).warnings():
         click.echo(f"rover: warning: {warning}", err=True)
     show({name: report.summary(name) for name in others}, as_json)
 

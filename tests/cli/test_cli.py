@@ -162,13 +162,13 @@ def test_quantizes_and_compares_on_recordings(tiny_file, drives, tmp_path):
     files = [tmp_path / f"{mode}.pt" for mode in ("fp32", "static", "mixed")]
     result = rover("compare", *files, "--episodes", drives, "--json")
     assert result.exit_code == 0, result.output
-    content = json.loads(result.output)
+    content = json.loads(result.stdout)
     assert set(content) == {"static", "mixed"}
     assert len(content["static"]["steering_mae_per_step_pct"]) == 32
     (tmp_path / "other").mkdir()
     same_name = shutil.copy(tmp_path / "static.pt", tmp_path / "other" / "static.pt")
     result = rover("compare", *files[:2], same_name, "--episodes", drives, "--json")
-    assert set(json.loads(result.output)) == {f"{tmp_path.name}/static", "other/static"}
+    assert set(json.loads(result.stdout)) == {f"{tmp_path.name}/static", "other/static"}
     plain = rover("compare", *files, "--episodes", drives)
     assert "32 values, see --json" in plain.output and "steering_mae_us" in plain.output
 

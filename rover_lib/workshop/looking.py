@@ -1,0 +1,94 @@
+"""Does a policy look, or copy? Its state is its last action, and to repeat that is right most of the time.
+
+    seen = look(fp32, report)
+    for warning in seen.warnings(): ...
+
+Each frame is planned again with the state of another one, and with the picture of another one. A policy that only
+copies moves by the states and not by the pictures: it drives well on recordings, and off the track on a car.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rover_lib.onboard.errors import PolicyError
+from rover_lib.workshop.compare import Fidelity, thinned
+from rover_lib.workshop.judge import shown_pct
+from rover_lib.workshop.progress import Progress, silent
+
+FRAMES = 24  # planned twice more each, by FP32 alone: half a minute for a policy of full size
+FOLLOWS = 0.1  # of how far plans lie apart: what moves a plan by less than that is hardly followed
+
+
+@dataclass(frozen=True, eq=False)
+class Looking:
+    """How far plans move, mean over frames and steps, in units of each action.
+
+    by_picture: with another frame's picture and their own state; by_state: the other way round; apart: how far the
+    plans of the two frames are from each other. Each (A,) float64.
+    """
+
+    report: Fidelity
+    frames: int
+    by_picture: np.ndarray
+    by_state: np.ndarray
+    apart: np.ndarray
+
+    def summary(self) -> dict[str, Any]:
+        """By action and unit, for compare.json; percentages of an action that is not judged are None."""
+        summary: dict[str, Any] = {"frames": self.frames}
+        for i, action in enumerate(self.report.action_names):
+            for name, moved in (("by_picture", self.by_picture), ("by_state", self.by_state), ("apart", self.apart)):
+                summary[f"{action}_{name}_pct"] = self.report.in_pct(float(moved[i]), action)
+                if math.isfinite(us := self.report.us(action)):
+                    summary[f"{action}_{name}_us"] = float(moved[i]) * us
+        return summary
+
+    def table(self) -> str:
+        """The same for a reader."""
+        found, lines = self.summary(), ["           another picture    another state    both"]
+        for action in self.report.action_names:
+            pct = [shown_pct(found[f"{action}_{name}_pct"]).strip() for name in ("by_picture", "by_state", "apart")]
+            lines.append(f"{action:9s}  {pct[0]:>15s}  {pct[1]:>15s}  {pct[2]:>8s}")
+        return "\n".join(lines)
+
+    def warnings(self) -> list[str]:
+        """What must be known before anybody drives it: an action that does not follow the camera."""
+        judged = [(i, a) for i, a in enumerate(self.report.action_names) if self.report.pct(a) is not None]
+        if judged and all(self.apart[i] == 0 for i, _ in judged):
+            return ["this policy plans the same whatever it is shown"]
+        blind = [(i, a) for i, a in judged if self.by_picture[i] <= FOLLOWS * self.apart[i]]
+        if judged and len(blind) == len(judged):
+            return [f"this policy ignores its camera: {self._moves(blind)}; it copies its state, do not drive it"]
+        return [f"{action} hardly follows the camera: {self._moves([(i, action)])}" for i, action in blind]
+
+    def _moves(self, actions: list[tuple[int, str]]) -> str:
+        def pct(moved: np.ndarray, i: int, action: str) -> str:
+            return shown_pct(self.report.in_pct(float(moved[i]), action)).strip()
+
+        return ", ".join(
+            f"another picture moves {a} by {pct(self.by_picture, i, a)}, another state by {pct(self.by_state, i, a)}"
+            for i, a in actions
+        )
+
+
+def look(policy: Any, report: Fidelity, frames: int = FRAMES, progress: Progress = silent) -> Looking:
+    """Swap pictures and states among frames of a comparison whose reference `policy` is.
+
+    The other frame is the one half of all frames away: of another drive, where there are several. Raises PolicyError
+    for fewer than two frames.
+    """
+    rows = thinned(range(len(report.samples)), frames)
+    if len(rows) < 2:
+        raise PolicyError("there are no two frames to swap", remedy="record more, or hold out a larger share")
+    others = np.roll(rows, len(rows) // 2).tolist()
+    moved: list[tuple[np.ndarray, ...]] = []
+    for row, other in progress(list(zip(rows, others, strict=True)), desc="swapping", total=len(rows)):
+        sample, another, plan = report.samples[row], report.samples[other], report.reference[row].astype(np.float64)
+        by_picture = policy.predict_chunk(another.frame_bgr(), sample.state)
+        by_state = policy.predict_chunk(sample.frame_bgr(), another.state)
+        moved.append(tuple(np.abs(p - plan).mean(axis=0) for p in (by_picture, by_state, report.reference[other])))
+    by_picture, by_state, apart = np.mean(moved, axis=0)
+    return Looking(report, len(rows), by_picture, by_state, apart)
