@@ -14,7 +14,7 @@ export ROVER_AS_ROOT := 1
 .PHONY: help demo run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks tables clean
 
 help:
-	@echo "make demo                                   record, train, quantize, compare, benchmark and drive in the balloon world"
+	@echo "make demo                                   record, train, quantize, compare, benchmark, drive and distill in the balloon world"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make lab                                    JupyterLab on the notebooks"
 	@echo "make firmware; make flash PORT=/dev/ttyUSB0 build the Arduino's firmware, and put it on the board"
@@ -29,7 +29,7 @@ help:
 	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino"
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
-	@echo "make notebooks                              put the demo's outputs, and runs/full's count, into the committed notebooks,"
+	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the notebooks,"
 	@echo "                                            and the JSON behind them into results/, and README's tables from it"
 	@echo "make tables                                 README's tables alone"
 
@@ -46,6 +46,9 @@ demo: $(READY)
 	$(ROVER) world train runs/demo/episodes runs/demo/best_model.pth
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
 	$(ROVER) world latency runs/demo
+	$(ROVER) distill runs/demo/best_model.pth runs/demo/episodes --name demo-small --size 96x54 --feedforward 256 --steps 20 --samples 200
+	$(ROVER) quantize runs/demo-small/best_model.pth runs/demo/episodes -o runs/demo-small/policy_static.pt --samples 50
+	$(ROVER) world students runs/demo runs/demo-small --worlds 20
 
 run: $(READY)
 	@test -n '$(CHECKPOINT)' -a -n '$(EPISODES)' || { echo 'make run needs CHECKPOINT=best_model.pth EPISODES=folder [NAME=mine]' >&2; exit 2; }

@@ -8,9 +8,9 @@ from rover_lib.onboard import load_policy
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run import NAMES, NOTEBOOKS
-from rover_lib.world import latency
+from rover_lib.world import frontier, latency
 
-STAGES = ("load", "calibrate", "quantize", "compare", "drive")
+STAGES = ("load", "calibrate", "quantize", "compare", "drive", "distill")
 
 
 def stage_of(folder, name):
@@ -22,7 +22,7 @@ def test_left_everything_that_a_run_leaves(demo_run):
         assert stage_of(demo_run, stage)["inputs"]
     for mode in ("fp32", "dynamic", "static", "mixed"):
         assert load_policy(demo_run / f"policy_{mode}.pt").manifest["mode"] == mode
-    assert {p.stem for p in demo_run.glob("*.ipynb")} >= {*NAMES, "07_drive"}
+    assert {p.stem for p in demo_run.glob("*.ipynb")} >= {*NAMES, "07_drive", "08_distill"}
     assert len(list((demo_run / "figures").glob("*.png"))) >= 5
     assert list(demo_run.glob("benchmark-*.json"))
 
@@ -64,6 +64,24 @@ def test_late_plans_are_drawn(demo_run):
     assert latency.table(stage_of(demo_run, "drive")) in text and "ensembling, 0.01" in text
     figures = {p.stem for p in (demo_run / "figures").glob("07_*.png")}
     assert figures == {f"07_{figure}" for figure in ("age", "hits", "path", "above", "gates")}
+
+
+def test_a_student_of_its_own_is_judged_beside_it(demo_run):
+    """Of a few steps: it need not be as good, but what is said of it must be what was seen."""
+    metrics = stage_of(demo_run, "distill")["metrics"]
+    teacher, student = metrics["students"]
+    assert (student["name"], student["width"], student["feedforward"]) == ("demo-small", 96, 256)
+    assert student["gmac"] < 0.6 * teacher["gmac"]
+    assert teacher["trials"] == teacher["pushed_trials"] == student["trials"] == student["pushed_trials"] == 20
+    assert teacher["hits"] >= 18 and student["hits"] >= 10  # it looks where the balloon is
+    assert teacher["teacher_steering_pct"] < 0.5 < student["teacher_steering_pct"] < 10
+    gates = frontier.gates_of(student, teacher, params()["students"])
+    assert metrics["recommendation"]["gates"] == gates
+    assert metrics["recommendation"]["name"] == ("demo-small" if all(g["passed"] for g in gates) else "teacher")
+    text = printed(demo_run / "08_distill.ipynb")
+    assert "\n".join(frontier.sentences(metrics)) in text and frontier.table(metrics) in text
+    figures = {p.stem for p in (demo_run / "figures").glob("08_*.png")}
+    assert figures == {f"08_{figure}" for figure in ("frontier", "gates", "losses")}
 
 
 @pytest.mark.parametrize("name", NAMES)
