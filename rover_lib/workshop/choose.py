@@ -24,7 +24,7 @@ from rover_lib.workshop.episodes import Sample
 from rover_lib.workshop.judge import Range, constant_actions, not_judged, pct_of_range, worst
 from rover_lib.workshop.observe import Calibration, observed_graph
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.quantize import convert, quantize
+from rover_lib.workshop.quantize import convert, forget_graphs, quantize
 from rover_lib.workshop.scheme import OBSERVERS, Scheme
 
 Errors = dict[str, float | None]  # <action>_mae_pct, None where it is not judged
@@ -72,6 +72,7 @@ class Chooser:
 
     def error(self, module: nn.Module) -> Errors:
         """Of a quantized policy, against FP32 on the samples."""
+        forget_graphs()
         return mae_pct(predictions(module, self.inputs), self.reference, self.action_range)
 
     def observer(
@@ -92,6 +93,7 @@ class Chooser:
         before = _BeforeBlocks(graph, blocks(config), self.inputs)
         table = {}
         for block in progress(blocks(config), desc="blocks"):
+            forget_graphs()
             actions = before.predictions(convert(graph, config, plain, only=[block]), block)
             table[block] = mae_pct(actions, self.reference, self.action_range)
         return table

@@ -25,7 +25,7 @@ from rover_lib.workshop.episodes import Sample, choose_calibration
 from rover_lib.workshop.export import Exporter, Parity, export
 from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.quantize import QuantizedPolicy, quantize
+from rover_lib.workshop.quantize import QuantizedPolicy, forget_graphs, quantize
 from rover_lib.workshop.scheme import Scheme
 from rover_lib.workshop.session import Opened
 
@@ -94,6 +94,7 @@ def export_policies(
     described = {}
     exporter = Exporter(checkpoint, samples, parity)
     for name, policy in policies.items():
+        forget_graphs()
         path = Path(folder) / f"policy_{name}.pt"
         if isinstance(policy, QuantizedPolicy):
             digest = exporter.export(policy, path, calibration)

@@ -8,6 +8,7 @@ Only this module and `observe` touch torch.ao.quantization, whose last version i
 """
 
 import copy
+import gc
 import time
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -96,6 +97,15 @@ def check_acted(layers: Mapping[str, nn.Module], expected: Sequence[str]) -> Non
         raise QuantizeError("nothing was quantized: the qconfig mapping matched no module")
     if missing := [n for n in expected if n not in layers]:
         raise QuantizeError(f"{len(missing)} of {len(expected)} layers stayed float: {', '.join(missing[:5])}")
+
+
+def forget_graphs() -> None:
+    """Free the converted policies that nobody has any more.
+
+    A graph and its module refer to each other, so only the collector frees them, and it counts objects, not megabytes:
+    without this a full-size run holds a dozen of them, and takes 0.5 GB more after eight of its 29 blocks.
+    """
+    gc.collect()
 
 
 @torch.inference_mode()

@@ -1,6 +1,7 @@
 """Quantization: exact where it claims to be, acting where it claims to act, loud where it cannot."""
 
 import functools
+import gc
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -344,6 +345,22 @@ def test_chooses_by_error(tiny, calibration):
     assert plain.float_blocks == () and len(steps) == 1
     dear, steps = chooser.mixed(scheme, sensitivity, budget_pct=1e-6, max_cost_pct=0)
     assert dear.float_blocks == () and len(steps) == 1  # nothing is free
+
+
+def test_choosing_holds_no_policy_that_it_has_judged(tiny, calibration):
+    chooser = Chooser(tiny, calibration, memory_samples(1, seed=8), RANGE)
+
+    def alive() -> int:
+        return sum(isinstance(thing, torch.fx.GraphModule) for thing in gc.get_objects())
+
+    gc.collect()
+    before = alive()
+    gc.disable()  # which collects when it likes, and would hide what is held
+    try:
+        chooser.sensitivity(Scheme("static"))
+        assert alive() <= before + 4, "the observed graph and the last policy, each with its graph's own module"
+    finally:
+        gc.enable()
 
 
 @pytest.mark.slow
