@@ -30,7 +30,9 @@ LOG_DRIVE = click.option(
 
 SECONDS = click.FloatRange(min=0, min_open=True)
 
-WORKSTATION_COMMANDS = frozenset({"run", "quantize", "compare", "distill", "wheelhouse", "world"})  # rover_lib.cli's
+WORKSTATION_COMMANDS = frozenset(
+    {"run", "quantize", "compare", "distill", "export-dataset", "wheelhouse", "world"}
+)  # rover_lib.cli's
 
 
 class Rover(click.Group):

@@ -138,7 +138,35 @@ def _drives(results: Path) -> list[Row]:
     ]
 
 
-TABLES: dict[str, Callable[[Path], list[Row]]] = {"demo": _demo, "faults": _faults, "drives": _drives}
+def _students(results: Path) -> list[Row]:
+    """The full-size policy that has learned, and what was distilled from it."""
+    rows = _metrics(results / "full", "distill")["students"]
+    actions = [key.removeprefix("recorded_").removesuffix("_pct") for key in rows[0] if key.startswith("recorded_")]
+
+    def row(student: Mapping[str, Any]) -> Row:
+        layers = f"{student['decoder_layers']} decoder layers of {student['feedforward']}"
+        low, high = student["computed_ms"]
+        return (
+            f"{student['name']}: {student['width']}x{student['height']}, {layers}",
+            format(student["size_mb"], ".1f"),
+            f"{student['instructions_g']:.2f} ({student['simd_g']:.2f})",
+            f"{low:.0f} to {high:.0f}",
+            f"{student['hits']} of {student['trials']}",
+            f"{student['pushed_hits']} of {student['pushed_trials']} at {student['pushed_latency_ms']:.0f} ms",
+            " / ".join(f"{student[f'recorded_{action}_pct']:.2f}" for action in actions),
+        )
+
+    counted = "10^9 instructions (SIMD), *counted*", "ms on a Pi 5, *computed*"
+    driven = "hits left alone", "pushed, and as late"
+    return [("", "MB", *counted, *driven, f"{' / '.join(actions)} error to the recordings, %"), *map(row, rows)]
+
+
+TABLES: dict[str, Callable[[Path], list[Row]]] = {
+    "demo": _demo,
+    "faults": _faults,
+    "drives": _drives,
+    "students": _students,
+}
 
 
 def _metrics(folder: Path, stage: str, otherwise: dict[str, Any] | None = None) -> dict[str, Any]:

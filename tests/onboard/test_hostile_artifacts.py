@@ -1,7 +1,7 @@
 """Artifacts that somebody made to harm: none runs, none is staged, none costs much.
 
-Each is staged on a rover in a process of its own, forked from this one, with a limit of memory and of time; what comes
-through is proven there as rover-check@ does it, confined.
+Each is staged on a rover in a process of its own, with a limit of memory and of time; what comes through is proven
+there as rover-check@ does it, confined.
 """
 
 import contextlib
@@ -14,6 +14,7 @@ import shutil
 import signal
 import struct
 import subprocess
+import sys
 import time
 import zipfile
 from collections.abc import Callable
@@ -47,37 +48,49 @@ class Outcome:
     seconds: float
 
 
+def judge(path: Path, folder: Path, proof: bool) -> tuple[bool, str, float, float]:
+    """In a process of its own: an Outcome's values."""
+    signal.alarm(30)  # of one that waits
+    resource.setrlimit(resource.RLIMIT_CPU, (20, 20))
+    before_mb, start, staged, sentence = Host().process_peak_memory_mb(), time.monotonic(), False, ""
+    try:
+        releases = Releases(folder / "models", expected=EITHER)
+        name = releases.stage(path, unsigned=True).name
+        staged = True
+        if proof:
+            confine(memory_mb(path, 1))
+            releases.verify(name)
+    except RoverError as error:
+        sentence = str(error)
+    except BaseException as error:
+        sentence = f"UNFORESEEN {type(error).__name__}: {error}"
+    return staged, sentence, Host().process_peak_memory_mb() - before_mb, time.monotonic() - start
+
+
 def judged(path: Path, folder: Path, proof: bool = False) -> Outcome:
-    """path: of an artifact, or of a folder of parts. proof: run it, too, if it is staged."""
-    reading, writing = os.pipe()
-    start = time.monotonic()
-    pid = os.fork()
-    if pid == 0:
-        signal.alarm(30)  # of one that waits
-        resource.setrlimit(resource.RLIMIT_CPU, (20, 20))
-        with contextlib.suppress(BaseException):
-            os.close(reading)
-            before_mb, staged, sentence = Host().process_peak_memory_mb(), False, ""
-            try:
-                releases = Releases(folder / "models", expected=EITHER)
-                name = releases.stage(path, unsigned=True).name
-                staged = True
-                if proof:
-                    confine(memory_mb(path, 1))
-                    releases.verify(name)
-            except RoverError as error:
-                sentence = str(error)
-            except BaseException as error:
-                sentence = f"UNFORESEEN {type(error).__name__}: {error}"
-            cost_mb = Host().process_peak_memory_mb() - before_mb
-            os.write(writing, json.dumps([staged, sentence, cost_mb]).encode())
-        os._exit(0)
-    os.close(writing)
-    with os.fdopen(reading, "rb") as pipe:
-        answer = pipe.read()
-    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    said = json.loads(answer) if answer else [False, f"UNFORESEEN: it ended with {code}", 0.0]
-    return Outcome(*said, time.monotonic() - start)
+    """path: of an artifact, or of a folder of parts. proof: run it, too, if it is staged.
+
+    What is run is so by a new interpreter, as on a rover: a process that was forked off one with many tests behind it
+    may take what those have freed, beyond its limit.
+    """
+    if proof:
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        command = [sys.executable, __file__, path, folder]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+        answer, code = done.stdout, done.returncode
+    else:
+        reading, writing = os.pipe()
+        pid = os.fork()
+        if pid == 0:
+            with contextlib.suppress(BaseException):
+                os.close(reading)
+                os.write(writing, json.dumps(judge(path, folder, proof)).encode())
+            os._exit(0)
+        os.close(writing)
+        with os.fdopen(reading, "rb") as pipe:
+            answer = pipe.read().decode()
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    return Outcome(*json.loads(answer)) if answer else Outcome(False, f"UNFORESEEN: it ended with {code}", 0.0, 0.0)
 
 
 def refused(path: Path, folder: Path, message: str, *, staged: bool = False) -> None:
@@ -570,3 +583,7 @@ def test_what_is_refused_above_is_of_our_own_form_otherwise(artifacts, tmp_path)
         hostile(artifacts, tmp_path, {".py": line_before_end("y = torch.add(y, 0)")}), tmp_path, proof=True
     )
     assert (outcome.staged, outcome.sentence) == (True, "")
+
+
+if __name__ == "__main__":
+    print(json.dumps(judge(Path(sys.argv[1]), Path(sys.argv[2]), proof=True)))
