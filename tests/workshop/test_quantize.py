@@ -347,6 +347,7 @@ def test_chooses_by_error(tiny, calibration):
     assert dear.float_blocks == () and len(steps) == 1  # nothing is free
 
 
+@pytest.mark.slow
 def test_choosing_holds_no_policy_that_it_has_judged(tiny, calibration):
     chooser = Chooser(tiny, calibration, memory_samples(1, seed=8), RANGE)
 
