@@ -391,7 +391,8 @@ def lerobot_folder(path: Path) -> Path | None:
     return None
 
 
-def _load_lerobot(folder: Path) -> Checkpoint:
+def _act_config(folder: Path) -> dict[str, Any]:
+    """config.json of a whole ACT policy. Raises CheckpointError for an adapter and for other policies."""
     raw = {} if (folder / ADAPTER).exists() else _read_json(folder / "config.json")
     if not raw or raw.get("use_peft"):
         raise CheckpointError(
@@ -406,12 +407,11 @@ def _load_lerobot(folder: Path) -> Checkpoint:
             else "only 'act' is known here; if it is one from before 2025, convert it by LeRobot's "
             "lerobot.processor.migrate_policy_normalization",
         )
-    file = folder / "model.safetensors"
-    _refuse_shards(folder, file)
-    state = _read_safetensors(file)
-    buffers = {name: state.pop(name) for name in list(state) if name.startswith(BUFFERS)}
-    weights = _named_weights(file, state, file.stat().st_size)
-    inputs, outputs = (_features(folder, raw, key) for key in ("input_features", "output_features"))
+    return raw
+
+
+def _picture_sizes(folder: Path, inputs: Mapping[str, tuple[str, list[int]]]) -> dict[str, tuple[int, int]]:
+    """(height, width) by camera. Raises CheckpointError for inputs that no camera car has."""
     sizes: dict[str, tuple[int, int]] = {}
     for name, (kind, shape) in inputs.items():
         if kind == "VISUAL":
@@ -431,6 +431,18 @@ def _load_lerobot(folder: Path) -> Checkpoint:
             f"{folder}: the policy has no camera input (it has {listed(inputs) or 'none'})",
             remedy="nothing to drive by",
         )
+    return sizes
+
+
+def _load_lerobot(folder: Path) -> Checkpoint:
+    raw = _act_config(folder)
+    file = folder / "model.safetensors"
+    _refuse_shards(folder, file)
+    state = _read_safetensors(file)
+    buffers = {name: state.pop(name) for name in list(state) if name.startswith(BUFFERS)}
+    weights = _named_weights(file, state, file.stat().st_size)
+    inputs, outputs = (_features(folder, raw, key) for key in ("input_features", "output_features"))
+    sizes = _picture_sizes(folder, inputs)
     if "observation.state" not in inputs:
         raise CheckpointError(
             f"{folder}: the policy has no 'observation.state' input", remedy="LeRobot's forward needs one too"

@@ -3,6 +3,7 @@
 `episodes` reads our own recordings and `lerobot_dataset` LeRobot's; behind them nobody asks which of the two it was.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,11 @@ class Source:
         if isinstance(path, Source):
             return path
         return cls(Path(path), tuple(name.strip() for name in action_names.split(",") if name.strip()), camera)
+
+    @classmethod
+    def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":
+        """What a run loaded, or other recordings, read as those were. given: the params of its load.json."""
+        return cls.of(elsewhere or given["episodes"], given.get("action_names", ""), given.get("camera", ""))
 
 
 @dataclass(frozen=True)

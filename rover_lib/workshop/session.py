@@ -60,8 +60,7 @@ def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:
     if sum(stage["metrics"]["checkpoint"]["macs_by_block"].values()) < SMALL_GMAC * 1e9:
         torch.set_num_threads(1)
     given = stage["params"]
-    source = Source.of(given["episodes"], given.get("action_names", ""), given.get("camera", ""))
-    again = load(given["checkpoint"], source, progress)
+    again = load(given["checkpoint"], Source.loaded(given), progress)
     if again.checkpoint.sha256 != stage["metrics"]["checkpoint"]["sha256"]:
         raise RoverError(
             f"{again.checkpoint.path}: is not what notebook 01 loaded any more", remedy="run notebook 01 again"

@@ -6,14 +6,13 @@ A table stands in README between `<!-- table NAME, by make tables -->` and `<!--
 count that was not made, is an empty field.
 """
 
-import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.stage import atomic_path
+from rover_lib.onboard.stage import atomic_path, read_stage
 
 README = Path(__file__).parents[2] / "README.md"
 MODES = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed"}
@@ -177,7 +176,7 @@ def _metrics(folder: Path, stage: str, otherwise: dict[str, Any] | None = None) 
     if len(paths) != 1:
         found = [path.name for path in paths] or "none"
         raise TableError(f"{folder.name}/{stage}.json must be there once", found=found, remedy="make notebooks")
-    return json.loads(paths[0].read_text())["metrics"]
+    return read_stage(paths[0], stage.removesuffix("-*"))["metrics"]
 
 
 def _of(values: Mapping[str, Any], key: str, form: str) -> str | None:

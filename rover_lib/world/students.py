@@ -35,7 +35,7 @@ from rover_lib.workshop.judge import not_judged
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import Recordings, Sample, Source
 from rover_lib.world import latency, trial, world
-from rover_lib.world.frontier import NOBODY_DROVE, recommendation
+from rover_lib.world.frontier import DRIVES, NOBODY_DROVE, recommendation
 from rover_lib.world.latency import SEED, Condition, drive_late
 from rover_lib.world.trial import run_trials, wilson_interval
 
@@ -192,8 +192,7 @@ def _counts(run_dir: Path) -> dict[str, Any] | None:
 def _source_of(run_dir: Path, episodes: Path | str | None) -> Source:
     """What the teacher's run loaded, or other recordings, read as those were."""
     if (run_dir / "load.json").is_file():
-        given = read_stage(run_dir / "load.json", "load")["params"]
-        return Source.of(episodes or given["episodes"], given.get("action_names", ""), given.get("camera", ""))
+        return Source.loaded(read_stage(run_dir / "load.json", "load")["params"], episodes)
     if not episodes:
         raise DistillError(f"{run_dir}: says nothing of its recordings", remedy="give --episodes")
     return Source.of(episodes)
@@ -304,7 +303,7 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
         files[name] = cache_root() / f"drives-{key}.jsonl"
     found = _driven(run, asked, files, range(SEED, SEED + worlds), progress)
     row: dict[str, Any] = {"pushed_latency_ms": pushed_ms if worlds else None}
-    for name in ("", "pushed_"):
+    for name in DRIVES:
         missed = [seed for seed, outcome in found[name].items() if outcome != "hit"] if name in found else None
         hits = None if missed is None else worlds - len(missed)
         low, high = (None, None) if hits is None else wilson_interval(hits, worlds)

@@ -388,7 +388,7 @@ def test_the_service_says_what_the_command_line_takes(units):
 
 HOSTILE = [
     "/dev/video0 --throttle-limit 1",
-    "/dev/video0\nExecStartPre=+/bin/touch /root/mine",
+    "/dev/video0\nExecStartPre=+/bin/touch /etc/mine",
     "/dev/video0\\",
     "%h/video %n %%",
     "$HOME ${PATH} $$",

@@ -21,7 +21,7 @@ SEEDS = list(range(10_000, 10_200))
 
 
 def row(name, lost=0, pushed_lost=0, above=0.0, work=1.0, **changed):
-    """A policy that misses so many of 200 worlds, and so many of 200 in which it is pushed."""
+    """A policy that misses `lost` of 200 worlds when left alone, and `pushed_lost` of them when it is pushed."""
     values = {"name": name, "height": 180, "width": 320, "decoder_layers": 2, "feedforward": 1600, "qat": False}
     values |= {"gmac": 10 * work, "instructions_g": work, "simd_g": work, "size_mb": 30.0}
     values |= {"computed_ms": [40 * work, 60 * work], "pushed_latency_ms": 60 * work}
