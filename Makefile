@@ -16,7 +16,7 @@ export ROVER_AS_ROOT := 1
 help:
 	@echo "make demo                                   record, train, quantize, compare, benchmark, drive and distill in the balloon world"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
-	@echo "make lab                                    JupyterLab on the notebooks"
+	@echo "make lab NAME=mine                          JupyterLab on the notebooks of a run, with its outputs"
 	@echo "make firmware; make flash PORT=/dev/ttyUSB0 build the Arduino's firmware, and put it on the board"
 	@echo
 	@echo "For who changes something; CONTRIBUTING.md says what each proves and how long it takes:"
@@ -47,8 +47,8 @@ demo: $(READY)
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
 	$(ROVER) world latency runs/demo
 	$(ROVER) distill runs/demo/best_model.pth runs/demo/episodes --name demo-small --size 96x54 --feedforward 256 --steps 20 --samples 200
-	$(ROVER) quantize runs/demo-small/best_model.pth runs/demo/episodes -o runs/demo-small/policy_static.pt --samples 50
 	$(ROVER) world students runs/demo runs/demo-small --worlds 20
+	$(ROVER) report runs/demo
 
 run: $(READY)
 	@test -n '$(CHECKPOINT)' -a -n '$(EPISODES)' || { echo 'make run needs CHECKPOINT=best_model.pth EPISODES=folder [NAME=mine]' >&2; exit 2; }
@@ -102,8 +102,9 @@ firmware:
 flash:
 	$(MAKE) -C firmware flash PORT='$(PORT)'
 
+# The executed notebooks of a run, or where there is none of that name, those of the repository.
 lab: $(READY)
-	$(VENV)/bin/jupyter lab notebooks
+	$(VENV)/bin/jupyter lab $(if $(wildcard runs/$(NAME)/01_load.ipynb),'runs/$(NAME)',notebooks)
 
 notebooks: demo
 	$(VENV)/bin/python -m rover_lib.workshop.publish

@@ -1,12 +1,12 @@
 """What many tests share: one tiny policy, its calibration and its artifacts, and the demo's run."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from hypothesis import settings
-
-# LeRobot takes ten seconds to import, and `policies` needs it: here inside of the fixtures that have a policy.
 
 # In a container there may be nobody but root.
 os.environ.setdefault("ROVER_AS_ROOT", "1")
@@ -16,9 +16,9 @@ settings.load_profile("shared machine")
 
 
 def pytest_collection_modifyitems(items):
-    """What drives by the demo's policy starts processes that import torch: none of it is quick."""
+    """What drives by the demo's policy starts processes that import torch, and a kit takes ten seconds: not quick."""
     for item in items:
-        if "demo_run" in getattr(item, "fixturenames", ()):
+        if {"demo_run", "hailo_kit"} & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
 
 
@@ -28,6 +28,25 @@ def _one_thread():
     import torch
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory) -> Callable[[str, Callable[[Path], None]], Path]:
+    """made_once(name, make): a folder that make(folder) has filled once for all processes of this run of pytest."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def folder(name: str, make: Callable[[Path], None]) -> Path:
+        made = shared / name
+        with FileLock(f"{made}.lock"):
+            if not made.exists():
+                making = Path(f"{made}.making")
+                making.mkdir(exist_ok=True)
+                make(making)
+                making.rename(made)
+        return made
+
+    return folder
 
 
 @pytest.fixture(scope="session")
@@ -46,13 +65,14 @@ def full_policy():
 
 
 @pytest.fixture(scope="session")
-def tiny_file(tiny_policy, tmp_path_factory) -> Path:
-    import torch
-    from policies import trainer_content
+def tiny_file(made_once, request) -> Path:
+    def make(folder: Path) -> None:
+        import torch
+        from policies import trainer_content
 
-    path = tmp_path_factory.mktemp("checkpoint") / "best_model.pth"
-    torch.save(trainer_content(tiny_policy), path)
-    return path
+        torch.save(trainer_content(request.getfixturevalue("tiny_policy")), folder / "best_model.pth")
+
+    return made_once("checkpoint", make) / "best_model.pth"
 
 
 @pytest.fixture(scope="session")
@@ -72,27 +92,52 @@ def calibration(tiny):
 
 
 @pytest.fixture(scope="session")
-def artifacts(tiny, calibration, tmp_path_factory) -> dict[str, Path]:
+def artifacts(made_once, request) -> dict[str, Path]:
     """One artifact per mode of the tiny policy."""
+
+    def make(folder: Path) -> None:
+        from policies import memory_samples
+
+        from rover_lib.workshop.act import ACT
+        from rover_lib.workshop.export import export
+        from rover_lib.workshop.quantize import quantize
+        from rover_lib.workshop.scheme import Scheme
+
+        tiny, calibration = request.getfixturevalue("tiny"), request.getfixturevalue("calibration")
+        samples = memory_samples(4, seed=1)
+        export(ACT(tiny.config, tiny.weights), tiny, folder / "policy_fp32.pt", samples=samples)
+        for scheme in (
+            Scheme("dynamic"),
+            Scheme("static"),
+            Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward")),
+        ):
+            path = folder / f"policy_{scheme.mode}.pt"
+            export(quantize(tiny, scheme, calibration), tiny, path, samples=samples, calibration=calibration)
+
+    folder = made_once("artifacts", make)
+    return {mode: folder / f"policy_{mode}.pt" for mode in ("fp32", "dynamic", "static", "mixed")}
+
+
+@pytest.fixture(scope="session")
+def hailo_kit(tiny, tmp_path_factory) -> Path:
+    """The tiny policy for Hailo's compiler. Who writes into it takes a copy."""
+    from hailo_kit import make_kit, normalised
+
+    return make_kit(normalised(tiny), tmp_path_factory.mktemp("hailo") / "kit")
+
+
+@pytest.fixture(scope="session")
+def onnx_static(tiny, calibration, tmp_path_factory) -> Path:
+    """The artifact of `artifacts["static"]`, for ONNX Runtime."""
     from policies import memory_samples
 
-    from rover_lib.workshop.act import ACT
     from rover_lib.workshop.export import export
     from rover_lib.workshop.quantize import quantize
     from rover_lib.workshop.scheme import Scheme
 
-    folder = tmp_path_factory.mktemp("artifacts")
-    samples = memory_samples(4, seed=1)
-    paths = {"fp32": folder / "policy_fp32.pt"}
-    export(ACT(tiny.config, tiny.weights), tiny, paths["fp32"], samples=samples)
-    for mode, scheme in {
-        "dynamic": Scheme("dynamic"),
-        "static": Scheme("static"),
-        "mixed": Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward")),
-    }.items():
-        paths[mode] = folder / f"policy_{mode}.pt"
-        export(quantize(tiny, scheme, calibration), tiny, paths[mode], samples=samples, calibration=calibration)
-    return paths
+    path = tmp_path_factory.mktemp("onnx") / "policy_static.onnx.zip"
+    export(quantize(tiny, Scheme("static"), calibration), tiny, path, memory_samples(4, seed=1), calibration)
+    return path
 
 
 @pytest.fixture(scope="session")

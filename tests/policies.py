@@ -1,14 +1,16 @@
 """Policies and recordings that are small enough for tests, and made by the same tools as real ones."""
 
+# LeRobot takes ten seconds to import in each process that collects tests: whoever needs it imports it in its functions.
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import torch
-from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.policies.act.configuration_act import ACTConfig
-from lerobot.policies.act.modeling_act import ACTPolicy
-from torchvision.ops.misc import FrozenBatchNorm2d
+
+if TYPE_CHECKING:
+    from lerobot.policies.act.modeling_act import ACTPolicy
 
 TINY = {
     "dim_model": 64,
@@ -30,8 +32,13 @@ def smooth_frame(rng: np.random.Generator, height: int, width: int) -> np.ndarra
 
 def lerobot_policy(
     cameras: dict[str, tuple[int, int]] | None = None, states: int = 2, actions: int = 2, seed: int = 0, **config
-) -> ACTPolicy:
+) -> "ACTPolicy":
     """LeRobot's own policy with random weights, in eval mode; frozen statistics set so that its features are alive."""
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from torchvision.ops.misc import FrozenBatchNorm2d
+
     cameras = cameras or {"observation.images.cam_front": (72, 128)}
     config.setdefault("n_action_steps", config.get("chunk_size", 100))
     torch.manual_seed(seed)
@@ -70,7 +77,7 @@ def lerobot_policy(
     return policy
 
 
-def trainer_config(policy: ACTPolicy) -> dict:
+def trainer_config(policy: "ACTPolicy") -> dict:
     c = policy.config
     _, height, width = next(iter(c.image_features.values())).shape
     return {
@@ -95,7 +102,7 @@ def trainer_config(policy: ACTPolicy) -> dict:
     }
 
 
-def trainer_content(policy: ACTPolicy) -> dict:
+def trainer_content(policy: "ACTPolicy") -> dict:
     """What the user's trainer saves, optimizer and numpy scalar included."""
     optimizer = torch.optim.AdamW([policy.model.action_head.weight], lr=1e-4)
     policy.model.action_head.weight.grad = torch.ones_like(policy.model.action_head.weight)

@@ -10,7 +10,19 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = ("rover_lib.onboard", "rover_lib.workshop", "rover_lib.world", "rover_lib.cli", "lab")  # the lowest first
 ROOMS = ("lab.debian", "lab.arduino", "lab.driving", "lab.a76", "lab.pi", "lab.__main__")  # of the laboratory, the same
-ONBOARD_NEEDS = {"torch", "numpy", "cv2", "simplejpeg", "serial", "yaml", "systemd_watchdog", "click", "rover_lib"}
+ONBOARD_NEEDS = {
+    "torch",
+    "onnxruntime",
+    "hailo_platform",  # of Hailo's own packages, where there is such a card
+    "numpy",
+    "cv2",
+    "simplejpeg",
+    "serial",
+    "yaml",
+    "systemd_watchdog",
+    "click",
+    "rover_lib",
+}
 
 
 @functools.cache

@@ -19,6 +19,7 @@ def test_a_test_is_repeated_while_the_machine_is_late():
     assert len(attempts) == 3
 
 
+@pytest.mark.slow
 def test_it_fails_in_the_end_and_says_why():
     attempts = []
 

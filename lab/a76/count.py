@@ -2,7 +2,7 @@
 
 import json
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from lab.a76.core import GUEST, Core, emulate_script
+from lab.a76.core import FOR_GUEST, GUEST, Core, emulate_script, fetch_wheels
 from lab.a76.symbols import GuestFunctions, by_kernel
+from rover_lib.onboard import engines
+from rover_lib.onboard.artifact import read_manifest
+from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.progress import Progress
 
 COUNTED = 10  # inferences after loading, each for itself
@@ -29,6 +32,23 @@ class Guest:
 
 
 OURS = Guest()
+ONNXRUNTIME = "onnxruntime==1.31.1"  # of requirements_pi_onnxruntime.txt
+
+
+def onnxruntime_there() -> Path:
+    """The folder of ONNX Runtime's package for the emulated Pi, from the cache or fetched now; numpy is there."""
+    made = {"packages": (ONNXRUNTIME,), "for": FOR_GUEST}
+
+    def make(folder: Path) -> None:
+        fetch_wheels(folder, *FOR_GUEST, ONNXRUNTIME)
+
+    return cached_folder("arm-peer-onnxruntime", key_of(made), make)
+
+
+def guest_of(artifact: Path) -> Guest:
+    """What runs an artifact of ours: the same script, with the engine that its manifest names."""
+    is_onnx = read_manifest(artifact)["engine"] == engines.ONNXRUNTIME
+    return Guest(packages=onnxruntime_there()) if is_onnx else OURS
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +73,15 @@ class Counted:
 
 
 def write_observations(path: Path, samples: Sequence[Any]) -> Path:
-    """What a policy shall see, where the guest can read it: `state` (n, S) float32, `frame_0000`... (h, w, 3) BGR."""
-    frames = {f"frame_{i:04d}": s.frame_bgr() for i, s in enumerate(samples)}
+    """What a policy shall see, where the guest can read it: `state` (n, S) float32, `frame_0000`... (h, w, 3) BGR.
+
+    Of several cameras `frame_0000.<camera>`, ... each.
+    """
+    frames: dict[str, Any] = {}
+    for i, sample in enumerate(samples):
+        seen = sample.frame_bgr()
+        by_name = {f".{camera}": frame for camera, frame in seen.items()} if isinstance(seen, Mapping) else {"": seen}
+        frames |= {f"frame_{i:04d}{name}": frame for name, frame in by_name.items()}
     np.savez(path, state=np.stack([s.state for s in samples]).astype(np.float32), **frames)
     return path
 

@@ -17,17 +17,17 @@ import numpy as np
 import torch
 
 from lab.a76.core import Core, CountError, emulate_script, prepare
-from lab.a76.count import COUNTED, OURS, STEADY, Counted, count_artifact, side_by_side
+from lab.a76.count import COUNTED, OURS, STEADY, Counted, count_artifact, guest_of, side_by_side
 from lab.a76.report import LABEL, STATIC, artifact_metrics, gates
 from lab.params import lab_params
-from rover_lib.onboard.artifact import content_hash, read_manifest
-from rover_lib.onboard.params import params
+from rover_lib.onboard.artifact import ONNX_SUFFIX, read_manifest
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.judge import pct_of_range
+from rover_lib.workshop.pipeline import requantized
 from rover_lib.workshop.program import run
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.session import Opened, opened
@@ -65,7 +65,8 @@ def count_run(
     what reading the run raises.
     """
     run_dir = Path(run_dir)
-    artifacts = {p.stem: p for p in sorted(run_dir.glob("policy_*.pt"))}
+    files = [*run_dir.glob("policy_*.pt"), *run_dir.glob(f"policy_*{ONNX_SUFFIX}")]
+    artifacts = {p.stem: p for p in sorted(files)}
     if REFERENCE not in artifacts:
         raise CountError(
             f"{run_dir}: no {REFERENCE}.pt in it", found=sorted(artifacts), remedy="'rover run' makes a run"
@@ -107,9 +108,9 @@ def plans_of(manifests: Mapping[str, Mapping[str, Any]], frames: int) -> dict[st
     plans, every = {}, range(frames)
     for stem, manifest in manifests.items():
         reference = reference_of(stem, manifests)
-        if reference is None or (stem == reference and manifest["gmac"] >= SLOW_GMAC):
+        if reference is None or (manifest["mode"] == "fp32" and manifest["gmac"] >= SLOW_GMAC):
             plans[stem] = Plan(reference, tuple(every[:STEADY]), STEADY)
-        elif stem == reference or manifest["mode"] == "dynamic":
+        elif manifest["mode"] in ("fp32", "dynamic"):
             # FP32 is only held against this machine's, and nobody would drive a Pi with dynamic: both are slow.
             plans[stem] = Plan(reference, thinned(every, COUNTED))
         else:
@@ -129,7 +130,8 @@ def _count_all(
     counts: dict[str, Callable[..., Counted]] = {}
     for stem, plan in plans.items():
         chosen = [samples[i] for i in plan.frames]
-        counts[stem] = partial(count_artifact, core, artifacts[stem], chosen, counted=plan.counted)
+        guest = guest_of(artifacts[stem])
+        counts[stem] = partial(count_artifact, core, artifacts[stem], chosen, guest=guest, counted=plan.counted)
     inferences = sum(max(len(plan.frames), plan.counted) for plan in plans.values())
     return side_by_side(counts, inferences, "emulated inferences", jobs, progress)
 
@@ -150,8 +152,11 @@ def _judged(
     ranges = again.recordings.action_range()
     for reference in sorted({plan.reference for plan in plans.values() if plan.reference}):
         here = chunks_here(artifacts[reference], samples, progress)
-        difference = float(np.abs(counts[reference].chunks - here[list(plans[reference].frames)]).max())
-        if not difference <= params()["parity"]["fp32"]:
+        differences = np.abs(counts[reference].chunks - here[list(plans[reference].frames)]).max((0, 1))
+        difference = float(differences.max())
+        tolerance = read_manifest(artifacts[reference])["parity"]["tolerance"]
+        names = again.checkpoint.config.action_names
+        if not all(d <= tolerance[name] for name, d in zip(names, differences, strict=True)):
             raise CountError(
                 f"{artifacts[reference]}: differs by {difference:.2g} on the core", remedy="quantize again"
             )
@@ -159,7 +164,6 @@ def _judged(
             frames = plans[stem].frames
             expected, chosen = here[list(frames)], [samples[i] for i in frames]
             at_home = expected if stem == reference else chunks_here(artifacts[stem], chosen, progress)
-            names = again.checkpoint.config.action_names
             rows[stem] = errors_pct(expected, counts[stem].chunks, names, ranges)
             rows[stem] |= {f"workstation_{k}": v for k, v in errors_pct(expected, at_home, names, ranges).items()}
             rows[stem] |= {"reference": reference, "frames_on_the_core": len(frames)}
@@ -185,29 +189,13 @@ def errors_pct(
     return {f"{action}_mae_pct": pct_of_range(float(mean[i]), ranges[action]) for i, action in enumerate(actions)}
 
 
-def requantized(run_dir: Path, checkpoint: Checkpoint) -> q.QuantizedPolicy:
-    """The policy that a run's policy_static.pt was exported from, made again from the run's calibration.
-
-    Raises CountError if the run's files are not those that the artifact was made from.
-    """
-    stage = read_stage(run_dir / "quantize.json", "quantize")
-    made, calibrated = stage["metrics"]["modes"][STATIC.removeprefix("policy_")], run_dir / "calibration.pt"
-    hashes = content_hash(run_dir / f"{STATIC}.pt"), sha256_of(calibrated)
-    if hashes != (made["content_hash"], stage["inputs"]["calibration.pt"]):
-        raise CountError(
-            f"{run_dir}: {STATIC}.pt and calibration.pt are not those of quantize.json", remedy="quantize again"
-        )
-    scheme = q.Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
-    return q.quantize(checkpoint, scheme, q.Calibration.load(calibrated))
-
-
 def backbone_bits(run_dir: Path, core: Core, checkpoint: Checkpoint, samples: Sequence[Any]) -> dict[str, int]:
     """Whether policy_static's INT8 backbone gives the same bits in the emulated Pi as on this machine.
 
-    The backbone (up to the image projection's INT8 output) is cut out of the same graph (see `requantized`) and run on
-    prepared frames on both. Returns {frames, values, differing}, the counts of frames, of values that were compared,
-    and of those that are not the same. Raises CountError if the run's files are not those that policy_static.pt was
-    made from.
+    The backbone (up to the image projection's INT8 output) is cut out of the same graph (see pipeline.requantized) and
+    run on prepared frames on both. Returns {frames, values, differing}, the counts of frames, of values that were
+    compared, and of those that are not the same. Raises QuantizeError if the run's files are not those that
+    policy_static.pt was made from.
     """
     backbone = q.backbone_of(requantized(run_dir, checkpoint)).eval()
     inputs = [q.inputs_of(s, checkpoint.config) for s in samples]
@@ -217,8 +205,11 @@ def backbone_bits(run_dir: Path, core: Core, checkpoint: Checkpoint, samples: Se
             warnings.simplefilter("ignore")  # of the trace: shapes are constants here, and meant to be
             traced = torch.jit.freeze(torch.jit.trace(backbone, inputs[0], check_trace=False).eval())
         traced.save(folder / "backbone.pt")
-        frames: dict[str, Any] = {f"frame_{i:04d}": frame.numpy() for i, (_, frame) in enumerate(inputs)}
-        np.savez(folder / "inputs.npz", state=torch.cat([state for state, _ in inputs]).numpy(), **frames)
+        frames: dict[str, Any] = {}
+        for i, (_, *seen) in enumerate(inputs):
+            for camera, frame in zip(checkpoint.config.cameras, seen, strict=True):
+                frames[f"frame_{i:04d}.{camera}"] = frame.numpy()
+        np.savez(folder / "inputs.npz", state=torch.cat([x[0] for x in inputs]).numpy(), **frames)
         with torch.jit.optimized_execution(False):
             here = torch.cat([traced(*x) for x in inputs]).numpy()
         emulate_script(core, OURS.script, ["--backbone", q.ENGINE, "backbone.pt", "inputs.npz"], folder)

@@ -40,8 +40,9 @@ GROUPS = (
 COLUMNS = {  # of the table, with their widths
     **dict.fromkeys(("instructions_g", "simd_g", "x_floor", "first_g", "tenth_g", "load_instructions_g"), 7),
     **{"peak_memory_mb": 6, "peak_memory_loading_mb": 7},
-    **{"steering_mae_pct": 8, "throttle_mae_pct": 8, "frames_on_the_core": 6},
 }
+FRAMES = "frames_on_the_core"
+WORST = "worst action"  # of a policy with more than two
 
 
 def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, Any]:
@@ -150,13 +151,18 @@ def table(content: dict[str, Any]) -> str:
     counted = metrics["artifacts"] | {n: m for n, m in metrics.get("peers", {}).items() if "artifact" not in m}
     rows = sorted(counted.items(), key=lambda item: item[1]["instructions_g"])
     wide = max(24, *(len(stem) for stem in counted))
+    keys = {k: None for _, m in rows for k in m if k.endswith("_mae_pct") and not k.startswith("workstation_")}
+    errors = {k: k.removesuffix("_mae_pct") for k in keys} if len(keys) <= 2 else {WORST: WORST}
+    widths = COLUMNS | {key: max(8, len(name)) for key, name in errors.items()} | {FRAMES: 6}
+    named = " ".join(f"{name:>{widths[key]}}" for key, name in errors.items())
     lines = [
         f"{LABEL}, G instructions per inference; errors against FP32 in percent of the recorded range",
         f"{'':{wide}} {'steady':>7} {'SIMD':>7} {'x floor':>7} {'first':>7} {'tenth':>7} {'load':>7}"
-        f" {'MB':>6} {'loading':>7} {'steering':>8} {'throttle':>8} {'frames':>6}",
+        f" {'MB':>6} {'loading':>7} {named} {'frames':>6}",
     ]
     for stem, m in rows:
-        cells = (_cell(m.get(key), key, width) for key, width in COLUMNS.items())
+        shown = m | {WORST: worst(m.get(key) for key in keys)}
+        cells = (_cell(shown.get(key), key, width) for key, width in widths.items())
         lines.append(" ".join([f"{stem:{wide}}", *cells]))
     lines += ["", f"computed from these counts for a Raspberry Pi 5, ms, never timed ({PREDICTED})"]
     for stem, m in rows:
@@ -174,5 +180,6 @@ def table(content: dict[str, Any]) -> str:
 
 
 def _cell(value: float | None, key: str, width: int) -> str:
-    form = ".3f" if key.endswith("_pct") else ".0f" if key.endswith("_mb") else ".2f" if key == "x_floor" else ".4g"
+    error = key.endswith("_pct") or key == WORST
+    form = ".3f" if error else ".0f" if key.endswith("_mb") else ".2f" if key == "x_floor" else ".4g"
     return f"{'-' if value is None else format(value, form):>{width}}"

@@ -12,16 +12,19 @@ ROVERS = onboard.main.commands
 SECTIONS = {
     "Prepare a policy": (
         prepare.run,
+        prepare.list_runs,
         prepare.inspect,
+        prepare.report,
         prepare.quantize,
         prepare.compare,
-        prepare.distill,
-        prepare.export_dataset,
         ROVERS["benchmark"],
+        prepare.distill,
+        prepare.export,
+        prepare.export_dataset,
     ),
+    "Drive": (ROVERS["doctor"], ROVERS["record"], drive.drive, drive.log),
+    "Set up a rover, and arm it": (prepare.wheelhouse, ROVERS["release"], ROVERS["arm-car"], ROVERS["heartbeat"]),
     "Try it without a car": (world.world,),
-    "Set up a rover": (prepare.wheelhouse, ROVERS["release"]),
-    "Drive": (ROVERS["doctor"], ROVERS["record"], drive.drive, ROVERS["arm-car"], ROVERS["heartbeat"], drive.log),
 }
 
 

@@ -7,9 +7,10 @@ from typing import Any
 import click
 
 from rover_lib.onboard.cli import FILE, LOG_DRIVE, drive_options, run_drive, sum_up
+from rover_lib.onboard.kinds import PathTo
 
 
-@click.command()
+@click.command(short_help="Drive a car, or the balloon world, by an artifact.")
 @drive_options
 @click.option("--world", "in_world", is_flag=True, help="The balloon world instead of a car, in real time.")
 @click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="With --world: of a plan, at least.")
@@ -29,8 +30,8 @@ def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **op
     ctx.exit(run_drive(car=partial(VirtualCar, seed=seed) if in_world else None, latency_ms=latency_ms, **options))
 
 
-@click.command()
-@click.argument("file", type=FILE)
+@click.command(short_help="Sum up a flight log, and draw it.")
+@click.argument("file", type=PathTo("flight log"))
 @click.option("-o", "--output", type=FILE, help="The figure to write [default: FILE.png].")
 @LOG_DRIVE
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")

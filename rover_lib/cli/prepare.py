@@ -3,7 +3,6 @@
 import functools
 import json
 import re
-import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rover_lib.onboard.cli import AS_JSON, FILE, describe_artifact, show
+from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
+from rover_lib.onboard.columns import aligned
+from rover_lib.onboard.kinds import PathTo
 from rover_lib.workshop.progress import terminal
 
 if TYPE_CHECKING:
@@ -27,10 +28,13 @@ def _size(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int
     return int(sizes[2]), int(sizes[1])
 
 
+CHECKPOINT, EPISODES = PathTo("checkpoint"), PathTo("recordings")
 ACTION_NAMES = click.option(
     "--action-names", default="", help="What a LeRobotDataset's actions are, in their order, if it does not say it."
 )
-CAMERA = click.option("--camera", default="", help="Which of a LeRobotDataset's cameras is the car's.")
+CAMERA = click.option(
+    "--camera", default="", help="Which of a LeRobotDataset's cameras the policy looks through; commas between several."
+)
 
 
 def with_source(command: Callable[..., None]) -> Callable[..., None]:
@@ -47,9 +51,9 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
     return called
 
 
-@click.command()
-@click.argument("checkpoint", type=FILE)
-@click.argument("episodes", type=FILE)
+@click.command(short_help="From a checkpoint to artifacts and a verdict.")
+@click.argument("checkpoint", type=CHECKPOINT)
+@click.argument("episodes", type=EPISODES)
 @ACTION_NAMES
 @CAMERA
 @click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
@@ -60,47 +64,73 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     """Load, calibrate, quantize, compare and benchmark CHECKPOINT with the recordings in EPISODES.
 
-    EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command.
+    EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command; of the Hub, as
+    user/name@revision.
     Executes the five notebooks; reports, artifacts, figures and the executed notebooks are left in the run's folder.
+    Ends with a verdict: which artifact to deploy, what failed and what to do about it, in words, as report.html and as
+    run.json.
     """
     from rover_lib.workshop.run import run as run_notebooks
 
     chosen = {k: v for k, v in options.items() if v is not None}
     folder = run_notebooks(checkpoint, episodes, progress=terminal(), **chosen)
-    click.echo(f"done: {folder}")
+    _judge(folder)
 
 
-@click.command()
+@click.command(short_help="Judge a run again, from what is there.")
+@click.argument("run_dir", type=PathTo("run"))
+@AS_JSON
+def report(run_dir: Path, as_json: bool) -> None:
+    """Judge the run in RUN_DIR again, from what is there, as `rover run` does at its end.
+
+    For when `make arm` has counted its instructions, `rover world students` its students, or params.yml has changed.
+    """
+    _judge(run_dir, as_json)
+
+
+def _judge(run_dir: Path, as_json: bool = False) -> None:
+    from rover_lib.workshop.run_report import PAGE, text, write
+
+    content = write(run_dir)
+    if as_json:
+        return click.echo(json.dumps(content, indent=2))
+    click.echo(f"{text(content['metrics'])}\n\ndone: {run_dir / PAGE}")
+
+
+@click.command(short_help="Say what a file or folder is, and what is in it.")
 @click.argument("episodes", metavar="FILE", type=FILE)
 @AS_JSON
 @with_source
 def inspect(episodes: "Source", as_json: bool) -> None:
-    """Say what FILE is: an artifact, a checkpoint, a folder of recordings, or a LeRobotDataset."""
-    file = episodes.path
-    if file.is_file() and _is_scripted(file):
-        return show(describe_artifact(file), as_json)
-    from rover_lib.workshop.checkpoint import lerobot_folder, load_checkpoint
+    """Say what FILE is and what is in it: everything that this project writes, and what it reads.
 
-    if file.is_dir() and not lerobot_folder(file):
-        from rover_lib.workshop.episodes import load_recordings
+    A run, an artifact, a checkpoint (a trainer's or LeRobot's), an episode or a folder of them, a LeRobotDataset, a
+    flight log, a calibration, a stage's report.
+    """
+    from rover_lib.workshop.describe import describe
 
-        return show({"recordings": load_recordings(episodes, progress=terminal()).summary()}, as_json)
-    checkpoint = load_checkpoint(file)
-    return show({"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}, as_json)
+    show(describe(episodes, terminal()), as_json)
 
 
-def _is_scripted(file: Path) -> bool:
-    """Whether it is a TorchScript archive. A damaged one is not: the checkpoint's loader says what is wrong with it."""
-    try:
-        with zipfile.ZipFile(file) as z:
-            return any("/code/" in name for name in z.namelist())
-    except Exception:  # zipfile says in many types that a file is damaged
-        return False
+@click.command("list", short_help="List the runs with their verdicts.")
+@click.argument("runs_dir", type=FILE, default="runs")
+@AS_JSON
+def list_runs(runs_dir: Path, as_json: bool) -> None:
+    """List the runs in RUNS_DIR, one line each, with the verdict that each ended with."""
+    from rover_lib.workshop.describe import runs
+
+    found = runs(runs_dir)
+    if as_json:
+        return show(found, True)
+    for each in found:
+        click.echo(f"{each['name']:<16} {each['verdict']}")
+    if not found:
+        click.echo(f"no run in {runs_dir}: make demo, or rover run, makes the first")
 
 
-@click.command()
-@click.argument("checkpoint", type=FILE)
-@click.argument("episodes", type=FILE)
+@click.command(short_help="Make one artifact of a checkpoint.")
+@click.argument("checkpoint", type=CHECKPOINT)
+@click.argument("episodes", type=EPISODES)
 @click.option("-o", "--output", type=FILE, required=True, help="The artifact to write.")
 @click.option("--mode", type=click.Choice(["fp32", "dynamic", "static"]), default="static", show_default=True)
 @click.option("--kind", type=click.Choice(["symmetric", "affine"]), default="symmetric", show_default=True)
@@ -130,10 +160,10 @@ def quantize(checkpoint: Path, episodes: "Source", output: Path, mode: str, samp
     click.echo(f"{output}: {mode}, {output.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
 
 
-@click.command()
-@click.argument("reference", type=FILE)
-@click.argument("artifacts", type=FILE, nargs=-1, required=True)
-@click.option("--episodes", type=FILE, required=True, help="Recordings; their held-out part judges.")
+@click.command(short_help="Compare artifacts with FP32, on recorded frames.")
+@click.argument("reference", type=ARTIFACT)
+@click.argument("artifacts", type=ARTIFACT, nargs=-1, required=True)
+@click.option("--episodes", type=EPISODES, required=True, help="Recordings; their held-out part judges.")
 @AS_JSON
 @with_source
 def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as_json: bool) -> None:
@@ -151,18 +181,25 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
 
     p = params()["calibration"]
     fp32 = load_policy(reference)
+    if not episodes.cameras and len(fp32.cameras) > 1:
+        episodes = replace(episodes, cameras=fp32.cameras)
     recordings = load_recordings(episodes, fp32.chunk, p["sync_s"], terminal())
     held_out = split(recordings, p["held_out_share"], p["seed"]).held_out
     others = {name: load_policy(path) for name, path in distinct_names(artifacts, drop="policy_").items()}
     report = c.fidelity(fp32, others, held_out, recordings.action_range(), terminal())
     for warning in report.warnings() + look(fp32, report, progress=terminal()).warnings():
         click.echo(f"rover: warning: {warning}", err=True)
-    show({name: report.summary(name) for name in others}, as_json)
+    found = {name: report.summary(name) for name in others}
+    if as_json:
+        return show(found, as_json)
+    sizes_mb = {name: policy.path.stat().st_size / 1e6 for name, policy in {"reference": fp32, **others}.items()}
+    click.echo("\n".join(aligned(c.comparison_rows(found, sizes_mb, "reference"))))
+    click.echo(f"errors on {len(held_out)} held-out frames, of the recorded range, and microseconds of pulse")
 
 
-@click.command()
-@click.argument("checkpoint", type=FILE)
-@click.argument("episodes", type=FILE)
+@click.command(short_help="Teach a smaller policy, or train one for INT8.")
+@click.argument("checkpoint", type=CHECKPOINT)
+@click.argument("episodes", type=EPISODES)
 @click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="The student's picture [default: its teacher's].")
 @click.option("--decoder-layers", type=int, metavar="N", help="Keep only the first N decoder layers [default: all].")
 @click.option("--feedforward", type=int, metavar="N", help="Keep the N best units of each feed-forward [default: all].")
@@ -189,8 +226,8 @@ def distill(
 ) -> None:
     """Teach a smaller policy what CHECKPOINT plans on the recordings in EPISODES.
 
-    Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot, and distill.json in the run's folder. Ended at
-    any moment and started again, it goes on where it was.
+    Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot, policy_static.pt to drive with, and
+    distill.json in the run's folder. Ended at any moment and started again, it goes on where it was.
     """
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import read_stage
@@ -209,30 +246,66 @@ def distill(
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
 
 
-@click.command("export-dataset")
-@click.argument("episodes", type=FILE)
+@click.command(short_help="Write a run's policies for other engines: ONNX Runtime, Hailo.")
+@click.argument("run_dir", type=PathTo("run"))
+@click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")
+@click.option("--hailo", "kit", type=FILE, metavar="OUT", help="A kit for Hailo's compiler, in the new folder OUT.")
+@click.option("--samples", type=click.IntRange(min=1), default=1024, show_default=True, help="The kit's calibration.")
+def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
+    """Write the policies of the run in RUN_DIR for another engine.
+
+    --onnx: for ONNX Runtime, by the run's own calibration. Such a file goes wherever an artifact goes (benchmark,
+    compare, drive, release), and a rover with that engine needs no torch; model.onnx is inside.
+
+    --hailo: a kit of networks, calibration set and scripts, calibrated on the run's recordings; docs/hailo.md leads on.
+    """
+    if not onnx and kit is None:
+        raise click.UsageError("for which engine? --onnx, or --hailo OUT")
+    if onnx:
+        from rover_lib.workshop.pipeline import export_onnx
+
+        for name, digest in export_onnx(run_dir, terminal()).items():
+            path = run_dir / name
+            click.echo(f"{path}: {path.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
+    if kit is None:
+        return
+    from rover_lib.workshop.hailo import write_kit
+    from rover_lib.workshop.session import opened
+
+    report = write_kit(opened(run_dir, terminal()), kit, samples=samples, progress=terminal())
+    for name, network in report["networks"].items():
+        errors = ", ".join(f"{action} {error:.3g}" for action, error in network["stand_in_actions"].items())
+        click.echo(f"{name}: {network['gmac']:.2f} GMAC; in ONNX Runtime's INT8, actions differ by at most {errors}")
+    click.echo(f"{kit}: KIT.md says what is in it; next, where Hailo's compiler is: sh compile_hailo8.sh backbone")
+
+
+@click.command("export-dataset", short_help="Write recordings as a LeRobotDataset v3.")
+@click.argument("episodes", type=EPISODES)
 @click.argument("out", type=FILE)
 @click.option("--video", is_flag=True, help="AV1 video, far smaller and not equal to the last bit [default: images].")
+@click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="Of the pictures [default: as recorded].")
 @AS_JSON
-def export_dataset(episodes: Path, out: Path, video: bool, as_json: bool) -> None:
+def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> None:
     """Write our recordings in EPISODES as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.
 
+    lerobot-train trains at the size of the pictures: as recorded, it takes 25 times as long as at a fifth of the sides.
     What is repaired in them or left out is printed, and kept in OUT/rover_export.json.
     """
     from rover_lib.workshop.export_dataset import REPORT
     from rover_lib.workshop.export_dataset import export_dataset as write
 
-    report = write(episodes, out, video=video, progress=terminal())
+    report = write(episodes, out, progress=terminal(), **options)
     del report["episodes_are"]  # long, and in the file
     show({"exported": report | {"report": str(out / REPORT)}}, as_json)
 
 
-@click.command()
+@click.command(short_help="Collect all that a Pi without internet installs.")
 @click.argument("folder", type=FILE, default="wheels")
 @click.option("--python", "pythons", multiple=True, help="A Pi's Python [default: 3.11 and 3.13].")
 @click.option("--only-rover", is_flag=True, help="Only rover_lib's own wheel: Pis with internet fetch the others.")
-def wheelhouse(folder: Path, pythons: tuple[str, ...], only_rover: bool) -> None:
+@click.option("--engine", type=click.Choice(["torch", "onnxruntime"]), default="torch", show_default=True)
+def wheelhouse(folder: Path, pythons: tuple[str, ...], only_rover: bool, engine: str) -> None:
     """Put all that a Pi installs into FOLDER, for a rover without internet (154 MB for each Python)."""
     from rover_lib.workshop.wheelhouse import PYTHONS, make
 
-    show(vars(make(folder, pythons=pythons or PYTHONS, only_rover=only_rover)), True)
+    show(vars(make(folder, pythons=pythons or PYTHONS, only_rover=only_rover, engine=engine)), True)

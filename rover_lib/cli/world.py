@@ -6,16 +6,17 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.cli import AS_JSON, FILE, show
+from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
+from rover_lib.onboard.kinds import PathTo
 from rover_lib.workshop.progress import terminal
 
 
-@click.group()
+@click.group(short_help="The balloon world: record, train, drive.")
 def world() -> None:
     """The balloon world: record an expert, train a policy, drive it."""
 
 
-@world.command()
+@world.command(short_help="Record drives of an expert.")
 @click.argument("out_dir", type=FILE)
 @click.option("--count", type=click.IntRange(min=1), default=80, show_default=True, help="Episodes.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
@@ -26,8 +27,8 @@ def record(out_dir: Path, count: int, seed: int) -> None:
     click.echo(f"recorded: {record_episodes(out_dir, count, seed, terminal())}")
 
 
-@world.command()
-@click.argument("episodes", type=FILE)
+@world.command(short_help="Train LeRobot's ACT on recordings.")
+@click.argument("episodes", type=PathTo("recordings"))
 @click.argument("output", type=FILE)
 @click.option(
     "--size", type=click.Choice(["small", "full"]), default="small", show_default=True, help="Full: the real car's."
@@ -51,8 +52,8 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
         raise click.exceptions.Exit(130) from None
 
 
-@world.command()
-@click.argument("artifact", type=FILE)
+@world.command(short_help="Drive an artifact through unseen worlds; count hits.")
+@click.argument("artifact", type=ARTIFACT)
 @click.option("--worlds", type=click.IntRange(min=1), default=40, show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
 @AS_JSON
@@ -67,8 +68,8 @@ def trial(artifact: Path, worlds: int, seed: int, as_json: bool) -> None:
     show(result, as_json)
 
 
-@world.command("latency")
-@click.argument("run_dir", type=FILE)
+@world.command("latency", short_help="Drive a run with late plans; count hits.")
+@click.argument("run_dir", type=PathTo("run"))
 @click.option("--worlds", type=click.IntRange(min=1), default=40, show_default=True)
 @AS_JSON
 def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
@@ -86,9 +87,9 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
 
 
-@world.command()
-@click.argument("teacher_run", type=FILE)
-@click.argument("student_runs", type=FILE, nargs=-1, required=True)
+@world.command(short_help="Judge distilled policies beside their teacher.")
+@click.argument("teacher_run", type=PathTo("run"))
+@click.argument("student_runs", type=PathTo("run"), nargs=-1, required=True)
 @click.option("--episodes", type=FILE, help="Recordings to judge with [default: those of TEACHER_RUN].")
 @click.option(
     "--worlds", type=click.IntRange(min=0), default=200, show_default=True, help="0 for a real car's policy: no drives."

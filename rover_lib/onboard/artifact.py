@@ -1,7 +1,7 @@
-"""The artifact: one TorchScript file with its manifest and parity vectors inside. No pickled objects, no lerobot.
+"""The artifact: one zip with a policy for an engine (see engines.py), its manifest and its parity vectors inside.
 
-Inside the zip, beside TorchScript's own records: `extra/manifest.json` (what it is, see MANIFEST_KEYS) and
-`extra/parity.npz` (inputs, and the chunks that they must give).
+Beside TorchScript's own records, or model.onnx: `extra/manifest.json` (what it is, see MANIFEST_KEYS) and
+`extra/parity.npz` (inputs, and the chunks that they must give). No pickled objects, no lerobot.
 """
 
 import hashlib
@@ -15,21 +15,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rover_lib.onboard.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record
+from rover_lib.onboard.engines import HAILO, ONNXRUNTIME
 from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.onnx_file import check_model
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.onboard.torchscript import check_program, open_archive, read_record
+from rover_lib.onboard.torchscript import check_program
 
 if TYPE_CHECKING:  # reading what an artifact says of itself needs neither
     import numpy as np
     import torch
 
 SCHEMA = 1
+ONNX_SUFFIX = ".onnx.zip"  # of artifacts for ONNX Runtime, where torch's end in .pt; what reads one looks inside
 MANGLED = re.compile(rb"___torch_mangle_\d+")
 MANIFEST_KEYS: dict[str, type | tuple[type, ...]] = {
     "schema": int,
     "mode": str,  # fp32, dynamic, static, mixed
     "scheme": str,  # float, symmetric, affine
-    "engine": str,  # of torch.backends.quantized
+    "engine": str,  # see engines.py
     "cameras": list,  # [{name, height, width}], in the graph's order
     "state_names": list,
     "action_names": list,
@@ -41,7 +45,7 @@ MANIFEST_KEYS: dict[str, type | tuple[type, ...]] = {
     "weights_mb": (int, float),
     "gmac": (int, float),  # multiply-accumulates of one inference, in 1e9
     "parity": dict,  # {tolerance: {action: largest difference}, reason}
-    "versions": dict,  # {torch, rover_lib}
+    "versions": dict,  # {torch, rover_lib}, and {onnx, onnxruntime} if it is for that
 }
 MODES = ("fp32", "dynamic", "static", "mixed")
 SCHEMES = ("float", "dynamic", "symmetric", "affine")
@@ -64,22 +68,32 @@ def save_artifact(
     parity: `state` (n, S) float32, `frame_<camera>` (n, height, width, 3) uint8 RGB, `chunk` (n, C, A) float32.
     Raises ArtifactError if the manifest lacks something.
     """
-    import numpy as np
     import torch
+
+    # Through a buffer, because torch.jit.save names the zip's folder after the file: same inputs, same bytes.
+    buffer = io.BytesIO()
+    torch.jit.save(module, buffer, _extra_files=_extra(path, manifest, parity))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
+    return content_hash(path)
+
+
+def save_onnx(path: Path | str, model: bytes, manifest: dict[str, Any], parity: "dict[str, np.ndarray]") -> str:
+    """As save_artifact(), of an .onnx."""
+    records = {f"archive/extra/{name}": content for name, content in _extra(path, manifest, parity).items()}
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as z:
+        for name, content in {ONNX: model, **records}.items():
+            z.writestr(zipfile.ZipInfo(name), content)  # of 1980, so that the same inputs give the same bytes
+    return content_hash(path)
+
+
+def _extra(path: Path | str, manifest: dict[str, Any], parity: "dict[str, np.ndarray]") -> dict[str, str | bytes]:
+    import numpy as np
 
     check_manifest(manifest, str(path))
     vectors = io.BytesIO()
     np.savez_compressed(vectors, allow_pickle=False, **parity)
-    extra = {
-        "manifest.json": json.dumps(manifest, sort_keys=True, indent=1),
-        "parity.npz": vectors.getvalue(),
-    }
-    # Through a buffer, because torch.jit.save names the zip's folder after the file: same inputs, same bytes.
-    buffer = io.BytesIO()
-    torch.jit.save(module, buffer, _extra_files=extra)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(buffer.getbuffer())
-    return content_hash(path)
+    return {"manifest.json": json.dumps(manifest, sort_keys=True, indent=1), "parity.npz": vectors.getvalue()}
 
 
 def content_hash(path: Path | str) -> str:
@@ -94,7 +108,7 @@ def content_hash(path: Path | str) -> str:
             if name.endswith((".debug_pkl", "/.data/serialization_id")):
                 continue
             record = read_record(z, name)
-            if not name.startswith("archive/constants/"):
+            if not name.startswith(("archive/constants/", ONNX)):
                 record = MANGLED.sub(b"", record)
             digest.update(MANGLED.sub(b"", name.encode()) + b"\0")
             digest.update(hashlib.sha256(record).digest())
@@ -119,7 +133,7 @@ def read_parity(path: Path | str) -> "dict[str, np.ndarray]":
         } | {f"frame_{c['name']}": ("uint8", (c["height"], c["width"], 3)) for c in manifest["cameras"]}
         vectors = {}
         try:
-            with zipfile.ZipFile(io.BytesIO(read_record(z, "archive/extra/parity.npz"))) as packed:
+            with zipfile.ZipFile(io.BytesIO(read_record(z, PARITY))) as packed:
                 for name, (dtype, shape) in wanted.items():
                     size = packed.getinfo(f"{name}.npy").file_size
                     if size > MOST_VECTORS * math.prod(shape) * np.dtype(dtype).itemsize + 200:
@@ -158,7 +172,10 @@ def check_artifact(path: Path | str) -> None:
             raise ArtifactError(
                 f"{path}: damaged, the checksum of '{damaged}' does not match", remedy="copy the file again"
             )
-        check_program(z, path)
+        if ONNX in z.namelist():
+            check_model(z, path)
+        elif kind_of(z.infolist()) == "torch":  # a HEF is a matter between HailoRT and the chip
+            check_program(z, path)
 
 
 def check_manifest(manifest: Any, where: str) -> None:
@@ -269,8 +286,15 @@ def _name(path: Path, folders: int, drop: str) -> str:
 
 def _manifest_in(z: zipfile.ZipFile, path: Path | str) -> dict[str, Any]:
     try:
-        manifest = json.loads(read_record(z, "archive/extra/manifest.json"))
+        manifest = json.loads(read_record(z, MANIFEST))
     except (ValueError, zipfile.BadZipFile, RecursionError) as e:
         raise ArtifactError(f"{path}: its manifest is not readable ({e})", remedy="copy the file again") from None
     check_manifest(manifest, str(path))
+    kind = manifest["engine"] if manifest["engine"] in (ONNXRUNTIME, HAILO) else "torch"
+    if kind != kind_of(z.infolist()):
+        raise ArtifactError(
+            f"{path}: its manifest names another engine than its policy is for",
+            found=manifest["engine"][:60],
+            remedy="quantize again",
+        )
     return manifest

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from rover_lib.onboard.errors import ParamsError, PolicyError
 from rover_lib.onboard.floor import floor_ms
@@ -96,9 +95,9 @@ class BenchmarkOptions:
 
     warmup: inferences of each policy that do not count. iterations: rounds; with duration_s, a soak, rounds until that
     time is over, with a time series. at_most_s: fewer rounds, LEAST_ROUNDS at least, where slow policies would take
-    longer. threads: torch's, 0 for all cores, None as they are. rate_hz: at most this many inferences per second, on
-    absolute deadlines, as a drive makes them; None: as fast as it can. main: the policy whose figures stand at the top
-    level (None: the first). reference: the policy whose p50 the others are compared with.
+    longer. threads: the engines', 0 for all cores, None as they are. rate_hz: at most this many inferences per second,
+    on absolute deadlines, as a drive makes them; None: as fast as it can. main: the policy whose figures stand at the
+    top level (None: the first). reference: the policy whose p50 the others are compared with.
     memory_alone: measure each artifact's memory in a process of its own (seconds each).
     """
 
@@ -152,8 +151,9 @@ def benchmark(
 ) -> dict[str, Any]:
     """Time every policy's predict_chunk(frame, state), interleaved, and return the metrics of benchmark-<host>.json.
 
-    policies: name -> anything with predict_chunk; `.manifest` ("mode", "gmac") and `.path` are used where there are
-    any. frames: taken in turn. progress: called like tqdm.tqdm(iterable, desc=, total=).
+    policies: name -> anything with predict_chunk; `.manifest` ("mode", "gmac"), `.path` and `.threads` with
+    `set_threads` are used where there are any. frames: taken in turn. progress: called like
+    tqdm.tqdm(iterable, desc=, total=).
 
     At the top level cpu_pct is this process's time over the whole run, as a share of all cores it may use; per
     artifact, of its own inferences. temperature_c is the highest and clock_mhz the lowest reading. peak_memory_mb is
@@ -169,18 +169,18 @@ def benchmark(
             raise ParamsError(f"no policy {name!r} to benchmark", found=names, remedy="name one of them")
     host = host or Host()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    threads_before = torch.get_num_threads()
+    threads_before = {name: policies[name].threads for name in names if hasattr(policies[name], "threads")}
     if options.threads is not None:
-        torch.set_num_threads(options.threads or cores)
+        _set_threads(policies, dict.fromkeys(threads_before, options.threads or cores))
     try:
         for name in names:
             for i in range(options.warmup):
                 policies[name].predict_chunk(frames[i % len(frames)], state)
         run = _Run(policies, frames, state, host, clocks)
         run.measure(options, progress)
-        threads = torch.get_num_threads()
+        threads = getattr(policies[main], "threads", None)
     finally:
-        torch.set_num_threads(threads_before)
+        _set_threads(policies, threads_before)
 
     artifacts = {name: run.metrics_of(name, cores) for name in names}
     for name, metrics in artifacts.items():
@@ -210,6 +210,12 @@ def benchmark(
         "artifacts": artifacts,
         "series": run.series if options.duration_s is not None else None,
     }
+
+
+def _set_threads(policies: Mapping[str, Any], threads: Mapping[str, int]) -> None:
+    for name, count in threads.items():
+        if policies[name].threads != count:
+            policies[name].set_threads(count)
 
 
 def _share_pct(cpu_s: float, wall_s: float, cores: int) -> float | None:

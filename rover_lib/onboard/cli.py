@@ -4,6 +4,8 @@ Thin: it parses, calls the library and prints.
 """
 
 import json
+import os
+import platform
 import sys
 import traceback
 from collections.abc import Callable
@@ -13,10 +15,14 @@ from typing import Any
 import click
 
 import rover_lib
+from rover_lib.onboard.columns import aligned, benchmark_rows, number
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.kinds import PathTo
 
 FILE = click.Path(path_type=Path)
+ARTIFACT = PathTo("artifact")
 LONG_LIST = 12  # longer ones are for programs
+BUSY = 0.5  # load per core, of the last minute, beside which a time is no measurement
 # Of every command that works with the car:
 CAMERA = click.option(
     "--camera", default="0", show_default=True, help="Number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
@@ -31,7 +37,7 @@ LOG_DRIVE = click.option(
 SECONDS = click.FloatRange(min=0, min_open=True)
 
 WORKSTATION_COMMANDS = frozenset(
-    {"run", "quantize", "compare", "distill", "export-dataset", "wheelhouse", "world"}
+    {"run", "report", "list", "quantize", "compare", "distill", "export", "export-dataset", "wheelhouse", "world"}
 )  # rover_lib.cli's
 
 
@@ -113,7 +119,7 @@ def drive_options(command: Callable) -> Callable:
 
 
 DRIVE_OPTIONS = (
-    click.argument("artifact", type=FILE, required=False),
+    click.argument("artifact", type=ARTIFACT, required=False),
     CAMERA,
     PORT,
     click.option("--hz", type=click.FloatRange(10, 100), default=30.0, show_default=True, help="Commands a second."),
@@ -134,13 +140,13 @@ DRIVE_OPTIONS = (
     click.option(
         "--json", "json_file", type=click.File("w", lazy=True), help="Write what the drive was there; - prints it."
     ),
-    click.option("--replay", type=FILE, help="Send this episode's pulses; no policy, no camera."),
+    click.option("--replay", type=PathTo("recordings"), help="Send this episode's pulses; no policy, no camera."),
     click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder, FIFO or .mjpeg."),
     click.option("--service", is_flag=True, help="As a systemd service: disarmed until `rover arm-car`."),
 )
 
 
-@main.command()
+@main.command(short_help="Drive a car by an artifact.")
 @drive_options
 @click.pass_context
 def drive(ctx: click.Context, **options: Any) -> None:
@@ -187,7 +193,7 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
     return code
 
 
-@main.command("record")
+@main.command("record", short_help="Record a human who drives.")
 @click.argument("out_dir", type=FILE)
 @CAMERA
 @PORT
@@ -215,8 +221,8 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -
     ctx.exit(1 if fault else 0)
 
 
-@main.command()
-@click.argument("artifact", type=FILE, required=False)
+@main.command(short_help="Look at all that driving needs; say what to do.")
+@click.argument("artifact", type=ARTIFACT, required=False)
 @CAMERA
 @PORT
 @click.option("--hz", type=click.FloatRange(1, 120), default=30.0, show_default=True, help="Frames a second wanted.")
@@ -252,7 +258,7 @@ def doctor(
     ctx.exit(1 if failed else 0)
 
 
-@main.command()
+@main.command(short_help="Say what an artifact is.")
 @click.argument("file", type=FILE)
 @AS_JSON
 def inspect(file: Path, as_json: bool) -> None:
@@ -268,8 +274,8 @@ def describe_artifact(file: Path) -> dict[str, Any]:
     return {"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}
 
 
-@main.command()
-@click.argument("artifacts", type=FILE, nargs=-1, required=True)
+@main.command(short_help="Take the time of artifacts on this machine.")
+@click.argument("artifacts", type=ARTIFACT, nargs=-1, required=True)
 @click.option("--warmup", type=click.IntRange(min=0), default=10, show_default=True)
 @click.option("--iterations", type=click.IntRange(min=1), default=100, show_default=True)
 @click.option("--threads", type=click.IntRange(min=0), default=0, show_default=True, help="0: all cores.")
@@ -307,16 +313,29 @@ def benchmark(
         {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
     ]  # stored as RGB; a camera gives BGR
     options: dict[str, Any] = {"warmup": warmup, "iterations": iterations, "threads": threads, "duration_s": duration}
+    busy = os.getloadavg()[0] / (os.cpu_count() or 1)
     metrics = measure(policies, frames, vectors["state"][0], BenchmarkOptions(**options, memory_alone=True))
+    if busy > BUSY:
+        click.echo(f"rover: warning: this machine was busy before ({busy:.0%} of its cores): times are rough", err=True)
     if output:
         inputs = {f"{name}{path.suffix}": content_hash(path) for name, path in files.items()}
         write_stage(output, "benchmark", params=options, metrics=metrics, inputs=inputs)
     if gates:
         metrics["gates"] = check_gates(metrics, params()["gates"]["original"])
-    show(metrics, as_json)
+    if as_json:
+        return show(metrics, as_json)
+    click.echo("\n".join(aligned(benchmark_rows(metrics))))
+    machine = {key: metrics[key] for key in ("threads", "cores", "temperature_c", "clock_mhz", "throttled")}
+    show({k: v for k, v in machine.items() if v is not None}, False)
+    if gates and platform.machine() != "aarch64":
+        click.echo(f"These limits are a Pi's, and this is {platform.machine()}: torch's CUDA build alone takes 530 MB.")
+    for row in metrics.get("gates", []):
+        passed = {True: "kept", False: "MISSED", None: "not measured"}[row["passed"]]
+        found = row["found"] if isinstance(row["found"], str) else number(row["found"], ".4g")
+        click.echo(f"{row['gate']:<20} {found:>8}  promised {row['limit']}: {passed}")
 
 
-@main.command("arm-car")
+@main.command("arm-car", short_help="Arm the car: its service drives at once.")
 @click.option("--yes", is_flag=True, help="Do not ask.")
 @click.option(
     "--model", default="", help="Content hash of the model that is meant; with another, the car is not armed."
@@ -344,7 +363,7 @@ def arm_car(yes: bool, model: str, max_seconds: float | None, heartbeat_s: float
     click.echo(arm(request, model=model, confirm=ask, notify=click.echo, wait_s=wait_s))
 
 
-@main.command()
+@main.command(short_help="Tell the drive that its operator is there.")
 def heartbeat() -> None:
     """Tell the drive that its operator is there, and say what the car does. See `rover arm-car --heartbeat-s`."""
     from rover_lib.onboard.service import ask_service
@@ -352,7 +371,7 @@ def heartbeat() -> None:
     click.echo(ask_service(ask="heartbeat")["text"])
 
 
-@main.group()
+@main.group(short_help="The models on a rover: stage, switch, roll back.")
 @click.option("--models", type=FILE, default="/var/lib/rover/models", show_default=True, help="The rover's models.")
 @click.option("--chunk", type=click.IntRange(min=1), default=32, show_default=True, help="Actions of a plan.")
 @click.option("--camera", default="cam_front", show_default=True, help="The policy's name for this rover's camera.")
@@ -381,8 +400,8 @@ ALLOW = click.option(
 )
 
 
-@release.command()
-@click.argument("artifact", type=FILE)
+@release.command(short_help="Cut an artifact into parts that travel one by one.")
+@click.argument("artifact", type=ARTIFACT)
 @click.argument("folder", type=FILE)
 @click.option("--sign-key", type=FILE, help="The ssh key that logs in to the rover, to sign with.")
 @ALLOW
@@ -394,7 +413,7 @@ def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, all
     show(pack_parts(artifact, folder, releases.expected, allow, sign_key), True)
 
 
-@release.command()
+@release.command(short_help="Make a release of an artifact; use stays as it is.")
 @click.argument("source", type=FILE)
 @click.option("--sha256", help="The SHA-256 that the artifact must have.")
 @click.option("--unsigned", is_flag=True, help="Take it without the signature of a laptop that this rover knows.")
@@ -405,24 +424,24 @@ def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow
     show(vars(releases.stage(source, sha256=sha256, allow=allow, unsigned=unsigned)), True)
 
 
-@release.command()
+@release.command(short_help="Prove that a release computes what it should.")
 @click.argument("name", default="current")
 @click.option("--confined", is_flag=True, help="Give up first what an inference does not need, as rover-check@ does.")
 @click.pass_obj
 def verify(releases: Any, name: str, confined: bool) -> None:
     """Prove that a release is whole and computes here what it should: checksums and parity vectors."""
     if confined and (path := releases.path_of(name)).exists():
-        import torch
-
         from rover_lib.onboard.confine import confine, memory_mb
+        from rover_lib.onboard.policy import import_engine
 
-        if unconfined := confine(memory_mb(path, torch.get_num_threads())):
+        import_engine(path)
+        if unconfined := confine(memory_mb(path, os.cpu_count() or 1)):
             click.echo(f"rover: not confined: {unconfined}", err=True)
     releases.check(name)
     click.echo(f"{name}: whole, and computes what it should")
 
 
-@release.command()
+@release.command(short_help="Use a release from now on.")
 @click.argument("name")
 @click.pass_obj
 def switch(releases: Any, name: str) -> None:
@@ -430,14 +449,14 @@ def switch(releases: Any, name: str) -> None:
     show({"name": name, "changed": releases.switch(name)}, True)
 
 
-@release.command()
+@release.command(short_help="Use the release before the one in use.")
 @click.pass_obj
 def rollback(releases: Any) -> None:
     """Use the release before the one in use, the newest that can be proven."""
     show({"name": releases.rollback(), "changed": True}, True)
 
 
-@release.command()
+@release.command(short_help="Remove all but the releases used last.")
 @click.option("--keep", type=click.IntRange(min=1), default=3, show_default=True)
 @click.pass_obj
 def prune(releases: Any, keep: int) -> None:
@@ -446,7 +465,7 @@ def prune(releases: Any, keep: int) -> None:
     show({"removed": removed, "changed": bool(removed)}, True)
 
 
-@release.command()
+@release.command(short_help="What is in use, and whether it is whole.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, with the machine's and the service's state.")
 @click.pass_obj
 def status(releases: Any, as_json: bool) -> None:
@@ -474,8 +493,8 @@ def status(releases: Any, as_json: bool) -> None:
         raise RoverError(report["trouble"])
 
 
-@main.command()
-@click.argument("file", type=FILE)
+@main.command(short_help="Sum up a flight log.")
+@click.argument("file", type=PathTo("flight log"))
 @LOG_DRIVE
 @AS_JSON
 def log(file: Path, drive: int, as_json: bool) -> None:

@@ -102,7 +102,7 @@ def examine(
         "group dialout": lambda: access("group dialout", Path(port), "dialout"),
         "Arduino": lambda: arduino(port, dev=dev, proc_root=host.proc_root, boot_s=boot_s),
         "ModemManager": lambda: modem_manager(host.proc_root),
-        "torch": lambda: torch_here(),
+        "engines": lambda: engines_here(),
         "artifact": lambda: policy(artifact),
         "temperature": lambda: temperature(host),
         "power": lambda: power(host),
@@ -415,19 +415,29 @@ def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:
     yield Check("ModemManager", "ok", "does not run")
 
 
-def torch_here() -> Iterator[Check]:
-    """torch and its quantization engines."""
+def engines_here() -> Iterator[Check]:
+    """The engines that are installed, of which one is enough: torch with its quantization engines, ONNX Runtime."""
+    missing = []
     try:
         import torch
     except ImportError as error:
-        yield Check("torch", "fail", f"cannot be imported ({error})", "pip install -r requirements_pi.txt")
-        return
-    engines = [e for e in torch.backends.quantized.supported_engines if e != "none"]
-    found = f"{torch.__version__}, engines {', '.join(engines) or 'none'}, {torch.get_num_threads()} threads"
-    if "qnnpack" in engines:
-        yield Check("torch", "ok", found)
+        missing.append(f"torch ({error})")
     else:
-        yield Check("torch", "fail", found, "INT8 artifacts need qnnpack: install PyPI's build of torch")
+        engines = [e for e in torch.backends.quantized.supported_engines if e != "none"]
+        found = f"{torch.__version__}, engines {', '.join(engines) or 'none'}, {torch.get_num_threads()} threads"
+        if "qnnpack" in engines:
+            yield Check("torch", "ok", found)
+        else:
+            yield Check("torch", "fail", found, "INT8 artifacts need qnnpack: install PyPI's build of torch")
+    try:
+        import onnxruntime
+    except ImportError as error:
+        missing.append(f"onnxruntime ({error})")
+    else:
+        yield Check("onnxruntime", "ok", onnxruntime.__version__)
+    if len(missing) == 2:
+        found = f"none can be imported: {', '.join(missing)}"
+        yield Check("engines", "fail", found, "pip install -r requirements_pi.txt")
 
 
 def policy(artifact: Path | str | None) -> Iterator[Check]:

@@ -29,10 +29,11 @@ import numpy as np
 from rover_lib.onboard.artifact import read_manifest
 from rover_lib.onboard.camera import Camera
 from rover_lib.onboard.confine import confine, memory_mb, open_no_more
+from rover_lib.onboard.engines import UNCONFINED
 from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
 from rover_lib.onboard.plan import Commanded, Plan
 
-LOAD_S = 120.0  # torch and a full policy from a slow card
+LOAD_S = 120.0  # an engine and a full policy from a slow card
 POLL_S = 0.05
 WAIT_S = 0.1
 FRESH_S = 0.8  # WatchdogSec of the service is 2 s, and the Arduino has to answer too
@@ -154,8 +155,8 @@ class PolicyProcess:
     A process and not a thread, for the loop's sake: at p99 its commands were 1.4 to 3.5 ms late beside the process, and
     5.4 to 6.3 ms beside a thread (measured on a workstation at commit 7343b87, which could do both).
 
-    threads: of torch, None: all cores but one, which is the loop's. Raises ArtifactError's sentences as PolicyError if
-    the artifact cannot be used here.
+    threads: of its engine, None: all cores but one, which is the loop's. Raises ArtifactError's sentences as
+    PolicyError if the artifact cannot be used here.
 
     What runs there is somebody's artifact, so that it is confined (see confine.py), and its answers are believed only
     if they are of the shape that the manifest says, as it is read here. unconfined: why the kernel does not do that.
@@ -295,16 +296,16 @@ def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any],
     """
     with contextlib.suppress(EOFError, OSError):
         try:
-            # Here, because the side that drives must not load torch.
-            from rover_lib.onboard.policy import load_policy
+            # Here, because the side that drives must load no engine, and before the limits, which an engine exceeds.
+            from rover_lib.onboard.policy import import_engine, load_policy
 
-            unconfined = confine(memory_mb(artifact, threads))
+            unconfined = UNCONFINED.get(import_engine(artifact)) or confine(memory_mb(artifact, threads))
             policy = load_policy(artifact, threads=threads)
             names = list(policy.state_names), list(policy.action_names)
             if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
                 raise PolicyError(
                     f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}",
-                    remedy="this car has one camera, steering and throttle",
+                    remedy="this car has one camera, steering and throttle, by these names (quantize: --action-names)",
                 )
             loaded(policy)
             open_no_more()

@@ -8,16 +8,16 @@ full policy. Nothing in torch drops it: `setReleaseWeightsWhenPrepacking` does n
 import ctypes
 import mmap
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:  # only policies that torch runs hold anything twice
+    import torch
 
 DONT_NEED = 4  # MADV_DONTNEED of Linux: the pages are the kernel's again, and read as zeros
 PACKED = "__torch__.torch.classes.quantized.Conv2dPackedParamsBase"
 
 
-def give_back_packed_weights(module: torch.jit.ScriptModule) -> int:
+def give_back_packed_weights(module: "torch.jit.ScriptModule") -> int:
     """Return the pages of the convolutions' original weights to the kernel; how many bytes that were.
 
     module: frozen, and it has run, so that its weights are packed. It cannot be saved afterwards, and whoever calls
@@ -44,8 +44,10 @@ def give_back_freed() -> None:
         libc.malloc_trim(0)
 
 
-def _originals(block: Any) -> Iterator[Tensor]:
+def _originals(block: Any) -> "Iterator[torch.Tensor]":
     """The weights that packed parameters, constants of a frozen graph, still hold."""
+    import torch
+
     for node in block.nodes():
         if node.kind() == "prim::Constant" and str(node.output().type()) == PACKED:
             yield torch.ops.quantized.conv2d_unpack(node.output().toIValue())[0]

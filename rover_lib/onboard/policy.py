@@ -1,18 +1,17 @@
-"""Run an artifact: a frame and a state in, a chunk of actions out. torch, numpy and cv2 only."""
+"""Run an artifact: a frame and a state in, a chunk of actions out, whichever engine computes it."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from rover_lib.onboard.artifact import check_artifact, read_manifest, read_parity
 from rover_lib.onboard.confine import refuse_root
+from rover_lib.onboard.engines import PACKAGES, Engine, module_of
 from rover_lib.onboard.errors import ArtifactError, PolicyError
-from rover_lib.onboard.memory import give_back_freed, give_back_packed_weights
+from rover_lib.onboard.memory import give_back_freed
 from rover_lib.onboard.preprocess import prepare_frame
-from rover_lib.onboard.torchscript import unknown_operators
 
 # What a pulse can express (facts of the car: steering both ways, throttle forward only). Others pass unclipped.
 ACTION_LIMITS = {"steering": (-1.0, 1.0), "throttle": (0.0, 1.0)}
@@ -21,7 +20,7 @@ ACTION_LIMITS = {"steering": (-1.0, 1.0), "throttle": (0.0, 1.0)}
 class Policy:
     """A loaded artifact. Use `load_policy`."""
 
-    def __init__(self, path: Path, module: torch.jit.ScriptModule, manifest: dict[str, Any]):
+    def __init__(self, path: Path, engine: Engine, manifest: dict[str, Any]):
         self.path = path
         self.manifest = manifest
         self.action_names: tuple[str, ...] = tuple(manifest["action_names"])
@@ -30,7 +29,7 @@ class Policy:
         self.chunk: int = manifest["chunk"]
         self.rate_hz = float(manifest["rate_hz"])
         self.image_size: tuple[int, int] = (manifest["cameras"][0]["height"], manifest["cameras"][0]["width"])
-        self._module = module
+        self._engine = engine
         limits = [ACTION_LIMITS.get(name, (-np.inf, np.inf)) for name in self.action_names]
         self._low, self._high = np.array(limits, np.float32).T
 
@@ -74,62 +73,63 @@ class Policy:
 
         Raises PolicyError for an answer of another shape or type than the manifest says.
         """
-        # TorchScript re-optimises in its second call (0.37 G instructions on a Cortex-A76); the switch is thread-local.
-        with torch.inference_mode(), torch.jit.optimized_execution(False):
-            y = self._module(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames_rgb))
-        if y.dtype != torch.float32 or y.shape != (1, self.chunk, len(self.action_names)):
+        y = self._engine.run(state, frames_rgb)
+        if y.dtype != np.float32 or y.shape != (1, self.chunk, len(self.action_names)):
             raise PolicyError(
                 f"{self.path}: the policy must give {self.chunk} times {len(self.action_names)} float32",
                 found=f"{tuple(y.shape)} {y.dtype}",
                 remedy="do not drive with it",
             )
-        return y[0].numpy().copy()
+        return y[0].copy()
+
+    @property
+    def threads(self) -> int:
+        """That compute an inference."""
+        return self._engine.threads
+
+    def set_threads(self, threads: int) -> None:
+        """From now on. Some engines load the artifact again for it."""
+        self._engine.set_threads(threads)
+
+
+def import_engine(path: Path | str) -> str:
+    """Import what an artifact needs to run, which takes seconds and memory; the name of its engine.
+
+    Raises ArtifactError for an engine that is not known, or not installed.
+    """
+    name = read_manifest(path)["engine"]
+    try:
+        module_of(name)
+    except KeyError:
+        raise ArtifactError(
+            f"{path}: needs the engine '{name[:80]}'", remedy=f"this rover_lib knows {', '.join(PACKAGES)}"
+        ) from None
+    except ImportError as e:
+        raise ArtifactError(
+            f"{path}: needs {PACKAGES[name]}, which cannot be imported here ({e})",
+            remedy=f"install {PACKAGES[name]}, or use an artifact of another engine",
+        ) from None
+    return name
 
 
 def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
     """Load an artifact and prove that it computes here what it computed where it was made.
 
-    threads: for torch's kernels in this process; None leaves them as they are.
+    threads: for the engine's kernels (torch's are those of this process); None leaves them as they are.
     Checks the file's checksums, that its program is of the form and the operators that artifacts have, the manifest,
-    the torch version, the quantization engine and the parity vectors (which also warm the kernels). Raises
-    ArtifactError, in one sentence, if any of these fails, and for root, who has too much to lose.
+    the engine and the parity vectors (which also warm the kernels). Raises ArtifactError, in one sentence, if any of
+    these fails, and for root, who has too much to lose.
     """
     path = Path(path)
     refuse_root()
     check_artifact(path)
     manifest = read_manifest(path)
-    made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
-    if made_with.split(".")[:2] != here.split(".")[:2]:
-        raise ArtifactError(
-            f"{path}: made with torch {made_with}, here is {here}", remedy=f"install torch {made_with.split('+')[0]}"
-        )
-    engine = manifest["engine"]
-    if engine not in torch.backends.quantized.supported_engines:
-        raise ArtifactError(
-            f"{path}: needs the quantization engine '{engine}', this torch has "
-            f"{list(torch.backends.quantized.supported_engines)}",
-            remedy="install PyPI's build of torch",
-        )
-    torch.backends.quantized.engine = engine
-    if threads:
-        torch.set_num_threads(threads)
-    try:
-        module = torch.jit.load(str(path), map_location="cpu").eval()
-    except RuntimeError as e:
-        raise ArtifactError(
-            f"{path}: TorchScript cannot load it ({str(e).splitlines()[0][:200]})", remedy="quantize again"
-        ) from None
-    if unknown := unknown_operators(module.graph):
-        raise ArtifactError(
-            f"{path}: its program has operators that no artifact has",
-            found=", ".join(unknown)[:200],
-            remedy="do not load it; quantize again",
-        )
-    policy = Policy(path, module, manifest)
+    engine = module_of(import_engine(path)).load(path, manifest, threads)
+    policy = Policy(path, engine, manifest)
     vectors = read_parity(path)
     chunks = _predict(policy, vectors)
     _check_differences(policy, chunks, vectors)
-    if give_back_packed_weights(module) and not np.array_equal(_predict(policy, vectors), chunks):
+    if engine.give_back() and not np.array_equal(_predict(policy, vectors), chunks):
         raise ArtifactError(
             f"{path}: predicts something else once the memory of its original weights was given back",
             remedy="do not drive with it; report this, with the version of torch",

@@ -28,15 +28,16 @@ import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from rover_lib.onboard.archive import ARCHIVE_BYTES, ONNX, kind_of, open_archive, read_record
 from rover_lib.onboard.artifact import check_artifact, content_hash, read_manifest, read_parity
 from rover_lib.onboard.confine import less_memory
+from rover_lib.onboard.engines import PACKAGES, TORCH
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.stage import open_plain, sha256_of
-from rover_lib.onboard.torchscript import ARCHIVE_BYTES, open_archive, read_record
 
 MODELS = Path("/var/lib/rover/models")
 POLICY, DIGEST, ORIGIN = "policy.pt", "policy.pt.sha256", "release.json"
@@ -54,9 +55,10 @@ LOCK_TRIES, LOCK_S = 5, 0.05
 SANDBOX = "rover-check@{}.service"
 
 STAGE_MB = 400  # that staging may take, whoever asks for it: an artifact is a stranger's until it is staged
-ENGINE = "qnnpack"  # of a Pi
 MAY_DIFFER = ("mode", "chunk", "camera")  # torch, engine and actions may not: this rover could not drive by them
 CODE_OF_MODE = {"static": b"ops.quantized.conv2d", "mixed": b"ops.quantized.conv2d", "dynamic": b"linear_dynamic"}
+ONNX_OF_MODE = {"static": b"QuantizeLinear", "mixed": b"QuantizeLinear"}
+OF_MODE: dict[str, dict[str, bytes]] = {"torch": CODE_OF_MODE, "onnxruntime": ONNX_OF_MODE, "hailo": {}}
 
 Check = Callable[[str], None]  # takes a release's name or "current"; raises RoverError
 
@@ -85,17 +87,28 @@ class Expected:
         shapes = [(c["name"], round(c["width"] / c["height"], 1)) for c in manifest["cameras"]]
         if shapes != [(self.camera, round(self.aspect, 1))]:
             refusals["camera"] = f"it looks through {cameras}, this rover has {self.camera} at {self.aspect:.2f} to 1"
-        made_with, here = str(manifest["versions"].get("torch", "?")), version("torch")
-        if made_with.split(".")[:2] != here.split(".")[:2]:
+        engine, made_with = manifest["engine"], str(manifest["versions"].get("torch", "?"))
+        package = PACKAGES.get(engine)
+        here = _version(package) if package else None
+        if package is None:
+            refusals["engine"] = f"it needs the engine '{engine}', rovers have {' or '.join(PACKAGES)}"
+        elif here is None:
+            refusals["engine"] = f"it needs {package}, which is not installed here"
+        elif engine == TORCH and made_with.split(".")[:2] != here.split(".")[:2]:
             refusals["torch"] = f"it was made with torch {made_with}, rovers have {here}"
-        if manifest["engine"] != ENGINE:
-            refusals["engine"] = f"it needs the quantization engine '{manifest['engine']}', a Pi has '{ENGINE}'"
         if manifest["action_names"] != ["steering", "throttle"] or manifest["state_names"] != ["steering", "throttle"]:
             refusals["actions"] = f"it gives {manifest['action_names']}, this car has steering and throttle"
         return refusals
 
 
 THIS_CAR = Expected()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Iterable[str] = ()) -> dict[str, Any]:
@@ -110,8 +123,9 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
     check_artifact(path)
     manifest = read_manifest(path)
     with open_archive(path) as z:
-        code = b"".join(read_record(z, n) for n in z.namelist() if n.endswith(".py"))
-    if (wanted := CODE_OF_MODE.get(manifest["mode"])) and wanted not in code:
+        code = b"".join(read_record(z, n) for n in z.namelist() if n.endswith(".py") or n == ONNX)
+        of_mode = OF_MODE[kind_of(z.infolist())]
+    if (wanted := of_mode.get(manifest["mode"])) and wanted not in code:
         raise ArtifactError(f"{path}: its manifest says {manifest['mode']}, its code is not", remedy="quantize again")
     for kind, why in expected.refusals(manifest).items():
         if kind not in allow:
@@ -355,7 +369,7 @@ class Releases:
         real = path.parent.resolve().name
         if wrong := self.wrong_with(real):
             raise ReleaseError(f"{path}: {wrong}", remedy="deploy it again")
-        from rover_lib.onboard.policy import load_policy  # here, because it loads torch
+        from rover_lib.onboard.policy import load_policy
 
         load_policy(path)
 

@@ -476,9 +476,9 @@ class ServoLink:
             values = heard.uptime_ms, *values
         with self._sending:
             self._sequence = number = (self._sequence + 1) % SEQUENCES
-            self._write(frame(" ".join([kind, *map(str, (self._boot, number, *values))])))
-            with self._heard:
+            with self._heard:  # before it is written: the answer may be here before this thread has its turn again
                 self._unanswered.append((number, self._clock()))
+            self._write(frame(" ".join([kind, *map(str, (self._boot, number, *values))])))
             return number
 
     def _write(self, line: bytes) -> None:

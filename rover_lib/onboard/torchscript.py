@@ -12,34 +12,18 @@ is, without looking whether its bytes are there (torch 2.8, tests/onboard/test_h
 import ast
 import io
 import math
-import os
 import pickle
 import pickletools
 import re
-import struct
 import zipfile
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
+from rover_lib.onboard.archive import read_record
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.stage import open_plain
 
-# Sizes, each several times what a policy of full size needs; total: 266 MB in FP32
-ARCHIVE_BYTES, DIRECTORY_BYTES, RECORDS = 1_000_000_000, 1_000_000, 5000
-CODE_BYTES, DEBUG_BYTES, PICKLE_BYTES = 250_000, 2_000_000, 1_000_000
-MANIFEST_BYTES, PARITY_BYTES = 100_000, 50_000_000
 LARGEST_NUMBER = 10_000_000  # of a size or an index in the program
 TO_THE_END = 2**63 - 1  # of a slice
-REQUIRED = frozenset({"data.pkl", "constants.pkl", "version", "extra/manifest.json", "extra/parity.npz"})
-RECORD_BYTES = {  # by name after "archive/"; None: as large as the file
-    r"version|byteorder|\.data/serialization_id": 100,
-    r"(data|constants)\.pkl": PICKLE_BYTES,
-    r"extra/manifest\.json": MANIFEST_BYTES,
-    r"extra/parity\.npz": PARITY_BYTES,
-    r"code/__torch__/[\w/]+\.py": CODE_BYTES,
-    r"code/__torch__/[\w/]+\.py\.debug_pkl": DEBUG_BYTES,
-    r"constants/\d{1,6}": None,
-}
 
 OPERATORS = frozenset({
     "torch._convolution", "torch._make_per_tensor_quantized_tensor", "torch.add", "torch.addcmul", "torch.as_strided",
@@ -67,91 +51,6 @@ ITEM_BYTES = {
     "torch.ShortStorage": 2, "torch.ByteStorage": 1, "torch.CharStorage": 1, "torch.BoolStorage": 1,
     "torch.QInt8Storage": 1, "torch.QUInt8Storage": 1, "torch.QInt32Storage": 4,
 }  # fmt: skip
-
-
-def open_archive(path: Path | str) -> zipfile.ZipFile:
-    """An artifact whose records are few, of known names and of bounded sizes, by its headers alone.
-
-    Raises ArtifactError.
-    """
-    try:
-        with open_plain(path, ArtifactError(f"{path}: not a file", remedy="give a policy_*.pt")) as file:
-            _check_directory(file, path)
-        z = zipfile.ZipFile(path)
-        try:
-            _check_records(z.infolist(), path)
-        except BaseException:
-            z.close()
-            raise
-    except FileNotFoundError:
-        raise ArtifactError(f"{path}: not found", remedy="'rover run' writes artifacts to runs/<name>/") from None
-    # NotImplementedError: zipfile's, for a version of the format that it does not know
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as e:
-        raise ArtifactError(f"{path}: not an artifact, or cut short ({e})", remedy="copy the file again") from None
-    return z
-
-
-def read_record(z: zipfile.ZipFile, name: str) -> bytes:
-    """A record, of which no more is unpacked than its header says. Raises as zipfile does."""
-    with z.open(name) as record:
-        return record.read(z.getinfo(name).file_size)
-
-
-def _check_directory(file: BinaryIO, path: Path | str) -> None:
-    """One zip archive from the file's first byte to its last, with a directory that may be read into memory.
-
-    Two readers that look at different places for it would see two archives.
-    """
-    if file.read(4) != b"PK\3\4":
-        raise zipfile.BadZipFile("it does not begin as an archive")
-    size = file.seek(0, os.SEEK_END)
-    file.seek(max(0, size - 98))
-    tail = file.read()
-    end, locator, end64 = tail[-22:], tail[-42:-22], tail[:-42]
-    if end[:4] != b"PK\5\6" or end[20:] != b"\0\0":
-        raise zipfile.BadZipFile("it does not end as an archive")
-    records, length, start = struct.unpack("<10xHII2x", end)
-    after = 22
-    if locator[:4] == b"PK\6\7":  # torch writes the larger form of this, too
-        if end64[:4] != b"PK\6\6" or struct.unpack("<4xIQI", locator)[1] != size - 98:
-            raise zipfile.BadZipFile("its end is not where it says")
-        records, length, start = struct.unpack("<32xQQQ", end64)
-        after = 98
-    if start + length + after != size:
-        raise zipfile.BadZipFile("its directory is not where it says")
-    if records > RECORDS or length > DIRECTORY_BYTES:
-        raise ArtifactError(f"{path}: {records} records are more than an artifact has", remedy="quantize again")
-    file.seek(0)
-
-
-def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
-    names, total = set(), 0
-    for record in records:
-        name = record.filename.removeprefix("archive/")
-        known = [limit for pattern, limit in RECORD_BYTES.items() if re.fullmatch(pattern, name, re.ASCII)]
-        if not known or not record.filename.startswith("archive/"):
-            raise ArtifactError(
-                f"{path}: a record that no artifact has", found=repr(record.filename)[:80], remedy="quantize again"
-            )
-        if name.lower() in names:  # torch finds names without regard to case
-            raise ArtifactError(f"{path}: '{name}' is in it twice", remedy="quantize again")
-        if known[0] is not None and record.file_size > known[0]:
-            raise ArtifactError(
-                f"{path}: '{name}' unpacks to {record.file_size} bytes, at most {known[0]} are taken",
-                remedy="quantize again",
-            )
-        packed = record.compress_type == zipfile.ZIP_DEFLATED and name.startswith("code/")
-        if not packed and (record.compress_type != zipfile.ZIP_STORED or record.compress_size != record.file_size):
-            raise ArtifactError(f"{path}: '{name}' is compressed, only code may be", remedy="quantize again")
-        names.add(name.lower())
-        total += record.file_size
-    if total > ARCHIVE_BYTES:
-        raise ArtifactError(f"{path}: {total} bytes are more than an artifact has", remedy="quantize again")
-    for name in sorted(REQUIRED - names):
-        raise ArtifactError(
-            f"{path}: no {name.removeprefix('extra/')} in it",
-            remedy="is it an artifact of this project? ('rover inspect' says what)",
-        )
 
 
 # The program

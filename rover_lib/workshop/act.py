@@ -9,10 +9,10 @@ Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions,
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -637,10 +637,13 @@ def example_inputs(config: ActConfig) -> tuple[Tensor, ...]:
     return torch.zeros(1, len(config.state_names)), *frames
 
 
-def inputs_of(sample: Sample, config: ActConfig) -> tuple[Tensor, Tensor]:
-    """A recorded sample as the graph's inputs: (1, 2) float32 and (height, width, 3) uint8 RGB."""
-    frame = prepare_frame(sample.frame_bgr(), *config.image_sizes[0])
-    return torch.from_numpy(np.asarray(sample.state, np.float32))[None], torch.from_numpy(frame)
+def inputs_of(sample: Sample, config: ActConfig) -> tuple[Tensor, ...]:
+    """A recorded sample as the graph's inputs: (1, S) float32, and (height, width, 3) uint8 RGB of each camera."""
+    seen: Any = sample.frame_bgr()
+    frames = seen if isinstance(seen, Mapping) else {config.cameras[0]: seen}
+    prepared = (prepare_frame(frames[n], *size) for n, size in zip(config.cameras, config.image_sizes, strict=True))
+    state = torch.from_numpy(np.asarray(sample.state, np.float32))[None]
+    return state, *map(torch.from_numpy, prepared)
 
 
 @torch.inference_mode()

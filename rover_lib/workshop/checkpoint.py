@@ -23,8 +23,9 @@ from torch import Tensor
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
+from rover_lib.workshop import hub
 from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, Affine, imagenet
-from rover_lib.workshop.samples import Layout
+from rover_lib.workshop.samples import Layout, camera_name
 from rover_lib.workshop.untrusted import LARGEST, listed, shown
 
 TRAINER_KEYS = {  # of the trainer's config: what the shape of the policy needs
@@ -115,19 +116,20 @@ class Checkpoint:
         second: the dataset that they were trained on does. So their weights are put into the recordings' order. The
         trainer's files, and what we write, are always of [steering, throttle], 30 times a second.
 
-        Raises CheckpointError for another count of states or actions than recorded, and for one of those policies if
-        the recordings have another rate.
+        Raises CheckpointError for another count of cameras, states or actions than recorded, and for one of those
+        policies if the recordings have another rate.
         """
         c, rate_hz = self.config, layout.rate_hz
-        if rate_hz is None:  # our own recordings
-            return self
-        has, recorded = (len(c.state_names), len(c.action_names)), (len(layout.state_names), len(layout.action_names))
+        has = len(c.cameras), len(c.state_names), len(c.action_names)
+        recorded = len(layout.cameras), len(layout.state_names), len(layout.action_names)
         if has != recorded:
             raise CheckpointError(
-                f"{self.path}: a policy of {has[0]} states and {has[1]} actions",
-                found=f"recordings of {recorded[0]} and {recorded[1]}",
+                f"{self.path}: a policy of cameras, states and actions {', '.join(map(str, has))}",
+                found=f"recordings of {', '.join(map(str, recorded))}",
                 remedy="give the dataset that it was trained on",
             )
+        if rate_hz is None:  # our own recordings
+            return self
         if self.format != "lerobot" or self.report["written_here"]:
             if rate_hz != c.rate_hz:
                 raise CheckpointError(
@@ -153,7 +155,7 @@ class Checkpoint:
                 weights[name] = weights[name].index_select(axis, torch.tensor(order))
         config = replace(
             c,
-            cameras=(layout.camera,) if len(c.cameras) == 1 else c.cameras,
+            cameras=c.cameras if set(c.cameras) == set(layout.cameras) else layout.cameras,
             state_names=layout.state_names,
             action_names=layout.action_names,
             rate_hz=rate_hz,
@@ -167,18 +169,20 @@ class Checkpoint:
 
 def load_checkpoint(path: Path | str) -> Checkpoint:
     """Read and check a checkpoint: a trainer's .pth file, or a LeRobot folder with config.json and model.safetensors,
-    which may also be given by the output folder of `lerobot-train` (its last checkpoint is read) or a checkpoint of it.
+    which may also be given by the output folder of `lerobot-train` (its last checkpoint is read), a checkpoint of it,
+    or the Hub's id user/name@revision.
 
     Raises CheckpointError, in one sentence, for a file that is missing, damaged, needs to run code, or whose config and
     weights do not agree, and for policies that this project cannot run.
     """
-    path = Path(path)
+    path = hub.fetched(path, "model", CheckpointError) if hub.is_hub_id(path) else Path(path)
     if path.is_dir():
         return _load_lerobot(lerobot_folder(path) or path)
     if not path.is_file():
         what = "neither a file nor a folder" if path.exists() else "not found"
         raise CheckpointError(
-            f"{path}: {what}", remedy="give the trainer's .pth file or LeRobot's pretrained_model folder"
+            f"{path}: {what}",
+            remedy="give the trainer's .pth file, LeRobot's pretrained_model folder, or user/name@revision of the Hub",
         )
     return _load_trainer(path)
 
@@ -463,7 +467,7 @@ def _load_lerobot(folder: Path) -> Checkpoint:
     config = _config_from(
         folder,
         weights,
-        cameras=tuple(c.removeprefix("observation.images.").removeprefix("observation.") for c in sizes),
+        cameras=tuple(camera_name(c) for c in sizes),
         image_sizes=tuple(sizes.values()),
         chunk=chunk,
         dim=dim,

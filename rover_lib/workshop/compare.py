@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.columns import number, ratio
 from rover_lib.onboard.errors import PolicyError, PwmError
 from rover_lib.onboard.policy import ACTION_LIMITS, Policy, load_policy
 from rover_lib.onboard.preprocess import prepare_frame
@@ -82,6 +83,11 @@ class Fidelity:
     def errors(self, mode: str) -> np.ndarray:
         """(n, C, A) float64 absolute difference to FP32, in units of the action."""
         return np.abs(self.chunks[mode].astype(np.float64) - self.reference)
+
+    def relative(self, mode: str) -> float:
+        """The largest difference to FP32, as a share of the largest that is planned of that action, or of 1."""
+        largest = np.abs(self.reference).max((0, 1)).clip(1)
+        return float((self.errors(mode).max((0, 1)) / largest).max())
 
     def pct(self, action: str) -> float | None:
         """One unit of an action in percent of its recorded range; None for an action that is not judged."""
@@ -323,6 +329,28 @@ def _plain_worst(worst: WorstFrame) -> dict[str, Any]:
         "fp32": worst.reference,
         "int8": worst.other,
     }
+
+
+def comparison_rows(
+    summaries: Mapping[str, Mapping[str, Any]], sizes_mb: Mapping[str, float], reference: str
+) -> list[list[str]]:
+    """Artifacts beside their reference, a header first: each action's mean, 95th percentile and largest error.
+
+    summaries: `Fidelity.summary` by name. sizes_mb: of these and of the reference, which stands first.
+    """
+    keys = next(iter(summaries.values()))
+    actions = [key.removesuffix("_mae_pct") for key in keys if key.endswith("_mae_pct")]
+    header = ["", "MB", "times smaller"]
+    for action in actions:
+        header += [f"{action} mean %", "p95", "largest", "mean us"]
+    rows = [header, [reference, number(sizes_mb[reference]), "1.0", *["-"] * (len(header) - 3)]]
+    for name, summary in summaries.items():
+        row = [name, number(sizes_mb[name]), number(ratio(sizes_mb[reference], sizes_mb[name]))]
+        for action in actions:
+            row += [number(summary[f"{action}_{which}_pct"], ".2f") for which in ("mae", "p95", "max")]
+            row.append(number(summary.get(f"{action}_mae_us"), ".2f"))
+        rows.append(row)
+    return rows
 
 
 def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str, Any]:

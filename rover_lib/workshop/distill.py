@@ -5,7 +5,7 @@
 The student begins with its teacher's weights (see `student`) and learns in phases: its backbone to see what the teacher
 sees, its transformer on what that backbone sees, then all together at a tenth of the rate. It learns what the teacher
 plans, and a little what was recorded. With qat it then learns on, rounded as its export rounds it (see `fake_quant`).
-The run's folder gets best_model.pth, pretrained_model/ and distill.json.
+The run's folder gets best_model.pth, pretrained_model/, policy_static.pt and distill.json.
 
 Letters: n samples, B batch, C chunk, A actions.
 """
@@ -35,17 +35,18 @@ from rover_lib.workshop import pipeline as quantization
 from rover_lib.workshop import student as student_module
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.cache import cache_root, key_of
-from rover_lib.workshop.checkpoint import Checkpoint, expected_shapes
+from rover_lib.workshop.checkpoint import Checkpoint, expected_shapes, load_checkpoint
 from rover_lib.workshop.checkpoint_files import trainer_can_hold, write_lerobot, write_trainer
 from rover_lib.workshop.choose import Chooser
 from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.episodes import Sample
+from rover_lib.workshop.export import export
 from rover_lib.workshop.fake_quant import RoundedPolicy
 from rover_lib.workshop.judge import Range, not_judged, pct_of_range, shown_pct, worst
 from rover_lib.workshop.lessons import BLOCK, BatchedPolicy, Lessons
 from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.quantize import quantize
+from rover_lib.workshop.quantize import QuantizedPolicy, quantize
 from rover_lib.workshop.samples import Source
 from rover_lib.workshop.scheme import Scheme
 from rover_lib.workshop.session import SMALL_GMAC, Opened, load
@@ -375,6 +376,13 @@ def _calibrated(work: _Work, student: Checkpoint) -> tuple[Calibration, Scheme]:
     return calibration, chooser.observer(how.scheme, p["quantization"]["observers"], work.progress)[0]
 
 
+def _rounded(work: _Work, weights: dict[str, Tensor]) -> tuple[QuantizedPolicy, Calibration]:
+    """A student in static INT8, and what calibrated it."""
+    student = _checkpoint(work, weights)
+    calibration, scheme = _calibrated(work, student)
+    return quantize(student, scheme, calibration), calibration
+
+
 # --- judging ----------------------------------------------------------------------------------------------------------
 
 
@@ -408,21 +416,18 @@ def errors_of(
 
 
 def _int8_errors(
-    work: _Work, weights: dict[str, Tensor], samples: Sequence[Sample], taught: np.ndarray
+    work: _Work, weights: dict[str, Tensor], rounded: QuantizedPolicy, samples: Sequence[Sample], taught: np.ndarray
 ) -> dict[str, float | None]:
     """Of static INT8, on the samples: int8_<action>_pct to its own FP32, int8_teacher_<action>_pct to the teacher.
 
-    weights: the student's. taught: (n, C, A) of the teacher.
+    weights: the student's. rounded: the same in INT8. taught: (n, C, A) of the teacher.
     """
-    student = _checkpoint(work, weights)
-    calibration, scheme = _calibrated(work, student)
     inputs = [inputs_of(s, work.config) for s in samples]
-    exact = predictions(ACT(work.config, weights), inputs)
-    rounded = predictions(quantize(student, scheme, calibration).module, inputs)
+    exact, int8 = (predictions(policy, inputs) for policy in (ACT(work.config, weights), rounded.module))
     errors: dict[str, float | None] = {}
     for i, (action, recorded) in enumerate(work.opened.recordings.action_range().items()):
         for name, other in (("int8", exact), ("int8_teacher", torch.from_numpy(taught))):
-            off = (rounded[..., i] - other[..., i]).abs().mean().item()
+            off = (int8[..., i] - other[..., i]).abs().mean().item()
             errors[f"{name}_{action}_pct"] = pct_of_range(off, recorded)
     return errors
 
@@ -486,8 +491,13 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
         | errors_of(planned, plans["teacher"], held_out, action_range)
         for name, planned in plans.items()
     ]
-    students[1] |= _int8_errors(work, taught.weights, held_out, plans["teacher"])
-    unrounded = taught.unrounded and _int8_errors(work, taught.unrounded, held_out, plans["teacher"])
+    rounded, calibration = _rounded(work, taught.weights)
+    students[1] |= _int8_errors(work, taught.weights, rounded, held_out, plans["teacher"])
+    unrounded = None
+    if taught.unrounded:
+        unrounded = _int8_errors(
+            work, taught.unrounded, _rounded(work, taught.unrounded)[0], held_out, plans["teacher"]
+        )
     chosen = _plans(work, work.config, taught.weights, choosing)
     driven = ~np.stack([s.is_pad for s in choosing])
     loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
@@ -511,6 +521,9 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
             write_trainer(new / "best_model.pth", work.config, taught.weights, loss, origin, **settings)
             files["best_model.pth"] = "best_model.pth"
         hashes = {name: sha256_of(new / path) for name, path in files.items()}
+        student = load_checkpoint(new / ("best_model.pth" if "best_model.pth" in files else "pretrained_model"))
+        samples, parity = thinned(parts.choosing, quantization.CHOOSING_FRAMES), quantization.Recipe.of(params()).parity
+        export(rounded, student, new / "policy_static.pt", samples, calibration, parity)
         write_stage(
             new / "distill.json",
             "distill",

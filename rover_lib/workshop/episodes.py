@@ -45,7 +45,7 @@ from rover_lib.onboard.recording import (
     no_pulse,
     number_of,
 )
-from rover_lib.workshop import lerobot_dataset
+from rover_lib.workshop import hub, lerobot_dataset
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source, relative
 from rover_lib.workshop.untrusted import listed, shown
@@ -114,7 +114,7 @@ def load_recordings(
     progress: Progress = silent,
     pwm: PwmCalibration | None = None,
 ) -> Recordings:
-    """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset.
+    """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset, also of the Hub.
 
     chunk: actions per sample. sync_s: how far a control may be from its frame. Faults are counted and skipped;
     pictures are only checked for their ends here and decoded in `Sample.frame_bgr`. Raises EpisodeError when
@@ -124,6 +124,8 @@ def load_recordings(
     root = source.path
     if chunk < 1 or not sync_s > 0:
         raise EpisodeError("chunk must be at least 1 and sync_s above 0", found=f"{chunk} and {sync_s}")
+    if hub.is_hub_id(root):
+        return lerobot_dataset.load_dataset(lerobot_dataset.fetched(source), chunk, progress)
     if lerobot_dataset.is_dataset(root):
         return lerobot_dataset.load_dataset(source, chunk, progress)
     if source.action_names not in ((), ACTION_NAMES):
@@ -142,7 +144,8 @@ def load_recordings(
     except OSError as e:
         raise EpisodeError(
             f"{root}: no folder of episodes ({e.strerror})",
-            remedy="give the folder with episode_* in it, or a LeRobotDataset's (with meta/info.json)",
+            remedy="give the folder with episode_* in it, a LeRobotDataset's (with meta/info.json), or "
+            "user/name@revision of the Hub",
         ) from None
     if not folders:
         raise EpisodeError(

@@ -1,6 +1,7 @@
 """The artifact: one file with the graph, its manifest and its parity vectors, which is all that a rover needs.
 
 export(quantized, checkpoint, "policy_static.pt", samples, calibration)
+export(quantized, checkpoint, "policy_static.onnx.zip", samples, calibration)    # the same, for ONNX Runtime
 """
 
 import warnings
@@ -8,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -16,22 +17,83 @@ from torch import Tensor, nn
 
 import rover_lib
 from rover_lib.onboard import artifact
+from rover_lib.onboard.artifact import ONNX_SUFFIX
+from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.workshop.act import ACT, example_inputs, inputs_of, multiply_accumulates, predictions
+from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.episodes import Sample
 from rover_lib.workshop.observe import Calibration
 from rover_lib.workshop.quantize import QuantizedPolicy, int8_layers
-from rover_lib.workshop.scheme import ENGINE
+
+
+class Form(Protocol):
+    """A policy as one engine takes it."""
+
+    engine: str
+    versions: dict[str, str]
+
+    def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
+        """(n, C, A) raw actions."""
+
+    def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
+        """The artifact; returns its content hash."""
+
+
+class TorchScript:
+    """Traced and frozen."""
+
+    engine = TORCH
+
+    def __init__(self, module: nn.Module, config: ActConfig):
+        self.versions: dict[str, str] = {}  # torch's is in every manifest
+        with warnings.catch_warnings(), torch.inference_mode():
+            warnings.simplefilter("ignore")
+            self.traced = torch.jit.freeze(torch.jit.trace(module, example_inputs(config), check_trace=False).eval())
+
+    def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
+        with torch.jit.optimized_execution(False):
+            return predictions(self.traced, inputs)
+
+    def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
+        return artifact.save_artifact(path, self.traced, manifest, vectors)
+
+
+class Onnx:
+    """Written node by node, see `onnx_graph`."""
+
+    engine = ONNXRUNTIME
+
+    def __init__(self, module: nn.Module, config: ActConfig):
+        # here, because only who wants this form needs its packages
+        import onnx
+        import onnxruntime
+
+        from rover_lib.workshop.onnx_graph import graph_of, onnx_model
+
+        self.versions = {"onnx": onnx.__version__, "onnxruntime": onnxruntime.__version__}
+        self.names = ["state", *(f"frame_{name}" for name in config.cameras)]
+        inputs = dict(zip(self.names, example_inputs(config), strict=True))
+        self.model = onnx_model(graph_of(module), inputs, ("chunk",)).SerializeToString(deterministic=True)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = torch.get_num_threads()
+        self.session = onnxruntime.InferenceSession(self.model, options, providers=["CPUExecutionProvider"])
+
+    def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
+        named = ({k: v.numpy() for k, v in zip(self.names, x, strict=True)} for x in inputs)
+        return torch.cat([torch.from_numpy(self.session.run(None, x)[0]) for x in named])
+
+    def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
+        return artifact.save_onnx(path, self.model, manifest, vectors)
 
 
 @dataclass(frozen=True)
 class Parity:
     """What an artifact must answer when it is loaded elsewhere, and how far its answers may differ.
 
-    tolerance: of FP32, in action units. int8_errors: INT8 may differ by at least `tolerance`, and by this many times
-    its own largest error against FP32, because flipped roundings are of the size of quantization itself. vectors: so
-    many samples are stored in the artifact.
+    tolerance: of FP32, in action units, or of the largest planned where that is above 1. int8_errors: INT8 may differ
+    by at least `tolerance`, and by this many times its own largest error against FP32, because flipped roundings are of
+    the size of quantization itself. vectors: how many samples are stored in the artifact.
     """
 
     tolerance: float = 1e-4
@@ -54,7 +116,8 @@ class Exporter:
         self.inputs = [inputs_of(s, checkpoint.config) for s in samples]
         self.stored = np.unique(np.linspace(0, len(samples) - 1, self.parity.vectors).round().astype(int))
         for i in self.stored:
-            self.inputs[i] = (self.inputs[i][0], _in_blocks(self.inputs[i][1]))
+            state, *frames = self.inputs[i]
+            self.inputs[i] = (state, *map(_in_blocks, frames))
 
     @cached_property
     def float_actions(self) -> Tensor:
@@ -65,36 +128,36 @@ class Exporter:
         return sum(multiply_accumulates(self.float_policy).values()) / 1e9
 
     def export(self, policy: ACT | QuantizedPolicy, path: Path | str, calibration: Calibration | None = None) -> str:
-        """Trace, freeze and write the artifact; return its content hash.
+        """Write the artifact, for ONNX Runtime if the path ends in ONNX_SUFFIX; return its content hash.
 
-        calibration: of a quantized policy, for the manifest. Raises QuantizeError if the traced graph does not give
+        calibration: of a quantized policy, for the manifest. Raises QuantizeError if what was written does not give
         what the policy gave, or anything that is not finite.
         """
         checkpoint, parity = self.checkpoint, self.parity
         config = checkpoint.config
         module: nn.Module = policy.module if isinstance(policy, QuantizedPolicy) else policy
-        with warnings.catch_warnings(), torch.inference_mode():
-            warnings.simplefilter("ignore")
-            traced = torch.jit.freeze(torch.jit.trace(module, example_inputs(config), check_trace=False).eval())
+        form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(module, config)
         expected = predictions(module, self.inputs)
-        with torch.jit.optimized_execution(False):
-            actions = predictions(traced, self.inputs)
+        actions = form.predict(self.inputs)
         if not torch.isfinite(actions).all():
             raise QuantizeError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
-        allowed = dict.fromkeys(config.action_names, parity.tolerance)
+        # Float rounds in proportion: an arm's degrees are a hundred times a car's shares.
+        sizes = expected.abs().amax((0, 1)).clamp(min=1).tolist()
+        allowed = {n: parity.tolerance * size for n, size in zip(config.action_names, sizes, strict=True)}
         if isinstance(policy, QuantizedPolicy):
             errors = (actions - self.float_actions).abs().amax((0, 1))
             for name, error in zip(config.action_names, errors, strict=True):
-                allowed[name] = max(parity.tolerance, parity.int8_errors * error.item())
+                allowed[name] = max(allowed[name], parity.int8_errors * error.item())
         gap = (actions - expected).abs().max().item()
         if gap > max(allowed.values()):
-            raise QuantizeError(f"{path}: the traced graph differs from the policy by {gap:.3g}; nothing was written")
+            raise QuantizeError(f"{path}: the written graph differs from the policy by {gap:.3g}; nothing was written")
         vectors = {
             "state": np.stack([self.inputs[i][0][0].numpy() for i in self.stored]),
-            f"frame_{config.cameras[0]}": np.stack([self.inputs[i][1].numpy() for i in self.stored]),
             "chunk": np.stack([actions[i].numpy() for i in self.stored]),
         }
-        manifest = _manifest(policy, checkpoint, calibration) | {
+        for at, camera in enumerate(config.cameras, 1):
+            vectors[f"frame_{camera}"] = np.stack([self.inputs[i][at].numpy() for i in self.stored])
+        manifest = _manifest(policy, checkpoint, calibration, form) | {
             "weights_mb": _weights_mb(module),
             "gmac": self.gmac,
             "parity": {
@@ -105,7 +168,7 @@ class Exporter:
                 else "another processor sums in another order",
             },
         }
-        return artifact.save_artifact(path, traced, manifest, vectors)
+        return form.save(path, manifest, vectors)
 
 
 def export(
@@ -120,7 +183,9 @@ def export(
     return Exporter(checkpoint, samples, parity).export(policy, path, calibration)
 
 
-def _manifest(policy: ACT | QuantizedPolicy, checkpoint: Checkpoint, calibration: Calibration | None) -> dict[str, Any]:
+def _manifest(
+    policy: ACT | QuantizedPolicy, checkpoint: Checkpoint, calibration: Calibration | None, form: Form
+) -> dict[str, Any]:
     """What the artifact says of itself, apart from what only its graph can tell."""
     config = checkpoint.config
     scheme = policy.scheme if isinstance(policy, QuantizedPolicy) else None
@@ -130,7 +195,7 @@ def _manifest(policy: ACT | QuantizedPolicy, checkpoint: Checkpoint, calibration
         "schema": artifact.SCHEMA,
         "mode": mode,
         "scheme": scheme.kind if scheme and mode not in arithmetic else arithmetic[mode],
-        "engine": ENGINE,
+        "engine": form.engine,
         "cameras": [
             {"name": n, "height": h, "width": w} for n, (h, w) in zip(config.cameras, config.image_sizes, strict=True)
         ],
@@ -148,7 +213,7 @@ def _manifest(policy: ACT | QuantizedPolicy, checkpoint: Checkpoint, calibration
             "channel_scales": calibration.smooth,
             "float_blocks": list(scheme.float_blocks) if scheme else [],
         },
-        "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": rover_lib.__version__},
+        "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": rover_lib.__version__, **form.versions},
     }
 
 

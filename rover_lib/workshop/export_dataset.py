@@ -21,29 +21,41 @@ import numpy as np
 
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.workshop.episodes import load_recordings
-from rover_lib.workshop.lerobot_dataset import ACTION, BACKEND, CAMERA, STATE
+from rover_lib.workshop.lerobot_dataset import ACTION, BACKEND, STATE
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.samples import ACTION_NAMES, Episode, Recordings, Sample
+from rover_lib.workshop.samples import ACTION_NAMES, CAMERA, Episode, Recordings, Sample
 
 NAME = "cam_front"  # of the camera, as in the trainer's policies
 REPORT = "rover_export.json"
+SIDES_PX = 16, 8192  # of a picture, as an artifact takes them
 SHORTEST = 2  # rows of an episode: of one there is no spread to normalise by
 OTHER_RATE = 0.2  # of the usual time between two frames
 
 
 def export_dataset(
-    episodes: Path | str, out: Path | str, *, video: bool = False, progress: Progress = silent
+    episodes: Path | str,
+    out: Path | str,
+    *,
+    video: bool = False,
+    size: tuple[int, int] | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Write all usable samples below `episodes` to `out`, a new folder, and return what was written and left out.
 
-    video: AV1, LeRobot's usual, far smaller and not equal to the last bit; else PNG in parquet, which is. The folder
-    appears when it is whole. Raises EpisodeError for recordings that cannot be used, of several rates or picture
-    sizes, and for a folder that is there.
+    video: AV1, LeRobot's usual, far smaller and not equal to the last bit; else PNG in parquet, which is. size:
+    (height, width) of the pictures, resized as a rover resizes what its camera gives; None: as recorded. The folder
+    appears when it is whole. Raises EpisodeError for recordings that cannot be used, of several rates or, without a
+    size, of several picture sizes, and for a folder that is there.
     """
     out = Path(out)
     if out.exists():
         raise EpisodeError(f"{out}: is there already", remedy="give a new folder, or remove it")
+    if size and not SIDES_PX[0] <= min(size) <= max(size) <= SIDES_PX[1]:
+        raise EpisodeError(
+            f"pictures must have {SIDES_PX[0]} to {SIDES_PX[1]} pixels a side", found=f"{size[1]}x{size[0]}"
+        )
     recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
     if recordings.layout.rate_hz is not None:
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
@@ -51,7 +63,7 @@ def export_dataset(
     new = out.with_name(f".{out.name}.new")
     shutil.rmtree(new, ignore_errors=True)
     try:
-        report = _write(recordings, new, rate_hz, video, progress)
+        report = _write(recordings, new, rate_hz, video, size, progress)
         (new / REPORT).write_text(json.dumps(report, indent=2) + "\n")
         new.rename(out)
     finally:
@@ -91,15 +103,23 @@ def _runs(samples: tuple[Sample, ...]) -> Iterator[list[Sample]]:
     yield run
 
 
-def _write(recordings: Recordings, root: Path, rate_hz: int, video: bool, progress: Progress) -> dict[str, Any]:
+def _write(
+    recordings: Recordings,
+    root: Path,
+    rate_hz: int,
+    video: bool,
+    size: tuple[int, int] | None,
+    progress: Progress,
+) -> dict[str, Any]:
     os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder tells its settings otherwise, once an episode
     # here, because it takes seconds that nothing else of the command line need wait for
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.datasets.utils import SuppressProgressBars
 
-    first = recordings.samples[0].frame_bgr()
+    recorded = recordings.samples[0].frame_bgr().shape
+    shape = (*size, 3) if size else recorded
     numbers = {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)}
-    picture = {"dtype": "video" if video else "image", "shape": first.shape, "names": ["height", "width", "channels"]}
+    picture = {"dtype": "video" if video else "image", "shape": shape, "names": ["height", "width", "channels"]}
     dataset = LeRobotDataset.create(
         repo_id=f"local/{root.name.strip('.').removesuffix('.new')}",
         fps=rate_hz,
@@ -114,7 +134,7 @@ def _write(recordings: Recordings, root: Path, rate_hz: int, video: bool, progre
     with SuppressProgressBars():
         for episode in progress(recordings.episodes, desc="exporting", total=len(recordings.episodes)):
             for run in _runs(episode.samples):
-                for rows, unread in _readable(run, first.shape):
+                for rows, unread in _readable(run, size, recorded):
                     broken += unread
                     if len(rows) < SHORTEST:
                         short += len(rows)
@@ -135,7 +155,8 @@ def _write(recordings: Recordings, root: Path, rate_hz: int, video: bool, progre
     if not written:
         raise EpisodeError(f"{recordings.root}: no two whole frames in a row", remedy="record again")
     return {
-        "dataset": "LeRobotDataset v3, " + ("AV1 video" if video else "images, as they were recorded"),
+        "dataset": "LeRobotDataset v3, " + ("AV1 video" if video else "images"),
+        "pictures": f"{shape[1]}x{shape[0]}" + ("" if shape == recorded else f", recorded {recorded[1]}x{recorded[0]}"),
         "episodes": len(origins),
         "frames": written,
         "frames_a_second": rate_hz,
@@ -147,7 +168,9 @@ def _write(recordings: Recordings, root: Path, rate_hz: int, video: bool, progre
     }
 
 
-def _readable(run: list[Sample], shape: tuple[int, ...]) -> Iterator[tuple[list[tuple[Sample, np.ndarray]], int]]:
+def _readable(
+    run: list[Sample], size: tuple[int, int] | None, recorded: tuple[int, ...]
+) -> Iterator[tuple[list[tuple[Sample, np.ndarray]], int]]:
     """The run in parts between pictures that cannot be decoded, with RGB frames; and how many those were."""
     rows: list[tuple[Sample, np.ndarray]] = []
     for sample in run:
@@ -157,11 +180,11 @@ def _readable(run: list[Sample], shape: tuple[int, ...]) -> Iterator[tuple[list[
             yield rows, 1
             rows = []
             continue
-        if frame.shape != shape:
+        if size is None and frame.shape != recorded:
             raise EpisodeError(
                 f"{sample.frame_path}: a picture of {frame.shape[1]}x{frame.shape[0]} among those of "
-                f"{shape[1]}x{shape[0]}",
-                remedy="export the episodes of each size by themselves",
+                f"{recorded[1]}x{recorded[0]}",
+                remedy="export the episodes of each size by themselves, or all at one: --size",
             )
-        rows.append((sample, np.ascontiguousarray(frame[..., ::-1])))
+        rows.append((sample, prepare_frame(frame, *(size or recorded[:2]))))
     yield rows, 0

@@ -7,6 +7,7 @@ judged. Its errors are None, it takes no part in a choice or a budget, and a war
 from collections.abc import Iterable, Mapping
 
 Range = tuple[float, float]  # (least, most) recorded value of an action
+FOLLOWS = 0.1  # of how far plans lie apart: what moves a plan by less than that is hardly followed
 
 
 def pct_of_range(error: float, recorded: Range) -> float | None:
@@ -29,6 +30,11 @@ def constant_actions(action_range: Mapping[str, Range]) -> list[str]:
 def not_judged(action_range: Mapping[str, Range]) -> list[str]:
     """A warning for each action that never changes in the recordings."""
     return [f"{name} never changes in these recordings: not judged" for name in constant_actions(action_range)]
+
+
+def follows(moved: float, apart: float) -> bool:
+    """Whether a plan follows what moved it by `moved`, where the plans for both lie `apart`; in one unit."""
+    return moved > FOLLOWS * apart
 
 
 def shown_pct(value: float | None) -> str:

@@ -10,7 +10,7 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +18,17 @@ import numpy as np
 
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.policy import ACTION_LIMITS
+from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.samples import ACTION_NAMES, Episode, Layout, Recordings, Sample, Source
+from rover_lib.workshop.samples import (
+    ACTION_NAMES,
+    Episode,
+    Layout,
+    Recordings,
+    Sample,
+    Source,
+    camera_name,
+)
 from rover_lib.workshop.untrusted import listed, shown
 
 if TYPE_CHECKING:
@@ -29,7 +38,7 @@ INFO = Path("meta/info.json")
 INFO_BYTES = 5_000_000  # LeRobot's: some kB
 CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
-STATE, ACTION, CAMERA = "observation.state", "action", "observation.images."
+STATE, ACTION = "observation.state", "action"
 COPY_AGAIN = "copy the whole dataset again"
 UNEVEN = 0.1  # of the time between two frames
 
@@ -39,31 +48,45 @@ def is_dataset(root: Path) -> bool:
     return (root / INFO).is_file()
 
 
-@dataclass(frozen=True, eq=False)
-class _Pictures:
-    """One camera of a dataset, opened once for all of its samples. size: (height, width)."""
+@dataclass(frozen=True)
+class _Camera:
+    """name: as the policy calls it; key: as the dataset does. size: (height, width)."""
 
-    dataset: "LeRobotDataset"
+    name: str
     key: str
     size: tuple[int, int]
 
-    def frame_bgr(self, row: int, path: Path) -> np.ndarray:
+
+@dataclass(frozen=True, eq=False)
+class _Pictures:
+    """The cameras of a dataset that a policy looks through, opened once for all of its samples."""
+
+    dataset: "LeRobotDataset"
+    cameras: tuple[_Camera, ...]
+
+    def frames_bgr(self, row: int, path: Path) -> dict[str, np.ndarray]:
+        """By camera's name, (h, w, 3) uint8 BGR each."""
         with _said_of(path, f"its frame {row} cannot be decoded"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torchvision, about the decoder that LeRobot has chosen
-            pixels = self.dataset[row][self.key]  # (3, h, w) float32 in [0, 1]
-        frame = (pixels * 255).round().byte().permute(1, 2, 0).numpy()  # uint8 / 255 times 255: exact
-        if frame.shape != (*self.size, 3):
-            raise EpisodeError(
-                f"{path}: its frame {row} has another shape than meta/info.json says, {(*self.size, 3)}",
-                found=frame.shape,
-                remedy="record pictures of one size in one dataset",
-            )
-        return np.ascontiguousarray(frame[..., ::-1])
+            item = self.dataset[row]
+        frames = {}
+        for camera in self.cameras:
+            pixels = item[camera.key]  # (3, h, w) float32 in [0, 1]
+            frame = (pixels * 255).round().byte().permute(1, 2, 0).numpy()  # uint8 / 255 times 255: exact
+            if frame.shape != (*camera.size, 3):
+                raise EpisodeError(
+                    f"{path}: its frame {row} of '{camera.key}' has another shape than meta/info.json says, "
+                    f"{(*camera.size, 3)}",
+                    found=frame.shape,
+                    remedy="record pictures of one size in one dataset",
+                )
+            frames[camera.name] = np.ascontiguousarray(frame[..., ::-1])
+        return frames
 
 
 @dataclass(frozen=True, eq=False)
 class LerobotSample(Sample):
-    """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file."""
+    """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file (of several cameras the first's)."""
 
     pictures: _Pictures
 
@@ -71,9 +94,13 @@ class LerobotSample(Sample):
     def frame_name(self) -> str:
         return f"frame {self.row}"
 
-    def frame_bgr(self) -> np.ndarray:
-        """The picture, (h, w, 3) uint8 BGR: LeRobot's own item. Raises EpisodeError if it cannot be decoded."""
-        return self.pictures.frame_bgr(self.row, self.frame_path)
+    def frame_bgr(self) -> Any:
+        """The picture, (h, w, 3) uint8 BGR: LeRobot's own item; where there are several cameras, a dict by their names.
+
+        Raises EpisodeError if it cannot be decoded.
+        """
+        frames = self.pictures.frames_bgr(self.row, self.frame_path)
+        return frames if len(frames) > 1 else next(iter(frames.values()))
 
 
 def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Recordings:
@@ -85,10 +112,10 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     """
     root = source.path
     info = _read_info(root)
-    layout, key = _layout(root, info, source)
+    layout, cameras = _layout(root, info, source)
     dataset = _opened(root)
     columns = _columns(root, dataset, layout)
-    pictures = _Pictures(dataset, key, _picture_size(root, key, info["features"][key]))
+    pictures = _Pictures(dataset, cameras)
     _check_rate(root, columns, float(info["fps"]))
     number = columns["episode_index"]
     starts = np.flatnonzero(np.diff(number, prepend=-1))
@@ -99,6 +126,13 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     for sample in last.values():  # a file that was cut lacks its end
         sample.frame_bgr()
     return Recordings(root, tuple(episodes), (), source, layout)
+
+
+def fetched(source: Source) -> Source:
+    """The same, of a dataset on the Hub, as a folder of this machine. Its version is read before gigabytes are."""
+    given = source.path, "dataset", EpisodeError
+    _read_info(hub.fetched(*given, files=("meta/*",)))
+    return replace(source, path=hub.fetched(*given))
 
 
 def _read_info(root: Path) -> dict[str, Any]:
@@ -132,24 +166,37 @@ def _is_feature(feature: Any) -> bool:
     return isinstance(shape, list) and all(isinstance(n, int) and 0 < n <= 10_000 for n in shape)
 
 
-def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, str]:
-    """Which camera and which numbers are whose, and the camera's whole name."""
+def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, tuple[_Camera, ...]]:
+    """Which cameras and which numbers are whose."""
     features = info["features"]
-    cameras = {k.removeprefix(CAMERA): k for k, f in features.items() if f.get("dtype") in ("image", "video")}
-    if not cameras:
+    keys = {camera_name(k): k for k, f in features.items() if f.get("dtype") in ("image", "video")}
+    if not keys:
         raise EpisodeError(f"{root}: has no camera", found=listed(features), remedy="record one that sees")
-    camera = source.camera or (next(iter(cameras)) if len(cameras) == 1 else "")
-    if camera not in cameras:
-        what = f"has no camera {shown(camera)}" if camera else f"has {len(cameras)} cameras"
-        raise EpisodeError(f"{root}: {what}", found=listed(cameras), remedy="say which is the car's: --camera NAME")
+    names = source.cameras or (tuple(keys) if len(keys) == 1 else ())
+    missing = [name for name in names if name not in keys]
+    if missing or not names:
+        what = f"has no camera {shown(missing[0])}" if missing else f"has {len(keys)} cameras"
+        remedy = "say what the policy looks through: --camera NAME, with commas between several"
+        raise EpisodeError(f"{root}: {what}", found=listed(keys), remedy=remedy)
+    cameras = tuple(_Camera(name, keys[name], _picture_size(root, keys[name], features[keys[name]])) for name in names)
     for key in (STATE, ACTION):
         if key not in features or len(features[key]["shape"]) != 1:
             found = features[key]["shape"] if key in features else listed(features)
             raise EpisodeError(f"{root}: has no '{key}' that is a row of numbers", found=found, remedy="record one")
     actions, action_order = _named(root, features, ACTION, source.action_names)
-    states, state_order = _named(root, features, STATE, _names(features[STATE]) or source.action_names)
-    layout = Layout(camera, states, actions, float(info["fps"]), state_order, action_order)
-    return layout, cameras[camera]
+    states, state_order = _named(root, features, STATE, _state_names(features, source.action_names))
+    return Layout(names, states, actions, float(info["fps"]), state_order, action_order), cameras
+
+
+def _state_names(features: Mapping[str, Any], said: tuple[str, ...]) -> tuple[str, ...]:
+    """A state's own names, or what the user says of the actions, if those were called the same or it has none."""
+    own = _names(features[STATE])
+    if own and not (said and own == _names(features[ACTION])):
+        return own
+    (size,) = features[STATE]["shape"]
+    if said and size != len(said):  # what such numbers are called matters nowhere: they are no actions
+        return tuple(f"state_{i}" for i in range(size))
+    return said
 
 
 def _named(
@@ -159,9 +206,10 @@ def _named(
     (size,) = features[key]["shape"]
     names = said or _names(features[key])
     if not names:
+        example = ACTION_NAMES if size == len(ACTION_NAMES) else [f"joint_{i}" for i in range(1, size + 1)]
         raise EpisodeError(
             f"{root}: '{key}' does not say which of its {size} numbers is what",
-            remedy=f"say it once, in the order of its numbers: --action-names {','.join(ACTION_NAMES)}",
+            remedy=f"say it once, in the order of its numbers: --action-names {','.join(example)}",
         )
     if len(names) != size or len(set(names)) != size:
         raise EpisodeError(
@@ -268,15 +316,15 @@ def _episode(
     meta, first, n = pictures.dataset.meta, int(rows[0]), len(rows)
     number = int(columns["episode_index"][first])
     name, data = f"episode_{number:06d}", root / meta.get_data_file_path(number)
-    video = pictures.key in meta.video_keys
-    holds = root / meta.get_video_file_path(number, pictures.key) if video else data
+    keys = [camera.key for camera in pictures.cameras]
+    files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
     index = np.arange(n)[:, None] + np.arange(chunk)
     actions, pads = columns[ACTION][rows], index >= n
     chunks = actions[np.minimum(index, n - 1)]
     samples = tuple(
         LerobotSample(
             episode=name,
-            frame_path=holds,
+            frame_path=files[0],
             time_s=float(columns["timestamp"][row] - columns["timestamp"][first]),
             state=columns[STATE][row].copy(),
             chunk=chunks[k].copy(),
@@ -295,5 +343,5 @@ def _episode(
         frames=n,
         controls=n,
         samples=samples,
-        files=(root / INFO, data),
+        files=(root / INFO, data, *files[1:]),
     )

@@ -15,11 +15,10 @@ import numpy as np
 
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.workshop.compare import Fidelity, thinned
-from rover_lib.workshop.judge import shown_pct
+from rover_lib.workshop.judge import follows, shown_pct
 from rover_lib.workshop.progress import Progress, silent
 
 FRAMES = 24  # planned twice more each, by FP32 alone: half a minute for a policy of full size
-FOLLOWS = 0.1  # of how far plans lie apart: what moves a plan by less than that is hardly followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +58,7 @@ class Looking:
         judged = [(i, a) for i, a in enumerate(self.report.action_names) if self.report.pct(a) is not None]
         if judged and all(self.apart[i] == 0 for i, _ in judged):
             return ["this policy plans the same whatever it is shown"]
-        blind = [(i, a) for i, a in judged if self.by_picture[i] <= FOLLOWS * self.apart[i]]
+        blind = [(i, a) for i, a in judged if not follows(float(self.by_picture[i]), float(self.apart[i]))]
         if judged and len(blind) == len(judged):
             return [f"this policy ignores its camera: {self._moves(blind)}; it copies its state, do not drive it"]
         return [f"{action} hardly follows the camera: {self._moves([(i, action)])}" for i, action in blind]

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -160,15 +161,6 @@ class Calibration:
             raise QuantizeError(f"{path}: not a calibration ({reason})", remedy="calibrate again") from None
 
 
-def _check_recordable(checkpoint: Checkpoint) -> None:
-    c = checkpoint.config
-    if len(c.cameras) != 1 or len(c.state_names) != 2 or len(c.action_names) != 2:
-        raise QuantizeError(
-            f"{checkpoint.path}: the recordings have one camera and [steering, throttle], this policy has "
-            f"{len(c.cameras)} cameras, {len(c.state_names)} states and {len(c.action_names)} actions"
-        )
-
-
 def calibrate(
     checkpoint: Checkpoint,
     samples: Sequence[Sample],
@@ -178,18 +170,17 @@ def calibrate(
 ) -> Calibration:
     """Run the float policy over the samples, twice: for the channel scales, then for the observers behind them.
 
-    smooth: SmoothQuant's a, None for no channel scales. progress: like tqdm. Raises QuantizeError without samples, for
-    a policy that the recordings do not fit, and for activations that are not finite.
+    smooth: SmoothQuant's a, None for no channel scales. progress: like tqdm. Raises QuantizeError without samples, and
+    for activations that are not finite.
     """
     if not samples:
         remedy = "give recordings with matching frames and controls"
         raise QuantizeError("calibration needs samples", found="none", remedy=remedy)
-    _check_recordable(checkpoint)
     torch.backends.quantized.engine = ENGINE
     start = time.monotonic()
     config = checkpoint.config
 
-    def inputs(what: str) -> Iterable[tuple[Tensor, Tensor]]:
+    def inputs(what: str) -> Iterable[tuple[Tensor, ...]]:
         return (inputs_of(s, config) for s in progress(samples, desc=what))
 
     model = ACT(config, checkpoint.weights, for_int8=True)
@@ -225,10 +216,8 @@ def calibrate(
 
 
 def _observer_behind(prepared: nn.Module, node: Node) -> RangeObserver | None:
-    for user in node.users:
-        if user.op == "call_module" and isinstance(m := prepared.get_submodule(str(user.target)), RangeObserver):
-            return m
-    return None
+    found = _behind(prepared, node)
+    return None if found is None else cast(RangeObserver, prepared.get_submodule(str(found.target)))
 
 
 def _pattern(block: str, relu: bool) -> str:
@@ -275,13 +264,50 @@ def _prepare(model: ACT, scheme: Scheme) -> GraphModule:
     full = replace(scheme, float_blocks=())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # deprecation: known, and the reason why only two modules touch it
-        return prepare_fx(
+        prepared = prepare_fx(
             model,
             qconfig_mapping(model.config, full),
             example_inputs(model.config),
             PrepareCustomConfig().set_non_traceable_module_classes([Columns]),
             backend_config=get_qnnpack_backend_config(),
         )
+    return _one_scale_for_all_cameras(prepared) if len(model.config.cameras) > 1 else prepared
+
+
+def _one_scale_for_all_cameras(prepared: GraphModule) -> GraphModule:
+    """Let a layer that runs once for each camera see all of them through the same observers, before and behind it.
+
+    A kernel packs its weights for one scale of its input: with another one for each camera it would pack them again in
+    every inference, from originals that a rover's memory has no room for.
+    """
+    calls: dict[str, list[Node]] = {}
+    for node in prepared.graph.nodes:
+        if node.op == "call_module" and not _is_observer(prepared, node):
+            calls.setdefault(str(node.target), []).append(node)
+    for nodes in calls.values():
+        for beside in (_before, _behind):
+            observers = [beside(prepared, node) for node in nodes]
+            if (first := observers[0]) is not None:
+                for other in observers[1:]:
+                    if other is not None:
+                        other.target = first.target
+    prepared.delete_all_unused_submodules()
+    prepared.recompile()
+    return prepared
+
+
+def _is_observer(prepared: nn.Module, node: Node) -> bool:
+    return node.op == "call_module" and isinstance(prepared.get_submodule(str(node.target)), RangeObserver)
+
+
+def _before(prepared: nn.Module, node: Node) -> Node | None:
+    """The observer of what a layer takes."""
+    return next((n for n in node.all_input_nodes if _is_observer(prepared, n)), None)
+
+
+def _behind(prepared: nn.Module, node: Node) -> Node | None:
+    """The observer of what a layer gives."""
+    return next((n for n in node.users if _is_observer(prepared, n)), None)
 
 
 def observed_graph(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:

@@ -16,8 +16,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.artifact import ONNX_SUFFIX, content_hash
+from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.stage import sha256_of, write_stage
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
@@ -27,7 +29,7 @@ from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.quantize import QuantizedPolicy, forget_graphs, quantize
 from rover_lib.workshop.scheme import Scheme
-from rover_lib.workshop.session import Opened
+from rover_lib.workshop.session import Opened, opened
 
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
 
@@ -104,11 +106,49 @@ def export_policies(
     return described
 
 
+def requantized(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
+    """The policy that a run's policy_static.pt was exported from, made again from the run's calibration.
+
+    Raises QuantizeError if the run's files are not those that the artifact was made from.
+    """
+    run_dir = Path(run_dir)
+    stage = read_stage(run_dir / "quantize.json", "quantize")
+    made, calibrated = stage["metrics"]["modes"]["static"], run_dir / "calibration.pt"
+    hashes = content_hash(run_dir / "policy_static.pt"), sha256_of(calibrated)
+    if hashes != (made["content_hash"], stage["inputs"]["calibration.pt"]):
+        raise QuantizeError(
+            f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json", remedy="quantize again"
+        )
+    scheme = Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
+    return quantize(checkpoint, scheme, Calibration.load(calibrated))
+
+
+def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, str]:
+    """policy_fp32 and policy_static of a run once more, for ONNX Runtime: {file's name: content hash}.
+
+    The same weights, calibration and scheme, so that the two engines compute the same policy. Raises QuantizeError as
+    `requantized` and `export` do, RoverError if the run's checkpoint or recordings have changed.
+    """
+    run_dir = Path(run_dir)
+    again = opened(run_dir, progress)
+    checkpoint, parts = again.checkpoint, again.parts
+    samples = thinned(parts.choosing or parts.calibration, CHOOSING_FRAMES)
+    exporter = Exporter(checkpoint, samples, Recipe.of(params()).parity)
+    calibration = Calibration.load(run_dir / "calibration.pt")
+    hashes = {}
+    for name in progress(("fp32", "static"), desc="for ONNX Runtime", total=2):
+        forget_graphs()
+        policy = ACT(checkpoint.config, checkpoint.weights) if name == "fp32" else requantized(run_dir, checkpoint)
+        path = run_dir / f"policy_{name}{ONNX_SUFFIX}"
+        hashes[path.name] = exporter.export(policy, path, None if name == "fp32" else calibration)
+    return hashes
+
+
 # --- what the stages of a run leave -----------------------------------------------------------------------------------
 
 
-def write_load(run_dir: Path | str, loaded: Opened, note: str = "") -> None:
-    """load.json: where a run starts from. note: what is special about its policy."""
+def write_load(run_dir: Path | str, loaded: Opened, note: str = "", fit: Mapping[str, Any] | None = None) -> None:
+    """load.json: where a run starts from. note: what is special about its policy. fit: `plausible.Fit.summary`."""
     checkpoint, recordings = loaded.checkpoint, loaded.recordings
     model = ACT(checkpoint.config, checkpoint.weights)
     work = {"macs_by_block": multiply_accumulates(model), "parameters_by_block": parameters_by_block(model)}
@@ -119,12 +159,14 @@ def write_load(run_dir: Path | str, loaded: Opened, note: str = "") -> None:
     }
     if note:
         metrics["note"] = note
+    if fit:
+        metrics["fit"] = fit
     source = recordings.source
     given = {
         "checkpoint": checkpoint.path.resolve(),
         "episodes": recordings.root.resolve(),
         "action_names": ",".join(source.action_names),
-        "camera": source.camera,
+        "camera": ",".join(source.cameras),
     }
     inputs = {checkpoint.path.name: checkpoint.sha256} | recordings.hashes()
     write_stage(Path(run_dir) / "load.json", "load", params=given, metrics=metrics, inputs=inputs)

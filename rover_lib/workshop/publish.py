@@ -19,7 +19,7 @@ from typing import Any
 import nbformat
 from PIL import Image
 
-from rover_lib.onboard.stage import atomic_path
+from rover_lib.onboard.stage import atomic_path, read_stage
 from rover_lib.workshop.run import NAMES, NOTEBOOKS, NotebookError
 
 RESULTS_OF = {  # stages that a notebook leaves
@@ -70,8 +70,8 @@ def publish(
 
 
 def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEBOOKS) -> list[Path]:
-    """Publish the demo, its count and its student; of runs/full its count and its students; of the laboratory its
-    reports: where they are there.
+    """Publish the demo, its count and its student; of runs/full its count and its students; what `rover distill` left
+    of each student; of the laboratory its reports: where they are there.
     """
     runs_dir, notebooks_dir = Path(runs_dir), Path(notebooks_dir)
     written = publish(runs_dir / "demo", notebooks_dir, (*NAMES, "07_drive", "08_distill"))
@@ -81,7 +81,14 @@ def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEB
     results = notebooks_dir.resolve().parent / "results"
     reports = {runs_dir / name: results / "lab" / name for name in OF_LABORATORY}
     reports[runs_dir / "demo" / "arm.json"] = results / "demo" / "arm.json"  # notebook 06 shows the full size's count
+    reports |= {path: results / "students" / f"{path.parent.name}.json" for path in students(runs_dir)}
     return written + _write({target: _result(path) for path, target in reports.items() if path.is_file()})
+
+
+def students(runs_dir: Path) -> list[Path]:
+    """What `rover distill` left of each student. A teacher's distill.json has no losses, but rows of its students."""
+    every = sorted(runs_dir.glob("*/distill.json"))
+    return [path for path in every if "losses" in read_stage(path, "distill")["metrics"]]
 
 
 def _write(texts: dict[Path, str]) -> list[Path]:

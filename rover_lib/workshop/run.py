@@ -24,6 +24,7 @@ from jupyter_client.manager import AsyncKernelManager
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
+from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
@@ -100,8 +101,8 @@ def run(
     new.mkdir(parents=True)
     given = {
         "run_dir": str(new),
-        "checkpoint": str(Path(checkpoint).resolve()),
-        "episodes": str(Path(episodes).resolve()),
+        "checkpoint": absolute(checkpoint),
+        "episodes": absolute(episodes),
         **overrides,
     }
     try:
@@ -122,8 +123,9 @@ def run(
 
 def _own(folder: Path) -> list[Path]:
     """What a run leaves in its folder, and what was made of its artifacts later: none of it is of another run's."""
-    stages = ("load", "calibrate", "quantize", "compare", "arm", "parts", "drive", f"benchmark-{socket.gethostname()}")
-    names = [*(f"{s}.json" for s in stages), *(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures"]
+    stages = ("load", "calibrate", "quantize", "compare", "run", "arm", "parts", "drive")
+    names = [f"{stage}.json" for stage in (*stages, f"benchmark-{socket.gethostname()}")]
+    names += [*(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures", "report.html"]
     if (folder / "08_distill.ipynb").exists():  # a teacher's; a student's distill.json is of what its run begins with
         names.append("distill.json")
     own = [folder / n for n in names] + [*folder.glob("calibration*.pt"), *folder.glob("policy_*.pt")]

@@ -16,25 +16,28 @@ from rover_lib.onboard.recording import CHANNELS
 from rover_lib.onboard.stage import sha256_of
 
 ACTION_NAMES = CHANNELS
+CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 
 @dataclass(frozen=True)
 class Source:
     """Where recordings are, and what a user says of a dataset that does not say it itself.
 
-    action_names: in the order of its numbers, and of its state's where that is unnamed too. camera: the policy's.
+    action_names: in the order of its numbers, and of its state's where that is unnamed too. cameras: those that the
+    policy looks through, in its order.
     """
 
     path: Path
     action_names: tuple[str, ...] = ()
-    camera: str = ""
+    cameras: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, path: "Path | str | Source", action_names: str = "", camera: str = "") -> "Source":
-        """action_names: with commas between, as on a command line. A source stays what it is."""
+        """action_names, camera: with commas between, as on a command line. A source stays what it is."""
         if isinstance(path, Source):
             return path
-        return cls(Path(path), tuple(name.strip() for name in action_names.split(",") if name.strip()), camera)
+        names, cameras = (tuple(n.strip() for n in said.split(",") if n.strip()) for said in (action_names, camera))
+        return cls(Path(path), names, cameras)
 
     @classmethod
     def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":
@@ -44,13 +47,13 @@ class Source:
 
 @dataclass(frozen=True)
 class Layout:
-    """Which camera and which numbers the samples have.
+    """Which cameras and which numbers the samples have.
 
     rate_hz: frames a second, None where a recording says nothing of it. state_order, action_order: the file's columns,
     in the order of the names; a car's are always [steering, throttle] here, in whatever order they were recorded.
     """
 
-    camera: str = "the car's"
+    cameras: tuple[str, ...] = ("the car's",)
     state_names: tuple[str, ...] = ACTION_NAMES
     action_names: tuple[str, ...] = ACTION_NAMES
     rate_hz: float | None = None
@@ -66,7 +69,8 @@ class Layout:
 
         rate = f", {self.rate_hz:g} frames a second" if self.rate_hz else ""
         state, action = columns(self.state_names, self.state_order), columns(self.action_names, self.action_order)
-        return f"camera: {self.camera}; state: {state}; action: {action}{rate}"
+        cameras = f"camera{'s' if len(self.cameras) > 1 else ''}: {', '.join(self.cameras)}"
+        return f"{cameras}; state: {state}; action: {action}{rate}"
 
 
 @dataclass(frozen=True)
@@ -177,6 +181,11 @@ class Recordings:
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
             "faults": [{"file": f.file, "kind": f.kind, "count": f.count, "note": f.note} for f in self.faults],
         }
+
+
+def camera_name(key: str) -> str:
+    """What a policy calls the camera of a LeRobot feature: such names begin in one of two ways."""
+    return key.removeprefix(CAMERA).removeprefix("observation.")
 
 
 def relative(path: Path, root: Path) -> str:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import torch
 
-from rover_lib.onboard.errors import EpisodeError, RoverError
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.samples import ACTION_NAMES, Source
+from rover_lib.workshop.samples import Source
 
 SMALL_GMAC = 1.0  # below this a second thread costs more, on a busy machine, than it brings
 
@@ -31,24 +31,17 @@ class Opened:
 def load(checkpoint: Path | str, episodes: Path | str | Source, progress: Progress = silent) -> Opened:
     """Read a checkpoint and its recordings, and part them as params.yml says.
 
-    Of a LeRobotDataset the policy's own camera is read, if nobody chose another, and a LeRobot policy gets the order
-    and the rate of the numbers that it was trained on. Raises CheckpointError, and EpisodeError also for recordings of
-    what is no car.
+    Of a LeRobotDataset the policy's own cameras are read, if nobody chose others, and a LeRobot policy gets the order
+    and the rate of the numbers that it was trained on. Raises CheckpointError and EpisodeError.
     """
     p = params()["calibration"]
     policy = load_checkpoint(checkpoint)
     source = Source.of(episodes)
-    if policy.format == "lerobot" and not source.camera and len(policy.config.cameras) == 1:
-        source = replace(source, camera=policy.config.cameras[0])  # the trainer's file does not say what it is called
+    if policy.format == "lerobot" and not source.cameras:  # the trainer's file does not say what its camera is called
+        source = replace(source, cameras=policy.config.cameras)
     recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
-    layout = recordings.layout
-    for what, names in (("state", layout.state_names), ("action", layout.action_names)):
-        if names != ACTION_NAMES:
-            raise EpisodeError(
-                f"{recordings.root}: the {what} is {list(names)}, a rover's is {list(ACTION_NAMES)}",
-                remedy="if it is one by another name, say so: --action-names, in the order of its numbers",
-            )
-    return Opened(policy.recorded_as(layout), recordings, split(recordings, p["held_out_share"], p["seed"]))
+    parts = split(recordings, p["held_out_share"], p["seed"])
+    return Opened(policy.recorded_as(recordings.layout), recordings, parts)
 
 
 def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:

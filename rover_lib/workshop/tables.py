@@ -2,8 +2,8 @@
 
     python -m rover_lib.workshop.tables        # what `make tables` does
 
-A table stands in README between `<!-- table NAME, by make tables -->` and `<!-- end -->`; what has no JSON yet, as a
-count that was not made, is an empty field.
+A table stands in README between `<!-- table NAME, by make tables -->` and `<!-- end -->`. A field without its JSON is
+empty; a row of which nothing was measured, as a count that was not made, is left out.
 """
 
 import re
@@ -73,8 +73,7 @@ def _demo(results: Path) -> list[Row]:
 
     low, high = (f"{fp32['trials'] * fp32[f'hits_wilson_{end}']:.1f}".removesuffix(".0") for end in ("low", "high"))
     of = f"of {fp32['trials']} (95 % interval of FP32's {low} to {high})"
-    return [
-        ("", *MODES.values()),
+    rows = [
         row("artifact, MB", lambda mode: _of(modes[mode], "size_mb", ".1f")),
         row(f"balloons hit, {of}", lambda mode: _of(modes[mode], "hits", "d")),
         row("steering error, % of the recorded range", error("steering")),
@@ -90,6 +89,7 @@ def _demo(results: Path) -> list[Row]:
             lambda mode: _of(timed[mode], "floor_ms", ".1f") if mode in ("fp32", BEST) else None,
         ),
     ]
+    return [("", *MODES.values()), *(fields for fields in rows if any(fields[1:]))]
 
 
 def _faults(results: Path) -> list[Row]:

@@ -1,7 +1,8 @@
 """All that a Pi installs, in one folder, so that a rover without internet can be set up from a laptop.
 
 rover_policy-0.1.0+<hash of its files>-py3-none-any.whl       rover_lib/onboard, nothing else
-torch-2.8.0-cp313-...aarch64.whl, ...                          as requirements_pi.txt pins and hashes them
+torch-2.8.0-cp313-...aarch64.whl, ...                          as requirements_pi.txt pins and hashes them, or
+onnxruntime-1.31.1-cp313-...aarch64.whl, ...                   requirements_pi_onnxruntime.txt
 """
 
 import os
@@ -17,7 +18,11 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.wheel_version import ONBOARD, wheel_version
 from rover_lib.workshop.program import run
 
-REQUIREMENTS = Path(__file__).parents[2] / "requirements_pi.txt"
+REPOSITORY = Path(__file__).parents[2]
+REQUIREMENTS = {  # by engine
+    "torch": REPOSITORY / "requirements_pi.txt",
+    "onnxruntime": REPOSITORY / "requirements_pi_onnxruntime.txt",
+}
 PYTHONS = ("3.11", "3.13")  # of Debian 12 and 13, and of Raspberry Pi OS, which follows them
 # The newest glibc that a wheel may ask for is Debian 12's 2.36; pip takes a list, not "at most".
 PLATFORMS = [f"manylinux_2_{minor}_aarch64" for minor in range(17, 37)] + ["manylinux2014_aarch64"]
@@ -36,10 +41,12 @@ class Wheelhouse:
     changed: bool
 
 
-def make(folder: Path | str, *, pythons: Iterable[str] = PYTHONS, only_rover: bool = False) -> Wheelhouse:
+def make(
+    folder: Path | str, *, pythons: Iterable[str] = PYTHONS, only_rover: bool = False, engine: str = "torch"
+) -> Wheelhouse:
     """Fill a folder with the rover's own wheel and those that it needs; what is there already is not fetched again.
 
-    pythons: the Pis'. only_rover: no others, for Pis with internet. Raises WheelhouseError.
+    pythons: the Pis'. only_rover: no others, for Pis with internet. engine: of REQUIREMENTS. Raises WheelhouseError.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -47,7 +54,7 @@ def make(folder: Path | str, *, pythons: Iterable[str] = PYTHONS, only_rover: bo
     wheel, version = _build(folder)
     if not only_rover:
         for python in pythons:
-            _fetch(folder, python)
+            _fetch(folder, python, REQUIREMENTS[engine])
     return Wheelhouse(wheel, version, {p.name for p in folder.glob("*.whl")} != before)
 
 
@@ -68,9 +75,9 @@ def _build(folder: Path) -> tuple[Path, str]:
     return wheel, version
 
 
-def _fetch(folder: Path, python: str) -> None:
+def _fetch(folder: Path, python: str, requirements: Path) -> None:
     """The other wheels, for one Python."""
-    lines = REQUIREMENTS.read_text().splitlines()
+    lines = requirements.read_text().splitlines()
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as f:
         # Without conditions: pip would judge them by this machine's Python, not by the Pi's.
         f.write("\n".join(re.sub(r"\s;[^\\]*", " ", line) for line in lines) + "\n")
@@ -79,5 +86,5 @@ def _fetch(folder: Path, python: str) -> None:
         platforms = [o for p in PLATFORMS for o in ("--platform", p)]
         target = ["--python-version", python, "--implementation", "cp", *platforms]
         what = ["--require-hashes", "--no-deps", "--only-binary", ":all:", "--requirement", f.name]
-        remedy = f"is there internet here? pip fetches the wheels of {REQUIREMENTS.name} for Python {python}"
+        remedy = f"is there internet here? pip fetches the wheels of {requirements.name} for Python {python}"
         run(*pip, *target, *what, error=WheelhouseError, remedy=remedy)

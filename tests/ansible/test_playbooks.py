@@ -246,8 +246,8 @@ def test_a_pi_can_be_a_rover(tmp_path):
         ({"architecture": "armv7l"}, "localhost is armv7l, a rover is aarch64: flash the 64-bit Raspberry Pi OS"),
         ({"distribution_version": "11.8", "distribution_major_version": "11"}, "localhost runs Debian 11.8: flash"),
         ({"os_family": "RedHat", "distribution": "Fedora"}, "localhost runs Fedora 12.9: flash Raspberry Pi OS"),
-        ({"python_version": "3.9.2"}, "localhost has Python 3.9.2, torch 2.8 is wanted for 3.11 to 3.13"),
-        ({"python_version": "3.14.0"}, "localhost has Python 3.14.0, torch 2.8 is wanted for 3.11 to 3.13"),
+        ({"python_version": "3.9.2"}, "localhost has Python 3.9.2, the engines have wheels for 3.11 to 3.13"),
+        ({"python_version": "3.14.0"}, "localhost has Python 3.14.0, the engines have wheels for 3.11 to 3.13"),
         (
             {"mounts": [{"mount": "/", "size_available": 900_000_000}]},
             "localhost has 900 MB free on /, 2500 are needed",

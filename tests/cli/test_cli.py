@@ -1,13 +1,16 @@
 """The command line: help that helps, one sentence for bad input, nothing half-written."""
 
+import errno
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 import torch
 from click.testing import CliRunner
 
 from rover_lib.cli import main
+from rover_lib.onboard import cli as onboard
 
 
 def rover(*args):
@@ -19,10 +22,13 @@ def rover(*args):
     [
         [],
         ["run"],
+        ["report"],
+        ["list"],
         ["inspect"],
         ["quantize"],
         ["compare"],
         ["distill"],
+        ["export"],
         ["export-dataset"],
         ["benchmark"],
         ["log"],
@@ -45,6 +51,23 @@ def test_help(command):
     assert result.exit_code == 0 and "Usage" in result.output and len(result.output) > 150
 
 
+@pytest.mark.parametrize("group", [main, main.commands["world"], main.commands["release"], onboard.main])
+def test_commands_are_said_whole_in_80_columns(group):
+    lines = CliRunner().invoke(group, ["--help"], terminal_width=80).output.splitlines()[1:]
+    assert max(map(len, lines)) <= 80 and not [line for line in lines if line.endswith("...")]
+
+
+def test_a_reader_who_has_seen_enough_is_no_error(monkeypatch):
+    """`rover inspect X | head -1`: the pipe is closed while there is more to print."""
+
+    def closed(*args, **options):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    monkeypatch.setattr("rover_lib.workshop.describe.runs", closed)
+    result = rover("list")
+    assert "rover:" not in result.output and "Traceback" not in result.output
+
+
 def test_inspects_each_kind_of_file(artifacts, tiny_file):
     content = json.loads(rover("inspect", artifacts["static"], "--json").output)
     assert content["artifact"]["mode"] == "static" and len(content["artifact"]["content_hash"]) == 64
@@ -57,11 +80,13 @@ def test_inspects_each_kind_of_file(artifacts, tiny_file):
     "args",
     [
         ["inspect", "nothing.pt"],
+        ["report", "nothing"],
         ["benchmark", "nothing.pt"],
         ["compare", "nothing.pt", "other.pt", "--episodes", "none"],
         ["quantize", "nothing.pth", "none", "-o", "out.pt"],
         pytest.param(["run", "nothing.pth", "none"], marks=pytest.mark.slow),  # starts a kernel
         ["distill", "nothing.pth", "none", "--size", "320x180", "--name", "fast"],
+        ["export", "none", "--onnx"],
         ["export-dataset", "none", "out"],
         ["world", "train", "none", "out.pth"],
         ["world", "trial", "nothing.pt"],
@@ -76,6 +101,19 @@ def test_bad_input_is_one_sentence(args, tmp_path, monkeypatch):
     lines = [line for line in result.output.splitlines() if line]
     assert len(lines) == 1 and lines[0].startswith("rover: "), result.output
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []  # nothing half-written
+
+
+def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):
+    folder = tmp_path / "runs" / "mine"
+    shutil.copytree(Path(__file__).parents[2] / "results" / "demo", folder)
+    monkeypatch.setattr("rover_lib.workshop.run.run", lambda *args, **options: folder)
+    result = rover("run", "best_model.pth", "recordings")
+    assert result.exit_code == 0 and "Verdict: deploy policy_static.pt" in result.output
+    assert "Next:" in result.output and (folder / "report.html").is_file()
+    content = json.loads(rover("report", folder, "--json").output)
+    assert content == json.loads((folder / "run.json").read_text())
+    line = f"mine             {content['metrics']['headline']}"
+    assert rover("list", folder.parent).output.splitlines() == [line]
 
 
 def test_a_size_is_width_and_height(tmp_path):
@@ -120,7 +158,7 @@ def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypa
     out = tmp_path / "benchmark-here.json"
     result = rover("benchmark", *files, "--iterations", 2, "--warmup", 0, "--threads", 1, "--output", out, "--json")
     assert result.exit_code == 0, result.output
-    for metrics in (json.loads(result.output), json.loads(out.read_text())["metrics"]):
+    for metrics in (json.loads(result.stdout), json.loads(out.read_text())["metrics"]):
         timed = metrics["artifacts"]
         assert {name: v["mode"] for name, v in timed.items()} == {
             "a/policy_static": "static",
@@ -128,6 +166,13 @@ def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypa
         }
         assert metrics["main"] == "a/policy_static" and all(v["n"] == 2 for v in timed.values())
     assert set(json.loads(out.read_text())["inputs"]) == {"a/policy_static.pt", "b/policy_static.pt"}
+    monkeypatch.setattr("os.getloadavg", lambda: (1000.0, 0.0, 0.0))
+    result = rover("benchmark", *files, "--iterations", 1, "--warmup", 0, "--threads", 1, "--gates")
+    header, first, second, *rest = result.stdout.splitlines()
+    assert header.split()[:3] == ["MB", "p50", "ms"] and (first.split()[0], second.split()[0]) == tuple(
+        metrics["artifacts"]
+    )
+    assert "this machine was busy" in result.stderr and any(line.startswith("model_size_mb") for line in rest)
     result = rover("benchmark", files[0], files[0])
     assert result.exit_code == 1 and result.output.strip().endswith("given twice; name each file once")
 
@@ -170,7 +215,8 @@ def test_quantizes_and_compares_on_recordings(tiny_file, drives, tmp_path):
     result = rover("compare", *files[:2], same_name, "--episodes", drives, "--json")
     assert set(json.loads(result.stdout)) == {f"{tmp_path.name}/static", "other/static"}
     plain = rover("compare", *files, "--episodes", drives)
-    assert "32 values, see --json" in plain.output and "steering_mae_us" in plain.output
+    assert "steering mean %" in plain.output and "times smaller" in plain.output and "held-out frames" in plain.output
+    assert {line.split()[0] for line in plain.output.splitlines()} >= {"reference", "static", "mixed"}
 
 
 @pytest.mark.slow

@@ -22,14 +22,14 @@ ROOT = Path(__file__).parents[2]
 
 
 class Installed:
-    """A virtual environment with one wheel of ours, and of others those that requirements_pi.txt pins."""
+    """A virtual environment with one wheel of ours, and of others those that a Pi with that engine has."""
 
-    def __init__(self, folder: Path, wheel: Path):
+    def __init__(self, folder: Path, wheel: Path, engine: str = "torch"):
         self.folder = folder
         venv.create(folder / "venv", with_pip=False, symlinks=True)
         self.bin = folder / "venv" / "bin"
         self.packages = next((folder / "venv" / "lib").glob("python3*/site-packages"))
-        for name in re.findall(r"^([\w.-]+)==", REQUIREMENTS.read_text(), re.MULTILINE):
+        for name in re.findall(r"^([\w.-]+)==", REQUIREMENTS[engine].read_text(), re.MULTILINE):
             self.borrow(name)
         pip = [sys.executable, "-m", "pip", "--python", self.bin / "python", "install", "--no-deps", "--no-index"]
         subprocess.run([*pip, "--quiet", "--disable-pip-version-check", wheel], check=True)
@@ -56,6 +56,12 @@ class Installed:
 def rover(tmp_path_factory) -> Installed:
     folder = tmp_path_factory.mktemp("rover")
     return Installed(folder, make(folder / "wheels", only_rover=True).wheel)
+
+
+@pytest.fixture(scope="module")
+def rover_without_torch(tmp_path_factory) -> Installed:
+    folder = tmp_path_factory.mktemp("onnxruntime")
+    return Installed(folder, make(folder / "wheels", only_rover=True).wheel, "onnxruntime")
 
 
 def test_onboard_alone_is_there(rover):
@@ -105,10 +111,27 @@ def test_inspects_an_artifact(rover, artifacts):
     assert done.returncode == 0 and json.loads(done.stdout)["artifact"]["mode"] == "static", done.stderr
 
 
-def test_all_of_it_can_be_imported(rover):
-    names = [f"rover_lib.onboard.{p.stem}" for p in (rover.packages / "rover_lib" / "onboard").glob("*.py")]
-    done = rover.run("python", "-c", f"import importlib; [importlib.import_module(name) for name in {names}]")
+@pytest.mark.parametrize(
+    ("which", "others"),
+    [("rover", {"onnx_engine", "hailo_engine"}), ("rover_without_torch", {"torch_engine", "hailo_engine"})],
+)
+def test_all_of_it_can_be_imported_but_the_engines_that_it_lacks(which, others, request):
+    installed = request.getfixturevalue(which)
+    files = (installed.packages / "rover_lib" / "onboard").glob("*.py")
+    names = [f"rover_lib.onboard.{p.stem}" for p in files if p.stem not in others]
+    done = installed.run("python", "-c", f"import importlib; [importlib.import_module(name) for name in {names}]")
     assert done.returncode == 0 and len(names) > 20, done.stderr
+
+
+def test_a_rover_without_torch_runs_what_onnx_runtime_runs_and_says_what_it_lacks(
+    rover_without_torch, onnx_static, artifacts
+):
+    assert rover_without_torch.run("python", "-c", "import torch").returncode != 0
+    timed = ("rover", "benchmark", "--warmup", "1", "--iterations", "2")
+    done = rover_without_torch.run(*timed, onnx_static)  # it is loaded, so that its parity vectors are right
+    assert done.returncode == 0, done.stderr
+    done = rover_without_torch.run(*timed, artifacts["static"])
+    assert done.returncode == 1 and "needs torch" in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
 
 
 def test_bad_input_is_one_sentence(rover, tiny_file):

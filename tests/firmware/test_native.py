@@ -25,6 +25,7 @@ def fuzz(program, lines, seed):
     return subprocess.run([program, str(lines), str(seed)], capture_output=True, text=True, timeout=600)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [100_000, pytest.param(10_000_000, marks=pytest.mark.release)])
 def test_random_and_mutated_lines(count):
     """Never an unsafe pulse, no stuck state, no access out of bounds: tests/firmware/fuzz.c says what is unsafe."""

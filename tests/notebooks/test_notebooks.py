@@ -168,7 +168,8 @@ def test_what_a_run_was_not_asked_to_know_is_refused(one_notebook, tmp_path):
         runs.run("ck", "episodes", "../up", runs_dir=tmp_path, notebooks=one_notebook)
 
 
-OF_ARTIFACTS = ("load.json", "arm.json", "drive.json", "06_arm.ipynb", "07_drive.ipynb", "policy_static.pt")
+OF_ARTIFACTS = ("load.json", "run.json", "report.html", "arm.json", "drive.json", "06_arm.ipynb", "07_drive.ipynb")
+OF_ARTIFACTS += ("policy_static.pt",)
 OF_OTHERS = ("benchmark-pi.json", "best_model.pth", "episodes/frame.jpg")
 
 
@@ -321,6 +322,12 @@ def test_publishing_leaves_the_json_behind_the_outputs(one_notebook, tmp_path):
     with pytest.raises(runs.NotebookError, match="shows a path of this machine"):
         publish.publish(tmp_path / "mine", one_notebook, ("01_load",))
     assert read_stage(path, "load") == content
+
+
+def test_students_are_told_from_their_teachers(tmp_path):
+    write_stage(tmp_path / "full" / "distill.json", "distill", params={}, metrics={"students": []})
+    write_stage(tmp_path / "fast" / "distill.json", "distill", params={}, metrics={"losses": {"qat": [0.1]}})
+    assert publish.students(tmp_path) == [tmp_path / "fast" / "distill.json"]
 
 
 def test_committed_results_are_small_and_show_no_path():

@@ -91,14 +91,16 @@ def test_refuses_what_is_no_observation(artifacts, frame, state, error):
 
 def test_a_prediction_that_is_not_finite_never_comes_out(artifacts, monkeypatch):
     policy = load_policy(artifacts["fp32"])
-    monkeypatch.setattr(policy, "_module", lambda *x: torch.full((1, 32, 2), torch.nan))
+    monkeypatch.setattr(policy._engine, "run", lambda *x: np.full((1, 32, 2), np.nan, np.float32))
     with pytest.raises(PolicyError, match="NaN"):
         policy.predict_chunk(FRAME, STATE)
 
 
 def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(artifacts, monkeypatch):
     asked, (state, frame) = [], (np.full(2, 0.1, np.float32), 255 - FRAME)
-    monkeypatch.setattr("rover_lib.onboard.policy.give_back_packed_weights", lambda module: asked.append(module) or 0)
+    monkeypatch.setattr(
+        "rover_lib.onboard.torch_engine.give_back_packed_weights", lambda module: asked.append(module) or 0
+    )
     policy = load_policy(artifacts["static"])
     before = policy.predict_chunk(frame, state)
     (module,) = asked
@@ -123,7 +125,7 @@ def test_refuses_a_policy_that_changes_when_memory_is_given_back(artifacts, monk
         bias.zero_()
         return bias.nbytes
 
-    monkeypatch.setattr("rover_lib.onboard.policy.give_back_packed_weights", take_what_is_used)
+    monkeypatch.setattr("rover_lib.onboard.torch_engine.give_back_packed_weights", take_what_is_used)
     assert "once the memory of its original weights was given back; do not drive" in refused(artifacts["static"])
 
 

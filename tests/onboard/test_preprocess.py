@@ -7,7 +7,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from policies import smooth_frame
-from torchvision.transforms.v2 import functional as tv
 
 from rover_lib.onboard.errors import FrameError
 from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise, prepare_frame
@@ -15,6 +14,8 @@ from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise,
 
 def lerobots(frame_bgr, height, width):
     """RGB, to float, torchvision's resize, torchvision's normalisation."""
+    from torchvision.transforms.v2 import functional as tv  # takes seconds, and not in every process that collects
+
     x = torch.from_numpy(cv2.cvtColor(frame_bgr, cv2.COLOR_BGR2RGB)).permute(2, 0, 1).float() / 255
     x = tv.resize(x, [height, width], antialias=True)
     return tv.normalize(x, IMAGENET_MEAN, IMAGENET_STD).numpy()

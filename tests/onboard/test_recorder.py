@@ -480,6 +480,7 @@ def pictures(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_a_real_link_has_no_burst(tmp_path, arduino, pictures):
     with Camera(pictures) as camera, ServoLink(arduino.port) as link:
         report = record(camera, link, tmp_path / "out", max_seconds=0.7)
@@ -507,6 +508,7 @@ def recording_in(out):
     return len(list(out.glob(".episode_*/frames/*.jpg"))) > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_signals_end_an_episode_properly(tmp_path, arduino, pictures, number):
     out = tmp_path / "out"
@@ -522,6 +524,7 @@ def test_signals_end_an_episode_properly(tmp_path, arduino, pictures, number):
     assert len(load_recordings(out, chunk=4).samples) > 5
 
 
+@pytest.mark.slow
 def test_a_fault_is_an_exit_code_and_a_sentence(tmp_path, arduino, pictures):
     out = tmp_path / "out"
     run = rover_record(out, arduino, pictures)
@@ -536,6 +539,7 @@ def test_a_fault_is_an_exit_code_and_a_sentence(tmp_path, arduino, pictures):
     assert content_of(folder)["metadata"]["fault"] in errors
 
 
+@pytest.mark.slow
 def test_several_episodes(tmp_path, arduino, pictures):
     out = tmp_path / "out"
     run = rover_record(out, arduino, pictures, "--episodes", "3", "--max-seconds", "0.5")

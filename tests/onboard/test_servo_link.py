@@ -274,6 +274,7 @@ def test_an_arduino_that_has_just_started_may_not_know_the_signals_yet():
         assert link.arm().state is State.AUTONOMOUS
 
 
+@pytest.mark.slow
 def test_arming_without_an_answer():
     with board_of() as board, ServoLink(board.port) as link:
         start = time.monotonic()
@@ -283,6 +284,7 @@ def test_arming_without_an_answer():
         assert len({b for b in board.heard if b.startswith(">A")}) >= 5  # again and again, each with its own number
 
 
+@pytest.mark.slow
 def test_a_status_from_before_is_no_answer():
     def old(board, body):
         board.status("A", "a", sequence=4294967290)
@@ -304,6 +306,7 @@ def test_a_reset_meanwhile_needs_arming_again():
         assert link.hello.reset == "watchdog"
 
 
+@pytest.mark.slow
 def test_a_reset_whose_hello_was_lost_is_noticed():
     with board_of(answer=obedient) as board, ServoLink(board.port) as link:
         board.hello = "<H 2 2.1.0 8 0 w"
@@ -338,8 +341,8 @@ def test_a_stuck_port_does_not_stop_the_loop():
                         slowest = max(slowest, time.monotonic() - start)
             board.reading = True
             start = time.monotonic()
-        assert slowest < 0.1
-        assert time.monotonic() - start < 2
+        assert slowest < 1.0  # a write that waits would wait for ever; this process may wait for its turn
+        assert time.monotonic() - start < 10
 
 
 def test_silence_is_an_error():
@@ -388,6 +391,23 @@ def test_the_age_of_what_is_not_acknowledged():
         board.hello = "<H 2 2.1.0 8 0 w"  # another start will never answer
         board.say(board.hello)
         until(lambda: link.unacknowledged_s(clock()) == 0)
+
+
+def test_an_answer_that_comes_before_the_write_returns_is_one():
+    """The reader's thread may have the answer while the thread that sent still waits for its turn."""
+    with board_of(answer=obedient) as board, ServoLink(board.port) as link:
+        link.arm()
+        write = link._write
+
+        def write_and_wait(line):
+            write(line)
+            time.sleep(0.1)
+
+        link._write = write_and_wait
+        number = link.send(1500, 200)
+        until(lambda: link.latest().sequence == number)
+        link._write = write
+        assert link.unacknowledged_s(link._clock()) == 0
 
 
 def test_the_cap_is_lowered():

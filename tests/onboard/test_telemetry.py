@@ -116,6 +116,7 @@ def test_without_a_file_events_are_still_said(caplog):
     assert not log._ticks
 
 
+@pytest.mark.slow
 def test_a_power_cut_costs_less_than_a_second(path):
     code = (
         "import sys, time, os, signal\n"
@@ -564,6 +565,7 @@ def test_log_records_go_above_the_line(terminal):
             logger.removeHandler(status.handler)
 
 
+@pytest.mark.slow
 def test_a_stuck_terminal_holds_up_nobody(terminal):
     with StatusLine(lambda: "x" * 70, terminal.stream, every_s=0.0001) as status:
         until(lambda: not select.select([], [terminal.stream.fileno()], [], 0)[1])  # nobody reads it
@@ -575,6 +577,7 @@ def test_a_stuck_terminal_holds_up_nobody(terminal):
         assert time.monotonic() - start < 1
 
 
+@pytest.mark.slow
 def test_a_pipe_that_blocks_holds_up_nobody():
     reading, writing = os.pipe()
     with os.fdopen(writing, "w") as stream:
@@ -600,6 +603,7 @@ def test_a_status_that_raises_and_a_reader_that_leaves():
         status.say("nobody hears")
 
 
+@pytest.mark.slow
 def test_a_program_ends_though_its_terminal_is_stuck(tmp_path):
     code = (
         "import logging, sys, time\n"

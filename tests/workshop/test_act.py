@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from lerobot.configs.types import NormalizationMode
-from lerobot.policies.act.processor_act import make_act_pre_post_processors
 from policies import FULL, TINY, lerobot_policy, smooth_frame
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -54,6 +52,9 @@ def saved(policy, folder, stats=None):
 
 def saved_processors(policy, folder, stats):
     """The processors; what has no statistics is not normalised, and they say so."""
+    from lerobot.configs.types import NormalizationMode
+    from lerobot.policies.act.processor_act import make_act_pre_post_processors
+
     for kind, name in (("VISUAL", "images"), ("STATE", "state"), ("ACTION", "action")):
         if not any(name in key for key in stats or ()):
             policy.config.normalization_mapping[kind] = NormalizationMode.IDENTITY
@@ -101,6 +102,8 @@ def test_equals_lerobot(name, request, tmp_path):
 
 @pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY"])
 def test_lerobots_processors_end_up_inside(mode, tmp_path):
+    from lerobot.configs.types import NormalizationMode
+
     norm = {k: NormalizationMode(mode) for k in ("STATE", "ACTION")} | {"VISUAL": NormalizationMode.MEAN_STD}
     policy = lerobot_policy(**TINY, normalization_mapping=norm)
     low, high = torch.tensor([-0.3, 0.1]), torch.tensor([0.9, 0.4])

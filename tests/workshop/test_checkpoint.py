@@ -16,9 +16,6 @@ import torch
 from click.testing import CliRunner
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from lerobot.configs.types import NormalizationMode
-from lerobot.policies.act.processor_act import make_act_pre_post_processors
-from lerobot.processor.migrate_policy_normalization import extract_normalization_stats
 from policies import TINY, lerobot_policy, memory_samples, trainer_content
 from safetensors.torch import load_file, save_file
 
@@ -597,6 +594,9 @@ def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copi
 
 def normalised(policy, mode):
     """LeRobot's processors for a policy whose inputs and outputs are all normalised by `mode`, and the statistics."""
+    from lerobot.configs.types import NormalizationMode
+    from lerobot.policies.act.processor_act import make_act_pre_post_processors
+
     policy.config.normalization_mapping = dict.fromkeys(RAW, NormalizationMode(mode))
     low, high = torch.tensor([-0.3, 0.1]), torch.tensor([0.9, 0.4])
     numbers = {"mean": (low + high) / 2, "std": high - low, "min": low, "max": high}
@@ -626,6 +626,8 @@ def check_is(checkpoint, policy, inner, outer):
 
 @pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX"])
 def test_statistics_in_the_weights_are_read_as_lerobot_did_before_processors(mode, tmp_path):
+    from lerobot.processor.migrate_policy_normalization import extract_normalization_stats
+
     policy = lerobot_policy(**TINY)
     inner, outer, stats = normalised(policy, mode)
     policy.save_pretrained(tmp_path)

@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from lerobot.policies.act.modeling_act import ACTPolicy
-from lerobot.policies.factory import make_pre_post_processors
 from policies import TINY, lerobot_policy, memory_samples
 
 from rover_lib.onboard.errors import CheckpointError
@@ -34,6 +32,9 @@ def config(tiny):
 
 def lerobots_chunk(folder, sample, config):
     """(C, A) by LeRobot's own classes, its processors included."""
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+
     policy = ACTPolicy.from_pretrained(folder)
     before, after = make_pre_post_processors(policy.config, pretrained_path=str(folder))
     frame = prepare_frame(sample.frame_bgr(), *config.image_sizes[0]).astype(np.float32) / 255

@@ -263,3 +263,10 @@ def test_us_per_unit_is_the_calibrations():
 def test_a_run_without_fp32_is_refused(tmp_path):
     with pytest.raises(PolicyError, match="notebook 03"):
         compare.load_policies(tmp_path)
+
+
+def test_a_comparison_has_each_action_in_both_units():
+    summary = {f"steering_{which}_pct": 0.5 for which in ("mae", "p95", "max")} | {"steering_mae_us": 3.0}
+    rows = compare.comparison_rows({"static": summary}, {"fp32": 40.0, "static": 10.0}, "fp32")
+    assert rows[0][3:] == ["steering mean %", "p95", "largest", "mean us"]
+    assert rows[1][:3] == ["fp32", "40.0", "1.0"] and rows[2][2:] == ["4.0", "0.50", "0.50", "0.50", "3.00"]

@@ -12,6 +12,7 @@ from policies import TINY, lerobot_policy, smooth_frame, trainer_content
 
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import EpisodeWriter
 from rover_lib.workshop import distill as distill_module
@@ -88,7 +89,10 @@ def test_what_is_left_is_one_policy_in_two_formats(taught, teacher):
     assert origin == ours.report["trainer_config"]["origin"]
     assert origin["teacher_sha256"] == load_checkpoint(teacher).sha256
     assert origin["distilled_by"]["transformer_steps"] == 8
-    assert sorted(p.name for p in taught.iterdir()) == ["best_model.pth", "distill.json", "pretrained_model"]
+    files = ["best_model.pth", "distill.json", "policy_static.pt", "pretrained_model"]
+    assert sorted(p.name for p in taught.iterdir()) == files
+    manifest = load_policy(taught / "policy_static.pt").manifest
+    assert (manifest["mode"], manifest["checkpoint"]["sha256"]) == ("static", ours.sha256)
 
 
 @pytest.mark.slow
@@ -202,17 +206,21 @@ def test_it_learns_what_its_teacher_plans(teacher, episodes, recipe, tmp_path):
 def test_what_was_there_stays_until_the_new_is_whole(teacher, episodes, recipe, tmp_path, monkeypatch):
     (tmp_path / "fast" / "pretrained_model").mkdir(parents=True)
     (tmp_path / "fast" / "pretrained_model" / "config.json").write_text("old")
-    (tmp_path / "fast" / "policy_static.pt").write_text("of a run")
+    (tmp_path / "fast" / "policy_static.pt").write_text("old")
+    (tmp_path / "fast" / "compare.json").write_text("of a run")
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
         patch.setattr(distill_module, "write_stage", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             distill(teacher, episodes, "fast", SHAPE, **arguments)
     assert (tmp_path / "fast" / "pretrained_model" / "config.json").read_text() == "old"
-    assert sorted(p.name for p in (tmp_path / "fast").iterdir()) == ["policy_static.pt", "pretrained_model"]
+    assert (tmp_path / "fast" / "policy_static.pt").read_text() == "old"
+    before = ["compare.json", "policy_static.pt", "pretrained_model"]
+    assert sorted(p.name for p in (tmp_path / "fast").iterdir()) == before
     distill(teacher, episodes, "fast", SHAPE, **arguments)
     assert load_checkpoint(tmp_path / "fast" / "pretrained_model").config.feedforward == 64
-    assert (tmp_path / "fast" / "policy_static.pt").read_text() == "of a run"
+    assert load_policy(tmp_path / "fast" / "policy_static.pt").manifest["mode"] == "static"
+    assert (tmp_path / "fast" / "compare.json").read_text() == "of a run"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cache", "fast"]
 
 

@@ -640,6 +640,7 @@ def csv_folder(tmp_path_factory):
     return folder, {name: (folder / name).read_bytes() for name in ("control_data.csv", "frame_data.csv")}
 
 
+@pytest.mark.slow
 @QUICK
 @given(
     controls=st.lists(st.lists(st.one_of(st.text(max_size=6), st.floats().map(str), st.integers().map(str)))),

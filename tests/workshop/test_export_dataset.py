@@ -11,6 +11,7 @@ from test_episodes import edit, load, record
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.workshop.export_dataset import export_dataset
 
 CHUNK = 8  # as test_episodes' load
@@ -61,6 +62,17 @@ def test_lerobot_reads_it_back_and_so_do_we(recorded, tmp_path):
     assert again.action_range() == original.action_range()
 
 
+def test_lerobots_tools_edit_it(recorded, tmp_path):
+    from lerobot.datasets.dataset_tools import delete_episodes
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    export_dataset(recorded, tmp_path / "out")
+    delete_episodes(LeRobotDataset("local/out", tmp_path / "out"), [1], tmp_path / "less", "local/less")
+    original, less = load(recorded), load(tmp_path / "less")
+    kept = [s for s in original.samples if s.episode != original.episodes[1].id]
+    check_equal(less.samples, kept)
+
+
 def test_as_video(recorded, tmp_path):
     result = CliRunner().invoke(main, ["export-dataset", str(recorded), str(tmp_path / "out"), "--video", "--json"])
     assert result.exit_code == 0, result.output
@@ -94,9 +106,9 @@ def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
     check_equal(again[18:], original[18:])  # the last two episodes, and no end of the first one
 
 
-def refused(episodes, out) -> str:
+def refused(episodes, out, **options) -> str:
     with pytest.raises(EpisodeError) as e:
-        export_dataset(episodes, out)
+        export_dataset(episodes, out, **options)
     assert "\n" not in str(e.value) and [p for p in out.parent.glob(f".{out.name}*")] == []
     return str(e.value)
 
@@ -117,7 +129,13 @@ def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
     shutil.rmtree(slow)
     shutil.copy(wide(tmp_path), other / "frames/frame_000003.jpg")
     assert "a picture of 64x18 among those of 32x18" in refused(tmp_path / "mixed", tmp_path / "out")
+    assert "16 to 8192 pixels a side, found 32x9" in refused(tmp_path / "mixed", tmp_path / "out", size=(9, 32))
     assert not (tmp_path / "out").exists()
+    report = export_dataset(tmp_path / "mixed", tmp_path / "out", size=(36, 64))
+    assert report["pictures"] == "64x36, recorded 32x18"
+    expected = [prepare_frame(s.frame_bgr(), 36, 64)[..., ::-1] for s in load(tmp_path / "mixed").samples]
+    found = [s.frame_bgr() for s in load(tmp_path / "out").samples]
+    assert np.array_equal(found, expected)
 
 
 def wide(folder):

@@ -33,6 +33,7 @@ def test_its_parameters_are_the_policys(tiny):
     assert all(torch.equal(value.reshape(model[name].shape), model[name]) for name, value in made.items())
 
 
+@pytest.mark.slow
 def test_its_weights_are_the_int8_weights_to_the_last_bit(tiny, calibration, rounded):
     layers = int8_layers(quantize(tiny, Scheme("static"), calibration).module)
     made = rounded.parameters_of(tiny.weights)

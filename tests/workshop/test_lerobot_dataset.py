@@ -180,7 +180,7 @@ def test_frames_states_and_chunks_are_lerobots_own_items(datasets, kind):
         assert sample.state.dtype == sample.chunk.dtype == np.float32
     assert [e.label for e in recordings.episodes] == [f"hit the {i}. balloon" for i in range(EPISODES)]
     assert [e.frames for e in recordings.episodes] == [FRAMES, FRAMES + 1, FRAMES + 2]
-    assert recordings.layout == Layout("cam_front", rate_hz=FPS)
+    assert recordings.layout == Layout(("cam_front",), rate_hz=FPS)
     assert json.dumps(recordings.summary()) and "camera: cam_front; state: steering, thr" in recordings.layout.words()
     assert set(recordings.hashes()) == {
         "meta/info.json",
@@ -279,7 +279,7 @@ def planned(checkpoint, sample):
 
 def test_a_policy_is_put_into_the_recordings_order(trained, tmp_path):
     policy = load_checkpoint(trained)
-    swapped = Layout("cam_front", rate_hz=20.0, state_order=(1, 0), action_order=(1, 0))
+    swapped = Layout(("cam_front",), rate_hz=20.0, state_order=(1, 0), action_order=(1, 0))
     other = policy.recorded_as(swapped)
     (sample,) = memory_samples(1)
     expected = planned(policy, sample)[:, ::-1]
@@ -297,19 +297,22 @@ def replace_state(sample, state):
 
 
 def test_a_policy_of_other_numbers_or_another_rate_is_refused(trained, tiny):
-    arm = Layout("cam_front", tuple("abcdef"), tuple("abcdef"), 30.0, tuple(range(6)), tuple(range(6)))
-    with pytest.raises(CheckpointError, match="2 states and 2 actions, found recordings of 6 and 6"):
+    arm = Layout(("cam_front",), tuple("abcdef"), tuple("abcdef"), 30.0, tuple(range(6)), tuple(range(6)))
+    with pytest.raises(CheckpointError, match="cameras, states and actions 1, 2, 2, found recordings of 1, 6, 6"):
         load_checkpoint(trained).recorded_as(arm)
     with pytest.raises(CheckpointError, match="30 steps a second, found recordings of 20 frames a second"):
-        tiny.recorded_as(Layout("cam_front", rate_hz=20.0))
-    assert tiny.recorded_as(Layout("front", rate_hz=30.0)) is tiny
+        tiny.recorded_as(Layout(("cam_front",), rate_hz=20.0))
+    assert tiny.recorded_as(Layout(("front",), rate_hz=30.0)) is tiny
+    twice = replace(tiny, config=replace(tiny.config, cameras=("front", "wrist")))
+    with pytest.raises(CheckpointError, match="2, 2, 2, found recordings of 1, 2, 2"):
+        twice.recorded_as(Layout())  # our own
 
 
 @pytest.mark.slow
 def test_from_a_dataset_to_an_artifact(datasets, trained, tmp_path):
     root, artifact = datasets("video", actions=SWAPPED, states=SWAPPED), tmp_path / "policy.pt"
     loaded = load(trained, root)
-    assert loaded.checkpoint.config.rate_hz == FPS and loaded.recordings.source.camera == "cam_front"
+    assert loaded.checkpoint.config.rate_hz == FPS and loaded.recordings.source.cameras == ("cam_front",)
     options = ["--mode", "fp32", "-o", str(artifact)]
     result = CliRunner().invoke(main, ["quantize", str(trained), str(root), *options], catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -323,6 +326,10 @@ def test_from_a_dataset_to_an_artifact(datasets, trained, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_no_car_is_not_calibrated_for_one(datasets, trained):
-    with pytest.raises(EpisodeError, match=r"the action is \['left', 'right'\], a rover's is"):
-        load(trained, datasets(actions=("left", "right")))
+def test_other_names_are_kept_until_the_user_says_that_it_is_a_car(datasets, trained):
+    wheels = ("left", "right")
+    root = datasets(actions=wheels, states=wheels)
+    assert load(trained, root).checkpoint.config.action_names == wheels
+    said = load(trained, Source.of(root, "throttle,steering"))
+    assert said.checkpoint.config.action_names == said.checkpoint.config.state_names == CAR
+    assert said.recordings.layout.state_order == said.recordings.layout.action_order == (1, 0)

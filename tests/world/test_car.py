@@ -82,6 +82,7 @@ def test_straight_ahead():
     assert abs(bearing) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", BOARDS)
 @needs.real_time
 def test_the_whole_chain_hits_a_balloon(board):
@@ -118,6 +119,7 @@ def test_the_whole_chain_hits_a_balloon(board):
         eye.close()
 
 
+@pytest.mark.slow
 @needs.real_time
 def test_it_stays_after_the_last_world():
     with VirtualCar(seed=AHEAD, worlds=1, rate_hz=60, hold_s=0) as car, ServoLink(car.port) as link:

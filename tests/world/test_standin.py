@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 
 import needs
+import pytest
 import serial
 from uno import body_of, line, status_of
 
@@ -50,6 +51,7 @@ def opened():
         raw.port.close()
 
 
+@pytest.mark.slow
 @needs.real_time
 def test_the_stand_in_ignores_what_the_firmware_ignores():
     with opened() as raw:

@@ -45,6 +45,7 @@ def test_rendering_changes_nothing():
     assert world.state == before
 
 
+@pytest.mark.slow
 def test_other_seeds_look_and_drive_differently():
     assert len({frame_hash(World(seed)) for seed in range(20)}) == 20
     assert len({World(seed).balloon for seed in range(20)}) == 20

@@ -17,7 +17,8 @@ import numpy as np
 GETPPID, MARK = 173, 0xC0FFEE  # as in count.c; without the plugin it is a system call that does nothing
 libc = ctypes.CDLL(None)
 
-Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint8 BGR, state (S,) -> (chunk, A) float32
+# frame (h, w, 3) uint8 BGR, or one by each camera's name; state (S,) -> (chunk, A) float32
+Predict = Callable[[Any, np.ndarray], np.ndarray]
 
 
 def mark(starts: bool, section: int) -> None:
@@ -37,14 +38,15 @@ def loaded(load: Callable[[], Any]) -> Any:
 def predict_all(predict: Predict, observations: str, folder: str, counted: int) -> None:
     """Predict each observation, and leave `chunks.npy` (n, chunk, A) float32 in the folder.
 
-    observations: an npz of `state` (n, S) float32 and `frame_0000`... (h, w, 3) uint8 BGR; they are predicted in that
-    order, and again from the first if there are fewer than `counted`. A frame is read outside of what is counted.
+    observations: an npz of `state` (n, S) float32 and `frame_0000`... (h, w, 3) uint8 BGR, or `frame_0000.<camera>`...
+    where there are several cameras; they are predicted in that order, and again from the first if there are fewer than
+    `counted`. A frame is read outside of what is counted.
     """
     chunks = []
     with np.load(observations) as seen:
         states = seen["state"]
         for i in range(max(len(states), counted)):
-            state, frame = states[i % len(states)], seen[f"frame_{i % len(states):04d}"]
+            state, frame = states[i % len(states)], frame_of(seen, i % len(states))
             print("predict", flush=True)
             if i < counted:
                 mark(True, i + 1)
@@ -54,6 +56,14 @@ def predict_all(predict: Predict, observations: str, folder: str, counted: int) 
                 chunk = predict(frame, state)
             chunks.append(chunk)
     np.save(Path(folder) / "chunks.npy", np.stack(chunks[: len(states)]))
+
+
+def frame_of(seen: Any, number: int) -> Any:
+    """A frame of an npz; of several cameras a dict by their names."""
+    name = f"frame_{number:04d}"
+    if name in seen:
+        return seen[name]
+    return {key.removeprefix(f"{name}."): seen[key] for key in seen if key.startswith(f"{name}.")}
 
 
 def leave(folder: str, threads: int, **versions: str) -> None:

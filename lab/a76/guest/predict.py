@@ -6,26 +6,31 @@
 What it reads, counts, prints and leaves in FOLDER is told in inferences.py; preparing a frame is counted too.
 
 The second form runs a TorchScript part of a policy, for its bits and not for a count: INPUTS is an npz of `state`
-(n, S) and prepared frames, as the part takes them; leaves `backbone.npy` (n, ...) of what it gave, in its folder.
+(n, S) and prepared frames `frame_0000.<camera>`..., in the order in which the part takes them; leaves `backbone.npy`
+(n, ...) of what it gave, in its folder.
 """
 
 import sys
+from importlib.metadata import version
 
 import numpy as np
-import torch
-from inferences import leave, loaded, predict_all
+from inferences import frame_of, leave, loaded, predict_all
 
 from rover_lib.onboard import load_policy
+from rover_lib.onboard.engines import PACKAGES
 from rover_lib.onboard.errors import RoverError
 
 
 def main(artifact: str, observations: str, folder: str, counted: str) -> None:
     policy = loaded(lambda: load_policy(artifact, threads=1))
     predict_all(policy.predict_chunk, observations, folder, int(counted))
-    leave(folder, torch.get_num_threads(), torch=torch.__version__)
+    package = PACKAGES[policy.manifest["engine"]]
+    leave(folder, policy.threads, **{package: version(package)})
 
 
 def backbone(engine: str, module: str, inputs: str) -> None:
+    import torch  # here, because an artifact of the other engine must not pay for it
+
     torch.backends.quantized.engine = engine
     torch.set_num_threads(1)
     print("load", flush=True)
@@ -33,7 +38,7 @@ def backbone(engine: str, module: str, inputs: str) -> None:
     with np.load(inputs) as seen, torch.inference_mode(), torch.jit.optimized_execution(False):
         for i, state in enumerate(torch.from_numpy(seen["state"])):
             print("predict", flush=True)
-            given.append(part(state[None], torch.from_numpy(seen[f"frame_{i:04d}"])))
+            given.append(part(state[None], *map(torch.from_numpy, frame_of(seen, i).values())))
     np.save("backbone.npy", torch.cat(given).numpy())
 
 

@@ -13,12 +13,15 @@ from rover_lib.workshop.plots.style import (
     BLUE,
     COLOURS,
     GREY,
+    MOST_ACTIONS,
     NAMES,
     RED,
+    figure_of,
     legend_below,
     new_figure,
     note,
     plain_table,
+    shown_picture,
 )
 
 
@@ -41,10 +44,10 @@ def sizes(metrics: Mapping[str, Any]) -> Figure:
 def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure:
     """Mean error of every mode against FP32 at each step of the plan: percent of the recorded range, and pulse."""
     actions, steps = report.action_names, report.reference.shape[1]
-    fig, axes = new_figure(1, len(actions), height_in=3.6)
+    fig, fields = figure_of(len(actions), 2 if len(actions) < MOST_ACTIONS else MOST_ACTIONS, 3.6)
     times_s = np.arange(steps) / rate_hz
     for i, action in enumerate(actions):
-        ax, pct = axes[0, i], report.pct(action)
+        ax, pct = fields[i], report.pct(action)
         ax.set_title(action, fontsize=11)
         if pct is None:
             note(ax, "never changes in these\nrecordings: not judged")
@@ -58,29 +61,32 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure:
             other = ax.secondary_yaxis("right", functions=(lambda p, u=us: p * u, lambda e, u=us: e / u))
             other.set_ylabel("the same as pulse (us)")
             other.tick_params(labelsize=9)
-    judged = [ax for ax in axes[0] if ax.get_lines()]
+    judged = [ax for ax in fields if ax.get_lines()]
     if judged:
         legend_below(fig, judged[0], 5)
     return fig
 
 
 def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0) -> Figure:
-    """The frames on which a mode differs most from FP32: the picture and both plans, with the recording's own."""
+    """The frames on which a mode differs most from FP32: the picture and both plans, with the recording's own.
+
+    Of a policy with many actions the one that is worst there.
+    """
     frames = report.worst(mode, count)
-    names = report.action_names
-    fig, axes = new_figure(max(len(frames), 1), 1 + len(names), height_in=0.9 + 1.9 * max(len(frames), 1))
+    every = report.action_names if len(report.action_names) <= MOST_ACTIONS else ()
+    fig, axes = new_figure(max(len(frames), 1), 1 + max(len(every), 1), height_in=0.9 + 1.9 * max(len(frames), 1))
     if not frames:
         for ax in axes[0]:
             note(ax, "not judged")
         return fig
     times_s = np.arange(report.reference.shape[1]) / rate_hz
     for row, worst in zip(axes, frames, strict=True):
-        row[0].imshow(worst.sample.frame_bgr()[..., ::-1])
+        row[0].imshow(shown_picture(worst.sample))
         row[0].axis("off")
         row[0].set_title(f"{worst.action} {worst.error_pct:.2f} % off", fontsize=10)
         recorded = getattr(worst.sample, "chunk", None)
-        for i, name in enumerate(names):
-            ax = row[1 + i]
+        for ax, name in zip(row[1:], every or (worst.action,), strict=True):
+            i = report.action_names.index(name)
             if recorded is not None:
                 known = ~worst.sample.is_pad
                 ax.plot(times_s[known], recorded[known, i], color=GREY, lw=3, label="driver")

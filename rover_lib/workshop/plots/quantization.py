@@ -18,6 +18,7 @@ from rover_lib.workshop.plots.style import (
     SKY,
     action_colour,
     bar_values,
+    few_actions,
     judged_keys,
     legend,
     legend_below,
@@ -76,6 +77,7 @@ def errors_by_choice(
     table: Mapping[str, Mapping[str, float | None]], title: str, budget_pct: float | None = None
 ) -> Figure:
     """Error of each action for each choice, say of observers. table: {choice: {<action>_mae_pct}}."""
+    table, what = few_actions(table)
     choices = list(table)
     fig, axes = new_figure(1, height_in=1.3 + 0.42 * len(choices))
     ax = axes[0, 0]
@@ -90,7 +92,7 @@ def errors_by_choice(
         ax.axvline(budget_pct, color=BLACK, ls="--", lw=1, label=f"limit, {budget_pct:g} %")
     ax.set_yticks(range(len(choices)), choices)
     ax.invert_yaxis()
-    ax.set_xlabel("mean error against FP32 (% of the recorded range)")
+    ax.set_xlabel(f"{what} against FP32 (% of the recorded range)")
     ax.set_title(title, fontsize=11)
     legend(ax, loc="upper left", bbox_to_anchor=(1, 1))
     return fig
@@ -103,6 +105,8 @@ def sensitivity(
 
     table: {block: {<action>_mae_pct}}; steps: of `Chooser.mixed`, {float_blocks, cost_pct, <action>_mae_pct}.
     """
+    table, what = few_actions(table)
+    shown, _ = few_actions({str(i): step for i, step in enumerate(steps)})
     blocks = list(table)
     fig, axes = new_figure(1, 2, height_in=max(3.6, 1.2 + 0.26 * len(blocks)), width_ratios=(1.5, 1))
     left, right = axes[0]
@@ -112,10 +116,10 @@ def sensitivity(
         name, colour = key.removesuffix("_mae_pct"), action_colour(key, i)
         y = np.arange(len(blocks)) + (i - (len(keys) - 1) / 2) * height
         left.barh(y, [table[b][key] for b in blocks], height, color=colour, label=name)
-        right.plot([s["cost_pct"] for s in steps], [s[key] for s in steps], "o-", color=colour, label=name)
+        right.plot([s["cost_pct"] for s in steps], [s[key] for s in shown.values()], "o-", color=colour, label=name)
     left.set_yticks(range(len(blocks)), blocks)
     left.invert_yaxis()
-    left.set_xlabel("mean error (% of the recorded range)")
+    left.set_xlabel(f"{what} (% of the recorded range)")
     left.set_title("this block alone in INT8", fontsize=11)
     right.axhline(budget_pct, color=BLACK, ls="--", lw=1, label=f"budget, {budget_pct:g} %")
     right.set(xlabel="more instructions (%, computed)", ylabel="mean error (% of the recorded range)")

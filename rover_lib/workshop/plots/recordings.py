@@ -6,6 +6,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rover_lib.onboard.pwm import PwmCalibration
@@ -21,12 +22,16 @@ from rover_lib.workshop.plots.style import (
     RED,
     SKY,
     WIDTH_IN,
+    action_colour,
     bar_values,
+    figure_of,
     legend,
     legend_below,
     new_figure,
     note,
+    shown_picture,
 )
+from rover_lib.workshop.samples import ACTION_NAMES
 from rover_lib.workshop.scheme import OBSERVERS
 
 
@@ -83,22 +88,45 @@ def work_per_block(parameters: Mapping[str, int], macs: Mapping[str, int]) -> Fi
     return fig
 
 
-def episode_overview(episode: Episode, pictures: int = 5) -> Figure:
-    """One drive: what the camera saw, what the driver did, and the pulses that the servos got."""
+def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pictures: int = 5) -> Figure:
+    """One episode: what the cameras saw, and what was done; of a car also the pulses that its servos got."""
     samples = episode.samples
     shown = [samples[i] for i in np.linspace(0, len(samples) - 1, pictures).round().astype(int)]
-    fig = plt.figure(figsize=(WIDTH_IN, 6.2), dpi=DPI, layout="constrained")
+    car = tuple(actions) == ACTION_NAMES
+    rows = 2 if car else len(actions)
+    fig = plt.figure(figsize=(WIDTH_IN, 6.2 if car else 2.0 + 0.9 * rows), dpi=DPI, layout="constrained")
     plt.close(fig)
-    grid = fig.add_gridspec(3, pictures, height_ratios=(1.1, 1.3, 1.3))
+    grid = fig.add_gridspec(1 + rows, pictures, height_ratios=(1.1, *([1.3] if car else [0.6]) * rows))
     for i, sample in enumerate(shown):
         ax = fig.add_subplot(grid[0, i])
-        ax.imshow(sample.frame_bgr()[..., ::-1])
+        ax.imshow(shown_picture(sample))
         ax.set_title(f"{sample.time_s:.1f} s", fontsize=9)
         ax.axis("off")
+    draw = _drive if car else _motion
+    draw([fig.add_subplot(grid[1 + row, :]) for row in range(rows)], samples, actions)
+    fig.suptitle(
+        f"{episode.id}: {episode.label or 'no label'}, {len(samples)} samples of {episode.frames} frames",
+        fontsize=11,
+    )
+    return fig
+
+
+def _motion(fields: Sequence[Axes], samples: Sequence[Sample], actions: Sequence[str]) -> None:
+    """Each action over time, in its own units."""
+    for i, (ax, name) in enumerate(zip(fields, actions, strict=True)):
+        ax.plot([s.time_s for s in samples], [s.chunk[0, i] for s in samples], color=action_colour(name, i), lw=1.5)
+        ax.set_ylabel(name, fontsize=8, rotation=0, ha="right")
+        ax.tick_params(labelsize=8, labelbottom=ax is fields[-1])
+        ax.spines[["top", "right"]].set_visible(False)
+    fields[-1].set_xlabel("time in the episode (s)")
+
+
+def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) -> None:
+    """A car's steering and throttle, and their pulses."""
     times_s = [s.time_s for s in samples]
     actions = np.stack([s.chunk[0] for s in samples])
     pulses = [PwmCalibration().pulses(*(float(v) for v in a)) for a in actions]
-    upper, lower = fig.add_subplot(grid[1, :]), fig.add_subplot(grid[2, :])
+    upper, lower = fields
     rows = (
         (upper, actions[:, 0], actions[:, 1], "{} (share of full)"),
         (lower, [p.steering_us for p in pulses], [p.throttle_us for p in pulses], "{} pulse (us)"),
@@ -112,11 +140,6 @@ def episode_overview(episode: Episode, pictures: int = 5) -> Figure:
         ax.spines["top"].set_visible(False)
         other.spines["top"].set_visible(False)
     lower.set_xlabel("time in the episode (s)")
-    fig.suptitle(
-        f"{episode.id}: {episode.label or 'no label'}, {len(samples)} samples of {episode.frames} frames",
-        fontsize=11,
-    )
-    return fig
 
 
 def faults(recordings: Recordings) -> Figure:
@@ -144,10 +167,12 @@ def calibration_coverage(
     pool: Sequence[Sample],
     chosen: Sequence[Sample],
     held_out: Sequence[Sample],
-    names=("steering", "throttle"),
+    names: Sequence[str] = ACTION_NAMES,
 ) -> Figure:
     """Which recorded actions the calibration samples cover, beside those that judge later."""
-    fig, axes = new_figure(1, 3, height_in=3.4)
+    first_two = list(names[:2])
+    fig, fields = figure_of(1 + len(names), 3, 3.4)
+    unit = " (share of full)" if tuple(names) == ACTION_NAMES else ""
     sets = (
         ("could calibrate", pool, GREY, "o", 8),
         ("held out", held_out, ORANGE, "x", 14),
@@ -155,8 +180,9 @@ def calibration_coverage(
     )
     for label, samples, colour, marker, size in sets:
         first = np.stack([s.chunk[0] for s in samples])
-        axes[0, 0].scatter(
-            *first.T[:2],
+        fields[0].scatter(
+            first[:, 0],
+            first[:, len(first_two) - 1],
             s=size,
             c=colour,
             marker=marker,
@@ -164,10 +190,9 @@ def calibration_coverage(
             alpha=0.8,
             label=f"{label} ({len(samples)})",
         )
-    axes[0, 0].set(xlabel=f"{names[0]} (share of full)", ylabel=f"{names[1]} (share of full)")
-    axes[0, 0].set_title("one point per frame", fontsize=11)
-    for i in range(2):
-        ax = axes[0, i + 1]
+    fields[0].set(xlabel=f"{first_two[0]}{unit}", ylabel=f"{first_two[-1]}{unit}")
+    fields[0].set_title("one point per frame", fontsize=11)
+    for i, ax in enumerate(fields[1:]):
         every = np.concatenate([s.chunk[:, i] for s in pool])
         bins = np.linspace(every.min(), every.max(), 25) if every.max() > every.min() else 25
         for samples, colour, style in ((pool, GREY, "stepfilled"), (chosen, BLUE, "step")):
@@ -180,9 +205,9 @@ def calibration_coverage(
                 histtype=style,
                 lw=1.5,
             )
-        ax.set(xlabel=f"{names[i]} (share of full)", ylabel="actions (%)")
+        ax.set(xlabel=f"{names[i]}{unit}", ylabel="actions (%)")
         ax.set_title(f"{names[i]} over whole plans", fontsize=11)
-    legend_below(fig, axes[0, 0], 3)
+    legend_below(fig, fields[0], 3)
     return fig
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.table import Table
 
 from rover_lib.onboard.host import THROTTLED_BITS
+from rover_lib.workshop.judge import worst
 
 WIDTH_IN, DPI = 9.0, 100
 BLACK = "#333333"
@@ -61,6 +63,26 @@ def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: A
     return fig, axes
 
 
+def figure_of(count: int, columns: int, row_in: float) -> tuple[Figure, list[Any]]:
+    """A figure with a field for each of `count` things, in rows of `columns`."""
+    columns = min(columns, count)
+    rows = -(-count // columns)
+    fig, axes = new_figure(rows, columns, height_in=row_in * rows)
+    for ax in axes.flat[count:]:
+        ax.set_axis_off()
+    return fig, list(axes.flat[:count])
+
+
+def shown_picture(sample: Any) -> np.ndarray:
+    """What a sample saw, (h, w, 3) uint8 RGB: of several cameras the pictures side by side, as high as the highest."""
+    seen = sample.frame_bgr()
+    frames = list(seen.values()) if isinstance(seen, Mapping) else [seen]
+    height = max(len(frame) for frame in frames)
+    sizes = [(round(frame.shape[1] * height / len(frame)), height) for frame in frames]
+    same = [f if f.shape[1::-1] == size else cv2.resize(f, size) for f, size in zip(frames, sizes, strict=True)]
+    return np.concatenate(same, axis=1)[..., ::-1]
+
+
 def legend(ax: Axes, **options: Any) -> None:
     ax.legend(frameon=False, fontsize=9, **options)
 
@@ -91,6 +113,20 @@ def judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
         if errors[key] is None:
             ax.plot([], [], " ", label=f"{key.removesuffix('_mae_pct')}: not judged")
     return [k for k in keys if errors[k] is not None]
+
+
+MOST_ACTIONS = 3  # that a figure shows beside each other
+
+
+def few_actions(
+    table: Mapping[str, Mapping[str, float | None]],
+) -> tuple[dict[str, dict[str, float | None]], str]:
+    """A table of <action>_mae_pct as it can be drawn: of many actions only the worst of each row, and what is drawn."""
+    keys = [k for k in next(iter(table.values())) if k.endswith("_mae_pct")]
+    if len(keys) <= MOST_ACTIONS:
+        return {name: {k: row[k] for k in keys} for name, row in table.items()}, "mean error"
+    worst_of = {name: {"worst action_mae_pct": worst(row[k] for k in keys)} for name, row in table.items()}
+    return worst_of, f"mean error of the worst of {len(keys)} actions"
 
 
 def save(figure: Figure, run_dir: Path | str, name: str) -> Figure:

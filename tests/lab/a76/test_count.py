@@ -17,9 +17,10 @@ from lab.a76 import core as a76
 from lab.a76 import count_run as counting
 from lab.a76 import report as reports
 from lab.a76.core import BLOCK, Core, CountError, emulate, prepare
-from lab.a76.count import STEADY, Counted, count_artifact
+from lab.a76.count import STEADY, Counted, count_artifact, write_observations
 from lab.a76.count_run import count_run
 from lab.a76.symbols import Functions, GuestFunctions, by_kernel
+from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT
@@ -217,7 +218,7 @@ def test_bits_that_differ_are_found(core, tiny_run, again, monkeypatch):
     def flipped(_: Core, script: Path, arguments: list[str], folder: Path) -> None:
         torch.backends.quantized.engine = q.ENGINE
         with np.load(folder / "inputs.npz") as seen, torch.inference_mode():
-            frame = torch.from_numpy(seen["frame_0000"])
+            frame = torch.from_numpy(seen["frame_0000.cam_front"])
             flipped_bits = torch.jit.load(folder / "backbone.pt")(torch.from_numpy(seen["state"]), frame).numpy()
         flipped_bits[0, 0, 0, 0] += 1
         np.save(folder / "backbone.npy", flipped_bits)
@@ -231,7 +232,7 @@ def test_another_calibration_has_no_bits_to_compare(core, tiny_run, again, tmp_p
     for name in ("policy_static.pt", "quantize.json"):
         (tmp_path / name).write_bytes((tiny_run / name).read_bytes())
     calibrate(again.checkpoint, memory_samples(4, seed=5)).save(tmp_path / "calibration.pt")
-    with pytest.raises(CountError, match=r"calibration\.pt are not those of quantize\.json"):
+    with pytest.raises(QuantizeError, match=r"calibration\.pt are not those of quantize\.json"):
         counting.backbone_bits(tmp_path, core, again.checkpoint, memory_samples(1))
 
 
@@ -278,6 +279,19 @@ def test_a_count_is_repeatable(report, core, tiny_run):
     assert again.steady / 1e9 == pytest.approx(
         report["metrics"]["artifacts"]["policy_static"]["instructions_g"], rel=0.002
     )
+
+
+def test_the_guest_reads_the_pictures_of_several_cameras(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(Path(counting.__file__).parent / "guest")
+    from inferences import frame_of
+
+    one, other = memory_samples(2)
+    both = {"front": one.picture, "wrist": other.picture[:40]}
+    samples = [SimpleNamespace(state=one.state, frame_bgr=lambda: both), other]
+    with np.load(write_observations(tmp_path / "seen.npz", samples)) as seen:
+        found = frame_of(seen, 0)
+        assert list(found) == ["front", "wrist"] and all(np.array_equal(found[name], both[name]) for name in both)
+        assert np.array_equal(frame_of(seen, 1), other.picture)
 
 
 def test_a_loaded_policy_is_warm(report):

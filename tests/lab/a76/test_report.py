@@ -191,3 +191,14 @@ def test_the_command_counts_then_draws_then_says_what_it_found(tmp_path, monkeyp
     assert computed.startswith("policy_static") and "never timed" in result.output
     called.clear()
     assert CliRunner().invoke(main, ["arm", str(tmp_path)]).exit_code == 0 and "peers" not in called
+
+
+def test_the_table_names_two_actions_and_the_worst_of_more():
+    def lines(**artifacts):
+        return report.table({"metrics": {"artifacts": artifacts}}).splitlines()
+
+    _, header, row, *_ = lines(policy_static=artifact())
+    assert header.split()[-3:] == ["steering", "throttle", "frames"] and row.split()[-3:] == ["0.100", "0.200", "50"]
+    arm = artifact(**{f"joint_{i}_mae_pct": i / 10 for i in range(1, 7)})
+    _, header, row, *_ = lines(policy_static=arm)
+    assert header.split()[-3:] == ["worst", "action", "frames"] and row.split()[-2:] == ["0.600", "50"]

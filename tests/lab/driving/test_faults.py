@@ -335,6 +335,7 @@ def planned(obedient, instruction):
     return plans[0]
 
 
+@pytest.mark.slow
 def test_the_policy_does_what_the_picture_tells_it_to(obedient):
     assert np.allclose(planned(obedient, policy.PLAIN), policy.PLAN)
     assert np.allclose(planned(obedient, policy.OTHER), policy.OTHER_PLAN)

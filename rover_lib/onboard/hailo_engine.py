@@ -1,0 +1,153 @@
+"""Artifacts run by a Hailo chip: a compiled network (HEF), and in ONNX Runtime what follows it on the processor.
+
+The chip is driven by HailoRT's Python package, `hailo_platform`, which Hailo's packages install beside the driver, by
+`create_infer_model`, which the Hailo-8, 8L and 10H all have. A network that was right in the compiler's emulator may
+compute something else on the chip: the parity vectors that every artifact has are asked of the device itself.
+"""
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import hailo_platform
+import numpy as np
+
+from rover_lib.onboard.archive import HEF, ONNX, open_archive, read_record
+from rover_lib.onboard.errors import ArtifactError
+
+TIMEOUT_MS = 1000  # for one inference: some thirty times what one should take
+LARGEST_SIDE = 8192  # of an output
+
+
+class HailoEngine:
+    """A network on the chip, and the rest of the policy on the processor. Use `load`.
+
+    runs: the manifest's "hailo", see `_checked`.
+    """
+
+    def __init__(self, path: Path, manifest: dict[str, Any], threads: int | None):
+        self._path, self._runs = path, _checked(manifest, path)
+        cameras = manifest["cameras"]
+        self._frames = [f"frame_{c['name']}" for c in cameras]
+        shapes = {f"frame_{c['name']}": [c["height"], c["width"], 3] for c in cameras}
+        if self._runs["network"] == "whole":
+            shapes["state"] = [1, 1, len(manifest["state_names"])]
+        with open_archive(path) as z:
+            hef = read_record(z, HEF)
+            self._rest_model = read_record(z, ONNX) if ONNX in z.namelist() else None
+        if (self._rest_model is None) != (self._runs["network"] == "whole"):
+            raise ArtifactError(f"{path}: its parts are not those of its network", remedy="pack it again")
+        formats = hailo_platform.FormatType
+        self._device = hailo_platform.VDevice()
+        model = self._device.create_infer_model(hef)
+        self._inputs = self._matched(model, model.inputs, shapes)
+        self._outputs = self._matched(model, model.outputs, self._runs["outputs"])
+        for name, stream in self._inputs.items():
+            model.input(stream).set_format_type(formats.UINT8 if name in self._frames else formats.FLOAT32)
+        for stream in self._outputs.values():
+            model.output(stream).set_format_type(formats.FLOAT32)
+        self._model, self._network = model, model.configure()
+        self._bindings = self._network.create_bindings()
+        self._answers = {name: np.empty(shape, np.float32) for name, shape in self._runs["outputs"].items()}
+        for name, buffer in self._answers.items():
+            self._bindings.output(self._outputs[name]).set_buffer(buffer)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self.set_threads(threads or cores)
+
+    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
+        """As engines.Engine."""
+        given = dict(zip(self._frames, frames_rgb, strict=True))
+        if "state" in self._inputs:
+            given["state"] = _affine(state, self._runs["state"]).reshape(1, 1, -1)
+        try:
+            for name, value in given.items():
+                self._bindings.input(self._inputs[name]).set_buffer(np.ascontiguousarray(value))
+            self._network.run([self._bindings], TIMEOUT_MS)
+            if self._rest is None:
+                return _affine(self._answers["actions"], self._runs["actions"])
+            (y,) = self._rest.run(None, {"state": state[None], **self._answers})
+        except Exception as e:  # HailoRT has a dozen types, and so has ONNX Runtime
+            raise RuntimeError(f"{type(e).__name__}: {e}") from None
+        return y
+
+    def give_back(self) -> bool:
+        """As engines.Engine: nothing is held that could be."""
+        return False
+
+    @property
+    def threads(self) -> int:
+        """As engines.Engine, of what runs on the processor."""
+        return self._threads
+
+    def set_threads(self, threads: int) -> None:
+        """As engines.Engine: a session has its threads for life, so it is made anew. Raises ArtifactError."""
+        self._threads, self._rest = threads, None
+        if self._rest_model is None:
+            return
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # as onnx_engine does, and why
+        self._rest = onnxruntime.InferenceSession(self._rest_model, options, providers=["CPUExecutionProvider"])
+
+    def _matched(self, model: Any, streams: list[Any], shapes: dict[str, list[int]]) -> dict[str, str]:
+        """HailoRT's name of the stream for each of ours: by its size; where several have it, by the original name."""
+        matched = {}
+        for name, shape in shapes.items():
+            alike = [s.name for s in streams if math.prod(s.shape) == math.prod(shape)]
+            if len(alike) > 1:
+                wanted = {name, self._runs["original_names"].get(name, name)}
+                alike = [s for s in alike if wanted & set(model.hef.get_original_names_from_vstream_name(s))]
+            if len(alike) != 1:
+                raise ArtifactError(
+                    f"{self._path}: its HEF has no stream of {shape} for {name}",
+                    found=", ".join(f"{s.name} {list(s.shape)}" for s in streams),
+                    remedy="compile the kit's network again",
+                )
+            matched[name] = alike[0]
+        if len(set(matched.values())) != len(streams):
+            raise ArtifactError(
+                f"{self._path}: its HEF has other streams than the policy", found=", ".join(s.name for s in streams)
+            )
+        return matched
+
+
+def load(path: Path, manifest: dict[str, Any], threads: int | None) -> HailoEngine:
+    """Raises ArtifactError where there is no chip, or HailoRT does not take the network."""
+    try:
+        return HailoEngine(path, manifest, threads)
+    except ArtifactError:
+        raise
+    except Exception as e:
+        why = " ".join(f"{type(e).__name__}: {e}".split())[:200]
+        raise ArtifactError(
+            f"{path}: the Hailo chip does not run it here ({why})",
+            remedy="is the card in, its driver loaded, and the HEF for this chip? ('hailortcli fw-control identify')",
+        ) from None
+
+
+def _checked(manifest: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The manifest's "hailo": {network, outputs: {name: shape}, original_names, state, actions: scale and shift}."""
+    runs = manifest.get("hailo")
+    expected = {f"features_{c['name']}" for c in manifest["cameras"]}
+    try:
+        assert isinstance(runs, dict) and runs["network"] in ("backbone", "whole")
+        assert runs["outputs"].keys() == ({"actions"} if runs["network"] == "whole" else expected)
+        for shape in runs["outputs"].values():
+            assert len(shape) == 3 and all(type(n) is int and 0 < n <= LARGEST_SIDE for n in shape)
+        assert all(isinstance(name, str) for name in runs["original_names"].values())
+        for affine, size in (("state", len(manifest["state_names"])), ("actions", len(manifest["action_names"]))):
+            if runs[affine] is not None:
+                assert all(np.array(runs[affine][k], np.float32).shape == (size,) for k in ("scale", "shift"))
+    except (AssertionError, KeyError, TypeError, ValueError, AttributeError):
+        raise ArtifactError(
+            f"{path}: its manifest does not say how its network runs", remedy="pack it again with the kit's compile.py"
+        ) from None
+    return runs
+
+
+def _affine(x: np.ndarray, by: dict[str, list[float]] | None) -> np.ndarray:
+    return x if by is None else x * np.array(by["scale"], np.float32) + np.array(by["shift"], np.float32)

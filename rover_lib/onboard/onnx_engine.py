@@ -1,0 +1,71 @@
+"""Artifacts run by ONNX Runtime, for a rover without torch."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+
+from rover_lib.onboard.archive import ONNX, open_archive, read_record
+from rover_lib.onboard.errors import ArtifactError
+
+ERRORS_ONLY = 3  # of ONNX Runtime's log, which warns of what a machine without a graphics card lacks
+
+
+class OnnxEngine:
+    """The model of an ONNX artifact. Use `load`."""
+
+    def __init__(self, path: Path, threads: int):
+        self._path = path
+        self.set_threads(threads)
+
+    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
+        """As engines.Engine."""
+        inputs = dict(zip(self._names, (state[None], *frames_rgb), strict=True))
+        try:
+            (y,) = self._session.run(None, inputs)
+        except Exception as e:  # it has a dozen types, none of which is a RuntimeError
+            raise RuntimeError(str(e)) from None
+        return y
+
+    def give_back(self) -> bool:
+        """As engines.Engine: nothing is held that could be."""
+        return False
+
+    @property
+    def threads(self) -> int:
+        """As engines.Engine."""
+        return self._threads
+
+    def set_threads(self, threads: int) -> None:
+        """As engines.Engine: a session has its threads for life, so it is made anew. Raises ArtifactError."""
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.log_severity_level = ERRORS_ONLY
+        # A thread that waits for work by spinning takes the control loop's turn, and warms the processor for nothing.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        try:
+            with open_archive(self._path) as z:
+                self._session = onnxruntime.InferenceSession(
+                    read_record(z, ONNX), options, providers=["CPUExecutionProvider"]
+                )
+        except ArtifactError:
+            raise
+        except Exception as e:
+            why = " ".join(str(e).split())[:200]
+            raise ArtifactError(f"{self._path}: ONNX Runtime cannot load it ({why})", remedy="quantize again") from None
+        self._threads, self._names = threads, [i.name for i in self._session.get_inputs()]
+
+
+def load(path: Path, manifest: dict[str, Any], threads: int | None) -> OnnxEngine:
+    """Raises ArtifactError for a model that ONNX Runtime refuses, or with other inputs than its manifest says."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    engine = OnnxEngine(path, threads or cores)
+    wanted = ["state", *(f"frame_{c['name']}" for c in manifest["cameras"])]
+    if engine._names != wanted:
+        raise ArtifactError(
+            f"{path}: its model takes {engine._names}, its manifest says {wanted}"[:300], remedy="quantize again"
+        )
+    return engine

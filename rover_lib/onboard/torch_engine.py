@@ -1,0 +1,71 @@
+"""Artifacts run by torch: TorchScript, with INT8 by the engine that the manifest names."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.memory import give_back_packed_weights
+from rover_lib.onboard.torchscript import unknown_operators
+
+
+class TorchEngine:
+    """A TorchScript archive. Use `load`."""
+
+    def __init__(self, module: torch.jit.ScriptModule):
+        self._module = module
+
+    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
+        """As engines.Engine."""
+        # TorchScript re-optimises in its second call (0.37 G instructions on a Cortex-A76); the switch is thread-local.
+        with torch.inference_mode(), torch.jit.optimized_execution(False):
+            y = self._module(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames_rgb))
+        return y.numpy()
+
+    def give_back(self) -> bool:
+        """As engines.Engine: the convolutions' original weights."""
+        return give_back_packed_weights(self._module) > 0
+
+    @property
+    def threads(self) -> int:
+        """As engines.Engine."""
+        return torch.get_num_threads()
+
+    def set_threads(self, threads: int) -> None:
+        """As engines.Engine."""
+        torch.set_num_threads(threads)
+
+
+def load(path: Path, manifest: dict[str, Any], threads: int | None) -> TorchEngine:
+    """Raises ArtifactError for another torch than the artifact's, or one without its quantization engine."""
+    made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
+    if made_with.split(".")[:2] != here.split(".")[:2]:
+        raise ArtifactError(
+            f"{path}: made with torch {made_with}, here is {here}", remedy=f"install torch {made_with.split('+')[0]}"
+        )
+    engine = manifest["engine"]
+    if engine not in torch.backends.quantized.supported_engines:
+        raise ArtifactError(
+            f"{path}: needs the quantization engine '{engine}', this torch has "
+            f"{list(torch.backends.quantized.supported_engines)}",
+            remedy="install PyPI's build of torch",
+        )
+    torch.backends.quantized.engine = engine
+    if threads:
+        torch.set_num_threads(threads)
+    try:
+        module = torch.jit.load(str(path), map_location="cpu").eval()
+    except RuntimeError as e:
+        raise ArtifactError(
+            f"{path}: TorchScript cannot load it ({str(e).splitlines()[0][:200]})", remedy="quantize again"
+        ) from None
+    if unknown := unknown_operators(module.graph):
+        raise ArtifactError(
+            f"{path}: its program has operators that no artifact has",
+            found=", ".join(unknown)[:200],
+            remedy="do not load it; quantize again",
+        )
+    return TorchEngine(module)

@@ -1,0 +1,102 @@
+"""What a file or a folder of this project is, and what is in it: `rover inspect`; and the runs: `rover list`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rover_lib.onboard.artifact import ONNX_SUFFIX
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.kinds import kinds_of
+from rover_lib.onboard.stage import read_stage
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.samples import Source
+
+BULK = 200  # characters of a report's value; of a longer one only the count is shown
+STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "distill")
+
+
+def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
+    """{kind: what is in it}, of everything that this project writes, and of what it reads.
+
+    Raises the RoverError of the kind's own loader: damaged, of another version, or nothing that is known here.
+    """
+    path, kinds = source.path, kinds_of(source.path)
+    kind = kinds[0] if kinds else None
+    if kind == "artifact":
+        from rover_lib.onboard.cli import describe_artifact
+
+        return describe_artifact(path)
+    if kind == "run":
+        return {"run": _run(path)}
+    if kind == "flight log":
+        from rover_lib.onboard.telemetry import read_log
+
+        return {"flight log": {k: v for k, v in read_log(path).summary().items() if k != "events"}}
+    if kind == "calibration":
+        return {"calibration": _calibration(path)}
+    if kind == "stage":
+        return {"report": _report(path)}
+    if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
+        from rover_lib.workshop.episodes import load_recordings
+
+        return {"recordings": load_recordings(source, progress=progress).summary()}
+    from rover_lib.workshop.checkpoint import load_checkpoint
+
+    checkpoint = load_checkpoint(path)
+    return {"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}
+
+
+def _run(folder: Path) -> dict[str, Any]:
+    files = sorted([*folder.glob("policy_*.pt"), *folder.glob(f"policy_*{ONNX_SUFFIX}")])
+    artifacts = {p.name: f"{p.stat().st_size / 1e6:.1f} MB" for p in files}
+    stages = [stage for stage in STAGES if (folder / f"{stage}.json").is_file()]
+    stages += sorted(p.stem for p in folder.glob("benchmark-*.json"))
+    return {"verdict": verdict_of(folder), "stages": stages, "artifacts": artifacts}
+
+
+def _calibration(path: Path) -> dict[str, Any]:
+    from rover_lib.workshop.observe import Calibration
+
+    found = Calibration.load(path)
+    return {
+        "samples": found.samples,
+        "smooth": found.smooth,
+        "checkpoint_sha256": found.checkpoint,
+        "ranges": len(found.ranges),
+    }
+
+
+def _report(path: Path) -> dict[str, Any]:
+    content = json.loads(path.read_text())
+    content = read_stage(path, str(content.get("stage")))
+    metrics = {key: _counted(value) for key, value in content["metrics"].items()}
+    return {"stage": content["stage"], "env": content["env"], "params": content["params"], "metrics": metrics}
+
+
+def _counted(value: Any) -> Any:
+    if isinstance(value, (dict, list)) and len(json.dumps(value)) > BULK:
+        return f"{len(value)} values, see the file"
+    return value
+
+
+def runs(folder: Path | str) -> list[dict[str, str]]:
+    """{name, verdict} of each run in a folder such as runs/, by name. Raises RoverError where that is missing."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise RoverError(f"{folder}: no such folder", remedy="make demo, or rover run, makes the first run")
+    paths = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    return [{"name": p.name, "verdict": verdict_of(p)} for p in paths if set(kinds_of(p)) & {"run", "pretrained"}]
+
+
+def verdict_of(run_dir: Path) -> str:
+    """The verdict of a run in a line; where it has none, what makes one."""
+    if (run_dir / "run.json").is_file():
+        try:
+            return str(read_stage(run_dir / "run.json", "run")["metrics"]["headline"])
+        except (RoverError, KeyError):
+            return f"its run.json cannot be used: rover report {run_dir}"
+    if (run_dir / "compare.json").is_file():
+        return f"no verdict yet: rover report {run_dir}"
+    if (run_dir / "best_model.pth").is_file():
+        return f"a checkpoint: rover run {run_dir / 'best_model.pth'} EPISODES --name {run_dir.name}"
+    return "not whole: rover run makes it again"

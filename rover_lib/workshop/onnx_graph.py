@@ -1,0 +1,432 @@
+"""A policy, or a part of one, as an ONNX graph: FX's graph of it, written node by node.
+
+    model = onnx_model(graph_of(ACT(config, weights)), {"state": state, "frame_front": frame}, ("chunk",))
+    model = onnx_model(quantized.module, {"state": state, "frame_front": frame}, ("chunk",))
+
+What `quantize` made comes out as QDQ with the very scales, zero points, INT8 weights and INT32 biases of the static
+artifact, so that another engine computes the same numbers wherever its arithmetic is exact. torch's own exporter was
+the other way: it goes through TorchScript, which torch is retiring, knows nothing of columns of pixels, and rounds
+biases anew. Every module that FX can trace and that consists of what ACT consists of can be written, so a part of a
+policy (for an accelerator, say) is a module of its own given to `graph_of`, with as many inputs and outputs as it has.
+
+The graph has static shapes, one domain and operators of opset 17, which ONNX Runtime and the parsers of accelerators
+know; weights are initializers inside. Same module, same bytes.
+"""
+
+import math
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+import torch.nn.functional as F
+from onnx import TensorProto, helper, numpy_helper
+from torch import Tensor, nn
+from torch.ao.nn.intrinsic import ConvReLU2d
+from torch.ao.nn.intrinsic import quantized as fused_int8
+from torch.ao.nn.quantized import modules as int8
+from torch.fx import GraphModule, Interpreter, Node, Tracer
+
+from rover_lib.onboard.errors import QuantizeError
+from rover_lib.workshop.act import Columns
+
+OPSET = 17  # the first with LayerNormalization, the last that Hailo's parser documents
+IR_VERSION = 8  # of that opset
+ONNX_TYPES = {torch.float32: TensorProto.FLOAT, torch.uint8: TensorProto.UINT8, torch.int8: TensorProto.INT8}
+
+
+class _Leaves(Tracer):
+    def is_leaf_module(self, m: nn.Module, module_qualified_name: str) -> bool:
+        return isinstance(m, Columns) or super().is_leaf_module(m, module_qualified_name)
+
+
+def graph_of(module: nn.Module) -> GraphModule:
+    """FX's graph of a float module of ours. A converted policy's module is one already."""
+    return module if isinstance(module, GraphModule) else GraphModule(module, _Leaves().trace(module))
+
+
+def onnx_model(graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequence[str]) -> onnx.ModelProto:
+    """The graph as ONNX, checked by onnx.checker.
+
+    inputs: examples by the names they get, in the order of the graph's arguments; their shapes and dtypes become the
+    model's. outputs: names of what the graph returns, a tensor or a tuple of them. Raises QuantizeError for a part that
+    has no form in ONNX here, naming it.
+    """
+    writer = _Writer(graph, inputs, outputs)
+    with torch.inference_mode():
+        writer.run(*inputs.values())
+    model = writer.model()
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+class _Writer(Interpreter):
+    """Runs a graph once, for its shapes and quantization parameters, and writes what each node does."""
+
+    def __init__(self, graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequence[str]):
+        super().__init__(graph)
+        self._inputs, self._outputs = dict(inputs), list(outputs)
+        self._names: dict[Node, Any] = {}  # of the ONNX value, or a list of names for several
+        self._nodes: list[onnx.NodeProto] = []
+        self._constants: dict[str, onnx.TensorProto] = {}
+        self._made: list[Tensor] = []  # what the graph returned
+        self._taken = 0
+
+    def model(self) -> onnx.ModelProto:
+        """Once it has run."""
+        used = {name for node in self._nodes for name in node.input}
+        graph = helper.make_graph(
+            self._nodes,
+            "policy",
+            [_info(name, tensor) for name, tensor in self._inputs.items()],
+            [_info(name, tensor) for name, tensor in zip(self._outputs, self._made, strict=True)],
+            [
+                c for name, c in self._constants.items() if name in used
+            ],  # a scale that torch reads from a constant is not
+        )
+        opset = helper.make_opsetid("", OPSET)
+        return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="rover_lib")
+
+    # --- walking ---
+
+    def run_node(self, n: Node) -> Any:
+        result = super().run_node(n)
+        if n.op == "output":
+            self._made = list(result) if isinstance(result, (tuple, list)) else [result]
+            (returned,) = _args(n)
+            for name, source in zip(self._outputs, _as_list(returned), strict=True):
+                self._add("Identity", [self._float(source)], name)
+        else:
+            self._names[n] = self._write(n, result)
+        return result
+
+    def _write(self, n: Node, result: Any) -> Any:
+        if n.op == "placeholder":
+            names = list(self._inputs)[self._taken :]
+            if str(n.target).startswith("*"):
+                return names
+            self._taken += 1
+            return names[0]
+        if n.op == "get_attr":
+            return self._constant(str(n.target), result) if isinstance(result, Tensor) else None
+        if n.op == "call_module":
+            module = self.fetch_attr(str(n.target))
+            write = MODULES.get(type(module))
+        else:
+            module = None
+            write = FUNCTIONS.get(n.target) or FUNCTIONS.get(getattr(n.target, "__name__", ""))
+        if write is None:
+            what = type(module).__name__ if module is not None else n.target
+            raise QuantizeError(f"{n.name}: {what} has no form in ONNX here", remedy="add it to onnx_graph.py")
+        return write(self, n, result, module) if module is not None else write(self, n, result)
+
+    # --- what writers use ---
+
+    def _add(self, kind: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
+        self._nodes.append(helper.make_node(kind, list(inputs), [output], name=output, **attributes))
+        return output
+
+    def _constant(self, name: str, value: Tensor | np.ndarray) -> str:
+        if name not in self._constants:
+            array = value.detach().contiguous().numpy() if isinstance(value, Tensor) else value
+            self._constants[name] = numpy_helper.from_array(array, name)
+        return name
+
+    def _ints(self, name: str, values: Sequence[int]) -> str:
+        return self._constant(name, np.array(values, np.int64))
+
+    def _value(self, n: Any) -> Tensor:
+        """What a node gave in this run."""
+        return self.env[n]
+
+    def _name(self, n: Any) -> str:
+        return self._names[n]
+
+    def _float(self, n: Any, user: str = "output") -> str:
+        """The value as floats; each user of an INT8 one gets a DequantizeLinear of its own, as QDQ wants it."""
+        value = self._value(n)
+        if not value.is_quantized:
+            return self._name(n)
+        output = f"{self._name(n)}_for_{user}"
+        return self._add("DequantizeLinear", [self._name(n), *self._steps(self._name(n), value)], output)
+
+    def _steps(self, name: str, value: Tensor) -> tuple[str, str]:
+        """Constants of an INT8 value's scale and zero point."""
+        dtype = value.int_repr().numpy().dtype
+        scale = self._constant(f"{name}_scale", np.array(value.q_scale(), np.float32))
+        return scale, self._constant(f"{name}_zero_point", np.array(value.q_zero_point(), dtype))
+
+    def _quantized(self, name: str, value: Tensor, source: str) -> str:
+        """A float of the ONNX graph, as the INT8 value that torch made of it."""
+        return self._add("QuantizeLinear", [source, *self._steps(name, value)], name)
+
+
+def _info(name: str, tensor: Tensor) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, ONNX_TYPES[tensor.dtype], list(tensor.shape))
+
+
+def _as_list(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, (tuple, list)) else [value]
+
+
+def _args(n: Node) -> list[Any]:
+    """Nodes and plain values that a node was called with."""
+    return list(n.args)
+
+
+def _lowest(value: Tensor) -> int:
+    return -128 if value.dtype == torch.qint8 else 0
+
+
+# --- modules: (writer, node, result, module) -> name ------------------------------------------------------------------
+
+
+def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
+    """Windows of 8 pixels (24 bytes) that begin at every second pixel.
+
+    Those with numbers p, p + 4, p + 8, ... follow each other in a row without a gap, so a row from pixel 2 p on is a
+    quarter of the windows, as it lies; the four are then laid between each other in pieces of 24 bytes.
+    """
+    (frame,) = _args(n)
+    height, width, channels = w._value(frame).shape
+    name, bytes_of_row = n.name, [height, width * channels]
+    flat = w._add("Reshape", [w._name(frame), w._ints(f"{name}_rows", bytes_of_row)], f"{name}_pixels")
+    fours, phases = -(-m.out_width // 4), m.WINDOW // 2
+    surplus = 4 * fours - m.out_width  # windows that nobody asked for, where there are no whole fours
+    right = torch.cat([m.right, m.top[:1, : 6 * surplus].expand(height, -1)], 1)
+    top, bottom = (torch.cat([e, e[:, : 6 * surplus]], 1) for e in (m.top, m.bottom))
+    edges = {"left": m.left, "right": right, "top": top, "bottom": bottom}
+    if m.dtype == torch.qint8:  # pixel - 128; through floats, as no operator of this opset does it on bytes
+        one = w._constant(f"{name}_one", np.array(1, np.float32))
+        shift = w._constant(f"{name}_128", np.array(128, np.uint8))
+        zero = w._constant(f"{name}_0", np.array(0, np.int8))
+        flat = w._add("DequantizeLinear", [flat, one, shift], f"{name}_shifted")
+        flat = w._add("QuantizeLinear", [flat, one, zero], f"{name}_signed")
+        edges = {side: (edge.to(torch.int16) - 128).to(torch.int8) for side, edge in edges.items()}
+    before, after, above, below = (w._constant(f"{name}_{side}", edge) for side, edge in edges.items())
+    rows = w._add("Concat", [before, flat, after], f"{name}_wide", axis=1)
+    rows = w._add("Concat", [above, rows, below], f"{name}_high", axis=0)
+    axis, shape = w._ints(f"{name}_axis", [1]), w._ints(f"{name}_quarter", [m.rows, fours, 1, 3 * m.WINDOW])
+    quarters = []
+    for p in range(phases):
+        start, end = w._ints(f"{name}_from_{p}", [6 * p]), w._ints(f"{name}_to_{p}", [6 * p + 24 * fours])
+        part = w._add("Slice", [rows, start, end, axis], f"{name}_slice_{p}")
+        quarters.append(w._add("Reshape", [part, shape], f"{name}_quarter_{p}"))
+    columns = w._add("Concat", quarters, f"{name}_windows", axis=2)
+    whole = w._ints(f"{name}_whole", [1, m.rows, 4 * fours, 3 * m.WINDOW])
+    columns = w._add("Reshape", [columns, whole], f"{name}_columns")
+    if surplus:
+        start, end, axis = (
+            w._ints(f"{name}_{k}", [v]) for k, v in (("first", 0), ("last", m.out_width), ("across", 2))
+        )
+        columns = w._add("Slice", [columns, start, end, axis], f"{name}_asked")
+    if result.is_quantized:
+        return w._add("Transpose", [columns], name, perm=[0, 3, 1, 2])
+    scale = w._constant(f"{name}_scale", np.array(m.scale, np.float32))
+    floats = [columns, scale, w._constant(f"{name}_zero_point", np.array(m.zero_pixel, np.uint8))]
+    return w._add("Transpose", [w._add("DequantizeLinear", floats, f"{name}_floats")], name, perm=[0, 3, 1, 2])
+
+
+def _geometry(m: nn.Conv2d | int8.Conv2d | nn.MaxPool2d) -> dict[str, list[int]]:
+    def both(value: Any) -> list[int]:
+        return [value, value] if isinstance(value, int) else list(value)
+
+    return {
+        "kernel_shape": both(m.kernel_size),
+        "strides": both(m.stride),
+        "pads": both(m.padding) * 2,
+        "dilations": both(m.dilation),
+    }
+
+
+def _conv(w: _Writer, n: Node, result: Tensor, m: Any, output: str = "") -> str:
+    assert m.bias is not None
+    inputs = [w._float(_args(n)[0], n.name), w._constant(f"{n.target}.weight", m.weight)]
+    inputs.append(w._constant(f"{n.target}.bias", m.bias))
+    return w._add("Conv", inputs, output or n.name, **_geometry(m))
+
+
+def _conv_relu(w: _Writer, n: Node, result: Tensor, m: ConvReLU2d) -> str:
+    return w._add("Relu", [_conv(w, n, result, m[0], f"{n.name}_sums")], n.name)
+
+
+def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
+    """A convolution between DequantizeLinear and QuantizeLinear, which engines compute in INT8 with sums of INT32."""
+    source, weight, bias = _args(n)[0], m.weight(), m.bias()
+    assert bias is not None
+    scales, zeros = weight.q_per_channel_scales(), weight.q_per_channel_zero_points()
+    sums = scales * w._value(source).q_scale()
+    whole_bias = torch.quantize_per_channel(bias.detach(), sums, torch.zeros_like(zeros), 0, torch.qint32).int_repr()
+    inputs = [w._float(source, n.name)]
+    for part, values, steps, zero_type in (
+        ("weight", weight.int_repr(), scales, np.int8),
+        ("bias", whole_bias, sums, np.int32),
+    ):
+        name = f"{n.target}.{part}"
+        scale = w._constant(f"{name}_scale", steps.float())
+        zero = w._constant(f"{name}_zero_point", np.zeros(len(steps), zero_type))
+        inputs.append(w._add("DequantizeLinear", [w._constant(name, values), scale, zero], f"{name}_floats", axis=0))
+    sums_name = w._add("Conv", inputs, f"{n.name}_sums", **_geometry(m))
+    return _rounded(w, n, result, sums_name, relu=isinstance(m, fused_int8.ConvReLU2d))
+
+
+def _rounded(w: _Writer, n: Node, result: Tensor, source: str, *, relu: bool) -> str:
+    """QuantizeLinear of a result; with the ReLU before it, unless clipping at the zero point is that already."""
+    if relu and result.q_zero_point() != _lowest(result):
+        source = w._add("Relu", [source], f"{n.name}_positive")
+    return w._quantized(n.name, result, source)
+
+
+def _linear(w: _Writer, n: Node, result: Tensor, m: nn.Linear) -> str:
+    weight = w._constant(f"{n.target}.weight", m.weight.T)
+    product = w._add("MatMul", [w._float(_args(n)[0], n.name), weight], f"{n.name}_product")
+    return w._add("Add", [product, w._constant(f"{n.target}.bias", m.bias)], n.name)
+
+
+def _max_pool(w: _Writer, n: Node, result: Tensor, m: nn.MaxPool2d) -> str:
+    return w._add("MaxPool", [w._name(_args(n)[0])], n.name, **_geometry(m))  # of bytes, too
+
+
+def _layer_norm(w: _Writer, n: Node, result: Tensor, m: nn.LayerNorm) -> str:
+    inputs = [w._float(_args(n)[0], n.name), w._constant(f"{n.target}.weight", m.weight)]
+    inputs.append(w._constant(f"{n.target}.bias", m.bias))
+    return w._add("LayerNormalization", inputs, n.name, axis=-1, epsilon=m.eps)
+
+
+def _relu(w: _Writer, n: Node, result: Tensor, m: nn.ReLU) -> str:
+    return w._add("Relu", [w._float(_args(n)[0], n.name)], n.name)
+
+
+def _gelu(w: _Writer, n: Node, result: Tensor, m: nn.GELU) -> str:
+    x = w._float(_args(n)[0], n.name)
+    parts = {"root": math.sqrt(2), "one": 1.0, "half": 0.5}
+    root, one, half = (w._constant(f"gelu_{k}", np.array(v, np.float32)) for k, v in parts.items())
+    y = w._add("Erf", [w._add("Div", [x, root], f"{n.name}_scaled")], f"{n.name}_erf")
+    y = w._add("Mul", [x, w._add("Add", [y, one], f"{n.name}_share")], f"{n.name}_twice")
+    return w._add("Mul", [y, half], n.name)
+
+
+def _same(w: _Writer, n: Node, result: Any, m: nn.Module) -> str:
+    return w._name(_args(n)[0])
+
+
+MODULES: dict[type, Callable[..., str]] = {
+    Columns: _columns,
+    nn.Conv2d: _conv,
+    ConvReLU2d: _conv_relu,
+    int8.Conv2d: _int8_conv,
+    fused_int8.ConvReLU2d: _int8_conv,
+    nn.Linear: _linear,
+    nn.MaxPool2d: _max_pool,
+    nn.LayerNorm: _layer_norm,
+    nn.ReLU: _relu,
+    nn.GELU: _gelu,
+    nn.Identity: _same,
+}
+
+
+# --- functions and methods: (writer, node, result) -> name ------------------------------------------------------------
+
+
+def _getitem(w: _Writer, n: Node, result: Any) -> Any:
+    source, index = _args(n)
+    if isinstance(names := w._name(source), list):
+        return names[index]
+    parts = _as_list(index)
+    if any(p is not None and p != slice(None) for p in parts):
+        raise QuantizeError(f"{n.name}: only new axes are taken, not [{index}]", remedy="add it to onnx_graph.py")
+    axes = [i for i, p in enumerate(parts) if p is None]
+    return w._add("Unsqueeze", [names, w._ints(f"{n.name}_axes", axes)], n.name)
+
+
+def _transpose(w: _Writer, n: Node, result: Tensor) -> str:
+    source, *axes = _args(n)
+    perm = list(range(result.dim()))
+    if n.target == "permute":
+        perm = [a % result.dim() for a in axes]
+    else:
+        a, b = axes
+        perm[a], perm[b] = perm[b], perm[a]
+    return w._add("Transpose", [w._name(source)], n.name, perm=perm)
+
+
+def _reshape(w: _Writer, n: Node, result: Tensor) -> str:
+    return w._add("Reshape", [w._name(_args(n)[0]), w._ints(f"{n.name}_shape", result.shape)], n.name)
+
+
+def _squeeze(w: _Writer, n: Node, result: Tensor) -> str:
+    source, axis = _args(n)
+    kind = "Squeeze" if n.target == "squeeze" else "Unsqueeze"
+    return w._add(kind, [w._name(source), w._ints(f"{n.name}_axes", [axis])], n.name)
+
+
+def _cast(w: _Writer, n: Node, result: Tensor) -> str:
+    return w._add("Cast", [w._name(_args(n)[0])], n.name, to=ONNX_TYPES[result.dtype])
+
+
+def _cat(w: _Writer, n: Node, result: Tensor) -> str:
+    parts, axis = _args(n)
+    return w._add("Concat", [w._float(p, n.name) for p in parts], n.name, axis=axis)
+
+
+def _binary(kind: str) -> Callable[[_Writer, Node, Tensor], str]:
+    return lambda w, n, result: w._add(kind, [w._float(x, n.name) for x in _args(n)], n.name)
+
+
+def _addcmul(w: _Writer, n: Node, result: Tensor) -> str:
+    x, y, scale = (w._float(a, n.name) for a in _args(n))
+    return w._add("Add", [x, w._add("Mul", [y, scale], f"{n.name}_product")], n.name)
+
+
+def _attend(w: _Writer, n: Node, result: Tensor) -> str:
+    q, k, v = (w._float(a, n.name) for a in _args(n))
+    scale = w._constant(f"{n.name}_scale", np.array(1 / math.sqrt(result.shape[-1]), np.float32))
+    q = w._add("Mul", [q, scale], f"{n.name}_queries")
+    k = w._add("Transpose", [k], f"{n.name}_keys", perm=[0, 1, 3, 2])
+    shares = w._add("Softmax", [w._add("MatMul", [q, k], f"{n.name}_scores")], f"{n.name}_shares", axis=-1)
+    return w._add("MatMul", [shares, v], n.name)
+
+
+def _quantize(w: _Writer, n: Node, result: Tensor) -> str:
+    return w._quantized(n.name, result, w._float(_args(n)[0], n.name))
+
+
+def _dequantize(w: _Writer, n: Node, result: Tensor) -> str:
+    return w._float(_args(n)[0], n.name)
+
+
+def _bytes(w: _Writer, n: Node, result: Tensor) -> str:
+    return w._name(_args(n)[0])
+
+
+def _int8_add(w: _Writer, n: Node, result: Tensor) -> str:
+    x, y, *_ = _args(n)
+    both = [w._float(x, f"{n.name}_left"), w._float(y, f"{n.name}_right")]
+    return _rounded(w, n, result, w._add("Add", both, f"{n.name}_sum"), relu=n.target is torch.ops.quantized.add_relu)
+
+
+FUNCTIONS: dict[Any, Callable[[_Writer, Node, Any], Any]] = {
+    operator.getitem: _getitem,
+    "transpose": _transpose,
+    "permute": _transpose,
+    "flatten": _reshape,
+    "unflatten": _reshape,
+    "reshape": _reshape,
+    "squeeze": _squeeze,
+    "unsqueeze": _squeeze,
+    "float": _cast,
+    torch.cat: _cat,
+    operator.add: _binary("Add"),
+    "add": _binary("Add"),  # of a constant and a value, in this order
+    operator.mul: _binary("Mul"),
+    "mul": _binary("Mul"),
+    torch.addcmul: _addcmul,
+    F.scaled_dot_product_attention: _attend,
+    torch.quantize_per_tensor: _quantize,
+    "dequantize": _dequantize,
+    "int_repr": _bytes,
+    torch.ops.quantized.add_relu: _int8_add,
+    torch.ops.quantized.add: _int8_add,
+}

@@ -1,0 +1,108 @@
+"""Do a policy's numbers fit the recordings? The wrong statistics raise nothing: they steer.
+
+    fit = fits(checkpoint, samples, recordings.action_range())
+    for warning in fit.warnings(): ...
+
+The policy plans on a few recorded frames. What it predicts must lie where the recorded actions do, and what it is told
+of its state must be of the size that it was trained on, once both are normalised by the checkpoint's statistics.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rover_lib.workshop.act import ACT, inputs_of, predictions
+from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.compare import thinned
+from rover_lib.workshop.judge import Range, constant_actions
+
+FRAMES = 12  # planned in FP32: ten seconds for a policy of full size
+BEYOND = 0.5  # of the recorded range, past either end: further than a policy overshoots
+MOST_BEYOND_PCT = 5.0
+LEAST_SPREAD = 0.1  # of the recorded spread: what moves less is no driver's
+LARGEST_STATE = 10.0  # standard deviations; those of other units are hundreds
+
+
+@dataclass(frozen=True)
+class Action:
+    """One action's numbers: recorded and predicted ends, how much is predicted beyond, and the spreads' ratio.
+
+    beyond_pct: of the predicted values, past the recorded range by more than BEYOND of it.
+    """
+
+    name: str
+    recorded: Range
+    predicted: Range
+    beyond_pct: float
+    spread: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What `fits` found. largest_state: (S,) by name, of the normalised recorded states, None if they stay raw."""
+
+    frames: int
+    actions: tuple[Action, ...]
+    largest_state: dict[str, float] | None
+
+    def table(self) -> str:
+        """For a reader: where actions were recorded, and where this policy's lie on the same frames."""
+        wide = max(9, *(len(a.name) for a in self.actions))
+        lines = [f"{'':{wide}}  {'recorded':>20}  {'predicted':>20}"]
+        for a in self.actions:
+            recorded, predicted = (f"{low:.3g} to {high:.3g}" for low, high in (a.recorded, a.predicted))
+            lines.append(f"{a.name:{wide}}  {recorded:>20}  {predicted:>20}")
+        return "\n".join(lines)
+
+    def warnings(self) -> list[str]:
+        """A sentence for each number that does not fit; the remedy is always the same one."""
+        remedy = "are these the recordings, and the statistics, that it was trained with?"
+        warnings = []
+        for a in self.actions:
+            if a.beyond_pct > MOST_BEYOND_PCT:
+                what = f"{a.beyond_pct:.0f} % of its predictions are far outside of what was recorded"
+                warnings.append(f"{a.name}: {what} ({a.predicted[0]:.3g} to {a.predicted[1]:.3g}); {remedy}")
+            elif a.spread < LEAST_SPREAD:
+                what = f"its predictions vary {100 * a.spread:.0f} % as much as what was recorded"
+                warnings.append(f"{a.name}: {what}; {remedy}")
+        for name, largest in (self.largest_state or {}).items():
+            if not largest <= LARGEST_STATE:
+                what = f"the policy is told up to {largest:.3g} standard deviations"
+                warnings.append(f"state {name}: {what}; {remedy}")
+        return warnings
+
+    def summary(self) -> dict[str, Any]:
+        """For load.json."""
+        actions = {
+            a.name: {"predicted": list(a.predicted), "beyond_pct": a.beyond_pct, "spread": a.spread}
+            for a in self.actions
+        }
+        return {"frames": self.frames, "actions": actions, "warnings": self.warnings()}
+
+
+def fits(checkpoint: Checkpoint, samples: Sequence[Any], action_range: Mapping[str, Range]) -> Fit:
+    """Plan on a few of the samples in FP32 and hold the plans against what was recorded there.
+
+    samples: with frame_bgr(), state (S,), chunk (C, A) and is_pad (C,). An action that never changes in the recordings
+    is left out: nobody knows how far it may go.
+    """
+    config, few = checkpoint.config, thinned(samples, FRAMES)
+    plans = predictions(ACT(config, checkpoint.weights), [inputs_of(s, config) for s in few]).numpy()
+    known = ~np.stack([s.is_pad for s in few])
+    recorded = np.stack([s.chunk for s in few])
+    actions = []
+    for i, (name, (low, high)) in enumerate(action_range.items()):
+        if name in constant_actions(action_range):
+            continue
+        values, margin = plans[..., i], BEYOND * (high - low)
+        beyond = (values < low - margin) | (values > high + margin)
+        spread = float(values[known].std() / max(recorded[..., i][known].std(), 1e-12))
+        ends = float(values.min()), float(values.max())
+        actions.append(Action(name, (low, high), ends, 100 * float(beyond.mean()), spread))
+    largest = None
+    if (norm := config.state_norm) is not None:
+        states = np.stack([s.state for s in samples]) * np.asarray(norm.scale) + np.asarray(norm.shift)
+        largest = dict(zip(config.state_names, np.abs(states).max(0).tolist(), strict=True))
+    return Fit(len(few), tuple(actions), largest)

@@ -1,0 +1,196 @@
+"""What a run ends with: its verdict as run.json, as one page of HTML, and in words.
+
+content = write("runs/mine")        # run.json and report.html, from the JSON that its stages left
+print(text(content["metrics"]))
+"""
+
+import os
+import socket
+from base64 import b64encode
+from collections.abc import Mapping
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from rover_lib.onboard.columns import aligned, number
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+from rover_lib.workshop.verdict import CALLED, Names, against, count, error_pct, verdict
+
+STAGES = ("load", "quantize", "compare", "benchmark")  # without which there is nothing to judge
+LATER = ("arm", "distill")  # that `make arm` and `rover world students` add to a run
+PAGE = "report.html"
+FIGURES = {  # of the run's folder, with what each shows
+    "04_action_error": "How far each mode's plan is from FP32's, step by step",
+    "04_worst_frames": "The frames on which static INT8 is furthest from FP32",
+    "03_sensitivity": "Which block takes how much of the error",
+    "04_hits": "Balloons hit, by mode",
+    "05_latency": "How long a plan takes, by mode",
+}
+# Narrow columns may be scrolled to, but the page itself never is: it is read on a phone beside the track.
+STYLE = """
+body{font:16px/1.5 system-ui,sans-serif;margin:0 auto;max-width:46rem;padding:1rem;color:#222;background:#fff}
+h1{font-size:1.4rem;line-height:1.25}h2{font-size:1.1rem;margin-top:2rem}
+.verdict{border-left:.4rem solid #2a7;padding:.2rem .8rem;background:#f2faf6}.none{border-color:#c33;background:#fdf3f3}
+.wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
+td,th{padding:.25rem .6rem;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
+td:first-child,th:first-child{text-align:left}tr.deploy{font-weight:bold;background:#f2faf6}
+img{max-width:100%;height:auto}figure{margin:1rem 0}figcaption,small{color:#666}
+code{font-size:.9rem;overflow-wrap:anywhere}li{margin:.3rem 0}
+"""
+
+
+def write(run_dir: Path | str) -> dict[str, Any]:
+    """Judge a run and leave run.json and report.html in its folder. Returns run.json's content.
+
+    Made anew of what is there, so that `make arm` and `rover world students` count once they were made. Raises
+    RoverError where a stage is missing.
+    """
+    folder, p = Path(run_dir), params()
+    files = _files(folder)
+    contents = {stage: read_stage(path, stage) for stage, path in files.items()}
+    given = contents["load"]["params"]
+    names = Names(*(_typed(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
+    judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names)
+    judged = {"headline": headline(judged), "host": contents["benchmark"]["env"]["host"], **judged}
+    inputs = {path.name: sha256_of(path) for path in files.values()}
+    content = write_stage(
+        folder / "run.json", "run", params={"verdict": p["verdict"], "gates": p["gates"]}, metrics=judged, inputs=inputs
+    )
+    figures = {name: (folder / "figures" / f"{name}.png") for name in FIGURES}
+    with atomic_path(folder / PAGE) as temporary:
+        temporary.write_text(page(content, names.name, {n: f.read_bytes() for n, f in figures.items() if f.is_file()}))
+    return content
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    """The JSON of each stage; the benchmark is this machine's, where there is one. Raises RoverError."""
+    if not folder.is_dir():
+        raise RoverError(f"{folder}: there is no such run", remedy="rover list shows the runs that there are")
+    benchmarks = sorted(folder.glob("benchmark-*.json"), key=lambda p: p.stem != f"benchmark-{socket.gethostname()}")
+    files = {stage: folder / f"{stage}.json" for stage in (*STAGES, *LATER)}
+    files["benchmark"] = benchmarks[0] if benchmarks else folder / "benchmark-<host>.json"
+    if missing := [files[stage].name for stage in STAGES if not files[stage].is_file()]:
+        raise RoverError(
+            f"{folder}: no verdict without {', '.join(missing)}", remedy="rover run makes them, of a checkpoint"
+        )
+    files = {stage: path for stage, path in files.items() if path.is_file()}
+    if "distill" in files and "recommendation" not in read_stage(files["distill"], "distill")["metrics"]:
+        del files["distill"]  # how this policy itself was taught
+    return files
+
+
+def _typed(path: Path | str) -> str:
+    """A path as it would be typed here: relative where it is below this folder."""
+    path = Path(path)
+    return os.path.relpath(path) if path.is_absolute() and path.is_relative_to(Path.cwd()) else str(path)
+
+
+# --- in words ---------------------------------------------------------------------------------------------------------
+
+
+def headline(judged: Mapping[str, Any]) -> str:
+    """The verdict in one line, as `rover list` shows it."""
+    failed = judged["failed"]
+    misses = f"; {count(len(failed), 'gate')} failed" if failed else ""
+    if judged["deploy"] is None:
+        return f"deploy nothing{misses}"
+    row = next(row for row in judged["modes"] if row["mode"] == judged["deploy"])
+    return f"deploy {judged['artifact']}, {row['size_mb']:.1f} MB, {error_pct(row):.2f} % off{misses}"
+
+
+def text(judged: Mapping[str, Any]) -> str:
+    """The verdict for a terminal, in lines."""
+    lines = [f"Verdict: {judged['headline']}", *(f"  {line}" for line in judged["why"]), "", *table(judged)]
+    if judged["failed"]:
+        lines += ["", "What failed:"]
+        for row in judged["failed"]:
+            lines += [f"  {against(row)}", *(f"    - {remedy}" for remedy in row["remedies"])]
+    if judged["cautions"]:
+        lines += ["", "To know:", *(f"  {line}" for line in judged["cautions"])]
+    lines += ["", "Next:", *(f"  {step['command']}\n      {step['why']}" for step in judged["next"])]
+    return "\n".join(lines)
+
+
+def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """The modes beside each other, a header first: for a terminal and for a page. A dash where nothing was measured."""
+    actions = list(dict.fromkeys(action for row in judged["modes"] for action in row["errors_pct"]))
+    counted = any(row["instructions_g"] for row in judged["modes"])
+    header = [
+        "",
+        "MB",
+        "times smaller",
+        *(f"{action} error, %" for action in actions),
+        "hits",
+        "p50 ms",
+        "times faster",
+    ]
+    lines = [tuple([*header, *(["10^9 instructions"] if counted else [])])]
+    for row in judged["modes"]:
+        errors = [number(row["errors_pct"].get(action), ".2f") for action in actions]
+        hits = f"{row['hits']} of {row['trials']}" if row["trials"] else "-"
+        cells = [CALLED[row["mode"]], f"{row['size_mb']:.1f}", f"{row['times_smaller']:.1f}", *errors, hits]
+        cells += [number(row["latency_p50_ms"], ".1f"), number(row["times_faster"], ".1f")]
+        lines.append(tuple([*cells, *([number(row["instructions_g"], ".3g")] if counted else [])]))
+    return lines
+
+
+def table(judged: Mapping[str, Any]) -> list[str]:
+    """`columns` in a terminal, and below it what each mode is worth."""
+    return aligned(columns(judged)) + [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
+
+
+# --- as a page --------------------------------------------------------------------------------------------------------
+
+
+def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) -> str:
+    """run.json as one HTML page that needs no other file. name: the run's. figures: PNGs by their names in FIGURES."""
+    judged, env = content["metrics"], content["env"]
+    title = f"{name}: {judged['headline']}"
+    kind = "verdict none" if judged["deploy"] is None else "verdict"
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        f'<div class="{kind}">{_paragraphs(judged["why"])}</div>',
+        "<h2>The modes beside each other</h2>",
+        _html_table(judged),
+        _list([f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]),
+        f"<small>Errors are mean differences to FP32, of the recorded range. Speed: {escape(judged['timing'])}, on "
+        f"{escape(judged['host'])}.</small>",
+    ]
+    if judged["failed"]:
+        parts.append("<h2>What failed, and what to do</h2>")
+    for row in judged["failed"]:
+        parts += [f"<p><b>{escape(against(row))}</b></p>", _list(row["remedies"])]
+    if judged["cautions"]:
+        parts += ["<h2>To know</h2>", _list(judged["cautions"])]
+    steps = "".join(f"<li><code>{escape(s['command'])}</code><br>{escape(s['why'])}</li>" for s in judged["next"])
+    parts += ["<h2>Next</h2>", f"<ol>{steps}</ol>"]
+    for figure, caption in FIGURES.items():
+        if figure in figures:
+            source = f"data:image/png;base64,{b64encode(figures[figure]).decode()}"
+            picture = f'<img src="{source}" alt="{escape(caption)}">'
+            parts.append(f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>")
+    made = ", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key))
+    parts.append(f"<small>{escape(made)}</small>")
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(name)}</title>'
+    return f'<!doctype html><html lang="en"><head>{head}<style>{STYLE}</style></head><body>\n' + "\n".join(
+        [*parts, "</body></html>\n"]
+    )
+
+
+def _html_table(judged: Mapping[str, Any]) -> str:
+    header, *rows = columns(judged)
+    lines = ["<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in header) + "</tr>"]
+    for row, mode in zip(rows, judged["modes"], strict=True):
+        kind = ' class="deploy"' if mode["mode"] == judged["deploy"] else ""
+        lines.append(f"<tr{kind}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
+    return '<div class="wide"><table>' + "\n".join(lines) + "</table></div>"
+
+
+def _list(lines: list[str]) -> str:
+    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def _paragraphs(lines: list[str]) -> str:
+    return "".join(f"<p>{escape(line)}</p>" for line in lines)

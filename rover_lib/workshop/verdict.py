@@ -1,0 +1,427 @@
+"""Which artifact to deploy, and what to do about what failed? By rule, from the JSON that the stages of a run left.
+
+    stages = {name: read_stage(...)["metrics"] for name in ("load", "quantize", "compare", "benchmark")}
+    judged = verdict(stages, params(), Names("runs/mine", "best_model.pth", "episodes"))
+
+The rule, with its limits in params.yml's sections `verdict` and `gates`: of the modes that keep every gate, those that
+are as fast as the fastest; of these, those that are as true to FP32 as the truest; of these, the smallest; and where
+that leaves several, the first of PREFERRED. FP32 always keeps its gates of error, so that there is an artifact to
+deploy whenever the policy itself drives.
+"""
+
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rover_lib.onboard.columns import ratio
+from rover_lib.workshop import judge
+from rover_lib.workshop.compare import GATED, MODES, gate, gates
+
+CALLED = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed INT8"}
+PREFERRED = ("fp32", "static", "mixed", "dynamic")  # where nothing else parts them: what was trained, then the simplest
+COUNTED = "counted on an emulated Cortex-A76"
+NEXT_COMMANDS = 3
+MOST_EPISODES = 3  # named for a remedy
+
+Stages = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Names:
+    """What a user types for the run's folder, its checkpoint and its recordings, as from where they stand."""
+
+    run: str
+    checkpoint: str
+    episodes: str
+
+    @property
+    def name(self) -> str:
+        return self.run.rstrip("/").rpartition("/")[2]
+
+    def artifact(self, mode: str) -> str:
+        return f"{self.run.rstrip('/')}/policy_{mode}.pt"
+
+
+def verdict(stages: Stages, params: Mapping[str, Any], names: Names) -> dict[str, Any]:
+    """What run.json says of a run.
+
+    stages: metrics by stage: load, quantize, compare and benchmark; arm and distill where they were made. params:
+    params.yml's content. Its "deploy" is None where no artifact of this policy ought to drive a car.
+    """
+    rows = _rows(stages, params)
+    failed = _failed(stages, params, names, rows)
+    unfit = _does_not_drive(stages, failed)
+    best = _best(list(rows.values()), params["verdict"])
+    deploy = None if unfit else best["mode"]
+    for row in rows.values():
+        row["because"] = _because(row, best, params["verdict"])
+    judged = {
+        "deploy": deploy,
+        "artifact": None if deploy is None else f"policy_{deploy}.pt",
+        "why": unfit or _why(best, rows["fp32"]),
+        "timing": _timing(rows),
+        "modes": list(rows.values()),
+        "failed": failed,
+        "cautions": _cautions(stages, params, rows, best),
+    }
+    return judged | {"next": _next(judged, stages, names)}
+
+
+# --- the modes beside each other --------------------------------------------------------------------------------------
+
+
+def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """A row for each mode that was compared, FP32 first. Units are in the keys."""
+    compared, timed = stages["compare"], stages["benchmark"]["artifacts"]
+    counted = stages.get("arm", {}).get("artifacts", {})
+    fp32 = compared["fp32"]
+    rows = {}
+    for mode in ("fp32", *(m for m in MODES if m in compared["modes"])):
+        found, time = fp32 if mode == "fp32" else compared["modes"][mode], timed.get(mode, {})
+        errors = {k: v for k, v in found.items() if k.endswith("_mae_pct")}
+        rows[mode] = {
+            "mode": mode,
+            "size_mb": found["size_mb"],
+            "times_smaller": fp32["size_mb"] / found["size_mb"],
+            "latency_p50_ms": time.get("latency_p50_ms"),
+            "latency_p95_ms": time.get("latency_p95_ms"),
+            "times_faster": ratio(timed.get("fp32", {}).get("latency_p50_ms"), time.get("latency_p50_ms")),
+            "floor_ms": time.get("floor_ms"),
+            "instructions_g": counted.get(f"policy_{mode}", {}).get("instructions_g"),
+            "errors_pct": {k.removesuffix("_mae_pct"): v for k, v in errors.items()},
+            "hits": found["hits"],
+            "trials": found["trials"],
+            "float_blocks": stages["quantize"]["modes"].get(mode, {}).get("float_blocks", []),
+            "missed_gates": [] if mode == "fp32" else _missed(compared, params["gates"], mode),
+        }
+    return rows
+
+
+def _missed(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str) -> list[dict[str, Any]]:
+    """The gates that a mode does not keep, each said once: a loss in general only where no action has its own gate."""
+    rows = [r for r in gates(compared, limits, mode) if r["passed"] is False and r["gate"].startswith(f"{mode} ")]
+    keys = {r["gate"].partition(" ")[2] for r in rows}
+    doubled = set()
+    if any(k.endswith("_mae_pct") for k in keys):
+        doubled.add("accuracy_loss_pct")
+    if "size_mb" in keys:
+        doubled.add("model_size_mb")
+    return [_said(r) for r in rows if r["gate"].partition(" ")[2] not in doubled]
+
+
+def _best(rows: Sequence[dict[str, Any]], limits: Mapping[str, Any]) -> dict[str, Any]:
+    """The row that the rule takes. FP32 has no gates to miss, so one is always left."""
+    same = 1 + limits["worth_pct"] / 100
+    left = _candidates(rows)
+    key = _work_key(left)
+    if key:
+        fastest = min(row[key] for row in left)
+        left = [row for row in left if row[key] <= fastest * same]
+    truest = min(error_pct(row) for row in left)
+    left = [row for row in left if error_pct(row) <= truest + limits["better_points"]]
+    smallest = min(row["size_mb"] for row in left)
+    left = [row for row in left if row["size_mb"] <= smallest * same]
+    return min(left, key=lambda row: PREFERRED.index(row["mode"]))
+
+
+def _candidates(rows: Iterable[Mapping[str, Any]]) -> list[Any]:
+    """Those that keep their gates; a mixed one that has no block in float is static INT8 once more."""
+    return [row for row in rows if not row["missed_gates"] and (row["mode"] != "mixed" or row["float_blocks"])]
+
+
+def _work_key(rows: Sequence[Mapping[str, Any]]) -> str | None:
+    """What says which is fastest: instructions where all are counted, else the time here; None without either."""
+    return next((k for k in ("instructions_g", "latency_p50_ms") if all(row[k] for row in rows)), None)
+
+
+def error_pct(row: Mapping[str, Any]) -> float:
+    """The worse action's error, in percent of its recorded range; 0 for FP32, and where nothing is judged."""
+    return judge.worst(row["errors_pct"]) or 0.0
+
+
+def _timing(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """Where the figures of speed come from."""
+    key = _work_key(_candidates(rows.values()))
+    return {"instructions_g": COUNTED, "latency_p50_ms": "measured here", None: "not measured"}[key]
+
+
+# --- what failed, and what to do --------------------------------------------------------------------------------------
+
+
+def _said(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of `compare.gates` with what it is in words."""
+    mode, _, key = row["gate"].partition(" ")
+    return {**row, "words": in_words(mode, key)}
+
+
+def in_words(mode: str, key: str) -> str:
+    """A gate as people call it: "throttle error of static INT8"."""
+    of = CALLED.get(mode, mode)
+    if key.endswith("_mae_pct"):
+        return f"{key.removesuffix('_mae_pct')} error of {of}, % of the recorded range"
+    return {
+        "hits": f"balloons that {of} hits",
+        "hits lost": f"balloons that {of} misses and FP32 hits",
+        "size_mb": f"size of {of}, MB",
+        "model_size_mb": f"size of {of}, MB",
+        "accuracy_loss_pct": f"largest error of {of}, % of the recorded range",
+        "floor_ms": f"a plan of {of} on a Pi 5 at the very best, ms (computed)",
+    }.get(key, f"{key} of {of}")
+
+
+def _failed(
+    stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Each gate that the policy, or the mode that a Pi is meant to run, does not keep: with its remedies, best first.
+
+    What this workstation measures of time and memory fails no gate here: those are a Pi's.
+    """
+    limits, hits = params["gates"], stages["compare"]["fp32"]["hits"]
+    failed = []
+    trained = gate("fp32 hits", hits, ">=", limits["fp32_hits"])
+    if trained["passed"] is False:
+        remedies = [
+            "No other format heals this: train longer, on more recordings.",
+            "Record drives in which the car is off its way and is steered back, so that it learns to.",
+        ]
+        failed.append(_said(trained) | {"remedies": remedies})
+    for row in rows[GATED]["missed_gates"] if GATED in rows else []:
+        failed.append(row | {"remedies": _remedies(row["gate"].partition(" ")[2], stages, params, names, rows)})
+    promised = limits["original"]["latency_mean_ms"][1]
+    floor = gate(f"{GATED} floor_ms", rows.get(GATED, {}).get("floor_ms"), "<=", promised)
+    if floor["passed"] is False:
+        remedies = [
+            "Driving at 30 Hz does not need it, as one plan is a second of driving; no program can change it.",
+            f"A smaller policy can: `{_smaller(stages, names)}`.",
+        ]
+        failed.append(_said(floor) | {"remedies": remedies})
+    return failed
+
+
+def _remedies(
+    key: str,
+    stages: Stages,
+    params: Mapping[str, Any],
+    names: Names,
+    rows: Mapping[str, Mapping[str, Any]],
+) -> list[str]:
+    """What to do about a gate that static INT8 does not keep, the cheapest first."""
+    if key in ("size_mb", "model_size_mb"):
+        return [f"INT8 has done what it can; a smaller policy is smaller: `{_smaller(stages, names)}`."]
+    action = key.removesuffix("_mae_pct") if key.endswith("_mae_pct") else None
+    remedies = [
+        _of_mixed(params, rows),
+        f"Train it for INT8: `{_qat(names)}`, then `rover run` on what it leaves.",
+    ]
+    if action and (block := _worst_block(stages["quantize"].get("sensitivity", {}), action)):
+        remedies.append(f"Most of it comes from {block[0]}: {block[1]:.2f} % with that alone in INT8 (notebook 03).")
+    if clipped := _clipped(stages["quantize"], params):
+        remedies.append(
+            f"Calibration did not show {clipped} all that came later: record more of what calibration lacked, "
+            "other light, other places, sharper turns."
+        )
+    if action and (worst := _worst_episodes(stages["compare"], action)):
+        remedies.append(f"Record more drives like {worst}, on whose frames it is worst (notebook 04 shows them).")
+    return remedies
+
+
+def _of_mixed(params: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]]) -> str:
+    mixed = rows.get("mixed")
+    if mixed is None or not mixed["float_blocks"]:
+        most = params["quantization"]["mixed_max_cost_pct"]
+        return f"Mixed could leave no block in float for {most:g} % of cost: raise mixed_max_cost_pct in params.yml."
+    blocks = ", ".join(mixed["float_blocks"])
+    if mixed["missed_gates"]:
+        missed = ", ".join(row["words"] for row in mixed["missed_gates"])
+        return f"Mixed does not heal it: it leaves {blocks} in float, and still misses: {missed}."
+    return f"Mixed heals it: it leaves {blocks} in float, and its error is {error_pct(mixed):.2f} % at most."
+
+
+def _worst_block(sensitivity: Mapping[str, Mapping[str, float | None]], action: str) -> tuple[str, float] | None:
+    alone = {block: errors.get(f"{action}_mae_pct") for block, errors in sensitivity.items()}
+    judged = {block: error for block, error in alone.items() if error is not None}
+    return max(judged.items(), key=lambda item: item[1], default=None)
+
+
+def _clipped(quantized: Mapping[str, Any], params: Mapping[str, Any]) -> str:
+    limit = params["quantization"]["clipped_warn_pct"]
+    return _some([row["name"] for row in quantized.get("layers", []) if (row.get("clipped_pct") or 0) > limit])
+
+
+def _worst_episodes(compared: Mapping[str, Any], action: str) -> str:
+    frames = [w for w in compared.get("worst", []) if (w["mode"], w["action"]) == (GATED, action) and w["episode"]]
+    return _some(list(dict.fromkeys(str(w["episode"]) for w in frames)))
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_EPISODES} more" if len(names) > MOST_EPISODES else ""
+    return ", ".join(names[:MOST_EPISODES]) + more
+
+
+def _qat(names: Names) -> str:
+    return f"rover distill {_shell(names.checkpoint, names.episodes)} --qat --name {_shell(f'{names.name}-qat')}"
+
+
+def _smaller(stages: Stages, names: Names) -> str:
+    """rover distill, to half of the picture's sides; fewer decoder layers where there are several."""
+    report = stages["load"]["checkpoint"]
+    config = report.get("trainer_config") or {}
+    width, height = config.get("image_width"), config.get("image_height")
+    shape = [f"--size {width // 2}x{height // 2}"] if width and height else []
+    layers = len({block.split(".")[1] for block in report["macs_by_block"] if block.startswith("decoder.")})
+    if layers > 2:
+        shape.append("--decoder-layers 2")
+    if not shape:
+        shape.append("--feedforward 1600")
+    name = _shell(f"{names.name}-small")
+    return f"rover distill {_shell(names.checkpoint, names.episodes)} {' '.join(shape)} --name {name}"
+
+
+def _shell(*words: str) -> str:
+    return shlex.join(words)
+
+
+# --- in sentences -----------------------------------------------------------------------------------------------------
+
+
+def _does_not_drive(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Why no artifact of this policy ought to drive a car; empty where that is not known to be so."""
+    looking = stages["compare"].get("looking", {})
+    actions = [k.removesuffix("_apart_pct") for k, v in looking.items() if k.endswith("_apart_pct") and v is not None]
+    if actions and not any(judge.follows(looking[f"{a}_by_picture_pct"], looking[f"{a}_apart_pct"]) for a in actions):
+        return ["The policy ignores its camera and copies its state: it would leave the track. Train it again."]
+    if any(row["gate"] == "fp32 hits" for row in failed):
+        fp32 = stages["compare"]["fp32"]
+        return [
+            f"As it was trained, in FP32, it hits {fp32['hits']} of {fp32['trials']} balloons: it does not drive yet."
+        ]
+    return []
+
+
+def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
+    """Why this one, each reason a sentence."""
+    if best is fp32:
+        return ["No INT8 mode keeps every gate and is worth what it costs: FP32 is what was trained."]
+    errors = [f"{action} {judge.shown_pct(e).strip()}" for action, e in best["errors_pct"].items()]
+    lines = [f"It keeps every gate: against FP32 it is off by {', '.join(errors)} of the recorded range."]
+    if best["trials"]:
+        lines.append(f"It hits {best['hits']} of {best['trials']} balloons, FP32 {fp32['hits']}.")
+    size = f"It has {best['size_mb']:.1f} MB, {best['times_smaller']:.1f} times smaller than FP32"
+    if best["instructions_g"] and fp32["instructions_g"]:
+        counts = f"{best['instructions_g']:.3g} G instructions instead of {fp32['instructions_g']:.3g}"
+        lines.append(f"{size}, and needs {counts} ({COUNTED}).")
+    elif best["times_faster"]:
+        times = f"{best['latency_p50_ms']:.1f} ms instead of {fp32['latency_p50_ms']:.1f}"
+        lines.append(f"{size}, and {best['times_faster']:.1f} times as fast ({times}, p50, measured here).")
+    else:
+        lines.append(f"{size}.")
+    return lines
+
+
+def _because(
+    row: Mapping[str, Any],
+    best: Mapping[str, Any],
+    limits: Mapping[str, Any],
+) -> str:
+    """Why a mode is the one to deploy, or not worth it, in one sentence."""
+    if row is best:
+        return "the one to deploy"
+    if row["missed_gates"]:
+        return "misses " + "; ".join(against(missed) for missed in row["missed_gates"])
+    if row["mode"] == "mixed" and not row["float_blocks"]:
+        return "is static INT8 once more: no block had to stay in float"
+    key = _work_key([row, best])
+    other = CALLED[best["mode"]]
+    if key and row[key] > best[key] * (1 + limits["worth_pct"] / 100):
+        times, size = row[key] / best[key], row["size_mb"] / best["size_mb"]
+        how = (
+            "takes {:.1f} times as long as {}"
+            if key == "latency_p50_ms"
+            else "needs {:.1f} times the instructions of {}"
+        )
+        larger = f", and its file is {size:.1f} times as large" if size > 1 + limits["worth_pct"] / 100 else ""
+        better = error_pct(best) - error_pct(row)
+        truer = (
+            f" for {better:.2f} points less error" if better > limits["better_points"] and row["mode"] != "fp32" else ""
+        )
+        return how.format(times, other) + larger + truer
+    if error_pct(row) > error_pct(best) + limits["better_points"]:
+        return f"is no faster than {other}, and {error_pct(row):.2f} % off"
+    return f"is no better than {other}: as fast, as true and no smaller"
+
+
+def against(row: Mapping[str, Any]) -> str:
+    return (
+        f"{row['words']}: {row['found']:.3g}, {'at least' if row['relation'] == '>=' else 'at most'} {row['limit']:g}"
+    )
+
+
+def _cautions(
+    stages: Stages, params: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]], best: Mapping[str, Any]
+) -> list[str]:
+    """What limits the verdict: too few recordings, nobody who drove, a time that is not a Pi's."""
+    compared, split = stages["compare"], stages["load"]["split"]
+    lines = []
+    shared = set(split["held_out"]) & set(split["calibration"])
+    if shared or len(split["held_out"]) < params["verdict"]["held_out_episodes"]:
+        alone = ", which calibrated too" if shared else ""
+        lines.append(
+            f"Judged on {compared['frames']} frames of {count(len(split['held_out']), 'episode')}{alone}: too few to "
+            "be sure. Record some 20 drives more, in other light and places."
+        )
+    if not compared["fp32"]["trials"]:
+        lines.append(
+            "Nobody drove: judged by errors on recordings alone. The first metres are the test; hold the stick."
+        )
+    lines += [f"{warning}." for warning in (*compared.get("warnings", []), *stages["quantize"].get("warnings", []))]
+    if _timing(rows) == "measured here":
+        lines.append(
+            "The times are this machine's, and modes may stand in another order on a Pi: `ansible/benchmark.yml` takes "
+            "them there."
+        )
+    spread = max((r["latency_p95_ms"] / r["latency_p50_ms"] for r in rows.values() if r["latency_p50_ms"]), default=0)
+    if spread > params["verdict"]["busy_p95"]:
+        lines.append(
+            f"This machine was busy when it took the times (p95 is {spread:.1f} times p50): take them on a quiet one."
+        )
+    if best["mode"] == "fp32" and best["floor_ms"]:
+        lines.append(f"A plan in FP32 takes a Pi 5 at least {best['floor_ms']:.0f} ms (computed).")
+    student = stages.get("distill", {}).get("recommendation", {}).get("name", "teacher")
+    if student != "teacher":
+        lines.append(f"A smaller policy may take its place: {student}, by `rover world students`.")
+    return lines
+
+
+def count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[str, str]]:
+    """The next three commands to type, with the reason for each."""
+    deploy, drove = judged["deploy"], bool(stages["compare"]["fp32"]["trials"])
+    run = _shell("rover", "run", f"runs/{names.name}-qat/best_model.pth", names.episodes, "--name", f"{names.name}-qat")
+    if deploy is None:
+        commands = [
+            (f"make lab NAME={_shell(names.name)}", "look at notebook 01, what the car saw, and 04, what it plans"),
+            ("rover record --max-seconds 30 episodes", "more drives, with corrections; on the car"),
+            (_shell("rover", "inspect", names.episodes), "what is in the recordings, and what is wrong with them"),
+        ]
+        return [{"command": command, "why": why} for command, why in commands]
+    artifact = names.artifact(deploy)
+    allow = "" if deploy in ("static", "mixed") else """ -e '{"rover_allow": ["mode"]}'"""
+    play = "ansible-playbook -i inventory.ini ansible/"
+    commands = []
+    if drove:
+        commands.append((_shell("rover", "drive", artifact, "--world", "--max-seconds", "60"), "watch it drive"))
+    if not any(row["gate"].startswith(GATED) and not row["gate"].endswith("floor_ms") for row in judged["failed"]):
+        commands.append((f"{play}deploy.yml -e {_shell(f'rover_artifact={artifact}')}{allow}", "put it on the rover"))
+        commands.append((f"{play}benchmark.yml", "take its time there"))
+        commands.append((f"{play}drive.yml --limit rover1", "drive, transmitter in hand"))
+    else:
+        if deploy == "mixed":
+            commands.append((f"{play}deploy.yml -e {_shell(f'rover_artifact={artifact}')}", "put it on the rover"))
+        commands.append((_qat(names), "train static INT8 to keep its gates"))
+        commands.append((run, "and judge that"))
+        commands.append((f"make lab NAME={_shell(names.name)}", "notebook 03 has the blocks, 04 the frames"))
+    return [{"command": command, "why": why} for command, why in commands[:NEXT_COMMANDS]]

@@ -1,0 +1,99 @@
+"""Wrong commands: each ends in one sentence that names the thing and what to do, and never in exit code 0."""
+
+import json
+import zipfile
+
+import pytest
+from click.testing import CliRunner
+
+from rover_lib.cli import main
+from rover_lib.onboard.cli import main as onboard
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with one of everything, by its looks."""
+    monkeypatch.chdir(tmp_path)
+    for name, entry in {"policy_static.pt": "archive/code/net.py", "damaged.zip": "a/b"}.items():
+        with zipfile.ZipFile(name, "w") as z:
+            z.writestr(entry, "")
+    for name, keys in {"best_model.pth": b"model_state_dict", "calibration.pt": b"samples smooth image_sizes"}.items():
+        with zipfile.ZipFile(name, "w") as z:
+            z.writestr("archive/data.pkl", keys)
+    (tmp_path / "flight.log").write_text('{"schema":1,"kind":"header","columns":[]}\n')
+    (tmp_path / "notes.txt").write_text("hello")
+    stage = {"schema": 1, "stage": "load", "params": {}, "metrics": {}, "inputs": {}, "env": {}}
+    for folder in ("episodes/episode_1/frames", "dataset/meta", "runs/mine", "pretrained_model", "empty"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "episodes/episode_1/episode_data.json").write_text("{}")
+    (tmp_path / "dataset/meta/info.json").write_text("{}")
+    (tmp_path / "pretrained_model/config.json").write_text("{}")
+    (tmp_path / "runs/mine/load.json").write_text(json.dumps(stage))
+    return tmp_path
+
+
+# The command, the thing that its sentence names, and the remedy in it.
+WRONG = [
+    # wrong file
+    ("run policy_static.pt episodes", "policy_static.pt: this is an artifact already", "deploy it"),
+    ("quantize policy_static.pt episodes -o o.pt", "policy_static.pt: this is an artifact already", "deploy it"),
+    ("distill policy_static.pt episodes --name a", "policy_static.pt: this is an artifact already", "deploy it"),
+    ("run calibration.pt episodes", "calibration.pt: this is the calibration of a run", "best_model.pth"),
+    ("run flight.log episodes", "flight.log: this is a flight log", "best_model.pth"),
+    ("quantize notes.txt episodes -o o.pt", "notes.txt: not a torch checkpoint", "copy it again"),
+    ("drive best_model.pth", "best_model.pth: this is a trainer's checkpoint", "rover run CHECKPOINT EPISODES"),
+    ("drive pretrained_model", "pretrained_model: this is a LeRobot checkpoint", "rover run CHECKPOINT EPISODES"),
+    ("doctor best_model.pth", "best_model.pth: this is a trainer's checkpoint", "rover run CHECKPOINT EPISODES"),
+    ("benchmark calibration.pt", "calibration.pt: this is the calibration of a run", "policy_<mode>.pt"),
+    ("world trial best_model.pth", "best_model.pth: this is a trainer's checkpoint", "rover run CHECKPOINT"),
+    ("log policy_static.pt", "policy_static.pt: this is an artifact", "rover drive wrote"),
+    ("log notes.txt", "notes.txt", "rover drive"),
+    ("release pack best_model.pth parts", "best_model.pth: this is a trainer's checkpoint", "rover run"),
+    ("inspect damaged.zip", "damaged.zip", ";"),
+    # wrong folder
+    ("run runs/mine episodes", "runs/mine: this is a run's folder", "load.json names"),
+    ("quantize empty episodes -o o.pt", "empty/config.json: not found", "model.safetensors"),
+    ("benchmark runs/mine", "runs/mine: this is a run's folder", "policy_<mode>.pt"),
+    ("export-dataset runs/mine out", "runs/mine: this is a run's folder", "load.json names"),
+    ("export-dataset empty out", "empty: no episode folders in it", "episode_YYYYMMDD_HHMMSS"),
+    ("inspect empty", "empty: no episode folders in it", "episode_YYYYMMDD_HHMMSS"),
+    ("report episodes", "episodes: this is a folder of recordings", "rover run has made"),
+    ("list nowhere", "nowhere: no such folder", "rover run"),
+    ("log episodes", "episodes: this is a folder of recordings", "rover inspect"),
+    # wrong order
+    ("run episodes best_model.pth", "episodes: this is a folder of recordings", "rover run CHECKPOINT EPISODES"),
+    ("quantize best_model.pth policy_static.pt -o o.pt", "policy_static.pt: this is an artifact", "episode_*"),
+    ("compare best_model.pth policy_static.pt --episodes episodes", "best_model.pth: this is a", "rover run"),
+    ("report runs/mine", "runs/mine: no verdict without", "rover run makes them"),
+    ("world latency episodes", "episodes: this is a folder of recordings", "rover run has made"),
+    (
+        "world students runs/mine pretrained_model",
+        "pretrained_model: this is a LeRobot checkpoint",
+        "rover run has made",
+    ),
+    # no device
+    ("drive policy_static.pt --dry-run --camera 99", "/dev/video99: no such camera", "rover doctor"),
+    ("record out --port ttyNONE --camera 99", "99", ";"),
+    ("doctor --receiver --port ttyNONE", "ttyNONE", "is the Arduino plugged in"),
+    # what is not there, or not meant
+    ("inspect nothing.pt", "nothing.pt: not found", "pretrained_model"),
+    ("drive", "ARTIFACT", "--replay EPISODE"),
+    ("drive policy_static.pt --latency-ms 100", "--latency-ms", "--world"),
+]
+
+
+@pytest.mark.parametrize(("command", "thing", "remedy"), WRONG, ids=[command for command, *_ in WRONG])
+def test_names_the_thing_and_the_remedy(here, command, thing, remedy):
+    before = sorted(here.rglob("*"))
+    result = CliRunner().invoke(main, command.split())
+    assert result.exit_code != 0
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    (sentence,) = [line for line in result.output.splitlines() if line.startswith(("rover: ", "Error: "))]
+    assert thing in sentence and remedy in result.output, result.output
+    assert "Traceback" not in result.output
+    assert sorted(here.rglob("*")) == before  # nothing half-written
+
+
+def test_a_workstations_command_on_the_rover_says_where_it_belongs():
+    result = CliRunner().invoke(onboard, ["list"])
+    assert result.exit_code == 2 and "a workstation's command" in result.output

@@ -1,0 +1,66 @@
+"""What a file is, told by its looks; and a command that wants another thing says what to do with it."""
+
+import json
+import os
+import zipfile
+
+import pytest
+
+from rover_lib.onboard.kinds import INSTEAD, WANTED, KindError, check_kind, kinds_of
+from rover_lib.onboard.stage import write_stage
+from rover_lib.onboard.telemetry import FlightLog
+
+
+def archive(path, **entries):
+    with zipfile.ZipFile(path, "w") as z:
+        for name, data in entries.items():
+            z.writestr(f"archive/{name.replace('_DOT_', '.')}", data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "kind"),
+    [
+        ("data_DOT_pkl", b"..model_state_dict..", ("checkpoint",)),
+        ("data_DOT_pkl", b"samples smooth image_sizes", ("calibration",)),
+        ("data_DOT_pkl", b"somebody's tensors", ()),
+        ("code/net_DOT_py", b"", ("artifact",)),
+        ("photo", b"", ()),
+    ],
+)
+def test_archives(tmp_path, name, data, kind):
+    assert kinds_of(archive(tmp_path / "file.pt", **{name: data})) == kind
+
+
+def test_what_this_project_writes(tmp_path):
+    with FlightLog(tmp_path / "flight.log", header={"hz": 30}, max_bytes=1_000_000, keep=1):
+        pass
+    assert kinds_of(tmp_path / "flight.log") == ("flight log",)
+    write_stage(tmp_path / "load.json", "load", params={}, metrics={"many": list(range(100_000))})
+    assert kinds_of(tmp_path / "load.json") == ("stage",) and kinds_of(tmp_path) == ("run",)
+
+
+def test_a_folder_may_be_several(tmp_path):
+    (tmp_path / "pretrained_model").mkdir()
+    (tmp_path / "policy_static.pt").touch()
+    assert kinds_of(tmp_path) == ("run", "pretrained")
+    check_kind(tmp_path, "checkpoint")
+    check_kind(tmp_path, "run")
+
+
+def test_what_cannot_be_told_is_left_to_the_command(tmp_path):
+    (tmp_path / "text").write_text("{")
+    (tmp_path / "json").write_text(json.dumps({"a": 1}))
+    (tmp_path / "zip").write_bytes(b"PK\x03\x04 damaged")
+    os.mkfifo(tmp_path / "fifo")  # reading from it would wait for ever
+    for name in ("text", "json", "zip", "fifo", "nothing"):
+        assert kinds_of(tmp_path / name) == ()
+        check_kind(tmp_path / name, "artifact")
+
+
+def test_another_thing_is_refused_with_what_to_do(tmp_path):
+    path = archive(tmp_path / "policy_static.pt", **{"code/net_DOT_py": b""})
+    with pytest.raises(KindError, match=r"an artifact already, not a trainer's checkpoint; .*deploy it"):
+        check_kind(path, "checkpoint")
+    for (_, wanted), remedy in INSTEAD.items():
+        assert wanted in WANTED and remedy

@@ -1,0 +1,81 @@
+"""LeRobot's own way, end to end and without network: recordings, a dataset, lerobot-train, rover run, a drive."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import needs
+import pytest
+from click.testing import CliRunner
+
+from rover_lib.cli import main
+from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.stage import read_stage
+
+TINY = ("--policy.chunk_size=32", "--policy.n_action_steps=32", "--policy.dim_model=64", "--policy.n_heads=4",
+        "--policy.dim_feedforward=64", "--policy.n_encoder_layers=1", "--policy.n_vae_encoder_layers=1")  # fmt: skip
+BIN = Path(sys.executable).parent
+
+
+def rover(*words):
+    """What a command printed. Its exit status is checked."""
+    result = CliRunner().invoke(main, [str(word) for word in words], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def lerobot_train(dataset, out, *options, cache, timeout=1800):
+    """LeRobot's own command, on a dataset of this machine, in a process of its own; returns what it leaves."""
+    offline = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
+    words = [
+        *("--policy.device=cpu", "--policy.push_to_hub=false", "--wandb.enable=false", "--num_workers=0"),
+        *("--dataset.repo_id=local/mine", f"--dataset.root={dataset}", "--dataset.video_backend=pyav"),
+        *(f"--output_dir={out}", *options),
+    ]
+    command = [BIN / "lerobot-train", *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, env={**os.environ, **offline})
+    assert done.returncode == 0, done.stderr[-2000:]
+    return out / "checkpoints/last"
+
+
+@pytest.fixture(scope="module", params=["images", "video"])
+def artifact(request, tmp_path_factory):
+    """What rover makes of what LeRobot trained, on a dataset of this kind."""
+    folder = tmp_path_factory.mktemp(request.param)
+    cache, recorded, dataset = folder / "cache", folder / "mine", folder / "dataset"
+    with pytest.MonkeyPatch.context() as patch:
+        import datasets
+
+        patch.setattr(datasets.config, "HF_DATASETS_CACHE", cache)
+        patch.setenv("HF_DATASETS_CACHE", str(cache))  # for the kernels of `rover run`
+        patch.setenv("HF_HUB_OFFLINE", "1")
+        rover("world", "record", recorded, "--count", 3)
+        video = ["--video"] if request.param == "video" else []
+        rover("export-dataset", recorded, dataset, "--size", "64x36", *video)
+        new = ("--policy.type=act", "--policy.pretrained_backbone_weights=null", *TINY)
+        steps = ("--steps=2", "--save_freq=2", "--batch_size=2")
+        last = lerobot_train(dataset, folder / "train", *new, *steps, cache=cache)
+        assert last.resolve().name == "000002"
+        words = json.loads(rover("inspect", folder / "train", "--json"))["checkpoint"]
+        assert words["format"] == "lerobot" and words["normalisation"]["action"].startswith("output * (")
+        if request.param == "video":  # only the pictures are read otherwise: the notebooks need not show it once more
+            rover("quantize", last, dataset, "-o", folder / "policy_static.pt", "--samples", 6)
+            return folder / "policy_static.pt"
+        rover("run", last, dataset, "--name", "a", "--runs-dir", folder, "--samples", 6, "--iterations", 2)
+        compared = read_stage(folder / "a/compare.json", "compare")["metrics"]
+        assert compared["modes"]["static"]["steering_mae_us"] > 0
+        return folder / "a/policy_static.pt"
+
+
+@pytest.mark.slow
+@needs.real_time
+def test_from_recordings_to_a_drive(artifact, tmp_path):
+    manifest = load_policy(artifact).manifest
+    assert (manifest["mode"], manifest["rate_hz"], manifest["chunk"]) == ("static", 30, 32)
+    assert manifest["cameras"] == [{"name": "cam_front", "height": 36, "width": 64}]
+    command = [BIN / "rover", "drive", artifact, "--world", "--ticks", "30", "--json", tmp_path / "drive.json"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "drive.json").read_text())["ticks"] == 30

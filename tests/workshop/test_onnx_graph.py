@@ -1,0 +1,130 @@
+"""Policies written as ONNX, run by ONNX Runtime, against the same modules run by torch."""
+
+import copy
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from policies import TINY, lerobot_policy, memory_samples
+from torch import nn
+
+from rover_lib.onboard.errors import QuantizeError
+from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
+from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.onnx_graph import graph_of, onnx_model
+from rover_lib.workshop.quantize import int8_layers, quantize
+from rover_lib.workshop.scheme import Scheme
+
+SHAPES = {
+    "tiny": TINY,
+    "pre-norm, gelu": {**TINY, "pre_norm": True, "feedforward_activation": "gelu", "n_decoder_layers": 3},
+    "dilation": {**TINY, "vision_backbone": "resnet50", "replace_final_stride_with_dilation": True},
+    "two cameras, odd": {**TINY, "cameras": {"observation.images.a": (75, 131), "observation.images.b": (64, 96)}},
+}
+
+
+def named(inputs, config: ActConfig) -> dict[str, torch.Tensor]:
+    return dict(zip(["state", *(f"frame_{c}" for c in config.cameras)], inputs, strict=True))
+
+
+def session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+
+
+def answers(model: onnx.ModelProto, inputs, config: ActConfig) -> np.ndarray:
+    run = session(model).run
+    return np.concatenate([run(None, {k: v.numpy() for k, v in named(x, config).items()})[0] for x in inputs])
+
+
+def observations(config: ActConfig, count: int = 3) -> list[tuple[torch.Tensor, ...]]:
+    rng = np.random.default_rng(3)
+    made = []
+    for _ in range(count):
+        state = rng.uniform(-0.5, 0.5, (1, len(config.state_names))).astype(np.float32)
+        frames = (rng.integers(0, 256, (*size, 3), np.uint8) for size in config.image_sizes)
+        made.append((torch.from_numpy(state), *(torch.from_numpy(f) for f in frames)))
+    return made
+
+
+@pytest.mark.parametrize("name", ["tiny", *(pytest.param(n, marks=pytest.mark.slow) for n in SHAPES if n != "tiny")])
+@pytest.mark.parametrize("for_int8", [False, True], ids=["linears", "columns and convolutions"])
+def test_float_policy_is_the_same(name, for_int8, tmp_path):
+    from test_act import saved
+
+    saved(lerobot_policy(**SHAPES[name]), tmp_path)
+    checkpoint = load_checkpoint(tmp_path)
+    model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
+    inputs = observations(checkpoint.config)
+    written = onnx_model(graph_of(model), named(inputs[0], checkpoint.config), ("chunk",))
+    expected = predictions(model, inputs).numpy()
+    assert np.abs(answers(written, inputs, checkpoint.config) - expected).max() < 2e-5  # sums in another order
+    assert {o.domain for o in written.opset_import} == {""}
+    assert not [i for i in written.graph.initializer if i.external_data]
+
+
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        pytest.param(Scheme(), id="static"),
+        pytest.param(Scheme(kind="affine"), id="affine", marks=pytest.mark.slow),
+        pytest.param(
+            Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward")),
+            id="mixed",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibration):
+    quantized = quantize(tiny, scheme, calibration)
+    inputs = [inputs_of(s, tiny.config) for s in memory_samples(4, seed=1)]
+    written = onnx_model(graph_of(quantized.module), named(inputs[0], tiny.config), ("chunk",))
+    torchs = predictions(quantized.module, inputs).numpy()
+    own_error = np.abs(torchs - predictions(ACT(tiny.config, tiny.weights), inputs).numpy()).max()
+    # Within twice its own error to FP32: a rounding that flips grows over the layers
+    assert np.abs(answers(written, inputs, tiny.config) - torchs).max() < 2 * own_error
+    stored = {i.name: onnx.numpy_helper.to_array(i) for i in written.graph.initializer}
+    for name, layer in int8_layers(quantized.module).items():
+        assert np.array_equal(stored[f"{name}.weight"], layer.weight().int_repr().numpy())
+
+
+def test_int8_convolutions_and_pooling_are_the_same_but_for_ties(tiny, calibration):
+    """Up to the backbone's first sum: nothing in it is float, but two engines round what lies in the middle."""
+    part = copy.deepcopy(quantize(tiny, Scheme(), calibration).module)
+    *_, output = part.graph.nodes
+    before = next(n for n in part.graph.nodes if n.target == "backbone.layer1.0.body.2")
+    with part.graph.inserting_before(output):
+        output.args = (part.graph.call_method("int_repr", (before,)),)
+    part.graph.eliminate_dead_code()
+    part.recompile()
+    inputs = [inputs_of(s, tiny.config) for s in memory_samples(2, seed=1)]
+    written = onnx_model(part, named(inputs[0], tiny.config), ("bytes",))
+    difference = np.abs(answers(written, inputs, tiny.config).astype(int) - predictions(part, inputs).numpy())
+    assert difference.max() <= 1 and (difference > 0).mean() < 0.001
+
+
+@pytest.mark.slow
+def test_same_policy_same_bytes(tiny, calibration):
+    module = quantize(tiny, Scheme(), calibration).module
+    inputs = named(example_inputs(tiny.config), tiny.config)
+    one, other = (onnx_model(module, inputs, ("chunk",)).SerializeToString(deterministic=True) for _ in range(2))
+    assert one == other
+
+
+def test_part_with_two_outputs():
+    class Part(nn.Module):
+        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            return x.transpose(1, 2), x + x
+
+    x = torch.randn(1, 2, 3)
+    written = onnx_model(graph_of(Part()), {"x": x}, ("turned", "twice"))
+    turned, twice = session(written).run(None, {"x": x.numpy()})
+    assert np.array_equal(turned, x.transpose(1, 2).numpy()) and np.array_equal(twice, 2 * x.numpy())
+
+
+def test_what_has_no_form_is_named():
+    with pytest.raises(QuantizeError, match="Tanh has no form in ONNX"):
+        onnx_model(graph_of(nn.Sequential(nn.Tanh())), {"x": torch.zeros(1, 2)}, ("y",))

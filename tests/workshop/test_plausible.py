@@ -1,0 +1,69 @@
+"""Statistics of other recordings are said, for a policy whose own plans were recorded."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from policies import MemorySample, memory_samples
+
+from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
+from rover_lib.workshop.plausible import fits
+
+NAMES = ("steering", "throttle")
+
+
+@dataclass(frozen=True, eq=False)
+class Driven(MemorySample):
+    chunk: np.ndarray
+    is_pad: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def driven(tiny):
+    """What the tiny policy itself plans, as if somebody had driven so, a little less steadily."""
+    samples, rng = memory_samples(14), np.random.default_rng(0)
+    plans = predictions(ACT(tiny.config, tiny.weights), [inputs_of(s, tiny.config) for s in samples]).numpy()
+    noisy = plans + rng.normal(0, 0.1, plans.shape) * plans.std((0, 1))
+    none = np.zeros(plans.shape[1], bool)
+    return [Driven(s.state, s.picture, chunk, none) for s, chunk in zip(samples, noisy, strict=True)]
+
+
+def ranges(driven):
+    values = np.concatenate([s.chunk for s in driven])
+    return {n: (float(values[:, i].min()), float(values[:, i].max())) for i, n in enumerate(NAMES)}
+
+
+def of(tiny, driven, **changes):
+    return fits(replace(tiny, config=replace(tiny.config, **changes)), driven, ranges(driven))
+
+
+def test_its_own_recordings_fit(tiny, driven):
+    fit = of(tiny, driven)
+    assert fit.warnings() == [] and fit.frames == 12
+    assert [a.name for a in fit.actions] == list(NAMES) and 0.9 < fit.actions[0].spread < 1.1
+    assert "steering" in fit.table() and fit.summary()["warnings"] == []
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "says"),
+    [
+        ((1.0, 30.0), (0.0, 0.0), "throttle: .* far outside of what was recorded"),
+        ((1.0, 1.0), (9.0, 0.0), "steering: 100 % of its predictions are far outside"),
+        ((1.0, 0.01), (0.0, 0.0), "throttle: "),
+    ],
+)
+def test_statistics_of_other_actions_are_said(tiny, driven, scale, shift, says):
+    (warning,) = of(tiny, driven, action_unnorm=Affine(scale, shift)).warnings()
+    import re
+
+    assert re.match(says, warning) and "statistics, that it was trained with?" in warning
+
+
+def test_statistics_of_other_states_are_said(tiny, driven):
+    told = of(tiny, driven, state_norm=Affine((1.0, 200.0), (0.0, 0.0))).warnings()
+    assert [w for w in told if w.startswith("state throttle: the policy is told up to ")]
+
+
+def test_an_action_that_never_changes_is_left_out(tiny, driven):
+    fit = fits(tiny, driven, ranges(driven) | {"throttle": (0.1, 0.1)})
+    assert [a.name for a in fit.actions] == ["steering"]

@@ -1,0 +1,104 @@
+"""What a run ends with: run.json, a page made from it, and words."""
+
+import json
+import re
+import shutil
+from base64 import b64decode
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.stage import read_stage, sha256_of
+from rover_lib.workshop import run_report as report
+
+DEMO = Path(__file__).parents[2] / "results" / "demo"
+PNG = b"\x89PNG a picture"
+
+
+@pytest.fixture
+def run_dir(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "runs" / "mine"
+    shutil.copytree(DEMO, folder)
+    (folder / "figures").mkdir()
+    (folder / "figures" / "04_action_error.png").write_bytes(PNG)
+    return folder
+
+
+class Page(HTMLParser):
+    """Tags that are open at the end, tags that were there, and what a reader sees."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.open, self.tags, self.text = [], [], ""
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def test_leaves_the_same_verdict_as_json_page_and_words(run_dir):
+    content = report.write(run_dir)
+    assert read_stage(run_dir / "run.json", "run") == content
+    assert content["inputs"]["compare.json"] == sha256_of(run_dir / "compare.json")
+    judged = content["metrics"]
+    page, words = Page((run_dir / report.PAGE).read_text()), report.text(judged)
+    assert page.open == []
+    commands = [step["command"] for step in judged["next"]]
+    for sentence in (judged["headline"], *judged["why"], *judged["cautions"], *commands):
+        assert sentence in page.text and sentence in words
+    assert "runs/mine/policy_static.pt" in commands[0]  # as one types it here
+    for mode in judged["modes"]:
+        assert f"{mode['size_mb']:.1f}" in page.text and f"{mode['size_mb']:.1f}" in words
+
+
+def test_the_page_needs_no_other_file_and_fits_a_phone(run_dir):
+    report.write(run_dir)
+    html = (run_dir / report.PAGE).read_text()
+    page = Page(html)
+    assert ("meta", {"name": "viewport", "content": "width=device-width"}) in page.tags
+    assert not re.search(r"""(?:src|href)=["'](?!data:)""", html) and "<script" not in html
+    assert html.index('class="wide"') < html.index("<table") and "max-width:100%" in html  # what is wide scrolls itself
+    (picture,) = [a["src"] for tag, a in page.tags if tag == "img"]
+    assert b64decode(picture.removeprefix("data:image/png;base64,")) == PNG
+
+
+def test_what_others_wrote_is_no_markup(run_dir):
+    evil = '<script>alert("1")</script>'
+    for stage, change in {"compare": {"warnings": [evil]}, "load": {}}.items():
+        path = run_dir / f"{stage}.json"
+        content = json.loads(path.read_text())
+        content["metrics"] |= change
+        content["params"] |= {"episodes": evil} if stage == "load" else {}
+        path.write_text(json.dumps(content))
+    renamed = run_dir.rename(run_dir.with_name("<b>mine"))
+    report.write(renamed)
+    html = (renamed / report.PAGE).read_text()
+    assert "<script" not in html and "<b>mine" not in html and "&lt;script&gt;" in html
+
+
+def test_a_students_own_distill_json_is_no_comparison(run_dir):
+    content = json.loads((run_dir / "distill.json").read_text())
+    content["metrics"] = {"parameters": 1}
+    (run_dir / "distill.json").write_text(json.dumps(content))
+    assert "distill.json" not in report.write(run_dir)["inputs"]
+
+
+def test_a_run_that_is_not_whole_has_no_verdict(run_dir, tmp_path):
+    with pytest.raises(RoverError, match="there is no such run"):
+        report.write(tmp_path / "nothing")
+    (run_dir / "compare.json").unlink()
+    next(run_dir.glob("benchmark-*.json")).unlink()
+    with pytest.raises(RoverError, match=r"no verdict without compare.json, benchmark-<host>.json; rover run"):
+        report.write(run_dir)
+    assert not (run_dir / "run.json").exists() and not (run_dir / report.PAGE).exists()
