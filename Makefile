@@ -63,8 +63,9 @@ lint: $(READY)
 test: lint demo
 	$(PYTEST)
 
+# Without nbval, whose import is three seconds in each process: no notebook is among these.
 test-fast: $(READY)
-	$(PYTEST) -m 'not slow and not emulated and not release' tests
+	$(PYTEST) -p no:nbval --override-ini 'addopts=-q -rs --strict-markers' -m 'not slow and not emulated and not release' tests
 
 # Real time, whole fleets and whole machines: for a quiet machine, before something is given to others.
 check-release: lint demo
