@@ -15,6 +15,7 @@ SECTIONS = {
         prepare.list_runs,
         prepare.inspect,
         prepare.report,
+        prepare.sweep,
         prepare.quantize,
         prepare.compare,
         ROVERS["benchmark"],

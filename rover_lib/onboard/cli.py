@@ -37,7 +37,19 @@ LOG_DRIVE = click.option(
 SECONDS = click.FloatRange(min=0, min_open=True)
 
 WORKSTATION_COMMANDS = frozenset(
-    {"run", "report", "list", "quantize", "compare", "distill", "export", "export-dataset", "wheelhouse", "world"}
+    {
+        "run",
+        "report",
+        "sweep",
+        "list",
+        "quantize",
+        "compare",
+        "distill",
+        "export",
+        "export-dataset",
+        "wheelhouse",
+        "world",
+    }
 )  # rover_lib.cli's
 
 
