@@ -11,13 +11,14 @@ NAME ?= mine
 # In a container there may be nobody but root, and what is loaded here was made here; see onboard/confine.py.
 export ROVER_AS_ROOT := 1
 
-.PHONY: help demo run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks tables clean
+.PHONY: help demo run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks tables docs clean
 
 help:
 	@echo "make demo                                   record, train, quantize, compare, benchmark, drive and distill in the balloon world"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make lab NAME=mine                          JupyterLab on the notebooks of a run, with its outputs"
 	@echo "make firmware; make flash PORT=/dev/ttyUSB0 build the Arduino's firmware, and put it on the board"
+	@echo "make docs                                   these pages and the notebooks as a site: runs/site/index.html"
 	@echo
 	@echo "For who changes something; CONTRIBUTING.md says what each proves and how long it takes:"
 	@echo "make test-fast                              what a minute and a half can prove"
@@ -38,7 +39,7 @@ $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and f"Python 3.11 to 3.13 is needed, found {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet 'uv>=0.5'
-	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,dev]'
+	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,dev,docs]'
 	@touch $@
 
 demo: $(READY)
@@ -58,6 +59,7 @@ lint: $(READY)
 	$(VENV)/bin/ruff check --quiet
 	$(VENV)/bin/ruff format --quiet --check
 	$(VENV)/bin/mypy
+	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware lab notebooks rover_lib tests
 
 # The demo is the tests' whole run; it is made once, and tests/test_demo.py holds it to the gates of params.yml.
 test: lint demo
@@ -112,6 +114,16 @@ notebooks: demo
 
 tables: $(READY)
 	$(VENV)/bin/python -m rover_lib.workshop.tables
+
+# What the pages link to travels with them; a link to anything else ends the build.
+PAGES = *.md params.yml lab/params.yml docs/* */README.md notebooks/*.ipynb pictures/* results/*/*.json
+
+docs: $(READY)
+	rm -rf runs/pages runs/site
+	mkdir -p runs/pages
+	cp --parents $(PAGES) runs/pages
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build
+	@echo 'open runs/site/index.html'
 
 clean:
 	rm -rf $(VENV) runs
