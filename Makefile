@@ -116,7 +116,7 @@ tables: $(READY)
 	$(VENV)/bin/python -m rover_lib.workshop.tables
 
 # What the pages link to travels with them; a link to anything else ends the build.
-PAGES = *.md params.yml lab/params.yml docs/* */README.md notebooks/*.ipynb pictures/* results/*/*.json
+PAGES = *.md params.yml lab/params.yml docs/* ansible/README.md firmware/README.md lab/README.md notebooks/*.ipynb pictures/* results/*/*.json
 
 docs: $(READY)
 	rm -rf runs/pages runs/site

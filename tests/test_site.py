@@ -21,12 +21,13 @@ GATHERED = (
     "params.yml",
     "lab/params.yml",
 )
+READMES = ("ansible/README.md", "firmware/README.md", "lab/README.md")
 ELSEWHERE = re.compile(r"""<(?:script|img|iframe|link)\b[^>]*\b(?:src|href)=["'](?:https?:)?//[^>]*>""")
 
 
 def gather(folder: Path) -> None:
     """A copy of what `make docs` reads."""
-    for path in (path for pattern in (*GATHERED, "*/README.md") for path in ROOT.glob(pattern)):
+    for path in (path for pattern in (*GATHERED, *READMES) for path in ROOT.glob(pattern)):
         target = folder / path.relative_to(ROOT)
         target.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():
@@ -51,7 +52,7 @@ def site(tmp_path_factory) -> Path:
 
 
 def test_each_page_and_notebook_is_there(site):
-    sources = [p for pattern in ("*.md", "docs/*.md", "*/README.md", "notebooks/*.ipynb") for p in ROOT.glob(pattern)]
+    sources = [p for pattern in ("*.md", "docs/*.md", *READMES, "notebooks/*.ipynb") for p in ROOT.glob(pattern)]
     assert len(sources) > 15
     for source in sources:
         name = str(source.relative_to(ROOT).with_suffix(".html")).replace("README", "index")
