@@ -165,3 +165,22 @@ print(json.dumps([rover_lib.cli.__file__, params()]))
     assert Path(file).is_relative_to(tmp_path)
     assert {"calibration", "quantization", "benchmark", "drive", "flight_log"} <= set(params)
     assert {"steering_mae_pct", "original"} <= set(params["gates"])
+
+
+def test_says_its_version_pythons_and_the_engines(rover, rover_without_torch):
+    lines = rover.run("rover", "--version").stdout.splitlines()
+    assert re.fullmatch(r"rover \d+\.\d+\.\d+\+[0-9a-f]{12}", lines[0]) and lines[1].startswith("Python 3.")
+    assert re.fullmatch(r"engine qnnpack: torch 2\.8\.0.*", lines[2])
+    lines = rover_without_torch.run("rover", "--version").stdout.splitlines()
+    assert lines[2] == "engine qnnpack: torch is not installed"
+    assert re.fullmatch(r"engine onnxruntime: onnxruntime \d+\.\d+\.\d+", lines[3])
+
+
+@pytest.mark.parametrize(("command", "code"), [(["--help"], 0), (["doctor", "--json"], 1)])
+def test_a_reader_who_has_seen_enough_changes_no_exit_code(rover, command, code):
+    """As `rover log FILE | head -1`, which closes the pipe early."""
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as closed:
+        done = subprocess.run([rover.bin / "rover", *command], stdout=closed, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (code, "")

@@ -174,7 +174,7 @@ def late_hits(alone: Sequence[Mapping[str, Any]]) -> str:
 
 
 def beside(compensated: Mapping[float, float], others: Mapping[float, float]) -> str:
-    """Where compensation keeps the car closer, and where not: median distances from the path in cm, by ms of latency."""
+    """Where compensation keeps the car closer, and where not: median cm from the path, by the latency in ms."""
     common = sorted(ms for ms in compensated.keys() & others.keys() if compensated[ms] and others[ms])
     closer = [ms for ms in common if compensated[ms] < others[ms]]
     if not common:
