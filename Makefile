@@ -31,8 +31,8 @@ help:
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the notebooks,"
-	@echo "                                            and the JSON behind them into results/, and README's tables from it"
-	@echo "make tables                                 README's tables alone"
+	@echo "                                            and the JSON behind them into results/, and the pages' tables from it"
+	@echo "make tables                                 the pages' tables alone"
 
 # uv installs the CUDA build of torch, gigabytes that its wheel insists on, in a minute where pip takes several.
 $(READY): pyproject.toml
@@ -106,6 +106,7 @@ flash:
 
 # The executed notebooks of a run, or where there is none of that name, those of the repository.
 lab: $(READY)
+	@test '$(origin NAME)' != 'command line' -o -f 'runs/$(NAME)/01_load.ipynb' || { echo 'there is no run runs/$(NAME): rover list' >&2; exit 2; }
 	$(VENV)/bin/jupyter lab $(if $(wildcard runs/$(NAME)/01_load.ipynb),'runs/$(NAME)',notebooks)
 
 notebooks: demo
