@@ -3,6 +3,7 @@
 Thin: it parses, calls the library and prints.
 """
 
+import contextlib
 import json
 import os
 import platform
@@ -10,11 +11,10 @@ import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO, cast
 
 import click
 
-import rover_lib
 from rover_lib.onboard.columns import aligned, benchmark_rows, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import PathTo
@@ -53,8 +53,42 @@ WORKSTATION_COMMANDS = frozenset(
 )  # rover_lib.cli's
 
 
+class Unread:
+    """Standard output that nobody may read any more, as behind `| head`: that changes neither what a command does nor
+    its exit code.
+    """
+
+    def __init__(self, stream: Any):
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        try:
+            return self._stream.write(text)
+        except BrokenPipeError:
+            return self._closed(len(text))
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except BrokenPipeError:
+            self._closed(0)
+
+    def _closed(self, written: int) -> int:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self._stream.fileno())  # so that Python's own flush at the end finds a reader too
+        os.close(nowhere)
+        return written
+
+
 class Rover(click.Group):
     """A bad input ends in one sentence and exit code 1; --debug adds the traceback."""
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        with contextlib.redirect_stdout(cast(TextIO, Unread(sys.stdout))):
+            return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -70,9 +104,7 @@ class Rover(click.Group):
                 f"rover: this command needs {e.name}, which only a workstation has: make demo sets one up", err=True
             )
         except (OSError, MemoryError) as e:
-            if ctx.params.get("debug") or isinstance(
-                e, BrokenPipeError
-            ):  # click ends quietly when `head` has seen enough
+            if ctx.params.get("debug"):
                 raise
             click.echo(f"rover: {type(e).__name__}: {e}", err=True)
         ctx.exit(1)
@@ -114,11 +146,29 @@ def show(value: Any, as_json: bool) -> None:
     lines(value, "")
 
 
+def _print_versions(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
+    if asked and not ctx.resilient_parsing:
+        from rover_lib.onboard.versions import versions
+
+        click.echo("\n".join(versions()))
+        ctx.exit()
+
+
+VERSION = click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_versions,
+    help="Show the versions of this program, Python and the engines.",
+)
+
+
 @click.group(
     "rover", cls=OnlyOnboard, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
-@click.version_option(rover_lib.__version__)
+@VERSION
 def main(debug: bool) -> None:
     """Drive a car by a learned policy: what works on the rover. A workstation's `rover` knows more commands."""
 

@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-import rover_lib
 from rover_lib.onboard import artifact
 from rover_lib.onboard.artifact import ONNX_SUFFIX
 from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.wheel_version import release
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.episodes import Sample
@@ -214,7 +214,7 @@ def _manifest(
             "channel_scales": calibration.smooth,
             "float_blocks": list(scheme.float_blocks) if scheme else [],
         },
-        "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": rover_lib.__version__, **form.versions},
+        "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": release(), **form.versions},
     }
 
 

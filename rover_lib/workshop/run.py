@@ -54,10 +54,15 @@ class ThisPython(AsyncKernelManager):
 
 def parameters_of(notebook: Path) -> set[str]:
     """Names that the notebook's `parameters` cell sets."""
+    return {name for name, *_ in parameters_in(notebook)}
+
+
+def parameters_in(notebook: Path) -> list[tuple[str, str, str]]:
+    """(name, literal, comment) of each line of the notebook's `parameters` cell."""
     for cell in nbformat.read(notebook, as_version=4).cells:
         if "parameters" in cell.metadata.get("tags", []):
-            return set(re.findall(r"^(\w+) *=", cell.source, re.M))
-    return set()
+            return re.findall(r"^(\w+) *= *(.*?) *(?:# *(.*))?$", cell.source, re.M)
+    return []
 
 
 def run(
