@@ -187,16 +187,29 @@ void pulses_set(const struct car *car, uint16_t steering_us, uint16_t throttle_u
     /* 16-bit registers share one temporary byte, which the capture's interrupt uses as well. */
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
         if (OCR1B != steering) OCR1B = steering;
-        slow_high = steps;
     }
-    if (fast) OCR2B = (uint8_t)(steps - 1);
+    if (fast) {
+        OCR2B = (uint8_t)(steps - 1);
+    } else if (slow_high != steps) {
+        ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { slow_high = steps; }
+    }
 }
 
 /* ---- pulses in: steering on D2 (INT0), throttle on D8 (ICP1); and the clock --------------------------------------- */
 
 /* Nothing but these interrupts may delay INT0 by more than about 3 us: a pulse that is measured by software is as good
  * as that. So the core's Timer0 is off, Timer1 is the only clock, and the longer interrupts let INT0 in. */
-ISR(TIMER1_OVF_vect) { period_start += steering_ticks; }
+/* period_start += steering_ticks. In C it saves registers for a microsecond longer, which INT0 has not. */
+ISR(TIMER1_OVF_vect, ISR_NAKED) {
+    asm volatile("push r24 \n in r24, %2 \n push r24 \n push r25 \n"
+                 "lds r24, %0 \n lds r25, %1 \n add r24, r25 \n sts %0, r24 \n"
+                 "lds r24, %0+1 \n lds r25, %1+1 \n adc r24, r25 \n sts %0+1, r24 \n"
+                 "ldi r25, 0 \n" /* leaves the carry */
+                 "lds r24, %0+2 \n adc r24, r25 \n sts %0+2, r24 \n"
+                 "lds r24, %0+3 \n adc r24, r25 \n sts %0+3, r24 \n"
+                 "pop r25 \n pop r24 \n out %2, r24 \n pop r24 \n reti"
+                 :: "i"(&period_start), "i"(&steering_ticks), "I"(_SFR_IO_ADDR(SREG)));
+}
 
 EMPTY_INTERRUPT(TIMER2_OVF_vect) /* wakes loop() every 1016 us; of a slow throttle, its matches do */
 
@@ -210,7 +223,15 @@ static inline uint32_t ticks_at(uint16_t tick) {
 uint32_t clock_ms() {
     static uint32_t counted, ms;
     uint32_t now = 0;
-    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { now = ticks_at(TCNT1); }
+    uint16_t tick = 0;
+    uint8_t flags = 0;
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { /* as ticks_at(), but INT0 waits for no more than the reading */
+        tick = TCNT1;
+        flags = TIFR1;
+        now = period_start;
+    }
+    if (flags & _BV(TOV1) && tick < steering_ticks / 2) now += steering_ticks;
+    now += tick;
     for (; (int32_t)(now - counted) >= 2000; counted += 2000) ms++; /* signed: never a leap, whatever was misread */
     return ms;
 }

@@ -145,7 +145,8 @@ class NativeArduino:
 
     sticks: the transmitter's pulses (us), may be set; 0 is no signal. misread: may be set; what the receiver makes of
     a throttle pulse, by its number (None: no pulse). now_ms: its clock, which wraps at 32 bits. sequence: of the last
-    command. car: the transmitter's, the host's, and what the board was told: nothing is told of the default.
+    command. periods_us: of the transmitter's pulses, may be set. car: the transmitter's, the host's, and what the board
+    was told: nothing is told of the default.
     """
 
     def __init__(self, now_ms: int = 0, sequence: int = 0, car: Car | None = None):
@@ -161,7 +162,7 @@ class NativeArduino:
         self._due_us = [0.0, 0.0]
         self._us = 0.0  # since the start
         self._pulses = 0
-        self._periods_us = self.car.numbers[0], self.car.numbers[4]
+        self.periods_us = self.car.numbers[0], self.car.numbers[4]
         self.start(Car())
         self._vehicle.sequence = sequence
         if not self.car.is_default:
@@ -198,7 +199,7 @@ class NativeArduino:
         return pins
 
     def _receive(self) -> None:
-        for channel, period_us in enumerate(self._periods_us):
+        for channel, period_us in enumerate(self.periods_us):
             while self._due_us[channel] <= self._us:
                 self._due_us[channel] += period_us
                 pulse_us: float | None = self.sticks[channel]
@@ -213,7 +214,7 @@ class NativeArduino:
         rest_us = self.sticks[STEERING]
         for pulse_us in WIGGLE_US:
             self.sticks[STEERING] = pulse_us
-            self.run(self._periods_us[STEERING] // 1000)
+            self.run(self.periods_us[STEERING] // 1000)
         self.sticks[STEERING] = rest_us
         self.run(LET_GO_MS)
 

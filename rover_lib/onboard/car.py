@@ -125,6 +125,13 @@ class Car:
         """Of its camera, for a picture of 640 pixels."""
         return round(WIDTH_PX / 2 / math.tan(math.radians(self.field_of_view_deg) / 2), 2)
 
+    def drives_like(self, other: "Car") -> bool:
+        """Whether an action means the same on both, and is seen the same: all but the name and the cap."""
+        mine, others = ({**c.description(), "name": ""} for c in (self, other))
+        for description in (mine, others):
+            description["throttle"] = {**description["throttle"], "cap_us": 0}
+        return mine == others
+
     def description(self) -> dict[str, Any]:
         """As car.yml has it; Car.of() makes the same car of it."""
         steering, throttle = self.pwm.steering, self.pwm.throttle
@@ -283,6 +290,12 @@ def car_file() -> Path | None:
     if named := os.environ.get(FILE_VARIABLE):
         return Path(named)
     return next((place for place in PLACES if place.is_file()), None)
+
+
+def default_place() -> Path:
+    """Where a new car.yml belongs on this machine."""
+    checkout, installed = PLACES
+    return car_file() or (checkout if (checkout.parent / "pyproject.toml").is_file() else installed)
 
 
 def this_car() -> Car:

@@ -16,7 +16,7 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from numbers import Integral
 from typing import Any
@@ -113,8 +113,9 @@ class Telemetry:
     host_s: time.monotonic() (or the link's clock) at which its line was complete here; uptime_ms: the Arduino's
     clock, which wraps at 2^32. sequence: of the last command that it took as new; result: what became of the last one,
     a key of RESULTS. missing: before it can be armed, a key of MISSING. steering_us, throttle_us: what its pins do.
-    cap_us: the most throttle that the host gets; as far on the other side of neutral. receiver_*: the transmitter's pulses. The counters stay at 65535:
-    lines that were no command, commands that were replayed, late or another start's, pulses out of range, bytes lost.
+    cap_us: the most throttle that the host gets; as far on the other side of neutral. receiver_*: the transmitter's
+    pulses. The counters stay at 65535: lines that were no command, commands that were replayed, late or another
+    start's, pulses out of range, bytes lost.
     """
 
     host_s: float
@@ -323,6 +324,12 @@ class ServoLink:
                 raise LinkError(f"{self.port}: the Arduino sends no status", remedy="press its reset button")
         return hello
 
+    def tell(self, car: Car) -> None:
+        """The Arduino's pins are that car's from now on. Raises LinkError if it does not take it."""
+        self.car, self.calibration = car, car.pwm
+        if hello := self.hello:
+            self._tell_car(replace(hello, car=0))
+
     def _tell_car(self, hello: Hello) -> None:
         """So that the pins' neutral, the receiver's pulses and the cap are this car's; before that nothing is armed."""
         if self.car.is_default and hello.car == self.car.id:
@@ -455,7 +462,10 @@ class ServoLink:
         return whole_us
 
     def send_action(self, steering: float, throttle: float) -> int:
-        """Sends steering in [-1, 1] and throttle in [0, 1], or from -1 with reverse, as pulses. PwmError for all else; otherwise as send()."""
+        """Sends steering in [-1, 1] and throttle in [0, 1], or from -1 with reverse, as pulses.
+
+        PwmError for all else; otherwise as send().
+        """
         pulses = self.calibration.pulses(steering, throttle)
         return self.send(pulses.steering_us, pulses.throttle_us)
 

@@ -104,7 +104,7 @@ class StandIn:
     def _reset(self) -> None:
         self._boot = (self._boot + 1) % 65536
         self._sequence = 0
-        self._lowered_us = 65535
+        self._cap_us = self._lowered_us = 65535
         self._take_car(DEFAULT_NUMBERS)
         self._result, self._state, self._reason = "-", "M", "r"
         self._bad = self._old = self._out_of_range = 0
@@ -168,7 +168,8 @@ class StandIn:
         receiver = " ".join(f"{us} {period_us}" for us, period_us in zip(self._neutral, self._periods_us, strict=True))
         self._send(
             f"<S {self._boot} {self._uptime_ms} {self._sequence} {self._result} {self._state} {self._reason} - "
-            f"{self._pins[0]} {self._pins[1]} {self._neutral[1] + self._cap_us} {receiver} {self._bad} {self._old} {self._out_of_range} 0"
+            f"{self._pins[0]} {self._pins[1]} {self._neutral[1] + self._cap_us} {receiver} "
+            f"{self._bad} {self._old} {self._out_of_range} 0"
         )
 
     def _take(self, byte: int) -> None:
