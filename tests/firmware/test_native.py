@@ -54,7 +54,7 @@ def test_random_and_mutated_lines(count):
         ("car's neutral", "vehicle.c", "throttle->min_us == throttle->neutral_us &&", ""),
         ("car's end", "vehicle.c", "throttle->neutral_us, THROTTLE_MAX_US)", "throttle->neutral_us, 980)"),
         ("car's period", "vehicle.c", "within(servo->period_us, PERIOD_MIN_US, PERIOD_MAX_US) &&", ""),
-        ("armed car", "vehicle.c", "AUTONOMOUS) return IGNORED;\n    uint32_t id", "0) return IGNORED;\n    uint32_t id"),
+        ("armed", "vehicle.c", "AUTONOMOUS) return IGNORED;\n    uint32_t id", "0) return IGNORED;\n    uint32_t id"),
         ("told", "vehicle.c", "!vehicle->car_told ||", ""),
         ("other car", "vehicle.c", "|| car != vehicle->car_id) return OTHER_CAR", ") return OTHER_CAR"),
         ("raised cap", "vehicle.c", "car.cap_us < vehicle->lowered_us ?", "true ?"),
