@@ -320,6 +320,50 @@ def doctor(
     ctx.exit(1 if failed else 0)
 
 
+@main.command(short_help="Measure another car's transmitter; write its car.yml.")
+@PORT
+@click.option("--output", type=FILE, help="The file [default: where the other commands look for car.yml].")
+@click.option("--name", default="my car", show_default=True, help="What to call the car.")
+@click.option("--field-of-view-deg", type=float, help="Of the camera, from left to right [default: the first car's].")
+@click.option("--wheelbase-m", type=float, help="From axle to axle [default: the first car's].")
+@click.option("--force", is_flag=True, help="Replace a file that is there.")
+def calibrate(
+    port: str,
+    output: Path | None,
+    name: str,
+    field_of_view_deg: float | None,
+    wheelbase_m: float | None,
+    force: bool,
+) -> None:
+    """Lead a human, with the transmitter in hand, through both sticks, and write what was measured as car.yml.
+
+    Recorder, drive, doctor and the balloon world read it from then on, and the Arduino is told it. Take the wheels off
+    the ground and unplug the motor first. Ctrl-C leaves everything as it was.
+    """
+    from rover_lib.onboard.calibrate import measure, refuse_existing, write_car
+    from rover_lib.onboard.car import Car, default_place, yaml_of
+    from rover_lib.onboard.servo_link import ServoLink
+
+    path = output or default_place()
+    refuse_existing(path, force)
+    more: dict[str, Any] = {"name": name}
+    if field_of_view_deg is not None:
+        more["camera"] = {"field_of_view_deg": field_of_view_deg}
+    if wheelbase_m is not None:
+        more["wheelbase_m"] = wheelbase_m
+    with ServoLink(port, car=Car()) as link:
+        car = measure(
+            link,
+            lambda text: click.prompt(text + " Enter", "", show_default=False, err=True),
+            notify=lambda text: click.echo(text, err=True),
+            **more,
+        )
+        link.tell(car)  # and not the last one that was tried
+    write_car(car, path)
+    click.echo(yaml_of(car), nl=False)
+    click.echo(f"rover: written to {path}", err=True)
+
+
 @main.command(short_help="Say what an artifact is.")
 @click.argument("file", type=FILE)
 @AS_JSON
