@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.cli import FILE, LOG_DRIVE, drive_options, run_drive, sum_up
+from rover_lib.onboard.cli import FILE, LOG_DRIVE, drive_options, open_view, run_drive, sum_up, view_options
 from rover_lib.onboard.kinds import PathTo
 
 
@@ -28,6 +28,25 @@ def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **op
     if latency_ms and not in_world:
         raise click.UsageError("--latency-ms belongs to --world")
     ctx.exit(run_drive(car=partial(VirtualCar, seed=seed) if in_world else None, latency_ms=latency_ms, **options))
+
+
+@click.command(short_help="Show a drive in the browser; it can be stopped there.")
+@click.argument("file", type=click.Path(path_type=Path, exists=True), required=False)
+@view_options
+@LOG_DRIVE
+def view(file: Path | None, drive: int, **options: Any) -> None:
+    """Show a drive in a browser: its picture, its plan, what the pins do. The page can stop the car and nothing else.
+
+    Without FILE it shows the `rover drive` of this machine, which may come and go. FILE: an artifact drives through the
+    balloon world; a flight log, or a recording, is shown as it was.
+
+    Who has the page's URL may look and stop; without --interface only from this machine.
+    """
+    from rover_lib.cli import watching
+
+    if file is None:
+        return open_view(**options, opened=watching.open_browser)
+    watching.watch(file, drive, options)
 
 
 @click.command(short_help="Sum up a flight log, and draw it.")
