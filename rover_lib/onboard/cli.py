@@ -503,9 +503,7 @@ def view_options(command: Callable) -> Callable:
 
 VIEW_OPTIONS = (
     click.option("--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="0: any."),
-    click.option(
-        "--interface", default="", help="A network that it serves too, such as wlan0 [default: none]."
-    ),
+    click.option("--interface", default="", help="A network that it serves too, such as wlan0 [default: none]."),
     click.option("--token-file", type=FILE, help="What the URL must have [default: a new one, printed]."),
     click.option("--feed", type=FILE, help="Socket at which drives come [default: that of your `rover drive`]."),
     click.option("--drive-user", help="Whose drives may come, beside this user's own."),

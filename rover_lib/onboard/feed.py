@@ -4,8 +4,8 @@
     drive(..., until=Until(over=feed.over), hooks=Hooks(show=partial(feed.tick, report, camera, pilot)))
 
 The view (view.py) is another process, on a rover another user's. It listens at a Unix socket of whole messages; the
-drive looks once a second whether somebody does. Both ways nothing is ever waited for: a message that does not fit the
-socket's buffer is dropped, and the next one, a tenth of a second later, says all again. So a view that hangs, floods or
+drive looks once a second whether somebody does. Both ways nothing is ever waited for: a message is dropped while the one
+before is not read yet, and the next one, a tenth of a second later, says all again. So a view that hangs, floods or
 dies costs a drive what a failed system call does. What comes back is read a few messages a tick; one of them, STOP,
 ends the drive as its other ends do, and all others are nothing.
 
@@ -14,9 +14,12 @@ every nth pixel of every nth row, (h, w, 3) uint8 BGR, where the line has "shape
 """
 
 import contextlib
+import fcntl
 import json
 import re
 import socket
+import struct
+import termios
 import time
 from collections import deque
 from collections.abc import Callable
@@ -38,7 +41,7 @@ LAST_S = 0.2  # for the last message of a drive, whose car stands
 ASKED_MOST = 8  # messages of the view that are read at a tick
 STOP = re.compile(rb"stop ([0-9a-f.:]{1,45})", re.ASCII)  # and the address of who asked
 RAW_BYTES = 120_000  # of a picture that is no JPEG
-BUFFER_BYTES = 400_000  # of the socket; a message that does not fit goes without its picture
+MOST_BYTES = 400_000  # of a message; one that would be larger goes without its picture
 DRIVING, WAITING, ENDED = "driving", "waiting", "ended"
 
 
@@ -48,8 +51,16 @@ class Feed:
     place: where the view listens. log: its newest events are shown. title: what drives.
     """
 
-    def __init__(self, place: Path, log: FlightLog, title: str, *, clock: Callable[[], float] = time.monotonic):
-        self._place, self._log, self._title, self._clock = place, log, title, clock
+    def __init__(
+        self,
+        place: Path,
+        log: FlightLog,
+        title: str,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
+        self._place, self._log, self._title, self._clock, self._sleep = place, log, title, clock, sleep
         self._socket: socket.socket | None = None
         self._look_s = self._due_s = 0.0
         self._ticks: deque[tuple[float, float]] = deque(maxlen=100)  # when, and how late in milliseconds
@@ -80,7 +91,7 @@ class Feed:
         while self._connected() and not self._show(ENDED, report.ended, report, camera, link=link):
             if self._clock() > end_s:
                 return
-            time.sleep(LAST_S / 10)
+            self._sleep(LAST_S / 10)
 
     def over(self) -> str | None:
         """For the loop, at each tick: why this drive is over, None if nobody asked for a stop."""
@@ -102,7 +113,7 @@ class Feed:
         now_s = self._clock()
         if now_s < self._due_s:
             return False
-        self._due_s = max(self._due_s + EVERY_S, now_s)
+        self._due_s = (self._due_s if now_s < self._due_s + EVERY_S else now_s) + EVERY_S
         return self._connected()
 
     def _connected(self) -> bool:
@@ -112,7 +123,7 @@ class Feed:
         self._look_s = now_s + AGAIN_S
         wire = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
-            wire.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+            wire.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_BYTES)
             wire.connect(str(self._place))
         except OSError:  # nobody listens, or has no time to answer
             wire.close()
@@ -191,8 +202,11 @@ class Feed:
             return False
         line = json.dumps(message).encode() + b"\n"
         try:
-            wire.send(line + picture if len(line) + len(picture) < BUFFER_BYTES // 2 else line)
-        except BlockingIOError:  # it has not taken the ones before
+            (unread,) = struct.unpack("i", fcntl.ioctl(wire, termios.TIOCOUTQ, bytes(4)))
+            if unread:  # the view has not taken the one before
+                raise BlockingIOError
+            wire.send(line + picture if len(line) + len(picture) < MOST_BYTES else line)
+        except BlockingIOError:
             self.dropped += 1
             return False
         except OSError:

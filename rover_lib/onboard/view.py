@@ -88,7 +88,7 @@ class Address:
             return False
         name = match[1].strip("[]").lower()
         with contextlib.suppress(ValueError):
-            return bool(self.interface) or ipaddress.ip_address(name).is_loopback
+            return ipaddress.ip_address(name).is_loopback or bool(self.interface)
         own = socket.gethostname().lower()
         return name == "localhost" or (bool(self.interface) and name in (own, f"{own}.local"))
 
@@ -257,7 +257,7 @@ class View:
         phase = ""
         try:
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError, IndexError):  # nonsense ends it
-                while data := await loop.sock_recv(drive, MESSAGE_BYTES):
+                while data := await _received(loop, drive):
                     line, _, picture = data.partition(b"\n")
                     head = json.loads(line)
                     phase = head["phase"]
@@ -366,6 +366,14 @@ def _jpeg_of(picture: bytes, shape: list[int]) -> bytes:
     import simplejpeg
 
     return simplejpeg.encode_jpeg(np.frombuffer(picture, np.uint8).reshape(shape), 80, "BGR")
+
+
+async def _received(loop: asyncio.AbstractEventLoop, drive: socket.socket) -> bytes:
+    """The next message, b"" at the end."""
+    try:
+        return await loop.sock_recv(drive, MESSAGE_BYTES)
+    except ConnectionResetError:  # it has closed without reading a second stop; its last message is still there
+        return await loop.sock_recv(drive, MESSAGE_BYTES)
 
 
 async def _end(task: asyncio.Future) -> None:
