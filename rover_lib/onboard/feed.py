@@ -4,8 +4,8 @@
     drive(..., until=Until(over=feed.over), hooks=Hooks(show=partial(feed.tick, report, camera, pilot)))
 
 The view (view.py) is another process, on a rover another user's. It listens at a Unix socket of whole messages; the
-drive looks once a second whether somebody does. Both ways nothing is ever waited for: a message is dropped while the one
-before is not read yet, and the next one, a tenth of a second later, says all again. So a view that hangs, floods or
+drive looks once a second whether somebody does. Both ways nothing is ever waited for: a message is dropped while the
+one before is not read yet, and the next one, a tenth of a second later, says all again. So a view that hangs, floods or
 dies costs a drive what a failed system call does. What comes back is read a few messages a tick; one of them, STOP,
 ends the drive as its other ends do, and all others are nothing.
 

@@ -1,4 +1,4 @@
-"""The view's server, by the page's own protocol: who may look, who may stop, and that a stop is all that can be asked."""
+"""The view's server, by the page's own protocol: who may look and stop, and that nothing else can be asked."""
 
 import asyncio
 import contextlib
@@ -16,8 +16,9 @@ from rover_lib.onboard import view as v  # noqa: E402  # after it is known that 
 
 TOKEN = "a-token-of-the-tests"
 JPEG = b"\xff\xd8 a picture \n \xff\xd9"
-HEAD = {"phase": "driving", "text": "", "title": "policy.pt", "sent_s": 10.1, "who": "A", "why": "", "pins": [1456, 150],
-        "tick": {"steering": 0.2, "throttle": 0.05}, "machine": {"temperature_c": 61.0, "throttled": "0x50000"},
+HEAD = {"phase": "driving", "text": "", "title": "policy.pt", "sent_s": 10.1, "who": "A", "why": "",
+        "pins": [1456, 150], "tick": {"steering": 0.2, "throttle": 0.05},
+        "machine": {"temperature_c": 61.0, "throttled": "0x50000"},
         "events": [[1.0, "armed"]], "frame": 7, "captured_s": 10.0, "size": [640, 360],
         "plan": {"captured_s": 10.0, "rate_hz": 30.0, "actions": [[0.1, 0.09]] * 32}}  # fmt: skip
 
@@ -290,8 +291,8 @@ def test_a_second_click_hides_no_end(tmp_path):
     asyncio.run(scene())
 
 
-NONSENSE = [b"", b"\n", b"{}", b"[]\n", b"no json\n" + JPEG, b'{"phase": "driving", "plan": 3}\n', b"\xff\xfe\n", b"null\n",
-            b'{"phase": "driving", "shape": [9, 9, 3]}\nshort', b'{"phase": "driving", "pins": "ab"}\n',
+NONSENSE = [b"", b"\n", b"{}", b"[]\n", b"no json\n" + JPEG, b'{"phase": "driving", "plan": 3}\n', b"\xff\xfe\n",
+            b"null\n", b'{"phase": "driving", "shape": [9, 9, 3]}\nshort', b'{"phase": "driving", "pins": "ab"}\n',
             b'{"phase": "driving", "machine": {"throttled": "hot"}}\n']  # fmt: skip
 
 
@@ -396,7 +397,7 @@ def test_what_cannot_be_opened(tmp_path):
 
     asyncio.run(both())
     assert not (tmp_path / "view").exists()
-    with pytest.raises(v.ViewError, match="of nosuch0 .*`ip -brief address` lists the interfaces"):
+    with pytest.raises(v.ViewError, match=r"of nosuch0 .*`ip -brief address` lists the interfaces"):
         v.Address(0, "nosuch0").open()
     with pytest.raises(v.ViewError, match="no user 'nobody-of-that-name'"):
         v.View(v.Address(0), TOKEN, tmp_path / "view", drive_user="nobody-of-that-name")
