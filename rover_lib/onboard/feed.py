@@ -37,6 +37,7 @@ from rover_lib.onboard.telemetry import FlightLog, Tick
 
 EVERY_S = 0.1  # between two messages
 AGAIN_S = 1.0  # between two looks whether somebody listens
+TOLD_S = 5.0  # between two lines of the log: a view that comes and goes must not fill it
 LAST_S = 0.2  # for the last message of a drive, whose car stands
 ASKED_MOST = 8  # messages of the view that are read at a tick
 STOP = re.compile(rb"stop ([0-9a-f.:]{1,45})", re.ASCII)  # and the address of who asked
@@ -62,9 +63,8 @@ class Feed:
     ):
         self._place, self._log, self._title, self._clock, self._sleep = place, log, title, clock, sleep
         self._socket: socket.socket | None = None
-        self._look_s = self._due_s = 0.0
+        self._look_s = self._due_s = self._tell_s = 0.0
         self._ticks: deque[tuple[float, float]] = deque(maxlen=100)  # when, and how late in milliseconds
-        self._told = False
         self.dropped = 0  # messages for which there was no room
 
     def close(self) -> None:
@@ -133,8 +133,8 @@ class Feed:
 
     def _lost(self, why: str) -> None:
         self.close()
-        if not self._told:  # once: a view that comes and goes must not fill the log
-            self._told = True
+        if self._clock() >= self._tell_s:
+            self._tell_s = self._clock() + TOLD_S
             self._log.event(why)
 
     def _show(
