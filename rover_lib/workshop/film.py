@@ -19,10 +19,10 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.replay import Moment
+from rover_lib.workshop.replay import AHEAD, Moment
 
 WIDTH = 640
-PANEL = 104  # rows below the picture
+PANEL = 118  # rows below the picture
 FULL_THROTTLE = 0.25  # of the bar
 WHO = {"M": "the human drives", "A": "the policy drives", "S": "stopped", "": ""}
 GREEN_BGR = (113, 204, 46)
@@ -150,10 +150,11 @@ def _draw_panel(draw: ImageDraw.ImageDraw, head: dict[str, Any], top: int) -> No
     if tick.get("late_ms") is not None:
         lines.append(f"command {tick['late_ms']:.1f} ms late, {head['missed']} missed")
     for row, line in enumerate(lines):
-        draw.text((412, top + 8 + 21 * row), line, INK, _font(14))
+        draw.text((404, top + 8 + 21 * row), line, INK, _font(14))
     if head["events"]:
         t_s, text = head["events"][-1]
-        draw.text((10, top + 80), f"{t_s:.1f} s  {text}"[:96], FAINT, _font(12))
+        draw.text((10, top + 76), f"{t_s:.1f} s  {text}"[:96], FAINT, _font(12))
+    draw.text((10, top + 95), AHEAD, FAINT, _font(12))
 
 
 def _draw_bar(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], name: str, value: Any, pin: Any) -> None:

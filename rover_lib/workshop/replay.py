@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from rover_lib.onboard.view import View
 
 RECORDED = "recorded: "  # the event that names the episode
+AHEAD = "ahead: where the commands of the next second led"
 EVENTS = 8
 AGAIN_S = 3.0  # between two showings
 LATEST = 100  # ticks whose lateness is shown
@@ -138,7 +139,7 @@ def _of_recording(folder: Path) -> list[Moment]:
         tick = dict.fromkeys(Tick._fields) | {"t_s": sample.time_s, "steering": steering, "throttle": throttle}
         tick |= {"frame": number, "plan": 0, "fade": 1.0}
         ahead = sample.chunk[~sample.is_pad].tolist()
-        head = _head(episode.id, sample.time_s, ahead, 30.0) | {"tick": tick, "text": episode.label}
+        head = _head(episode.id, sample.time_s, ahead, 30.0) | {"tick": tick}
         head["pins"] = [pulses.steering_us, pulses.throttle_us]
         found.append(Moment(sample.time_s - episode.samples[0].time_s, head, sample.frame_path))
     return found
@@ -146,7 +147,7 @@ def _of_recording(folder: Path) -> list[Moment]:
 
 def _head(title: str, now_s: float, ahead: Sequence[Sequence[float]], rate_hz: float) -> dict[str, Any]:
     plan = {"captured_s": now_s, "rate_hz": rate_hz, "actions": ahead[: round(rate_hz)]}
-    return {"phase": "replay", "text": "", "title": title, "sent_s": now_s, "who": "", "why": "", "missing": "",
+    return {"phase": "replay", "text": AHEAD, "title": title, "sent_s": now_s, "who": "", "why": "", "missing": "",
             "machine": {}, "events": [], "hz": None, "late_most_ms": None, "missed": 0, "plan": plan}  # fmt: skip
 
 
