@@ -191,6 +191,7 @@ def costs(
                     heard = [m for m in page.messages if since_s < m["heard_s"] < now_s and m["jpeg_bytes"]]
                     delays_ms += [(m["heard_s"] - m["captured_s"]) * 1e3 for m in heard]
                     rates_hz.append(len(heard) / (now_s - since_s))
+            drive.check()  # a machine that is too busy ends it
             echo(f"{pair + 1} of {pairs}: {cpu_pct[-1]:.1f} % of a core, {rates_hz[-1]:.1f} pictures a second")
         drive.close()
         flight = read_log(log)

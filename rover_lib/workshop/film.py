@@ -96,7 +96,7 @@ def _write_webp(path: Path, pictures: Iterator[np.ndarray], rate_hz: float, qual
     images = [Image.fromarray(picture) for picture in pictures]
     if images:
         images[0].save(path, "WEBP", save_all=True, append_images=images[1:], duration=round(1000 / rate_hz), loop=0,
-                       quality=quality, method=6, minimize_size=True)  # fmt: skip
+                       quality=quality, method=4)  # fmt: skip
     return len(images)
 
 
