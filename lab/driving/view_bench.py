@@ -146,75 +146,99 @@ def _arm(bench: DrivingBench, page: Page) -> None:
             raise FaultError("the car does not drive, or the page does not show it", found=page.newest)
 
 
+class _WorldDrive(Child):
+    """A drive of an artifact in the balloon world, which drives when it is made."""
+
+    def __init__(self, artifact: Path, place: Path, log: Path):
+        self.log = log
+        options = ("--world", "--view", place, "--log", log)
+        command = (sys.executable, "-m", "rover_lib.cli", "drive", artifact, *options)
+        super().__init__("rover drive", *command, error=FaultError)
+        end_s = time.monotonic() + DRIVES_S
+        while not any("armed" in line for line in self.errors()):
+            self.check()
+            if time.monotonic() > end_s:
+                raise FaultError("the drive did not begin", found=self.last_words(), remedy="try it by hand")
+            time.sleep(0.1)
+        time.sleep(SETTLE_S)
+
+    def late_ms(self, since_s: float, until_s: float) -> np.ndarray:
+        """Of its commands in a span of time."""
+        flight = read_log(self.log)
+        t_s = flight.ticks["t_s"] + flight.header["start_monotonic_s"]
+        return flight.ticks["late_ms"][(t_s > since_s) & (t_s < until_s)]
+
+
+@dataclass
+class _Turns:
+    """A turn without a view and one with: when each counts, and what the pages and the view's process were."""
+
+    alone: tuple[float, float]
+    looked: tuple[float, float]
+    delays_ms: list[float]
+    rates_hz: list[float]
+    cpu_pct: float
+
+
+def _turns(place: Path, turn_s: float, pages: int) -> _Turns:
+    begin_s = time.monotonic()
+    time.sleep(turn_s)
+    alone = begin_s + SETTLE_S, time.monotonic()
+    with ViewServer(place) as view, contextlib.ExitStack() as opened:
+        looking = [opened.enter_context(Page(view.url)) for _ in range(pages)]
+        time.sleep(max(0.0, alone[1] + SETTLE_S - time.monotonic()))
+        since_s, before_s = time.monotonic(), _processor_s(view.pid)
+        time.sleep(max(0.0, alone[1] + turn_s - time.monotonic()))
+        until_s = time.monotonic()
+        cpu_pct = 100 * (_processor_s(view.pid) - before_s) / (until_s - since_s)
+        heard = [[m for m in p.messages if since_s < m["heard_s"] < until_s and m["jpeg_bytes"]] for p in looking]
+    delays_ms = [(m["heard_s"] - m["captured_s"]) * 1e3 for messages in heard for m in messages]
+    rates_hz = [len(messages) / (until_s - since_s) for messages in heard]
+    return _Turns(alone, (since_s, until_s), delays_ms, rates_hz, cpu_pct)
+
+
 def costs(
     artifact: Path, pairs: int, turn_s: float = 12.0, pages: int = 3, echo: Callable[[str], None] = lambda text: None
 ) -> dict[str, Any]:
     """A drive of `artifact` in the balloon world, with and without a view, in turns.
 
-    Returns {late_ms: {with, without}, late_p99_pairs_ms, late_p99_more_ms, delay_ms, pictures_hz, cpu_pct, missed}.
-    delay_ms: from a picture's capture until a page has it. cpu_pct: of one core, by the view with all its pages.
+    Returns {pages, late_ms: {with, without}, late_p99_pairs_ms, late_p99_more_ms, delay_ms, pictures_hz, cpu_pct, load,
+    repeated}. delay_ms: from a picture's capture until a page has it. cpu_pct: of one core, by the view with all its
+    pages. repeated: pairs in which the drive ended because this machine was too busy, driven again.
     """
     late: dict[str, list[np.ndarray]] = {"with": [], "without": []}
-    delays_ms: list[float] = []
-    cpu_pct: list[float] = []
-    rates_hz: list[float] = []
-    spans: list[tuple[str, float, float]] = []
+    turns: list[_Turns] = []
+    repeated = 0
     with tempfile.TemporaryDirectory(prefix="rover-view-") as name, contextlib.ExitStack() as stack:
-        folder = Path(name)
-        place, log = folder / "view", folder / "flight.log"
-        options = ("--world", "--view", place, "--log", log)
-        drive = Child(
-            "rover drive", sys.executable, "-m", "rover_lib.cli", "drive", artifact, *options, error=FaultError
-        )
-        stack.callback(drive.close)
-        end_s = time.monotonic() + DRIVES_S
-        while not any("armed" in line for line in drive.errors()):
-            drive.check()
-            if time.monotonic() > end_s:
-                raise FaultError("the drive did not begin", found=drive.last_words(), remedy="try it by hand")
-            time.sleep(0.1)
-        time.sleep(SETTLE_S)
-        for pair in range(pairs):
-            begin_s = time.monotonic()
-            time.sleep(turn_s)
-            spans.append(("without", begin_s + SETTLE_S, time.monotonic()))
-            begin_s = time.monotonic()
-            with ViewServer(place) as view, contextlib.ExitStack() as opened:
-                looking = [opened.enter_context(Page(view.url)) for _ in range(pages)]
-                time.sleep(max(0.0, begin_s + SETTLE_S - time.monotonic()))
-                since_s, before_s = time.monotonic(), _processor_s(view.pid)
-                time.sleep(max(0.0, begin_s + turn_s - time.monotonic()))
-                now_s = time.monotonic()
-                cpu_pct.append(100 * (_processor_s(view.pid) - before_s) / (now_s - since_s))
-                spans.append(("with", since_s, now_s))
-                for page in looking:
-                    heard = [m for m in page.messages if since_s < m["heard_s"] < now_s and m["jpeg_bytes"]]
-                    delays_ms += [(m["heard_s"] - m["captured_s"]) * 1e3 for m in heard]
-                    rates_hz.append(len(heard) / (now_s - since_s))
-            drive.check()  # a machine that is too busy ends it
-            echo(f"{pair + 1} of {pairs}: {cpu_pct[-1]:.1f} % of a core, {rates_hz[-1]:.1f} pictures a second")
-        drive.close()
-        flight = read_log(log)
-    t_s = flight.ticks["t_s"] + flight.header["start_monotonic_s"]
-    missed = dict.fromkeys(late, 0)
-    for which, since_s, until_s in spans:
-        inside = (t_s > since_s) & (t_s < until_s)
-        late[which].append(flight.ticks["late_ms"][inside])
-        missed[which] += round((until_s - since_s) * 30) - int(inside.sum())
-    more = [
-        float(np.percentile(w, 99) - np.percentile(o, 99)) for w, o in zip(late["with"], late["without"], strict=True)
-    ]
-    both = {which: percentiles(np.concatenate(parts).tolist()) for which, parts in late.items()}
+        drive: _WorldDrive | None = None
+        while len(turns) < pairs:
+            if drive is None or not drive.running:
+                drive = _WorldDrive(artifact, Path(name, "view"), Path(name, f"flight-{repeated}.log"))
+                stack.callback(drive.close)
+            turn = _turns(Path(name, "view"), turn_s, pages)
+            time.sleep(1.0)  # the log is written twice a second
+            if not drive.running:
+                repeated += 1
+                if repeated > pairs:
+                    raise drive.ended()
+                continue
+            turns.append(turn)
+            late["without"].append(drive.late_ms(*turn.alone))
+            late["with"].append(drive.late_ms(*turn.looked))
+            echo(f"{len(turns)} of {pairs}: {turn.cpu_pct:.1f} % of a core, {turn.rates_hz[0]:.1f} pictures a second")
+    both = zip(late["with"], late["without"], strict=True)
+    more = [float(np.percentile(looked, 99) - np.percentile(alone, 99)) for looked, alone in both]
+    all_late = {which: percentiles(np.concatenate(parts).tolist()) for which, parts in late.items()}
     return {
         "pages": pages,
-        "late_ms": both,
+        "late_ms": all_late,
         "late_p99_pairs_ms": [round(value, 3) for value in more],
-        "late_p99_more_ms": round(both["with"]["p99"] - both["without"]["p99"], 3),
-        "ticks_not_there": missed,
-        "delay_ms": percentiles(delays_ms),
-        "pictures_hz": round(statistics.mean(rates_hz), 2),
-        "cpu_pct": round(statistics.mean(cpu_pct), 2),
+        "late_p99_more_ms": round(all_late["with"]["p99"] - all_late["without"]["p99"], 3),
+        "delay_ms": percentiles([ms for turn in turns for ms in turn.delays_ms]),
+        "pictures_hz": round(statistics.mean(hz for turn in turns for hz in turn.rates_hz), 2),
+        "cpu_pct": round(statistics.mean(turn.cpu_pct for turn in turns), 2),
         "load": [round(value, 2) for value in os.getloadavg()],
+        "repeated": repeated,
     }
 
 
