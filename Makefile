@@ -11,10 +11,11 @@ NAME ?= mine
 # In a container there may be nobody but root, and what is loaded here was made here; see onboard/confine.py.
 export ROVER_AS_ROOT := 1
 
-.PHONY: help demo run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks tables docs clean
+.PHONY: help demo watch run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks tables docs clean
 
 help:
 	@echo "make demo                                   record, train, quantize, compare, benchmark, drive and distill in the balloon world"
+	@echo "make watch                                  the demo's policy drives through that world, live in the browser"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make lab NAME=mine                          JupyterLab on the notebooks of a run, with its outputs"
 	@echo "make firmware; make flash PORT=/dev/ttyUSB0 build the Arduino's firmware, and put it on the board"
@@ -39,7 +40,7 @@ $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and f"Python 3.11 to 3.13 is needed, found {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet 'uv>=0.5'
-	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,dev,docs]'
+	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,view,dev,docs]'
 	@touch $@
 
 demo: $(READY)
@@ -50,6 +51,10 @@ demo: $(READY)
 	$(ROVER) distill runs/demo/best_model.pth runs/demo/episodes --name demo-small --size 96x54 --feedforward 256 --steps 20 --samples 200
 	$(ROVER) world students runs/demo runs/demo-small --worlds 20
 	$(ROVER) report runs/demo
+
+watch: $(READY)
+	@test -f runs/demo/policy_static.pt || $(MAKE) demo
+	$(ROVER) view runs/demo/policy_static.pt
 
 run: $(READY)
 	@test -n '$(CHECKPOINT)' -a -n '$(EPISODES)' || { echo 'make run needs CHECKPOINT=best_model.pth EPISODES=folder [NAME=mine]' >&2; exit 2; }

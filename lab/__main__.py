@@ -119,6 +119,27 @@ def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...], kinds
     ctx.exit(1 if outcome.wrong else 0)
 
 
+@main.command()
+@click.argument("output", type=FILE, default="runs/view.json")
+@click.option("--artifact", type=FILE, default="runs/demo/policy_static.pt", show_default=True, help="That drives.")
+@click.option("--pairs", type=click.IntRange(min=1), default=10, show_default=True, help="Turns with and without.")
+@click.option("--stops", type=click.IntRange(min=1), help="Presses of the button [default: lab/params.yml].")
+@click.pass_context
+def view(ctx: click.Context, output: Path, artifact: Path, pairs: int, stops: int | None) -> None:
+    """Measure what a view costs a drive, how old its picture is, and how soon its button stops the car.
+
+    About 10 minutes. Leaves OUTPUT as JSON; exit code 1 if a gate of lab/params.yml does not hold. Needs Debian's
+    packages for the Arduino's firmware and simavr, see README.
+    """
+    from lab.driving.view_bench import measure
+
+    metrics, wrong = measure(output, artifact, pairs, stops, click.echo)
+    show(metrics, False)
+    for sentence in wrong:
+        click.echo(f"rover: {sentence}", err=True)
+    ctx.exit(1 if wrong else 0)
+
+
 @main.command("random")
 @click.argument("output", type=FILE, required=False)
 @click.option("--drives", type=click.IntRange(min=1), default=10_000, show_default=True, help="How many.")

@@ -103,6 +103,8 @@ class Drive(RoverCommand):
     start: one of INSIDE; 'clock', bench.step_clock sets its clock; 'disk', its log is on bench.disk; '' none of them.
     """
 
+    arguments: tuple[str, ...] = ()  # more of them
+
     def __init__(self, bench: "DrivingBench", start: str):
         self.start = start
         self._marked = 0
@@ -115,8 +117,8 @@ class Drive(RoverCommand):
         run = [sys.executable, "-c", f"{code}from rover_lib.cli import main; main()"]
         if start == "clock":
             env = {"LD_PRELOAD": str(bench.clock_library()), "CLOCK_STEP": str(bench.clock)}
-        options = ["--film", "--hz", RATE_HZ, "--threads", 1, "--log", self.log]
-        super().__init__("drive", bench.artifact, *bench.devices(), *options, run=run, env=env)
+        options = ["--film", "--hz", RATE_HZ, "--threads", 1, "--log", self.log, "--view", bench.view]
+        super().__init__("drive", bench.artifact, *bench.devices(), *options, *self.arguments, run=run, env=env)
 
     def children(self) -> list[int]:
         """Its processes: the policy's."""
@@ -164,6 +166,7 @@ class DrivingBench:
         self.artifact = self.folder / "policy.pt"
         make_artifact(self.artifact)
         self.camera = self.folder / "camera"
+        self.view = self.folder / "view"
         self.events: list[PinEvent] = []
         self.rng = random.Random(0)
         self._pictures = {instruction: pictures(instruction) for instruction in range(7)}
@@ -214,7 +217,7 @@ class DrivingBench:
         """Has a drive that was started like that, and has been driving for a while; the one that is on, if it fits."""
         if self._drive and self._drive.running and self._drive.start == start:
             self.wait(AT_SPEED_S)
-            if self._driving():
+            if self.driving:
                 return
         self.restart(start)
 
@@ -231,7 +234,7 @@ class DrivingBench:
         drive = self.start(start)
         deadline = time.monotonic() + START_S
         first_s = None  # command
-        while first_s is None or time.monotonic() - first_s < AT_SPEED_S or not self._driving():
+        while first_s is None or time.monotonic() - first_s < AT_SPEED_S or not self.driving:
             self.wait(0.02)
             if first_s is None and self.cable.commands:
                 first_s = self.cable.commands[0].at_s
@@ -241,13 +244,18 @@ class DrivingBench:
                 )
         self.arduino.ready(False)  # from here on the human does nothing but what a fault says
 
-    def start(self, start: str = "", fault: Callable[["DrivingBench"], object] = lambda bench: None) -> Drive:
-        """A new drive, with a fault that is there before it."""
+    def start(
+        self,
+        start: str = "",
+        fault: Callable[["DrivingBench"], object] = lambda bench: None,
+        make: type[Drive] = Drive,
+    ) -> Drive:
+        """A new drive, with a fault that is there before it. make: another kind of it."""
         self.end_drive()
         self.repair()
         self.arduino.ready(True)
         fault(self)
-        self._drive = Drive(self, start)
+        self._drive = make(self, start)
         return self._drive
 
     def repair(self) -> None:
@@ -293,7 +301,8 @@ class DrivingBench:
         self.feed.close()
         self.cable.unplug()
 
-    def _driving(self) -> bool:
+    @property
+    def driving(self) -> bool:
         """Whether each of the latest throttle pulses moves the car."""
         since_s = time.monotonic() - BEFORE_S
         latest = [e.pulse_us for e in self.events[-2000:] if e.pin == "throttle" and e.end_s > since_s]

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.cli import FILE, LOG_DRIVE, drive_options, run_drive, sum_up
+from rover_lib.onboard.cli import FILE, LOG_DRIVE, drive_options, open_view, run_drive, sum_up, view_options
 from rover_lib.onboard.kinds import PathTo
 
 
@@ -30,19 +30,63 @@ def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **op
     ctx.exit(run_drive(car=partial(VirtualCar, seed=seed) if in_world else None, latency_ms=latency_ms, **options))
 
 
+@click.command(short_help="Show a drive in the browser; it can be stopped there.")
+@click.argument("file", type=click.Path(path_type=Path, exists=True), required=False)
+@view_options
+@LOG_DRIVE
+def view(file: Path | None, drive: int, **options: Any) -> None:
+    """Show a drive in a browser: its picture, its plan, what the pins do. The page can stop the car and nothing else.
+
+    Without FILE it shows the `rover drive` of this machine, which may come and go. FILE: an artifact drives through the
+    balloon world; a flight log, or a recording, is shown as it was.
+
+    Who has the page's URL may look and stop; without --interface only from this machine.
+    """
+    from rover_lib.cli import watching
+
+    if file is None:
+        return open_view(**options, opened=watching.open_browser)
+    watching.watch(file, drive, options)
+
+
 @click.command(short_help="Sum up a flight log, and draw it.")
 @click.argument("file", type=PathTo("flight log"))
 @click.option("-o", "--output", type=FILE, help="The figure to write [default: FILE.png].")
 @LOG_DRIVE
+@click.option("--video", type=FILE, help="A film of the drive: .mp4, or .webp for a page.")
+@click.option("--pictures", type=PathTo("recordings"), help="With --video: the drive's episode [default: by the log].")
+@click.option("--video-hz", type=click.FloatRange(1, 60), default=30, show_default=True, help="Of it, a second.")
+@click.option("--video-width", type=click.IntRange(160, 1920), default=640, show_default=True, help="Of it, in pixels.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")
-def log(file: Path, output: Path | None, drive: int, as_json: bool) -> None:
+def log(
+    file: Path,
+    output: Path | None,
+    drive: int,
+    video: Path | None,
+    pictures: Path | None,
+    video_hz: float,
+    video_width: int,
+    as_json: bool,
+) -> None:
     """Sum up the flight log FILE of `rover drive`, and draw it.
+
+    With --video it makes a film of the drive instead, which needs the pictures that `rover drive --record` has kept:
+    where the car was led, what was commanded, and what its pins did.
 
     Missed ticks, jitter, ages and latencies of plans, who drove, temperature, and what happened. Older parts of the
     same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation, the summary does not.
     """
     flight = sum_up(file, drive, as_json)
-    if output or not as_json:
+    if video:
+        from rover_lib.workshop.film import write_film
+        from rover_lib.workshop.progress import terminal
+        from rover_lib.workshop.replay import moments
+
+        shown = moments(file, drive, pictures)
+        width = video_width // 2 * 2
+        count = write_film(video, shown, rate_hz=video_hz, width=width, progress=terminal())
+        click.echo(f"drawn: {video}, {count} pictures, {video.stat().st_size / 1e6:.2f} MB", err=as_json)
+    if output or not (as_json or video):
         from rover_lib.onboard.stage import atomic_path
         from rover_lib.workshop.flight import flight_figure
 

@@ -55,7 +55,7 @@ class Frame:
     image: (h, w, 3) uint8 BGR. captured_s: time.monotonic() (or the camera's clock) at which it was captured, or
     arrived where the camera does not say. number: 1, 2, ... of this camera. repeats: of how many frames in a row, this
     one the last, nearly all had been in one of the 32 before them, byte for byte; a sensor's noise makes that 0.
-    mean: of its pixels, 0 to 255. contrast: as picture.brightness().
+    mean: of its pixels, 0 to 255. contrast: as picture.brightness(). jpeg: as it came; None of a camera of raw ones.
     """
 
     image: np.ndarray
@@ -64,6 +64,7 @@ class Frame:
     repeats: int
     mean: float
     contrast: float
+    jpeg: bytes | None = None
 
 
 class Camera:
@@ -180,7 +181,7 @@ class Camera:
                         continue
                     refused = 0
                     if captured_s is not None:
-                        self._add(image, captured_s)
+                        self._add(image, captured_s, picture if isinstance(picture, bytes) else None)
                 raise CameraError(
                     f"{self.source}: it ended after {self.frames} frames", remedy="is the camera unplugged?"
                 )
@@ -194,7 +195,7 @@ class Camera:
             self._failure = failure
             self._changed.notify_all()
 
-    def _add(self, image: np.ndarray, captured_s: float) -> None:
+    def _add(self, image: np.ndarray, captured_s: float, jpeg: bytes | None) -> None:
         """Makes a picture the newest frame. Raises CameraError if it is not like those before it."""
         before = self._frame
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
@@ -213,7 +214,7 @@ class Camera:
         same = (self._shown[: number - 1] == shown).mean(axis=1).max(initial=0.0)
         self._shown[(number - 1) % REMEMBERED] = shown
         repeats = before.repeats + 1 if before and same >= SAME else 0
-        frame = Frame(image, captured_s, number, repeats, *brightness(image))
+        frame = Frame(image, captured_s, number, repeats, *brightness(image), jpeg)
         with self._changed:
             self._frame = frame
             self._first_s = self._first_s or captured_s

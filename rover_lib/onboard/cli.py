@@ -204,6 +204,7 @@ DRIVE_OPTIONS = (
     ),
     click.option("--replay", type=PathTo("recordings"), help="Send this episode's pulses; no policy, no camera."),
     click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder, FIFO or .mjpeg."),
+    click.option("--view", type=FILE, help="Socket of the view that may look [default: that of your `rover view`]."),
     click.option("--service", is_flag=True, help="As a systemd service: disarmed until `rover arm-car`."),
 )
 
@@ -597,6 +598,61 @@ def status(releases: Any, as_json: bool) -> None:
         )
     if not report["healthy"]:
         raise RoverError(report["trouble"])
+
+
+def view_options(command: Callable) -> Callable:
+    """The options of a view, on the rover and on a workstation."""
+    for option in reversed(VIEW_OPTIONS):
+        command = option(command)
+    return command
+
+
+VIEW_OPTIONS = (
+    click.option("--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="0: any."),
+    click.option("--interface", default="", help="A network that it serves too, such as wlan0 [default: none]."),
+    click.option("--token-file", type=FILE, help="What the URL must have [default: a new one, printed]."),
+    click.option("--feed", type=FILE, help="Socket at which drives come [default: that of your `rover drive`]."),
+    click.option("--drive-user", help="Whose drives may come, beside this user's own."),
+)
+
+
+@main.command(short_help="Show a drive in the browser; it can be stopped there.")
+@view_options
+def view(**options: Any) -> None:
+    """Show the drive of this machine in a browser: its picture, its plan, what the pins do. A drive may come and go.
+
+    The page can stop the car and nothing else. Who has its URL may do so; without --interface only from this machine,
+    or through `ssh -L 8470:127.0.0.1:8470`.
+    """
+    open_view(**options)
+
+
+def open_view(
+    web_port: int,
+    interface: str,
+    token_file: Path | None,
+    feed: Path | None,
+    drive_user: str | None,
+    opened: Callable[[str], object] = lambda url: None,
+    replay: Any = None,
+) -> None:
+    """Serve the view until SIGINT or SIGTERM. opened: is told its URL. replay: what a view.View shows instead."""
+    import asyncio
+
+    from rover_lib.onboard.host import default_view
+    from rover_lib.onboard.view import Address, View, new_token, read_token
+
+    token = read_token(token_file) if token_file else new_token()
+    place = None if replay else feed or default_view()
+    view = View(Address(web_port, interface), token, place, drive_user=drive_user, replay=replay is not None)
+
+    def tell(url: str) -> None:
+        # The journal may be read by others than the owner of the file.
+        click.echo(url.replace(token, "...") if token_file else url)
+        sys.stdout.flush()
+        opened(url)
+
+    asyncio.run(view.run(tell, replay))
 
 
 @main.command(short_help="Sum up a flight log.")

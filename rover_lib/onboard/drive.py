@@ -23,7 +23,8 @@ from rover_lib.onboard.camera import Camera, CameraError, path_of
 from rover_lib.onboard.car import Car as CarFile
 from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver
-from rover_lib.onboard.host import default_log
+from rover_lib.onboard.feed import Feed
+from rover_lib.onboard.host import default_log, default_view
 from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
 from rover_lib.onboard.loop import Arm, Hooks, Report, Until, Warnings, drive
 from rover_lib.onboard.params import params
@@ -67,7 +68,7 @@ class DriveOptions:
     ensemble: instead of params.yml's. threads: the policy's, None: all cores but one. log_file: None: the user's.
     replay: an episode whose pulses are sent. service: as a systemd service, disarmed until a human arms it.
     film: the camera may be recorded pictures (a folder, a FIFO, an .mjpeg), which know nothing of where the car is.
-    latency_ms: what a plan takes at least, to compare.
+    latency_ms: what a plan takes at least, to compare. view: where a view may listen, None: the user's.
     """
 
     artifact: Path | None = None
@@ -88,6 +89,7 @@ class DriveOptions:
     service: bool = False
     film: bool = False
     latency_ms: float = 0.0
+    view: Path | None = None
 
 
 def _check_no_film(camera: str) -> None:
@@ -140,6 +142,9 @@ def drive_car(
             service = Service(report, stop, log.event, model=content_hash(artifact))
             stack.enter_context(service)
             until = replace(until, over=service.over)
+        title = (options.artifact or options.replay or Path()).name
+        feed = stack.enter_context(contextlib.closing(Feed(options.view or default_view(), log, title)))
+        until = replace(until, over=_first_of(until.over, feed.over))
         link = None if options.dry_run else stack.enter_context(ServoLink(options.port, car=this))
         run_loop = partial(drive, link=link, log=log, rate_hz=options.hz, until=until, report=report)
         if controls:
@@ -151,9 +156,12 @@ def drive_car(
                 arm = partial(arm_capped, link, limit, replay.most_throttle, log.event)
                 if sys.stdin.isatty():
                     arm = partial(arm_when_ready, arm, link, stop, log.event)
-            hooks = Hooks(arm, warnings)
-            with boosted_priority(log):
-                run_loop(replay, hooks=hooks)
+            hooks = Hooks(arm, warnings, show=partial(feed.tick, report, None, None))
+            try:
+                with boosted_priority(log):
+                    run_loop(replay, hooks=hooks)
+            finally:
+                feed.ended(report, None, link)
             return
         if not artifact:
             raise ParamsError("a drive needs an artifact or a replay")
@@ -169,8 +177,15 @@ def drive_car(
         if sentence := another_car(policy.manifest, this):
             log.event(sentence, level=logging.WARNING)
         arming = partial(_Arming, options, settings, planner, camera, link, log, policy.manifest["mode"])
-        checks = [camera.latest, planner.newest, *([link.latest] if link else [])]
         said = ""
+
+        def show_waiting() -> None:
+            asked = feed.over()  # of a service nothing more: it is disarmed
+            feed.waiting(report, camera, link, said)
+            if asked and not service:
+                raise NotArmed(asked)
+
+        checks = [camera.latest, planner.newest, *([link.latest] if link else []), show_waiting]
         while True:
             pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz, calibration=this.pwm)
             warnings = _all_of(
@@ -190,12 +205,15 @@ def drive_car(
                     arm = partial(arm_when_ready, attempt.arm, link, stop, log.event, checks)
                 else:
                     arm = attempt.arm
-                hooks = Hooks(arm, warnings, attempt.record if options.record else None)
+                show = partial(feed.tick, report, camera, pilot)
+                hooks = Hooks(arm, warnings, attempt.record if options.record else None, show)
                 try:
                     run_loop(pilot, hooks=hooks)
                 except (DriveFault, TakenOver):
                     if not service:
                         raise
+                finally:
+                    feed.ended(report, camera, link)
             if not service or stop.is_set():
                 return
             said = report.ended
@@ -343,6 +361,11 @@ class _Arming:
             car=self._link.car if self._link else this_car(),
             most_bytes=self._room,
         )
+
+
+def _first_of(*ends: Callable[[], str | None]) -> Callable[[], str | None]:
+    """One reason to end a drive out of several."""
+    return lambda: next((why for end in ends if (why := end())), None)
 
 
 def _all_of(*sources: Warnings) -> Warnings:

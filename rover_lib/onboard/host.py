@@ -99,3 +99,8 @@ def default_log() -> Path:
     """Where a drive's flight log goes: systemd's state folder of the service, or the user's."""
     home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(os.environ.get("STATE_DIRECTORY") or Path(home) / "rover") / "flight.log"
+
+
+def default_view() -> Path:
+    """Where the user's view listens for drives: beside their flight log."""
+    return default_log().with_name("view")

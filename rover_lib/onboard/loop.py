@@ -68,12 +68,13 @@ class Hooks:
 
     arm: called once all is ready, arms the car, and may wait for a human before; None: the link's own arm(), at once.
     warnings: called once a second; the sentences that it gives go to the log. record: takes each command, as
-    Recorder.control does.
+    Recorder.control does. show: is told of each command once it went out, for a view.
     """
 
     arm: Arm | None = None
     warnings: Warnings = lambda: ()
     record: Callable[..., None] | None = None
+    show: Callable[[Tick], None] | None = None
 
 
 @dataclass
@@ -336,25 +337,24 @@ class _Loop:
         if plan_age_ms is not None and latency_ms is not None:
             self.report.plan_age_ms.append(plan_age_ms)
             self.report.latency_ms.append(latency_ms)
-        self.log.tick(
-            Tick(
-                t_s=now - self.log.start_s,
-                late_ms=late_ms,
-                state=telemetry.state.value if telemetry else "",
-                reason=telemetry.reason if telemetry else "",
-                steering=order.steering,
-                throttle=order.throttle,
-                steering_us=order.steering_us,
-                throttle_us=order.throttle_us,
-                pins_steering_us=telemetry.steering_us if telemetry else None,
-                pins_throttle_us=telemetry.throttle_us if telemetry else None,
-                plan=order.plan,
-                plan_age_ms=plan_age_ms,
-                latency_ms=latency_ms,
-                fade=order.fade,
-                frame=order.frame,
-            )
+        tick = Tick(
+            t_s=now - self.log.start_s,
+            late_ms=late_ms,
+            state=telemetry.state.value if telemetry else "",
+            reason=telemetry.reason if telemetry else "",
+            steering=order.steering,
+            throttle=order.throttle,
+            steering_us=order.steering_us,
+            throttle_us=order.throttle_us,
+            pins_steering_us=telemetry.steering_us if telemetry else None,
+            pins_throttle_us=telemetry.throttle_us if telemetry else None,
+            plan=order.plan,
+            plan_age_ms=plan_age_ms,
+            latency_ms=latency_ms,
+            fade=order.fade,
+            frame=order.frame,
         )
+        self.log.tick(tick)
         if self.hooks.record:
             calibration = self.link.calibration if self.link else this_car().pwm
             self.hooks.record(
@@ -366,3 +366,5 @@ class _Loop:
                 round(calibration.throttle.period_us),
                 plan_age_ms=None if plan_age_ms is None else round(plan_age_ms, 1),
             )
+        if self.hooks.show:
+            self.hooks.show(tick)

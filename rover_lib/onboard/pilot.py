@@ -11,7 +11,7 @@ import numpy as np
 from rover_lib.onboard.camera import Camera, CameraError, Frame
 from rover_lib.onboard.errors import DriveFault, PolicyError
 from rover_lib.onboard.inference import Planner
-from rover_lib.onboard.plan import Commanded, Follower, Settings
+from rover_lib.onboard.plan import Commanded, Follower, Plan, Settings
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import Controls
 
@@ -74,6 +74,12 @@ class PolicyPilot:
         self._throttle_s = 0.0  # when it was last told to
         self._blank_s: float | None = None  # since when nothing has been on the picture
         self._frame_age_s = self._asking_s = 0.0  # the most, since warnings()
+
+    @property
+    def plan(self) -> tuple[Plan, float] | None:
+        """The one in use, and the rate of its steps."""
+        plan = self._follower.plan
+        return (plan, self._follower.rate_hz) if plan else None
 
     def ready(self, stop: threading.Event) -> None:
         end = time.monotonic() + FIRST_PLAN_S

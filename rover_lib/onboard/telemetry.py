@@ -52,6 +52,7 @@ MACHINE_S = 1.0
 CLOSE_S = 2.0
 MIN_BYTES = 20_000
 EVENT_CHARACTERS = 800
+RECENT = 8
 ARMED = "armed"  # the loop's event, with which a drive begins
 MISSING = "ticks are missing before this one"
 BACK_S = 1.0  # a tick that is so much older than the one before it belongs to another drive
@@ -161,6 +162,8 @@ class FlightLog:
         self.failures = 0
         self.last_error: str | None = None
         self.dropped = 0  # ticks for which the queue had no room
+        self.recent: deque[Event] = deque(maxlen=RECENT)  # the newest events
+        self.machine: dict[str, Any] = {}  # what it last said of itself: temperature_c, throttled
         self._header = {
             "schema": SCHEMA,
             "kind": "header",
@@ -209,6 +212,7 @@ class FlightLog:
         """Note that something happened, with what belongs to it, in the file and in `logging`. As harmless as tick."""
         event = Event(self._clock() - self.start_s, text, fields)
         self._events.append(event)
+        self.recent.append(event)
         self._pass_on(level, event)
 
     def close(self) -> None:
@@ -299,6 +303,7 @@ class FlightLog:
         row: dict[str, Any] = {"kind": "machine", "t_s": round(self._clock() - self.start_s, 4)}
         row["temperature_c"] = self._host.temperature_c()
         row["throttled"] = self._host.throttled() if self._vcgencmd else None
+        self.machine = {name: row[name] for name in ("temperature_c", "throttled")}
         return _sealed(row)
 
     def _fail(self, error: Exception) -> None:

@@ -3,6 +3,7 @@
 rover_policy-0.1.0+<hash of its files>-py3-none-any.whl       rover_lib/onboard, nothing else
 torch-2.8.0-cp313-...aarch64.whl, ...                          as requirements_pi.txt pins and hashes them, or
 onnxruntime-1.31.1-cp313-...aarch64.whl, ...                   requirements_pi_onnxruntime.txt
+aiohttp-3.14.5-cp313-...aarch64.whl, ...                       requirements_pi_view.txt
 """
 
 import os
@@ -23,6 +24,7 @@ REQUIREMENTS = {  # by engine
     "torch": REPOSITORY / "requirements_pi.txt",
     "onnxruntime": REPOSITORY / "requirements_pi_onnxruntime.txt",
 }
+VIEW = REPOSITORY / "requirements_pi_view.txt"  # with either, for `rover view`
 PYTHONS = ("3.11", "3.13")  # of Debian 12 and 13, and of Raspberry Pi OS, which follows them
 # The newest glibc that a wheel may ask for is Debian 12's 2.36; pip takes a list, not "at most".
 PLATFORMS = [f"manylinux_2_{minor}_aarch64" for minor in range(17, 37)] + ["manylinux2014_aarch64"]
@@ -54,7 +56,8 @@ def make(
     wheel, version = _build(folder)
     if not only_rover:
         for python in pythons:
-            _fetch(folder, python, REQUIREMENTS[engine])
+            for requirements in (REQUIREMENTS[engine], VIEW):
+                _fetch(folder, python, requirements)
     return Wheelhouse(wheel, version, {p.name for p in folder.glob("*.whl")} != before)
 
 

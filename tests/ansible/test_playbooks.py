@@ -26,6 +26,7 @@ ROLE = ANSIBLE / "roles" / "rover"
 PLAYBOOKS = ["provision", "deploy", "rollback", "status", "benchmark", "drive"]
 SPECS = yaml.safe_load((ROLE / "meta" / "argument_specs.yml").read_text())["argument_specs"]
 UNITS = ["rover-drive.service", "rover-check@.service", "rover-benchmark.service"]
+VIEW = "rover-view.service"
 DEFAULTS = yaml.safe_load((ROLE / "defaults" / "main.yml").read_text())
 
 
@@ -283,7 +284,7 @@ def units(tmp_path) -> Path:
     """The service's units with the defaults, and a rover_home that has something to execute."""
     (tmp_path / "venv" / "bin").mkdir(parents=True)
     (tmp_path / "venv" / "bin" / "rover").symlink_to("/bin/true")
-    for name in UNITS:
+    for name in [*UNITS, VIEW]:
         (tmp_path / name).write_text(rendered(name, rover_home=tmp_path))
     return tmp_path
 
@@ -295,7 +296,7 @@ def analyze(*arguments: object) -> subprocess.CompletedProcess:
     return run("systemd-analyze", *arguments)
 
 
-@pytest.mark.parametrize("name", UNITS)
+@pytest.mark.parametrize("name", [*UNITS, VIEW])
 def test_systemd_understands_the_units(units, name):
     found = analyze("verify", "--man=no", "--recursive-errors=no", units / name)
     assert found.returncode == 0 and str(units) not in found.stderr, found.stderr
@@ -384,6 +385,43 @@ def test_the_service_says_what_the_command_line_takes(units):
     assert {a for a in arguments if a.startswith("--")} <= {o for p in drive.params for o in p.opts}
     check = next(x for x in (units / "rover-check@.service").read_text().splitlines() if x.startswith("ExecStart="))
     assert shlex.split(check)[1:] == ["release", "--models", "/var/lib/rover/models", "verify", "--confined", "%i"]
+
+
+def test_the_view_is_closed_enough_and_more_open_only_where_the_owner_names_a_network(units):
+    """It serves pages, which no other unit does; so its exposure is above theirs."""
+    for interface, allowed in (("", True), ("wlan0", False)):
+        (units / VIEW).write_text(rendered(VIEW, rover_home=units, rover_view_interface=interface))
+        text = (units / VIEW).read_text()
+        assert ("IPAddressDeny=any\nIPAddressAllow=localhost\n" in text) is allowed
+        assert text.endswith("WantedBy=multi-user.target") and text.count('--interface "wlan0"') == (not allowed)
+        assert analyze("verify", "--man=no", "--recursive-errors=no", units / VIEW).returncode == 0
+        found = analyze("security", "--offline=true", "--threshold=25", "--no-pager", units / VIEW)
+        assert found.returncode == 0, found.stdout[-3000:]
+
+
+def test_the_view_is_nobody_who_drives_and_the_drive_is_as_closed_as_before(units):
+    view, drive = ((units / name).read_text() for name in (VIEW, "rover-drive.service"))
+    assert "\nUser=rover-view\nGroup=rover-view\n" in view and "SupplementaryGroups" not in view
+    assert "\nPrivateDevices=yes\n" in view and "DeviceAllow" not in view and "rover-drive" not in view
+    for line in ("User=rover", "PrivateNetwork=yes", "IPAddressDeny=any", "RestrictAddressFamilies=AF_UNIX"):
+        assert f"\n{line}\n" in drive
+    feeds = [
+        words[words.index(option) + 1]
+        for words, option in (
+            (commands(units / VIEW)["ExecStart"], "--feed"),
+            (commands(units / "rover-drive.service")["ExecStart"], "--view"),
+        )
+    ]
+    assert feeds[0] == feeds[1] == "/run/rover-view/feed" and "RuntimeDirectory=rover-view\n" in view
+
+
+def test_the_views_unit_says_what_the_command_line_takes(units):
+    from rover_lib.onboard.cli import main
+
+    words = shlex.split(rendered(VIEW, rover_view_interface="wlan0").partition("ExecStart=")[2].splitlines()[0])[1:]
+    assert words[0] == "view"
+    known = {o for p in main.commands["view"].params for o in p.opts}
+    assert {a for a in words if a.startswith("--")} <= known and "--interface" in words
 
 
 HOSTILE = [

@@ -144,7 +144,7 @@ def test_bad_input_is_one_sentence(rover, tiny_file):
 
 def test_the_rovers_params_are_what_the_rover_reads(rover):
     script = "import json; from rover_lib.onboard.params import params; print(json.dumps(params()))"
-    assert set(json.loads(rover.run("python", "-c", script).stdout)) == {"drive", "flight_log", "gates"}
+    assert set(json.loads(rover.run("python", "-c", script).stdout)) == {"drive", "flight_log", "gates", "view"}
 
 
 def test_a_workstations_wheel_finds_its_params_out_of_a_checkout(tmp_path):

@@ -24,7 +24,9 @@ def test_the_own_wheel_has_what_drives_and_nothing_else(own):
     names = zipfile.ZipFile(own.wheel).namelist()
     files = {n for n in names if not n.startswith("rover_policy-")}
     assert {"rover_lib/__init__.py", "rover_lib/onboard/cli.py", "rover_lib/onboard/params.yml"} <= files
-    assert all(re.fullmatch(r"rover_lib/(__init__\.py|LICENSE|onboard/\w+\.(py|yml|toml))", n) for n in files), files
+    assert all(re.fullmatch(r"rover_lib/(__init__\.py|LICENSE|onboard/\w+\.(py|yml|toml|html))", n) for n in files), (
+        files
+    )
     scripts = next(n for n in names if n.endswith("entry_points.txt"))
     assert "rover = rover_lib.onboard.cli:main" in zipfile.ZipFile(own.wheel).read(scripts).decode()
 
@@ -76,6 +78,9 @@ def test_the_rover_needs_the_same_on_both_sides():
     assert fallback["fallback_version"] == v.UNTAGGED
     rovers = dependencies(v.ONBOARD / "pyproject.toml")
     assert dependencies(ROOT / "pyproject.toml") == rovers
+    views = [tomllib.loads(p.read_text())["project"]["optional-dependencies"]["view"]
+             for p in (ROOT / "pyproject.toml", v.ONBOARD / "pyproject.toml")]  # fmt: skip
+    assert views[0] == views[1] and re.search(r"^aiohttp==", w.VIEW.read_text(), re.MULTILINE)
     pinned = set(re.findall(r"^([\w-]+)==", w.REQUIREMENTS["torch"].read_text(), re.MULTILINE))
     assert {re.split(r"[=<>]", line)[0] for line in rovers} <= pinned
 
@@ -94,8 +99,9 @@ def test_the_others_come_by_hash_for_each_python_and_aarch64(tmp_path, monkeypat
 
     monkeypatch.setattr(w, "run", run)
     w.make(tmp_path, pythons=("3.11", "3.13"))
-    assert [a[a.index("--python-version") + 1] for a, _ in asked] == ["3.11", "3.13"]
-    for arguments, listed in asked:
+    assert [a[a.index("--python-version") + 1] for a, _ in asked] == ["3.11", "3.11", "3.13", "3.13"]
+    assert all("aiohttp==" in listed and "--hash=sha256:" in listed for _, listed in asked[1::2])
+    for arguments, listed in asked[::2]:
         assert {"--require-hashes", "--only-binary", "manylinux2014_aarch64", "manylinux_2_28_aarch64"} <= set(
             arguments
         )

@@ -1,0 +1,151 @@
+"""The view from outside: its server as a process, and pages without a browser, which speak the page's own protocol."""
+
+import asyncio
+import contextlib
+import json
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+
+from rover_lib.onboard.errors import RoverError
+from rover_lib.world.child import Child
+
+START_S = 60.0
+
+
+class PageError(RoverError):
+    """A view that does not start, or a page that it does not show."""
+
+
+class ViewServer:
+    """`rover view` as a process; a context manager. place: the socket for drives. url: of its page."""
+
+    def __init__(self, place: Path):
+        options = ("view", "--web-port", "0", "--feed", place)
+        self._process = Child("rover view", sys.executable, "-m", "rover_lib.onboard.cli", *options,
+                              error=PageError, talks=True)  # fmt: skip
+        self.pid = self._process.pid
+        said, end_s = b"", time.monotonic() + START_S
+        try:
+            while b"\n" not in said:
+                said += self._process.read(0.1)
+                if time.monotonic() > end_s:
+                    raise PageError(f"rover view printed no URL within {START_S:g} s", remedy="try it by hand")
+        except BaseException:
+            self.close()
+            raise
+        self.url = said.decode().split()[0]
+
+    def __enter__(self) -> "ViewServer":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def signal(self, number: int) -> None:
+        self._process.process.send_signal(number)
+
+    def close(self) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            self.signal(signal.SIGCONT)
+            self.signal(signal.SIGTERM)
+        self._process.wait(5.0)
+        self._process.close()
+
+
+class Page:
+    """An open page, in a thread of its own; a context manager. It says of each message at once that it shows it.
+
+    messages: what it got: the head of each, "heard_s" (time.monotonic() at which it was here) and "jpeg_bytes" with it.
+    """
+
+    def __init__(self, url: str):
+        self._base, _, self._token = url.partition("/?token=")
+        self.messages: list[dict[str, Any]] = []
+        self._loop = asyncio.new_event_loop()
+        self._wire: aiohttp.ClientWebSocketResponse | None = None
+        self._open = threading.Event()
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._run(),), daemon=True)
+
+    def __enter__(self) -> "Page":
+        self._thread.start()
+        if not self._open.wait(START_S) or self._wire is None:
+            raise PageError(f"{self._base}: no page", remedy="try it in a browser")
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        if self._wire and self._thread.is_alive():
+            asyncio.run_coroutine_threadsafe(self._wire.close(), self._loop)
+        self._thread.join(10.0)
+
+    def stop(self) -> float:
+        """Clicks; when, by time.monotonic()."""
+        assert self._wire, "it is open"
+        now_s = time.monotonic()
+        asyncio.run_coroutine_threadsafe(self._wire.send_str("stop"), self._loop)
+        return now_s
+
+    @property
+    def newest(self) -> dict[str, Any]:
+        return self.messages[-1] if self.messages else {"phase": "", "stopped": False, "pins": None}
+
+    async def _run(self) -> None:
+        try:
+            async with aiohttp.ClientSession() as browser:
+                url = f"{self._base}/ws?token={self._token}"
+                self._wire = await browser.ws_connect(url, headers={"Origin": self._base})
+                self._open.set()
+                async for message in self._wire:
+                    if message.type == aiohttp.WSMsgType.BINARY:
+                        line, _, jpeg = message.data.partition(b"\n")
+                        head = json.loads(line)
+                        self.messages.append(head | {"heard_s": time.monotonic(), "jpeg_bytes": len(jpeg)})
+                        await self._wire.send_str(f"shown {head['n']}")
+        except (aiohttp.ClientError, ConnectionError):  # the server is gone
+            pass
+        finally:
+            self._open.set()
+
+
+def flood(url: str, seconds: float, a_second: int = 1000) -> dict[str, int]:
+    """Requests that may not look, and some that may: how many of each status the server gave. 0: none."""
+    base, _, token = url.partition("/?token=")
+    requests = [
+        (f"{base}/", {}),
+        (f"{base}/?token=wrong", {}),
+        (f"{base}/?token={token}", {"Host": "evil.example"}),
+        (f"{base}/ws?token={token}", {"Origin": "http://evil.example"}),
+        (f"{base}/?token={token}", {}),
+    ]
+    counts: dict[str, int] = {}
+
+    async def ask(browser: aiohttp.ClientSession, number: int) -> None:
+        path, headers = requests[number % len(requests)]
+        status = 0
+        with contextlib.suppress(aiohttp.ClientError, ConnectionError, TimeoutError):
+            async with browser.get(path, headers=headers) as answer:
+                status = answer.status
+        counts[str(status)] = counts.get(str(status), 0) + 1
+
+    async def run() -> None:
+        limits = aiohttp.ClientTimeout(total=2.0)
+        async with aiohttp.ClientSession(timeout=limits, connector=aiohttp.TCPConnector(limit=50)) as browser:
+            begin_s, number, tasks = time.monotonic(), 0, set()
+            while (passed_s := time.monotonic() - begin_s) < seconds:
+                while number < passed_s * a_second:
+                    tasks.add(task := asyncio.create_task(ask(browser, number)))
+                    task.add_done_callback(tasks.discard)
+                    number += 1
+                await asyncio.sleep(0.005)
+            await asyncio.gather(*tasks)
+
+    asyncio.run(run())
+    return counts

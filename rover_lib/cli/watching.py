@@ -1,0 +1,48 @@
+"""What `rover view FILE` shows: an artifact that drives through the balloon world, or a drive that was."""
+
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rover_lib.onboard.cli import open_view
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.host import default_view
+from rover_lib.onboard.kinds import check_kind, kinds_of
+from rover_lib.workshop.replay import show_replay
+from rover_lib.world.child import Child
+
+
+def open_browser(url: str) -> None:
+    """Where there is a screen; elsewhere a browser would take over the terminal."""
+    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(url)
+
+
+def watch(file: Path, drive: int, options: dict[str, Any]) -> None:
+    """As `rover view FILE`. drive: of a flight log, which. Raises KindError for a file that cannot be driven or shown.
+
+    An artifact's drive is a process of its own, and ends with the view.
+    """
+    kinds = kinds_of(file)
+    if {"flight log", "recordings"} & set(kinds):
+        return open_view(**options, opened=open_browser, replay=show_replay(file, drive))
+    check_kind(file, "artifact")
+    place = options.setdefault("feed", None) or default_view()
+    options["feed"] = place
+    command = (sys.executable, "-m", "rover_lib.cli", "drive", file, "--world", "--view", place)
+    child: list[Child] = []
+
+    def opened(url: str) -> None:
+        child.append(Child("the drive", *command, error=RoverError))
+        click.echo("the car drives in some seconds; Ctrl-C ends both", err=True)
+        open_browser(url)
+
+    try:
+        open_view(**options, opened=opened)
+    finally:
+        for process in child:
+            process.close()

@@ -1,0 +1,89 @@
+"""Where a plan leads, drawn into the camera's picture: the car's geometry, on a flat floor.
+
+A car of two axles, whose speed follows the throttle, and a camera that looks straight ahead and level. For people to
+look at, and for nothing else: no command depends on it.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from rover_lib.onboard.errors import ParamsError
+from rover_lib.onboard.params import params
+
+NEAR_M = 0.15  # before the camera; what is nearer is not on the picture
+
+
+@dataclass(frozen=True)
+class CarShape:
+    """The section `view` of params.yml. Lengths in metres; what is of the picture, as a share of it.
+
+    wheel_angle_rad: of the front wheels at full steering. speed_mps: at throttle 1. focal: of the picture's width.
+    horizon: its row, of the picture's height from the top.
+    """
+
+    wheelbase_m: float
+    width_m: float
+    wheel_angle_rad: float
+    speed_mps: float
+    camera_height_m: float
+    focal: float
+    horizon: float
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+            if not number or value <= 0:
+                raise ParamsError(f"view: {name} must be a number above 0", found=repr(value), remedy="see params.yml")
+
+    @classmethod
+    def of_params(cls) -> "CarShape":
+        """Raises ParamsError for what makes no car."""
+        section: dict[str, Any] = params()["view"]
+        if (names := {f.name for f in fields(cls)}) != set(section):
+            odd = sorted(names ^ set(section))
+            raise ParamsError(f"view: {odd} must be there once", found=sorted(section), remedy="see params.yml")
+        return cls(**section)
+
+    def track(self, actions: Iterable[Sequence[float]], step_s: float) -> list[tuple[float, float, float]]:
+        """(ahead, left, heading) in metres and radians from here on, a point before each action and one at the end.
+
+        actions: [steering, throttle] each, for step_s seconds; steering is positive to the left.
+        """
+        x = y = heading = 0.0
+        points = [(x, y, heading)]
+        for steering, throttle in actions:
+            way_m = throttle * self.speed_mps * step_s
+            turn = way_m / self.wheelbase_m * math.tan(steering * self.wheel_angle_rad)
+            x += way_m * math.cos(heading + turn / 2)
+            y += way_m * math.sin(heading + turn / 2)
+            heading += turn
+            points.append((x, y, heading))
+        return points
+
+    def ribbon(
+        self, actions: Iterable[Sequence[float]], step_s: float, aspect: float
+    ) -> list[tuple[float, float, float, float]]:
+        """The way of both wheels, as shares of the picture: (x, y) of the left one, then of the right one.
+
+        aspect: of the picture, width to height. Only points before the camera; empty for a car that stands.
+        """
+        ribbon = []
+        for x, y, heading in self.track(actions, step_s):
+            side = self.width_m / 2
+            feet = [(x - s * math.sin(heading), y + s * math.cos(heading)) for s in (side, -side)]
+            if min(ahead for ahead, _ in feet) > NEAR_M:
+                (a, b), (c, d) = (self._seen(ahead, left, aspect) for ahead, left in feet)
+                ribbon.append((a, b, c, d))
+        return ribbon
+
+    def _seen(self, ahead: float, left: float, aspect: float) -> tuple[float, float]:
+        x = 0.5 - self.focal * left / ahead
+        return round(x, 4), round(self.horizon + self.focal * aspect * self.camera_height_m / ahead, 4)
+
+
+def from_now(plan: dict[str, Any], now_s: float, seconds: float = 1.0) -> list[list[float]]:
+    """A plan's actions from now on, for that long at most. plan: actions, rate_hz, captured_s, as feed.py has it."""
+    first = max(0, round((now_s - plan["captured_s"]) * plan["rate_hz"]))
+    return plan["actions"][first : first + round(seconds * plan["rate_hz"])]

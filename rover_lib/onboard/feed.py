@@ -1,0 +1,215 @@
+"""What a view gets to see of a drive, and all that it may ask: a stop.
+
+    feed = Feed(place, log, title="policy_static.pt")
+    drive(..., until=Until(over=feed.over), hooks=Hooks(show=partial(feed.tick, report, camera, pilot)))
+
+The view (view.py) is another process, on a rover another user's. It listens at a Unix socket of whole messages; the
+drive looks once a second whether somebody does. Both ways nothing is ever waited for: a message is dropped while the
+one before is not read yet, and the next one, a tenth of a second later, says all again. So a view that hangs, floods or
+dies costs a drive what a failed system call does. What comes back is read a few messages a tick; one of them, STOP,
+ends the drive as its other ends do, and all others are nothing.
+
+A message is a line of JSON and, after it, the camera's newest picture: its own JPEG, or, of a camera that gives none,
+every nth pixel of every nth row, (h, w, 3) uint8 BGR, where the line has "shape".
+"""
+
+import contextlib
+import fcntl
+import json
+import re
+import socket
+import struct
+import termios
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rover_lib.onboard.camera import Camera, Frame
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.loop import Report
+from rover_lib.onboard.pilot import PolicyPilot
+from rover_lib.onboard.servo_link import MISSING, REASONS, ServoLink
+from rover_lib.onboard.telemetry import FlightLog, Tick
+
+EVERY_S = 0.1  # between two messages
+AGAIN_S = 1.0  # between two looks whether somebody listens
+TOLD_S = 5.0  # between two lines of the log: a view that comes and goes must not fill it
+LAST_S = 0.2  # for the last message of a drive, whose car stands
+ASKED_MOST = 8  # messages of the view that are read at a tick
+STOP = re.compile(rb"stop ([0-9a-f.:]{1,45})", re.ASCII)  # and the address of who asked
+RAW_BYTES = 120_000  # of a picture that is no JPEG
+MOST_BYTES = 400_000  # of a message; one that would be larger goes without its picture
+DRIVING, WAITING, ENDED = "driving", "waiting", "ended"
+
+
+class Feed:
+    """A drive's end of the view. For the loop's thread alone; raises nothing, and waits for nothing but in ended().
+
+    place: where the view listens. log: its newest events are shown. title: what drives.
+    """
+
+    def __init__(
+        self,
+        place: Path,
+        log: FlightLog,
+        title: str,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
+        self._place, self._log, self._title, self._clock, self._sleep = place, log, title, clock, sleep
+        self._socket: socket.socket | None = None
+        self._look_s = self._due_s = self._tell_s = 0.0
+        self._ticks: deque[tuple[float, float]] = deque(maxlen=100)  # when, and how late in milliseconds
+        self.dropped = 0  # messages for which there was no room
+
+    def close(self) -> None:
+        """Nobody is fed any more."""
+        if self._socket:
+            self._socket.close()
+            self._socket = None
+
+    def tick(self, report: Report, camera: Camera | None, pilot: PolicyPilot | None, tick: Tick) -> None:
+        """After a command went out. camera, pilot: None of a replay."""
+        self._ticks.append((tick.t_s, tick.late_ms))
+        if self._due():
+            self._show(DRIVING, "", report, camera, pilot=pilot, tick=tick)
+
+    def waiting(self, report: Report, camera: Camera | None, link: ServoLink | None, said: str = "") -> None:
+        """While nobody has armed the car. said: how the drive before this one ended."""
+        if self._due():
+            self._show(WAITING, said, report, camera, link=link)
+
+    def ended(self, report: Report, camera: Camera | None, link: ServoLink | None) -> None:
+        """Once, after a drive, with what the pins do now; where the view is busy, for LAST_S."""
+        end_s = self._clock() + LAST_S
+        self._ticks.clear()
+        while self._connected() and not self._show(ENDED, report.ended, report, camera, link=link):
+            if self._clock() > end_s:
+                return
+            self._sleep(LAST_S / 10)
+
+    def over(self) -> str | None:
+        """For the loop, at each tick: why this drive is over, None if nobody asked for a stop."""
+        for _ in range(ASKED_MOST if self._socket else 0):
+            try:
+                asked = self._socket.recv(64) if self._socket else b""
+            except BlockingIOError:
+                break
+            except OSError:
+                asked = b""
+            if not asked:  # of a socket of messages: its other end is closed
+                self._lost("the view is gone")
+                break
+            if stop := STOP.fullmatch(asked):
+                return f"stopped from the view ({stop[1].decode()})"
+        return None
+
+    def _due(self) -> bool:
+        now_s = self._clock()
+        if now_s < self._due_s:
+            return False
+        self._due_s = (self._due_s if now_s < self._due_s + EVERY_S else now_s) + EVERY_S
+        return self._connected()
+
+    def _connected(self) -> bool:
+        now_s = self._clock()
+        if self._socket or now_s < self._look_s:
+            return self._socket is not None
+        self._look_s = now_s + AGAIN_S
+        wire = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        try:
+            wire.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_BYTES)
+            wire.connect(str(self._place))
+        except OSError:  # nobody listens, or has no time to answer
+            wire.close()
+            return False
+        self._socket = wire
+        return True
+
+    def _lost(self, why: str) -> None:
+        self.close()
+        if self._clock() >= self._tell_s:
+            self._tell_s = self._clock() + TOLD_S
+            self._log.event(why)
+
+    def _show(
+        self,
+        phase: str,
+        text: str,
+        report: Report,
+        camera: Camera | None,
+        *,
+        pilot: PolicyPilot | None = None,
+        tick: Tick | None = None,
+        link: ServoLink | None = None,
+    ) -> bool:
+        """Whether the message went out."""
+        try:
+            message: dict[str, Any] = {"phase": phase, "text": text, "title": self._title, "sent_s": self._clock()}
+            message |= {"tick": tick and tick._asdict(), "missed": report.missed, "machine": self._log.machine}
+            message["events"] = [[round(event.t_s, 2), str(event)[:200]] for event in tuple(self._log.recent)]
+            message |= self._pace() | self._pins(tick, link)
+            if pilot and pilot.plan:
+                plan, rate_hz = pilot.plan
+                actions = plan.actions.round(3).tolist()
+                message["plan"] = {"captured_s": plan.captured_s, "rate_hz": rate_hz, "actions": actions}
+            shown, picture = self._picture(camera)
+            return self._send(message | shown, picture)
+        except Exception as error:  # whatever it is: a drive goes on without a view
+            self._lost(f"the view is not fed any more: {type(error).__name__}: {error}")
+            self._look_s = float("inf")
+            return False
+
+    def _pace(self) -> dict[str, float | None]:
+        since_s = self._ticks[-1][0] - self._ticks[0][0] if self._ticks else 0.0
+        most_ms = max((late_ms for _, late_ms in self._ticks), default=None)
+        return {"hz": (len(self._ticks) - 1) / since_s if since_s > 0 else None, "late_most_ms": most_ms}
+
+    def _pins(self, tick: Tick | None, link: ServoLink | None) -> dict[str, Any]:
+        if tick:
+            why = REASONS.get(tick.reason, "")
+            return {"pins": [tick.pins_steering_us, tick.pins_throttle_us], "who": tick.state, "why": why}
+        with contextlib.suppress(RoverError):  # a link that is gone is told by who needs it
+            if link and (telemetry := link.latest()):
+                missing = "" if telemetry.missing == "-" else MISSING[telemetry.missing]
+                pins = [telemetry.steering_us, telemetry.throttle_us]
+                why = REASONS.get(telemetry.reason, "")
+                return {"pins": pins, "who": telemetry.state.value, "why": why, "missing": missing}
+        return {"pins": None, "who": "", "why": ""}
+
+    def _picture(self, camera: Camera | None) -> tuple[dict[str, Any], bytes]:
+        frame: Frame | None = None
+        with contextlib.suppress(RoverError):  # as above
+            frame = camera.latest() if camera else None
+        if frame is None:
+            return {}, b""
+        height, width = frame.image.shape[:2]
+        shown: dict[str, Any] = {"frame": frame.number, "captured_s": frame.captured_s, "size": [width, height]}
+        if frame.jpeg:
+            return shown, frame.jpeg
+        every = int(np.ceil(np.sqrt(frame.image.size / RAW_BYTES)))
+        image = frame.image[::every, ::every]
+        return shown | {"shape": image.shape}, image.tobytes()
+
+    def _send(self, message: dict[str, Any], picture: bytes) -> bool:
+        wire = self._socket
+        if wire is None:
+            return False
+        line = json.dumps(message).encode() + b"\n"
+        try:
+            (unread,) = struct.unpack("i", fcntl.ioctl(wire, termios.TIOCOUTQ, bytes(4)))
+            if unread:  # the view has not taken the one before
+                raise BlockingIOError
+            wire.send(line + picture if len(line) + len(picture) < MOST_BYTES else line)
+        except BlockingIOError:
+            self.dropped += 1
+            return False
+        except OSError:
+            self._lost("the view is gone")
+            return False
+        return True

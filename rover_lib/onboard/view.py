@@ -1,0 +1,382 @@
+"""The view: a page in a browser that shows a drive, and can stop it. A process of its own, which no drive imports.
+
+    asyncio.run(View(Address(), token).run(lambda url: print(url)))
+
+It listens twice. At a Unix socket, for drives, which send what feed.py says; and for browsers, over HTTP: a page, and
+for each page a WebSocket. Through that the page gets the newest message, and another one only once it has said that it
+shows the one before, so that nothing waits in between and a slow page simply gets fewer. What a page may say is
+"shown N" and "stop", and a stop is all that ever goes to a drive.
+
+Who has the token may look and stop. A request must name this machine as its host, and a WebSocket come from our own
+page, so that no other page in the same browser can use it.
+"""
+
+import asyncio
+import base64
+import contextlib
+import errno
+import hashlib
+import hmac
+import ipaddress
+import json
+import os
+import pwd
+import re
+import secrets
+import signal
+import socket
+import struct
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aiohttp import WSMsgType, web
+
+from rover_lib.onboard.ahead import CarShape, from_now
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.host import throttled_means
+from rover_lib.onboard.pwm import STOPPED_THROTTLE_US, PwmCalibration
+
+PORT = 8470
+MESSAGE_BYTES = 1 << 20  # more than a drive's socket takes
+PAGES = 32
+BEAT_S = 5.0  # a page that does not answer for that long is gone
+GONE = "gone"
+PAGE = Path(__file__).with_name("view.html")
+HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]{1,253})(:\d{1,5})?", re.ASCII)
+SHOWN = re.compile(r"shown (\d{1,12})", re.ASCII)
+
+
+class ViewError(RoverError):
+    """A view that cannot be opened here."""
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where browsers find the view. port: 0 takes any that is free. interface: a network's that may reach it, such as
+    wlan0; "": this machine alone."""
+
+    port: int = PORT
+    interface: str = ""
+
+    def open(self) -> socket.socket:
+        """A listening socket. Raises ViewError."""
+        wire = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            wire.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if self.interface:
+                wire.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, self.interface.encode() + b"\0")
+            wire.bind(("0.0.0.0" if self.interface else "127.0.0.1", self.port))
+            wire.listen(64)
+            wire.setblocking(False)
+        except OSError as error:
+            wire.close()
+            remedy = "is another view open, or choose another --web-port"
+            if error.errno == errno.ENODEV:
+                remedy = "`ip -brief address` lists the interfaces"
+            where = f"port {self.port}" + (f" of {self.interface}" if self.interface else "")
+            raise ViewError(f"no page can be served at {where} ({error.strerror})", remedy=remedy) from None
+        return wire
+
+    def is_ours(self, host: str) -> bool:
+        """Whether a request's Host: header names this machine. An address cannot be made to lead elsewhere; a name that
+        somebody else owns can, and then his page would be taken for ours."""
+        match = HOST.fullmatch(host)
+        if not match:
+            return False
+        name = match[1].strip("[]").lower()
+        with contextlib.suppress(ValueError):
+            return ipaddress.ip_address(name).is_loopback or bool(self.interface)
+        own = socket.gethostname().lower()
+        return name == "localhost" or (bool(self.interface) and name in (own, f"{own}.local"))
+
+
+def new_token() -> str:
+    """One that nobody guesses."""
+    return secrets.token_urlsafe(16)
+
+
+def read_token(path: Path) -> str:
+    """A file's. Raises ViewError for one that is not there, or that could be guessed."""
+    try:
+        token = path.read_text().strip()
+    except OSError as error:
+        raise ViewError(f"{path}: the token cannot be read ({error.strerror})", remedy="provision the rover") from None
+    if not re.fullmatch(r"[A-Za-z0-9_-]{16,128}", token, re.ASCII):
+        raise ViewError(f"{path}: no token of 16 letters or more is in it", remedy="provision the rover")
+    return token
+
+
+class View:
+    """The server. address: for browsers. place: the socket for drives, None: there are none, a replay is shown.
+
+    drive_user: who may feed it beside this user; None: nobody. Raises ViewError as run().
+    """
+
+    def __init__(
+        self,
+        address: Address,
+        token: str,
+        place: Path | None = None,
+        drive_user: str | None = None,
+        replay: bool = False,
+    ):
+        self._address, self._token, self._place, self._replay = address, token, place, replay
+        self._users = {0, os.geteuid()}
+        if drive_user:
+            try:
+                self._users.add(pwd.getpwnam(drive_user).pw_uid)
+            except KeyError:
+                raise ViewError(f"no user {drive_user!r} is known here", remedy="provision the rover") from None
+        self._open_to_all = drive_user is not None  # the socket; who comes is looked at
+        self._shape = CarShape.of_params()
+        self._pwm = PwmCalibration()
+        self._drives: list[socket.socket] = []  # the newest last, which is the one that is shown
+        self._number = 0
+        self._head: dict[str, Any] = {"phase": "no drive", "text": "no drive has come yet", "replay": replay}
+        self._picture = b""
+        self._news = asyncio.Event()
+        self._pages = 0
+        self._html = PAGE.read_bytes()
+
+    async def run(
+        self, opened: Callable[[str], object], beside: Callable[["View"], Awaitable[object]] | None = None
+    ) -> None:
+        """Until SIGINT or SIGTERM. opened: is told the page's URL. beside: what goes on meanwhile."""
+        ended = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, ended.set)
+        async with contextlib.AsyncExitStack() as stack:
+            opened(await self.open(stack))
+            if beside:
+                task = asyncio.ensure_future(beside(self))
+                stack.push_async_callback(_end, task)
+                task.add_done_callback(lambda task: None if task.cancelled() or not task.exception() else ended.set())
+            await ended.wait()
+            if beside and task.done():
+                task.result()
+
+    async def open(self, stack: contextlib.AsyncExitStack) -> str:
+        """Serves until the stack is closed; the page's URL."""
+        app = web.Application(middlewares=[self._guard], client_max_size=1024)
+        app.router.add_get("/", self._give_page)
+        app.router.add_get("/ws", self._talk)
+        runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=0.5, keepalive_timeout=10)
+        wire = self._address.open()
+        stack.callback(wire.close)
+        if self._place:
+            drives = self._listen(self._place)
+            stack.callback(self._place.unlink, missing_ok=True)
+            stack.callback(drives.close)
+            stack.push_async_callback(_end, asyncio.create_task(self._accept(drives)))
+        await runner.setup()
+        stack.push_async_callback(runner.cleanup)
+        await web.SockSite(runner, wire).start()
+        name = f"{socket.gethostname()}.local" if self._address.interface else "127.0.0.1"
+        return f"http://{name}:{wire.getsockname()[1]}/?token={self._token}"
+
+    def show(self, head: dict[str, Any], picture: bytes) -> None:
+        """From now on the pages show this: a message of feed.py, whose picture is a JPEG, or none."""
+        self._number += 1
+        pins: list[Any] | None = head.get("pins")
+        pins = pins if pins and None not in pins else None
+        plan = head.pop("plan", None)
+        ribbon: list[tuple[float, ...]] = []
+        if plan and "size" in head:
+            width, height = head["size"]
+            actions = from_now(plan, head["sent_s"])
+            ribbon = [tuple(p) for p in self._shape.ribbon(actions, 1 / plan["rate_hz"], width / height)]
+        means = throttled_means((head.get("machine") or {}).get("throttled"))
+        head |= {
+            "n": self._number,
+            "ribbon": ribbon,
+            "replay": self._replay,
+            "pins": pins,
+            "pins_actions": self._actions(pins),
+            "stopped": pins is not None and pins[1] <= STOPPED_THROTTLE_US,
+            "throttled": ", ".join(means) if means else "",
+        }
+        self._head, self._picture = head, picture
+        self._news.set()
+        self._news = asyncio.Event()
+
+    def stop(self, who: str) -> int:
+        """Asks each drive for a stop; how many were asked. who: an IP address."""
+        asked = 0
+        for drive in tuple(self._drives):
+            with contextlib.suppress(OSError):  # one that does not listen any more
+                drive.send(f"stop {who}".encode())
+                asked += 1
+        return asked
+
+    def _actions(self, pins: list[Any] | None) -> list[float] | None:
+        """What the pins' pulses stand for."""
+        if not pins:
+            return None
+        channels = self._pwm.steering, self._pwm.throttle
+        return [channel.action(us) or 0.0 for channel, us in zip(channels, pins, strict=True)]
+
+    # ---- drives
+
+    def _listen(self, place: Path) -> socket.socket:
+        wire = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        try:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) as other:
+                if other.connect_ex(str(place)) == 0:
+                    raise ViewError(f"{place}: another view listens there", remedy="end that one first")
+            place.unlink(missing_ok=True)  # of one that was killed
+            wire.bind(str(place))
+            place.chmod(0o666 if self._open_to_all else 0o600)
+            wire.listen(4)
+        except OSError as error:
+            wire.close()
+            raise ViewError(f"{place}: no drive could reach a view there ({error})", remedy="give --feed") from None
+        except BaseException:
+            wire.close()
+            raise
+        return wire
+
+    async def _accept(self, wire: socket.socket) -> None:
+        loop, tasks = asyncio.get_running_loop(), set()
+        while True:
+            drive, _ = await loop.sock_accept(wire)
+            _, uid, _ = struct.unpack("3i", drive.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+            if uid not in self._users:
+                drive.close()
+                continue
+            tasks.add(task := asyncio.create_task(self._hear(drive)))
+            task.add_done_callback(tasks.discard)
+
+    async def _hear(self, drive: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        self._drives.append(drive)
+        phase = ""
+        try:
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError, IndexError):  # nonsense ends it
+                while data := await _received(loop, drive):
+                    line, _, picture = data.partition(b"\n")
+                    head = json.loads(line)
+                    phase = head["phase"]
+                    if shape := head.pop("shape", None):
+                        picture = _jpeg_of(picture, shape)
+                    if drive is self._drives[-1]:
+                        self.show(head, picture)
+        finally:
+            shown = drive is self._drives[-1]
+            self._drives.remove(drive)
+            drive.close()
+            if shown and phase != "ended":
+                text = "the drive has gone without a word; what the car does is not known"
+                self.show(
+                    {**self._head, "phase": GONE, "text": text, "tick": None, "pins": None, "who": ""}, self._picture
+                )
+
+    # ---- browsers
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
+        if not self._address.is_ours(request.headers.get("Host", "")):
+            return _refused("this is not the name of this machine")
+        if not hmac.compare_digest(request.query.get("token", "").encode(), self._token.encode()):
+            return _refused("this page needs its token: use the URL that `rover view` has printed")
+        return await handler(request)
+
+    async def _give_page(self, request: web.Request) -> web.Response:
+        style, script = (base64.b64encode(hashlib.sha256(part).digest()).decode() for part in _parts(self._html))
+        headers = {
+            "Content-Security-Policy": f"default-src 'none'; style-src 'sha256-{style}'; script-src 'sha256-{script}'; "
+            f"img-src blob:; connect-src ws://{request.host}; frame-ancestors 'none'; base-uri 'none'",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            "Cache-Control": "no-store",
+        }
+        return web.Response(body=self._html, content_type="text/html", charset="utf-8", headers=headers)
+
+    async def _talk(self, request: web.Request) -> web.StreamResponse:
+        if request.headers.get("Origin") != f"http://{request.host}":
+            return _refused("only the view's own page may ask this")
+        if self._pages >= PAGES:
+            return web.Response(status=503, text=f"{PAGES} pages are open already\n")
+        page = _Page()
+        wire = web.WebSocketResponse(heartbeat=BEAT_S, max_msg_size=64, compress=False)
+        self._pages += 1
+        try:
+            await wire.prepare(request)
+            sending = asyncio.create_task(self._send(wire, page))
+            try:
+                async for message in wire:
+                    if message.type != WSMsgType.TEXT:
+                        break
+                    if message.data == "stop":
+                        count = self.stop(request.remote or "0.0.0.0")
+                        await wire.send_str("asked for a stop" if count else "no drive is there to be stopped")
+                    elif shown := SHOWN.fullmatch(message.data):
+                        page.was_shown(int(shown[1]))
+            finally:
+                await _end(sending)
+        finally:
+            self._pages -= 1
+        return wire
+
+    async def _send(self, wire: web.WebSocketResponse, page: "_Page") -> None:
+        with contextlib.suppress(ConnectionError):
+            while True:
+                while page.sent == self._number:
+                    await self._news.wait()
+                page.sent, page.captured_s = self._number, self._head.get("captured_s")
+                page.showing.clear()
+                head = json.dumps(self._head | {"n": page.sent, "delay_ms": page.delay_ms})
+                await wire.send_bytes(head.encode() + b"\n" + self._picture)
+                await page.showing.wait()
+
+
+class _Page:
+    """What one page has: sent: number of the last message. delay_ms: from that one's capture until it was shown."""
+
+    def __init__(self) -> None:
+        self.sent = -1
+        self.captured_s: float | None = None
+        self.delay_ms: float | None = None
+        self.showing = asyncio.Event()
+
+    def was_shown(self, number: int) -> None:
+        if number == self.sent:
+            self.delay_ms = round((time.monotonic() - self.captured_s) * 1e3, 1) if self.captured_s else None
+            self.showing.set()
+
+
+def _parts(html: bytes) -> tuple[bytes, bytes]:
+    """Its style and its script, which are all that a browser may take from it."""
+    style, script = (re.search(rb"<%s>(.*?)</%s>" % (tag, tag), html, re.S) for tag in (b"style", b"script"))
+    assert style and script, "view.html has one of each"
+    return style[1], script[1]
+
+
+def _refused(why: str) -> web.Response:
+    return web.Response(status=403, text=f"{why}\n")
+
+
+def _jpeg_of(picture: bytes, shape: list[int]) -> bytes:
+    """Of a camera that gives none. Raises ValueError for bytes that are no such picture."""
+    import numpy as np  # few cameras need it
+    import simplejpeg
+
+    return simplejpeg.encode_jpeg(np.frombuffer(picture, np.uint8).reshape(shape), 80, "BGR")
+
+
+async def _received(loop: asyncio.AbstractEventLoop, drive: socket.socket) -> bytes:
+    """The next message, b"" at the end."""
+    try:
+        return await loop.sock_recv(drive, MESSAGE_BYTES)
+    except ConnectionResetError:  # it has closed without reading a second stop; its last message is still there
+        return await loop.sock_recv(drive, MESSAGE_BYTES)
+
+
+async def _end(task: asyncio.Future) -> None:
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError, Exception):
+        await task

@@ -1,0 +1,194 @@
+"""A drive that was, as a view shows one that is: its pictures, each with what the flight log says of that moment.
+
+    for moment in moments("flight.log"):
+        moment.head                # a message as feed.py makes them
+        moment.frame_bgr()
+
+The flight log has no pictures: they are those of the episode that was recorded with the drive (`rover drive --record`),
+which the log names. It has no plans either, but what became of them: "plan" is what was commanded in the next second.
+"""
+
+import asyncio
+import csv
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.kinds import kinds_of
+from rover_lib.onboard.picture import PictureError, read_jpeg
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.servo_link import REASONS
+from rover_lib.onboard.telemetry import Flight, LogError, Tick, read_log
+from rover_lib.workshop.episodes import load_recordings
+
+if TYPE_CHECKING:
+    from rover_lib.onboard.view import View
+
+RECORDED = "recorded: "  # the event that names the episode
+AHEAD = "ahead: where the commands of the next second led"
+EVENTS = 8
+AGAIN_S = 3.0  # between two showings
+LATEST = 100  # ticks whose lateness is shown
+PAGE_HZ = 10.0
+
+
+@dataclass(frozen=True)
+class Moment:
+    """t_s: since the first moment. head: a message of feed.py, its times by the same clock. frame: the picture."""
+
+    t_s: float
+    head: dict[str, Any]
+    frame: Path
+
+    def frame_bgr(self) -> np.ndarray | None:
+        """(h, w, 3) uint8 BGR; None where the picture is damaged or gone."""
+        try:
+            return read_jpeg(self.frame)
+        except (OSError, PictureError):
+            return None
+
+
+def moments(file: Path | str, drive: int = -1, pictures: Path | None = None) -> list[Moment]:
+    """Of a flight log, or of a recording alone, a moment for each picture.
+
+    drive: which one of a log. pictures: the episode that was recorded with it, None: the one that the log names. Of a
+    folder of several episodes the first. Raises LogError, and EpisodeError where there are no pictures.
+    """
+    file = Path(file)
+    if "flight log" not in kinds_of(file):
+        return _of_recording(file)
+    flight = read_log(file, drive)
+    return _of_flight(flight, pictures or _recorded_with(flight))
+
+
+def _recorded_with(flight: Flight) -> Path:
+    for event in reversed(flight.events):
+        if event.text.startswith(RECORDED):
+            named = Path(event.text.removeprefix(RECORDED))
+            for path in (named, flight.path.parent / named, flight.path.parent / "episodes" / named.name):
+                if path.is_dir():
+                    return path
+            raise EpisodeError(f"{named}: the drive's pictures are not there", remedy="name them by --pictures")
+    raise EpisodeError(
+        f"{flight.path}: no pictures were recorded with this drive",
+        remedy="`rover drive --record FOLDER` records them; those of elsewhere are named by --pictures",
+    )
+
+
+def _of_flight(flight: Flight, episode: Path) -> list[Moment]:
+    ticks = flight.ticks
+    t_s = ticks["t_s"]
+    if not len(t_s):
+        raise LogError(f"{flight.path}: nothing was driven in this drive", remedy="choose another by --drive")
+    try:
+        begin_s = datetime.fromisoformat(str(flight.header["start"])).timestamp()  # by the system's clock
+    except (KeyError, ValueError):
+        raise LogError(f"{flight.path}: when it began is not known, its header is damaged") from None
+    period_ms, late_ms = flight.period_ms or 1000 / 30, ticks["late_ms"]
+    gaps = np.rint(np.diff(t_s * 1000 - late_ms) / period_ms) - 1
+    missed = np.concatenate([[0], np.cumsum(gaps.clip(0))])
+    commanded = np.stack([ticks["steering"], ticks["throttle"]], axis=1)
+    title = Path(str(flight.header.get("drive", {}).get("artifact", ""))).name or flight.path.name
+    found = []
+    for at_s, frame in _frames(episode):
+        i = int(np.searchsorted(t_s, at_s - begin_s, side="right")) - 1
+        now_s = at_s - begin_s
+        if i < 0 or now_s > t_s[-1] + 0.1:
+            continue
+        row = [_plain(ticks[name][i]) for name in Tick._fields]
+        tick = Tick(*row)
+        first = max(0, i - LATEST + 1)
+        before = [m for m in range(len(flight.machine["t_s"])) if flight.machine["t_s"][m] <= now_s]
+        events = [e for e in flight.events if e.t_s <= now_s][-EVENTS:]
+        head = {
+            **_head(title, now_s, commanded[i:].tolist(), 1000 / period_ms),
+            "tick": tick._asdict(),
+            "who": tick.state,
+            "why": REASONS.get(tick.reason, ""),
+            "pins": [tick.pins_steering_us, tick.pins_throttle_us],
+            "missed": int(missed[i]),
+            "hz": (i - first) / (t_s[i] - t_s[first]) if i > first else None,
+            "late_most_ms": float(late_ms[first : i + 1].max()),
+            "events": [[e.t_s, str(e)[:200]] for e in events],
+        }
+        if before:
+            machine = flight.machine
+            head["machine"] = {
+                "temperature_c": _plain(machine["temperature_c"][before[-1]]),
+                "throttled": machine["throttled"][before[-1]],
+            }
+        found.append(Moment(now_s, head, frame))
+    if not found:
+        raise EpisodeError(f"{episode}: none of its pictures is of the drive in {flight.path}", remedy="choose --drive")
+    return [Moment(m.t_s - found[0].t_s, m.head, m.frame) for m in found]
+
+
+def _of_recording(folder: Path) -> list[Moment]:
+    episode = load_recordings(folder).episodes[0]
+    calibration, found = PwmCalibration(), []
+    for number, sample in enumerate(episode.samples, 1):
+        steering, throttle = (float(v) for v in sample.chunk[0])
+        pulses = calibration.pulses(float(np.clip(steering, -1, 1)), float(np.clip(throttle, 0, 1)))
+        tick = dict.fromkeys(Tick._fields) | {"t_s": sample.time_s, "steering": steering, "throttle": throttle}
+        tick |= {"frame": number, "plan": 0, "fade": 1.0}
+        ahead = sample.chunk[~sample.is_pad].tolist()
+        head = _head(episode.id, sample.time_s, ahead, 30.0) | {"tick": tick}
+        head["pins"] = [pulses.steering_us, pulses.throttle_us]
+        found.append(Moment(sample.time_s - episode.samples[0].time_s, head, sample.frame_path))
+    return found
+
+
+def _head(title: str, now_s: float, ahead: Sequence[Sequence[float]], rate_hz: float) -> dict[str, Any]:
+    plan = {"captured_s": now_s, "rate_hz": rate_hz, "actions": ahead[: round(rate_hz)]}
+    return {"phase": "replay", "text": AHEAD, "title": title, "sent_s": now_s, "who": "", "why": "", "missing": "",
+            "machine": {}, "events": [], "hz": None, "late_most_ms": None, "missed": 0, "plan": plan}  # fmt: skip
+
+
+def _frames(episode: Path) -> list[tuple[float, Path]]:
+    """When each picture of an episode was taken, by the system's clock, and its file."""
+    try:
+        with (episode / "frame_data.csv").open(newline="") as file:
+            rows = [(float(row["timestamp"]), episode / row["image_path"]) for row in csv.DictReader(file)]
+    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
+        raise EpisodeError(f"{episode}: its list of pictures cannot be read ({error})") from None
+    inside = episode.resolve()
+    return sorted((t_s, path) for t_s, path in rows if path.resolve().is_relative_to(inside))
+
+
+def _plain(value: Any) -> Any:
+    """A number that was not known as None, text as text."""
+    if isinstance(value, str):
+        return str(value)
+    value = float(value)
+    return None if np.isnan(value) else int(value) if value.is_integer() else value
+
+
+def show_replay(file: Path, drive: int) -> "Callable[[View], Awaitable[None]]":
+    """Shows a drive in a view, in its own time and again and again. Raises as moments()."""
+    shown = moments(file, drive)
+
+    async def show(view: "View") -> None:
+        while True:
+            begin_s, next_s = time.monotonic(), 0.0
+            for moment in shown:
+                if moment.t_s < next_s:
+                    continue
+                next_s = moment.t_s + 0.9 / PAGE_HZ
+                await asyncio.sleep(max(0.0, begin_s + moment.t_s - time.monotonic()))
+                image = moment.frame_bgr()
+                head = dict(moment.head)
+                jpeg = b""
+                if image is not None:
+                    head["size"] = [image.shape[1], image.shape[0]]
+                    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+                view.show(head, jpeg)
+            await asyncio.sleep(AGAIN_S)
+
+    return show

@@ -1,0 +1,91 @@
+"""`rover view` whole, in a real browser: the page beside the flight log, its button, ten of them, and a telephone's."""
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+from urllib.parse import quote
+
+import pytest
+
+pytest.importorskip("aiohttp", reason="needs the extra view")
+
+from browser import Browser, chromium  # it needs aiohttp
+
+from rover_lib.onboard.telemetry import read_log
+
+pytestmark = [pytest.mark.release, chromium]
+PAGES = 10
+SEEN = "JSON.stringify([newest.tick, ...['tt', 'st'].map(id => document.getElementById(id).textContent)])"
+GREEN = """(() => {  // pixels of the picture that are of the ribbon's colour
+  const c = document.getElementById('picture'), d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+  let n = 0;
+  for (let i = 0; i < d.length; i += 4) n += d[i + 1] > d[i] + 60 && d[i + 1] > d[i + 2] + 40;
+  return n;
+})()"""
+
+
+@pytest.fixture
+def view(demo_run, tmp_path):
+    """The demo's policy that drives through the balloon world, and the page's URL."""
+    command = [sys.executable, "-m", "rover_lib.cli", "view", demo_run / "policy_static.pt", "--web-port", "0"]
+    env = {**os.environ, "XDG_STATE_HOME": str(tmp_path), "DISPLAY": ""}
+    process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True, env=env)
+    yield process.stdout.readline().strip()
+    process.send_signal(signal.SIGINT)
+    process.wait(30)
+    process.stdout.close()
+
+
+def test_ten_pages_show_the_flight_log_and_one_click_stops_the_car(view, tmp_path):
+    async def scene():
+        async with Browser(tmp_path / "profile") as browser:
+            tabs = [await browser.open(quote(view, safe="")) for _ in range(PAGES)]
+            seen = []
+            for tab in tabs:
+                await tab.until("document.getElementById('phase').textContent === 'driving'")
+                seen.append(json.loads(await tab.value(SEEN)))
+            await tabs[0].until(f"newest.ribbon.length > 3 && {GREEN} > 100")  # where the plan leads
+            await tabs[-1].click("stop")
+            await tabs[-1].until("document.getElementById('answer').textContent.startsWith('stopped: ')")
+            said = await tabs[-1].text("answer")
+            for tab in tabs:
+                await tab.until("document.getElementById('phase').textContent !== 'driving'")
+            return seen, said
+
+    seen, said = asyncio.run(scene())
+    assert "throttle pin at 120 us" in said
+    flight = read_log(tmp_path / "rover" / "flight.log")
+    assert any(e.text == "ended: stopped from the view (127.0.0.1)" for e in flight.events)
+    at = {round(t, 3): i for i, t in enumerate(flight.ticks["t_s"])}
+    assert len(seen) == PAGES
+    for tick, throttle, steering in seen:
+        row = at[round(tick["t_s"], 3)]
+        for name, shown, digits in (("throttle", throttle, 3), ("steering", steering, 2)):
+            commanded, _, pin = shown.partition(" | ")
+            assert abs(float(commanded) - flight.ticks[name][row]) <= 0.51 * 10**-digits + 1e-4  # the log has four
+            assert pin == f"{flight.ticks[f'pins_{name}_us'][row]:.0f} us"
+
+
+def test_a_telephones_page_fits_and_says_so_when_the_view_is_gone(view, tmp_path):
+    async def scene():
+        async with Browser(tmp_path / "profile") as browser:
+            tab = await browser.open(quote(view, safe=""))
+            await tab.ask("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=2, mobile=True)
+            await tab.until("document.getElementById('phase').textContent === 'driving'")
+            assert await tab.value("document.documentElement.scrollWidth") <= 390
+            assert await tab.value("document.getElementById('stop').getBoundingClientRect().bottom") <= 844
+            if folder := os.environ.get("ROVER_SCREENSHOTS"):
+                import base64
+                from pathlib import Path
+
+                shot = await tab.ask("Page.captureScreenshot")
+                Path(folder, "view.png").write_bytes(base64.b64decode(shot["data"]))
+            await tab.value("wire.close(); connect = () => {}; true")
+            await tab.until("document.getElementById('phase').textContent.startsWith('no news for')")
+            await tab.click("stop")
+            assert "NO CONNECTION: stop the car with the transmitter" in await tab.text("answer")
+
+    asyncio.run(scene())

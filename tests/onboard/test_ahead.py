@@ -1,0 +1,55 @@
+"""Where a plan leads: against the balloon world's physics and camera, whose car the default is."""
+
+from dataclasses import replace
+
+import pytest
+
+from rover_lib.onboard.ahead import CarShape, from_now
+from rover_lib.onboard.errors import ParamsError
+from rover_lib.onboard.params import params
+from rover_lib.world import world as w
+
+SHAPE = CarShape.of_params()
+STEP_S = 1 / w.RATE_HZ
+ASPECT = w.FRAME_WIDTH / w.FRAME_HEIGHT
+
+
+@pytest.mark.parametrize("steering", [-0.6, 0.0, 0.3, 1.0])
+def test_the_track_is_the_worlds(steering):
+    world = w.World(1)
+    speed = 0.08 * w.SPEED_PER_THROTTLE_MPS
+    world.state = replace(world.state, steering=steering, speed_mps=speed)  # as it has been going for a while
+    for _ in range(30):
+        world.step(steering, 0.08)
+    x, y, heading = SHAPE.track([(steering, 0.08)] * 30, STEP_S)[-1]
+    state = world.state
+    assert (x, y, heading) == pytest.approx((state.x_m, state.y_m, state.heading_rad), abs=1e-9)
+
+
+def test_it_is_drawn_where_the_worlds_camera_sees_the_floor():
+    ribbon = SHAPE.ribbon([(0.2, 0.09)] * 30, STEP_S, ASPECT)
+    track = [p for p in SHAPE.track([(0.2, 0.09)] * 30, STEP_S) if p[0] > 0.2]
+    assert len(ribbon) >= len(track) > 10
+    for (x, y, _), (a, b, c, d) in zip(track[::-1], ribbon[::-1], strict=False):
+        u, v = (a + c) / 2 * w.FRAME_WIDTH, (b + d) / 2 * w.FRAME_HEIGHT
+        ahead = w.FOCAL_PX * w.CAMERA_HEIGHT_M / (v - w.HORIZON_ROW)
+        left = (w.CENTRE_COLUMN - u) * w.CAMERA_HEIGHT_M / (v - w.HORIZON_ROW)
+        assert (ahead, left) == pytest.approx((x, y), abs=0.02)
+        assert a < c  # the left wheel's way is left of the right one's
+
+
+def test_a_car_that_stands_leads_nowhere():
+    assert SHAPE.ribbon([(0.5, 0.0)] * 30, STEP_S, ASPECT) == []
+
+
+def test_from_now_leaves_out_what_is_over():
+    plan = {"captured_s": 10.0, "rate_hz": 30.0, "actions": [[i, 0] for i in range(32)]}
+    assert [a[0] for a in from_now(plan, 10.1)] == list(range(3, 32))
+    assert [a[0] for a in from_now(plan, 10.0)] == list(range(30))
+    assert from_now(plan, 9.9)[0] == [0, 0] and from_now(plan, 12.0) == []
+
+
+@pytest.mark.parametrize("change", [{"focal": 0}, {"width_m": "wide"}, {"horizon": float("nan")}, {"speed_mps": True}])
+def test_what_is_no_car(change, monkeypatch):
+    with pytest.raises(ParamsError, match=f"view: {next(iter(change))} must be a number above 0"):
+        CarShape(**{**params()["view"], **change})

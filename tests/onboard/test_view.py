@@ -1,0 +1,431 @@
+"""The view's server, by the page's own protocol: who may look and stop, and that nothing else can be asked."""
+
+import asyncio
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+
+aiohttp = pytest.importorskip("aiohttp", reason="needs the extra view: pip install 'rover-policy[view]'")
+
+from rover_lib.onboard import view as v  # noqa: E402  # after it is known that it can be
+
+TOKEN = "a-token-of-the-tests"
+JPEG = b"\xff\xd8 a picture \n \xff\xd9"
+HEAD = {"phase": "driving", "text": "", "title": "policy.pt", "sent_s": 10.1, "who": "A", "why": "",
+        "pins": [1456, 150], "tick": {"steering": 0.2, "throttle": 0.05},
+        "machine": {"temperature_c": 61.0, "throttled": "0x50000"},
+        "events": [[1.0, "armed"]], "frame": 7, "captured_s": 10.0, "size": [640, 360],
+        "plan": {"captured_s": 10.0, "rate_hz": 30.0, "actions": [[0.1, 0.09]] * 32}}  # fmt: skip
+
+
+class Drive:
+    """The other end of a feed."""
+
+    def __init__(self, place):
+        self.wire = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.wire.connect(str(place))
+        self.wire.setblocking(False)
+
+    def send(self, head=HEAD, picture=JPEG):
+        self.wire.send(json.dumps(head).encode() + b"\n" + picture)
+
+    async def asked(self):
+        """The next that the view asks."""
+        return await asyncio.wait_for(asyncio.get_running_loop().sock_recv(self.wire, 1000), 5)
+
+    def asked_nothing(self):
+        with contextlib.suppress(BlockingIOError):
+            return self.wire.recv(1000) == b""
+        return True
+
+
+class Bench:
+    """A view, a browser, and drives; everything is closed with the context."""
+
+    def __init__(self, folder, **options):
+        self.place = folder / "view"
+        self.view = v.View(v.Address(0), TOKEN, self.place, **options)
+        self.stack = contextlib.AsyncExitStack()
+
+    async def __aenter__(self):
+        self.url = await self.view.open(self.stack)
+        self.base = self.url.partition("/?")[0]
+        self.browser = await self.stack.enter_async_context(aiohttp.ClientSession())
+        return self
+
+    async def __aexit__(self, *exc):
+        await self.stack.aclose()
+
+    def drive(self):
+        drive = Drive(self.place)
+        self.stack.callback(drive.wire.close)
+        return drive
+
+    async def page(self, token=TOKEN, **headers):
+        headers = {"Origin": self.base, **headers}
+        return await self.browser.ws_connect(f"{self.base}/ws?token={token}", headers=headers)
+
+
+async def message(page, shown=True):
+    """The next whole message of a page: its head, and its picture."""
+    while (got := await asyncio.wait_for(page.receive(), 5)).type != aiohttp.WSMsgType.BINARY:
+        assert got.type == aiohttp.WSMsgType.TEXT, got
+    line, _, picture = got.data.partition(b"\n")
+    head = json.loads(line)
+    if shown:
+        await page.send_str(f"shown {head['n']}")
+    return head, picture
+
+
+async def driving(page):
+    """The first message of a drive."""
+    while (found := await message(page))[0]["phase"] != "driving":
+        pass
+    return found
+
+
+def test_a_page_shows_what_the_drive_says(tmp_path):
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            page = await bench.page()
+            assert (await message(page))[0]["phase"] == "no drive"
+            drive = bench.drive()
+            drive.send()
+            head, picture = await driving(page)
+            assert picture == JPEG and head["n"] == 1
+            assert {k: head[k] for k in ("title", "who", "pins", "tick", "events")} == {
+                k: HEAD[k] for k in ("title", "who", "pins", "tick", "events")
+            }
+            assert head["throttled"] == "under-voltage since the start, throttled since the start"
+            assert len(head["ribbon"]) > 10 and not head["stopped"] and not head["replay"]
+            assert head["pins_actions"][1] == pytest.approx(0.05, abs=0.01)
+            drive.send(HEAD | {"phase": "ended", "pins": [1456, 120], "plan": None})
+            head, _ = await message(page)
+            assert head["stopped"] and head["ribbon"] == [] and head["delay_ms"] is not None
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [
+        ("/", {}),
+        ("/?token=", {}),
+        ("/?token=wrong", {}),
+        ("/?token=%C3%A4", {}),
+        (f"/?token={TOKEN}x", {}),
+        (f"/?token={TOKEN}", {"Host": "rover.evil.example"}),
+        (f"/?token={TOKEN}", {"Host": "127.0.0.1.evil.example:80"}),
+        (f"/?token={TOKEN}", {"Host": "192.168.1.9"}),  # it serves this machine alone
+        (f"/?token={TOKEN}", {"Host": "a b"}),
+        (f"/ws?token={TOKEN}", {}),
+        (f"/ws?token={TOKEN}", {"Origin": "http://evil.example"}),
+        (f"/ws?token={TOKEN}", {"Origin": "null"}),
+        (f"/ws?token={TOKEN}", {"Origin": "http://127.0.0.1:1"}),  # another program's page on this machine
+        ("/ws?token=wrong", {"Origin": "the right one"}),
+        ("/ws", {"Origin": "the right one"}),
+    ],
+)
+def test_who_may_not_look_gets_a_sentence_and_reaches_no_drive(tmp_path, path, headers):
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            drive = bench.drive()
+            drive.send()
+            if headers.get("Origin") == "the right one":
+                headers["Origin"] = bench.base
+            upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+            upgrade |= {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="} if path.startswith("/ws") else {}
+            async with bench.browser.get(bench.base + path, headers=upgrade | headers) as answer:
+                assert answer.status == 403
+                text = await answer.text()
+                assert len(text.splitlines()) == 1 and TOKEN not in text and "policy.pt" not in text
+            assert drive.asked_nothing()
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize(
+    "path", ["/ws/../arm", "/arm", "/stop", "/view.py", "/static/../../etc/passwd", "/favicon.ico"]
+)
+@pytest.mark.parametrize("method", ["GET", "POST", "PUT", "DELETE"])
+def test_there_is_nothing_else(tmp_path, method, path):
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            drive = bench.drive()
+            async with bench.browser.request(method, f"{bench.base}{path}?token={TOKEN}") as answer:
+                assert answer.status in (404, 405)
+            assert drive.asked_nothing()
+
+    asyncio.run(scene())
+
+
+def test_the_page_itself_may_load_nothing_and_be_framed_by_nobody(tmp_path):
+    async def scene():
+        async with Bench(tmp_path) as bench, bench.browser.get(bench.url) as answer:
+            assert answer.status == 200 and answer.content_type == "text/html"
+            policy = answer.headers["Content-Security-Policy"]
+            for part in ("default-src 'none'", "frame-ancestors 'none'", f"connect-src ws://{bench.base[7:]};"):
+                assert part in policy
+            assert answer.headers["Referrer-Policy"] == "no-referrer"
+            html = await answer.text()
+            assert "src=" not in html and "http://" not in html and TOKEN not in html
+
+    asyncio.run(scene())
+
+
+def test_a_stop_from_each_of_ten_pages_reaches_the_drive(tmp_path):
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            drive = bench.drive()
+            drive.send()
+            pages = [await bench.page() for _ in range(10)]
+            for page in pages:
+                await driving(page)
+                await page.send_str("stop")
+                assert await drive.asked() == b"stop 127.0.0.1"
+                assert (await asyncio.wait_for(page.receive(), 5)).data == "asked for a stop"
+            other = await bench.page()
+            drive.wire.close()
+            while (await message(other))[0]["phase"] != v.GONE:
+                pass
+            await other.send_str("stop")
+            assert (await asyncio.wait_for(other.receive(), 5)).data == "no drive is there to be stopped"
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize(
+    "said", ["arm", "STOP", "stop ", "steer 1", "shown", "shown -1", "shown 99999999", '{"ask": "arm"}']
+)
+def test_a_page_can_say_nothing_else(tmp_path, said):
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            drive = bench.drive()
+            drive.send()
+            page = await bench.page()
+            await driving(page)
+            await page.send_str(said)
+            drive.send()
+            await message(page)  # it goes on
+            assert drive.asked_nothing()
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize("said", [b"stop", b"x" * 100, "stop" * 100])
+def test_a_page_that_says_what_no_page_says_is_closed(tmp_path, said):
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            drive = bench.drive()
+            page = await bench.page()
+            await message(page)
+            await (page.send_bytes(said) if isinstance(said, bytes) else page.send_str(said))
+            got = await asyncio.wait_for(page.receive(), 5)
+            assert got.type in (aiohttp.WSMsgType.CLOSE, aiohttp.WSMsgType.CLOSED)
+            assert drive.asked_nothing()
+
+    asyncio.run(scene())
+
+
+def test_nothing_waits_for_a_page_that_is_slow(tmp_path):
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            drive = bench.drive()
+            slow, quick = await bench.page(), await bench.page()
+            await message(slow, shown=False)
+            await message(quick)
+            for number in range(1, 40):
+                drive.send(HEAD | {"frame": number})
+                assert (await message(quick))[0]["frame"] == number
+            with pytest.raises(asyncio.TimeoutError):
+                await asyncio.wait_for(slow.receive(), 0.05)
+            await slow.send_str("shown 0")
+            head, _ = await message(slow)
+            assert head["frame"] == 39  # the newest, and none of those between
+            await slow.send_str("stop")
+            assert await drive.asked() == b"stop 127.0.0.1"
+
+    asyncio.run(scene())
+
+
+def test_more_pages_than_anybody_opens_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(v, "PAGES", 3)
+
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            pages = [await bench.page() for _ in range(3)]
+            with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
+                await bench.page()
+            await pages[0].close()
+            for _ in range(100):
+                with contextlib.suppress(aiohttp.WSServerHandshakeError):
+                    return await bench.page()
+                await asyncio.sleep(0.01)
+            raise AssertionError("a closed page still counts")
+
+    asyncio.run(scene())
+
+
+def test_a_second_click_hides_no_end(tmp_path):
+    """A drive that has ended closes its socket with the second stop unread."""
+
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            page, drive = await bench.page(), bench.drive()
+            drive.send()
+            await driving(page)
+            for _ in range(2):
+                await page.send_str("stop")
+                await page.receive()
+            assert await drive.asked() == b"stop 127.0.0.1"
+            drive.send(HEAD | {"phase": "ended", "text": "stopped from the view", "pins": [1456, 120]})
+            drive.wire.close()
+            head, _ = await message(page)
+            assert (head["phase"], head["stopped"]) == ("ended", True)
+
+    asyncio.run(scene())
+
+
+NONSENSE = [b"", b"\n", b"{}", b"[]\n", b"no json\n" + JPEG, b'{"phase": "driving", "plan": 3}\n', b"\xff\xfe\n",
+            b"null\n", b'{"phase": "driving", "shape": [9, 9, 3]}\nshort', b'{"phase": "driving", "pins": "ab"}\n',
+            b'{"phase": "driving", "machine": {"throttled": "hot"}}\n']  # fmt: skip
+
+
+@pytest.mark.parametrize("said", NONSENSE[1:], ids=lambda m: repr(m[:30]))
+def test_a_drive_that_talks_nonsense_ends_nothing_but_its_own_line(tmp_path, said):
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            mad = bench.drive()
+            mad.wire.send(said)
+            page = await bench.page()
+            drive = bench.drive()
+            for _ in range(20):
+                drive.send(HEAD | {"frame": 77})
+                if (await message(page))[0].get("frame") == 77:
+                    break
+            else:
+                raise AssertionError("the drive after it is not shown")
+            await page.send_str("stop")
+            assert await drive.asked() == b"stop 127.0.0.1"
+
+    asyncio.run(scene())
+
+
+def test_a_stop_goes_to_every_drive_and_the_newest_is_shown(tmp_path):
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            page = await bench.page()
+            first = bench.drive()
+            first.send(HEAD | {"title": "first"})
+            assert (await driving(page))[0]["title"] == "first"
+            second = bench.drive()
+            second.send(HEAD | {"title": "second"})
+            while (await message(page))[0]["title"] != "second":
+                pass
+            first.send(HEAD | {"title": "first"})
+            second.send(HEAD | {"title": "second", "frame": 8})
+            assert (await message(page))[0]["title"] == "second"
+            await page.send_str("stop")
+            assert await first.asked() == await second.asked() == b"stop 127.0.0.1"
+
+    asyncio.run(scene())
+
+
+def test_a_camera_of_raw_pictures_is_shown_as_jpeg(tmp_path):
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            page, drive = await bench.page(), bench.drive()
+            drive.send(HEAD | {"shape": [30, 40, 3]}, bytes(30 * 40 * 3))
+            _, picture = await driving(page)
+            assert picture[:2] == b"\xff\xd8" and picture[-2:] == b"\xff\xd9"
+
+    asyncio.run(scene())
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be somebody else")
+def test_another_user_feeds_nothing(tmp_path):
+    tmp_path.chmod(0o755)
+    for parent in list(tmp_path.parents)[:2]:
+        parent.chmod(0o755)
+    script = "import os, socket, sys; os.setuid(65534); s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)\n"
+    script += "s.connect(sys.argv[1]); s.settimeout(5); print(s.recv(10))"
+
+    async def scene():
+        async with Bench(tmp_path, drive_user="daemon") as bench:
+            command = [sys.executable, "-c", script, str(bench.place)]
+            done = await asyncio.to_thread(subprocess.run, command, capture_output=True, text=True, timeout=20)
+            assert done.stdout == "b''\n" or "reset" in done.stderr.lower(), done  # closed at once
+            assert bench.view.stop("127.0.0.1") == 0
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize(
+    ("interface", "host", "ours"),
+    [
+        ("", "127.0.0.1:8470", True),
+        ("", "localhost:1", True),  # the end of an ssh tunnel
+        ("", "[::1]:8470", True),
+        ("", "192.168.1.7:8470", False),
+        ("", "", False),
+        ("", "localhost.evil.example", False),
+        ("wlan0", "192.168.1.7:8470", True),
+        ("wlan0", "evil.example", False),
+        ("wlan0", f"{socket.gethostname()}.local:8470", True),
+        ("wlan0", f"{socket.gethostname()}.evil.example", False),
+        ("wlan0", "127.0.0.1@evil.example", False),
+    ],
+)
+def test_hosts_that_are_ours(interface, host, ours):
+    assert v.Address(interface=interface).is_ours(host) is ours
+
+
+def test_what_cannot_be_opened(tmp_path):
+    async def both():
+        async with Bench(tmp_path) as bench:
+            with pytest.raises(v.ViewError, match="another view listens there; end that one first"):
+                async with Bench(tmp_path):
+                    pass
+            port = int(bench.base.rpartition(":")[2])
+            with pytest.raises(v.ViewError, match=f"no page can be served at port {port} "):
+                v.Address(port).open()
+
+    asyncio.run(both())
+    assert not (tmp_path / "view").exists()
+    with pytest.raises(v.ViewError, match=r"of nosuch0 .*`ip -brief address` lists the interfaces"):
+        v.Address(0, "nosuch0").open()
+    with pytest.raises(v.ViewError, match="no user 'nobody-of-that-name'"):
+        v.View(v.Address(0), TOKEN, tmp_path / "view", drive_user="nobody-of-that-name")
+
+
+def test_a_socket_that_a_killed_view_has_left_is_taken(tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
+        left.bind(str(tmp_path / "view"))
+
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            bench.drive().send()
+            assert (bench.place.stat().st_mode & 0o777) == 0o600
+            await driving(await bench.page())
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize("content", ["", "short", "with a blank in the middle", "ä" * 20])
+def test_a_token_that_could_be_guessed_is_refused(tmp_path, content):
+    (tmp_path / "token").write_text(content)
+    with pytest.raises(v.ViewError, match="no token of 16 letters"):
+        v.read_token(tmp_path / "token")
+
+
+def test_tokens(tmp_path):
+    (tmp_path / "token").write_text(f"{TOKEN}\n")
+    assert v.read_token(tmp_path / "token") == TOKEN
+    assert len(v.new_token()) >= 20 and v.new_token() != v.new_token()
+    with pytest.raises(v.ViewError, match="the token cannot be read"):
+        v.read_token(tmp_path / "none")
