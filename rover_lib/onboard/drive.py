@@ -148,7 +148,7 @@ def drive_car(
             return
         if not artifact:
             raise ParamsError("a drive needs an artifact or a replay")
-        camera = stack.enter_context(Camera(options.camera))
+        camera = stack.enter_context(Camera(options.camera, held=options.film))
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:
             log.event(f"the policy's process is not confined: {policy.unconfined}", level=logging.WARNING)
@@ -175,7 +175,7 @@ def drive_car(
                     arm = partial(arm_when_ready, this.arm, link, stop, log.event, checks)
                 else:
                     arm = this.arm
-                hooks = Hooks(arm, warnings, this.record if options.record else None)
+                hooks = Hooks(_then(arm, camera.begin), warnings, this.record if options.record else None)
                 try:
                     run_loop(pilot, hooks=hooks)
                 except (DriveFault, TakenOver):
@@ -184,6 +184,17 @@ def drive_car(
             if not service or stop.is_set():
                 return
             said = report.ended
+
+
+def _then(arm: Arm, begin: Callable[[], object]) -> Arm:
+    """Arms, and then begins: a film starts when the loop does, not while somebody looks for the transmitter."""
+
+    def armed() -> Telemetry | None:
+        telemetry = arm()
+        begin()
+        return telemetry
+
+    return armed
 
 
 def what_is_missing(link: ServoLink) -> str:
