@@ -188,7 +188,7 @@ def test_a_reader_who_has_seen_enough_changes_no_exit_code(rover, command, code)
 
 
 def test_the_way_by_hand(tmp_path, artifacts):
-    """docs/install.md's lines as they stand there, but for what needs root, a car, another machine or minutes of pip."""
+    """docs/install.md's lines as they stand there, but for what needs root, a car, another machine or minutes."""
     page = (ROOT / "docs" / "install.md").read_text()
     blocks = re.findall(r"<!-- by hand: \w+ -->\n(.*?)<!-- end -->", page, re.S)
     lines = [line.strip() for block in blocks for line in block.splitlines() if line.strip()]
