@@ -41,7 +41,7 @@ DRIVES_S = 90.0
 
 @dataclass(frozen=True)
 class ViewGates:
-    """Of lab/params.yml's section `view`."""
+    """Of lab/params.yml's section `view_costs`."""
 
     stops: int
     stop_ms: float
@@ -253,7 +253,7 @@ def measure(
     output: Path, artifact: Path, pairs: int, count: int | None, echo: Callable[[str], None] = lambda text: None
 ) -> tuple[dict[str, Any], list[str]]:
     """Both, written to `output` as the stage `view`; and a sentence for each gate that does not hold."""
-    gates = ViewGates(**lab_params()["view"])
+    gates = ViewGates(**lab_params()["view_costs"])
     metrics = costs(artifact, pairs, pages=gates.pages, echo=echo)
     metrics["stop"] = stop = stops(gates.stops if count is None else count, echo)
     found = {
