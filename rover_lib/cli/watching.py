@@ -1,7 +1,9 @@
 """What `rover view FILE` shows: an artifact that drives through the balloon world, or a drive that was."""
 
+import contextlib
 import os
 import sys
+import threading
 import webbrowser
 from pathlib import Path
 from typing import Any
@@ -34,15 +36,20 @@ def watch(file: Path, drive: int, options: dict[str, Any]) -> None:
     place = options.setdefault("feed", None) or default_view()
     options["feed"] = place
     command = (sys.executable, "-m", "rover_lib.cli", "drive", file, "--world", "--view", place)
-    child: list[Child] = []
+    with contextlib.ExitStack() as stack:
 
-    def opened(url: str) -> None:
-        child.append(Child("the drive", *command, error=RoverError))
-        click.echo("the car drives in some seconds; Ctrl-C ends both", err=True)
-        open_browser(url)
+        def opened(url: str) -> None:
+            child = Child("the drive", *command, error=RoverError)
+            stack.callback(child.close)
+            threading.Thread(target=_tell_end, args=(child,), daemon=True).start()
+            click.echo("the car drives in some seconds; Ctrl-C ends both", err=True)
+            open_browser(url)
 
-    try:
         open_view(**options, opened=opened)
-    finally:
-        for process in child:
-            process.close()
+
+
+def _tell_end(child: Child) -> None:
+    """What a drive said last, once it has ended; the page stays open."""
+    child.process.wait()
+    with contextlib.suppress(ValueError):  # closed, as the view has ended too
+        click.echo(f"the drive has ended: {child.last_words()}; Ctrl-C ends the view", err=True)

@@ -100,9 +100,10 @@ class Rover(click.Group):
         except ModuleNotFoundError as e:
             if ctx.params.get("debug") or (e.name or "").startswith("rover_lib"):
                 raise
-            click.echo(
-                f"rover: this command needs {e.name}, which only a workstation has: make demo sets one up", err=True
-            )
+            sentence = f"this command needs {e.name}, which only a workstation has: make demo sets one up"
+            if e.name == "aiohttp":
+                sentence = "the view needs aiohttp: provision the rover with -e rover_view=true; on a laptop, make demo"
+            click.echo(f"rover: {sentence}", err=True)
         except (OSError, MemoryError) as e:
             if ctx.params.get("debug"):
                 raise

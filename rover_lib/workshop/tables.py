@@ -122,6 +122,23 @@ def _faults(root: Path) -> list[Row]:
         ("human takes over by a stick, until the pins are the human's", f"at most {takeover:.0f} ms, by design 46"),
         ("pulses recorded, replayed and measured again", f"within {report['bytes']['worst_us']:.0f} us"),
         ("drives with random faults in virtual time that broke a rule of safety", _random(root)),
+        *_view(root),
+    ]
+
+
+def _view(root: Path) -> list[Row]:
+    """What a view does to a drive; `python -m lab view`."""
+    report = _metrics(root / "results" / "lab", "view")
+    stop, late = report["stop"], report["late_ms"]
+    cost = f"{late['with']['p99']:.2f} ms late at p99, {late['without']['p99']:.2f} without, in turns"
+    picture = f"{report['delay_ms']['p95']:.0f} ms old at p95, {report['pictures_hz']:.0f} a second"
+    return [
+        (
+            "the car is stopped by the button of a page, from the click to throttle off",
+            f"{stop['stopped']} of {stop['stops']}, at most {stop['stop_ms']['max']:.0f} ms",
+        ),
+        (f"a view with {report['pages']} open pages, and the loop's commands", cost),
+        (f"its picture, and its share of a core, {report['cpu_pct']:.1f} %", picture),
     ]
 
 

@@ -41,6 +41,7 @@ def rover(*args):
         ["world", "students"],
         ["wheelhouse"],
         ["drive"],
+        ["view"],
         ["record"],
         ["release"],
     ],

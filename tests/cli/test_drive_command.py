@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from needs import until
 
 from lab.driving.policy import make_artifact, pictures
 from rover_lib.cli import main
@@ -110,6 +111,69 @@ def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number):
     assert process.returncode == 0, stderr
     assert f"{number.name}: stopping" in stderr
     assert json.loads((tmp_path / "drive").read_text())["ended"] == "told to stop"
+
+
+@pytest.fixture
+def watched(demo_run, tmp_path):
+    """A drive of 300 ticks in the world, its view's server, and an open page that shows it."""
+    pytest.importorskip("aiohttp", reason="needs the extra view")
+    from lab.driving.page import Page, ViewServer
+
+    options = ["--world", "--ticks", "300", "--view", tmp_path / "view", "--log", tmp_path / "flight.log"]
+    options += ["--json", tmp_path / "drive"]
+    with ViewServer(tmp_path / "view") as server, Page(server.url) as page:
+        command = [*ROVER, str(demo_run / "policy_static.pt"), *map(str, options)]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+            until(lambda: page.newest["phase"] == "driving", 120)
+            yield server, page, process
+            process.kill()
+
+
+def ending(process, folder):
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 0, stderr
+    return json.loads((folder / "drive").read_text())
+
+
+def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(watched, tmp_path):
+    _, page, process = watched
+    until(lambda: len(page.messages) > 20)
+    page.stop()
+    until(lambda: page.newest["phase"] == "ended")
+    assert page.newest["stopped"] and page.newest["pins"][1] == 120
+    assert ending(process, tmp_path)["ended"] == page.newest["text"] == "stopped from the view (127.0.0.1)"
+    flight = read_log(tmp_path / "flight.log")
+    assert "ended: stopped from the view (127.0.0.1)" in [e.text for e in flight.events]
+    at = {round(t, 3): i for i, t in enumerate(flight.ticks["t_s"])}
+    shown = [m for m in page.messages if m["phase"] == "driving"]
+    assert len(shown) > 15 and all(m["jpeg_bytes"] > 1000 and m["size"] == [640, 360] for m in shown)
+    for message in shown:
+        row = at[round(message["tick"]["t_s"], 3)]
+        for name in ("steering_us", "throttle_us", "pins_steering_us", "pins_throttle_us", "plan", "frame"):
+            assert message["tick"][name] == flight.ticks[name][row]
+        assert message["pins"] == [message["tick"]["pins_steering_us"], message["tick"]["pins_throttle_us"]]
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_view_that_hangs_or_dies_takes_no_tick(watched, tmp_path, number):
+    server, _, process = watched
+    server.signal(number)
+    report = ending(process, tmp_path)
+    assert (report["ticks"], report["ended"]) == (300, "300 ticks")
+
+
+def test_a_flood_of_requests_takes_no_tick_and_writes_nothing(watched, tmp_path):
+    from lab.driving.page import flood
+
+    server, page, process = watched
+    before = {p.name for p in tmp_path.iterdir()}
+    page.close()  # in the middle
+    counts = flood(server.url, 3.0)
+    assert counts.get("403", 0) > 100 and set(counts) <= {"0", "200", "403"}
+    report = ending(process, tmp_path)
+    assert (report["ticks"], report["ended"]) == (300, "300 ticks")
+    assert {p.name for p in tmp_path.iterdir()} - before <= {"drive"}
+    assert sum(e.text == "armed" for e in read_log(tmp_path / "flight.log").events) == 1
 
 
 def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):

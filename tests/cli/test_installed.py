@@ -114,7 +114,10 @@ def test_inspects_an_artifact(rover, artifacts):
 
 @pytest.mark.parametrize(
     ("which", "others"),
-    [("rover", {"onnx_engine", "hailo_engine"}), ("rover_without_torch", {"torch_engine", "hailo_engine"})],
+    [
+        ("rover", {"onnx_engine", "hailo_engine", "view"}),
+        ("rover_without_torch", {"torch_engine", "hailo_engine", "view"}),
+    ],
 )
 def test_all_of_it_can_be_imported_but_the_engines_that_it_lacks(which, others, request):
     installed = request.getfixturevalue(which)
@@ -133,6 +136,12 @@ def test_a_rover_without_torch_runs_what_onnx_runtime_runs_and_says_what_it_lack
     assert done.returncode == 0, done.stderr
     done = rover_without_torch.run(*timed, artifacts["static"])
     assert done.returncode == 1 and "needs torch" in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
+
+
+def test_a_rover_without_the_view_says_how_to_get_it(rover):
+    done = rover.run("rover", "view")
+    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith("rover: the view needs aiohttp: ") and "rover_view=true" in done.stderr
 
 
 def test_bad_input_is_one_sentence(rover, tiny_file):
