@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from rover_lib.onboard.artifact import SCHEMA, save_artifact
+from rover_lib.onboard.engines import TORCH
 
 SIZE = (160, 320)  # height and width of the camera's pictures
 CHUNK, RATE_HZ = 32, 30.0
@@ -24,7 +25,7 @@ def make_artifact(
 ) -> None:
     """An artifact with the constant plan PLAN.
 
-    camera, size: its name, and height and width of what the policy looks at. engine: in the manifest; this machine's.
+    camera, size: its name, and height and width of what the policy looks at. engine: in the manifest; torch if None.
     """
     import torch
 
@@ -46,7 +47,7 @@ def make_artifact(
         "schema": SCHEMA,
         "mode": "fp32",
         "scheme": "float",
-        "engine": engine or torch.backends.quantized.engine,
+        "engine": engine or TORCH,
         "cameras": [{"name": camera, "height": height, "width": width}],
         "state_names": names,
         "action_names": names,
