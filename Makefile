@@ -11,7 +11,7 @@ NAME ?= mine
 # In a container there may be nobody but root, and what is loaded here was made here; see onboard/confine.py.
 export ROVER_AS_ROOT := 1
 
-.PHONY: help demo watch run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks tables docs clean
+.PHONY: help demo watch run test test-fast check-release coverage lint lab arm faults faults-cars random pi-fast pi firmware flash notebooks tables docs clean
 
 help:
 	@echo "make demo                                   record, train, quantize, compare, benchmark, drive and distill in the balloon world"
@@ -29,6 +29,7 @@ help:
 	@echo "                                            a policy of the real car's size, LEARNED=1 one that has learned to"
 	@echo "                                            drive (an hour or more), PEERS=1 adds other runtimes"
 	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino"
+	@echo "make faults-cars                            the same on two other cars, of lab/cars"
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the notebooks,"
@@ -78,7 +79,7 @@ test-fast: $(READY)
 check-release: lint demo
 	$(VENV)/bin/pytest -m release tests
 	$(VENV)/bin/pytest notebooks
-	$(MAKE) faults random pi-fast pi
+	$(MAKE) faults faults-cars random pi-fast pi
 
 coverage: demo
 	$(VENV)/bin/pytest --cov=rover_lib --cov=lab --cov-report=term
@@ -90,6 +91,10 @@ arm: $(READY)
 
 faults: $(READY)
 	$(LAB) faults runs/faults.json
+
+faults-cars: $(READY)
+	$(LAB) faults runs/faults-crawler.json --car lab/cars/crawler.yml
+	$(LAB) faults runs/faults-inverted.json --car lab/cars/inverted.yml
 
 random: $(READY)
 	$(LAB) random runs/random.json

@@ -101,13 +101,21 @@ def full(run_dir: Path, steps: int, learned: bool, **options: Any) -> None:
 @click.argument("output", type=FILE, required=False)
 @click.option("--only", metavar="NAME", multiple=True, help="Only this row, 'fuzz' or 'bytes'; several times for more.")
 @click.option("--kind", "kinds", metavar="KIND", multiple=True, help="Rows of this kind; several times for more.")
+@click.option("--car", type=FILE, help="Drive this car.yml's instead, such as lab/cars/crawler.yml.")
 @click.pass_context
-def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...], kinds: tuple[str, ...]) -> None:
+def faults(
+    ctx: click.Context, output: Path | None, only: tuple[str, ...], kinds: tuple[str, ...], car: Path | None
+) -> None:
     """Break what can break while the car drives, and see on the pins of an emulated Arduino whether it stops.
 
     About 6 minutes for all. With OUTPUT, the rows are left there as JSON. Exit code 1 if anything is not as expected.
     Needs Debian's packages for the Arduino's firmware and simavr, see docs/first_hour.md.
     """
+    from rover_lib.onboard.car import FILE_VARIABLE, read_car
+
+    if car:
+        read_car(car)
+        os.environ[FILE_VARIABLE] = str(car.resolve())  # before anything asks which car this is, drive included
     from lab.driving.faults import run_faults
 
     outcome = run_faults(only, kinds=kinds, echo=click.echo)

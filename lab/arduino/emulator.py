@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lab import debian
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.program import run
@@ -117,9 +118,10 @@ class EmulatedArduino:
     ):
         """every_pulse: pulses() has each pulse, a thousand a second; otherwise those that differ from the one before.
 
-        transmitter: its pulses from the start on, see transmitter(). ready: see ready(). nice: scheduling priority,
-        NICE comes near a processor of its own (below 0 only for root, silently left out for others). slow: its clock
-        runs that many times slower than this machine's; pulses are by its own, monotonic_s by this machine's.
+        transmitter: its pulses from the start on, see transmitter(), with this_car()'s periods. ready: see ready().
+        nice: scheduling priority, NICE comes near a processor of its own (below 0 only for root, silently left out for
+        others). slow: its clock runs that many times slower than this machine's; pulses are by its own, monotonic_s by
+        this machine's.
         Raises ArduinoError as build() does, and if the program does not start.
         """
         built = build()
@@ -129,6 +131,8 @@ class EmulatedArduino:
         self._rest = b""
         options = ["--link", self.port, "--log", "all" if every_pulse else "changes", "--reset-on-open"]
         options += ["--boot-ms", f"{boot_s * 1000:.0f}", "--slow", f"{slow:g}"]
+        numbers = this_car().numbers
+        options += ["--periods", str(numbers[0]), str(numbers[4])]
         self._process = Child(
             "the emulated Arduino", built.program, built.firmware, *options, error=ArduinoError, talks=True
         )

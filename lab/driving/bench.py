@@ -20,11 +20,10 @@ from typing import Any
 
 from lab.arduino.emulator import CC, NICE, EmulatedArduino, compile_c
 from lab.driving.cable import Cable
-from lab.driving.pins import BEFORE_S
+from lab.driving.pins import BEFORE_S, STOPPED_THROTTLE_US
 from lab.driving.policy import PLAIN, RATE_HZ, make_artifact, pictures
 from lab.driving.priority import boost, boosted_priority
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.pwm import STOPPED_THROTTLE_US
 from rover_lib.onboard.telemetry import LogError, read_log
 from rover_lib.world.car import CameraFeed
 from rover_lib.world.child import Child

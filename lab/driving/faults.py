@@ -34,6 +34,7 @@ import numpy as np
 from lab.arduino.emulator import CC, REPOSITORY, build, compile_c
 from lab.driving.bench import END_S, START_S, Drive, DrivingBench, FaultError, RoverCommand
 from lab.driving.pins import (
+    CAR,
     CONTINUES,
     LATE_COMMAND_S,
     PERIOD_US,
@@ -180,7 +181,9 @@ def transmitted_and_replayed(bench: DrivingBench, steps: int = 24, step_s: float
     rng = random.Random(0)
     sent = [REST_US]
     while len(sent) < steps - 1:
-        pulses = float(rng.randint(1200, 1760)), float(rng.randint(124, 236))
+        # -256 to 304 and 4 to 116: what the cap lets through
+        steering_us, throttle_us = rng.randint(-256, 304), rng.randint(4, CAR.cap_us - 2)
+        pulses = REST_US[0] + steering_us, REST_US[1] + throttle_us
         if all(abs(a - b) > 40 for a, b in zip(pulses, sent[-1], strict=True)):
             sent.append(pulses)
     sent.append(REST_US)

@@ -9,13 +9,16 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 from lab.params import lab_params
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pwm import ARDUINO_STEP_US, STOPPED_THROTTLE_US
+from rover_lib.onboard.pwm import ARDUINO_STEP_US
 from rover_lib.world.standin import REST_US, PinEvent
 
 STOPPED, HUMAN, CONTINUES, REFUSED = "stopped", "human", "continues", "refused"
-NEUTRAL_US = {"steering": 1456, "throttle": 120}
-PERIOD_US = {"steering": 21316, "throttle": 1016}
+CAR = this_car()  # python -m lab faults --car names another
+NEUTRAL_US = {"steering": CAR.numbers[2], "throttle": CAR.numbers[6]}
+PERIOD_US = {"steering": CAR.numbers[0], "throttle": CAR.numbers[4]}
+STOPPED_THROTTLE_US = NEUTRAL_US["throttle"] + ARDUINO_STEP_US
 TICK_US = {"steering": 0.5, "throttle": 4.0}  # of the pin's timer: all that its hardware can do
 SLEW_US_PER_MS = {"steering": 4.0, "throttle": 2.0}  # how fast the firmware lets the host move a pin
 EDGE_US = 0.5  # an edge in simavr is known to 0.25 us
@@ -108,7 +111,8 @@ def judge(
     human_us: the transmitter's pulses. until_limit: of `continues`: a limit stops the car in the end.
     """
     throttle, steering = seen.pulses("throttle"), seen.pulses("steering")
-    moving = [e.end_s for e in throttle if e.pulse_us > gates.throttle_max_us]
+    backwards = [e for e in throttle if CAR.reverses and e.pulse_us < NEUTRAL_US["throttle"] - ARDUINO_STEP_US]
+    moving = [e.end_s for e in throttle if e.pulse_us > gates.throttle_max_us or e in backwards]
     late = [e.pulse_us for e in throttle if e.end_s > seen.at_s + gates.stopped_s]
     figures: dict[str, Any] = {
         "stopped_after_ms": round((max(moving) - seen.at_s) * 1e3, 1) if moving else 0.0,

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from lab.arduino.emulator import EmulatedArduino
-from lab.driving.pins import NEUTRAL_US, PERIOD_US, STEP_US
+from lab.driving.pins import NEUTRAL_US, PERIOD_US, STEP_US, STOPPED_THROTTLE_US
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.pwm import STOPPED_THROTTLE_US
 from rover_lib.onboard.telemetry import Flight
 from rover_lib.world.standin import PinEvent
 

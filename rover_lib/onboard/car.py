@@ -18,10 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rover_lib.onboard.errors import CarError, ParamsError
-from rover_lib.onboard.params import read_params
 from rover_lib.onboard.pwm import Channel, PwmCalibration
 
 FILE_VARIABLE = "ROVER_CAR"  # names another file; what the programs that a command starts get too
@@ -277,6 +275,8 @@ DEFAULT_NUMBERS = _DEFAULT_CAR.numbers
 
 def read_car(path: Path | str) -> Car:
     """The car of a file. Raises CarError if it is missing, no YAML, or describes no car that can be driven."""
+    from rover_lib.onboard.params import read_params  # and YAML, which a car without a file needs not
+
     if not Path(path).is_file():
         raise CarError(f"{path}: not found", remedy="`rover calibrate` writes one")
     try:
@@ -306,6 +306,8 @@ def this_car() -> Car:
 
 def yaml_of(car: Car) -> str:
     """What a car.yml of it says."""
+    import yaml
+
     return "# The car, as `rover calibrate` found it; docs/build.md says what each is. Pulses in microseconds.\n" + (
         yaml.safe_dump(car.description(), sort_keys=False)
     )

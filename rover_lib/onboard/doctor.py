@@ -7,6 +7,7 @@ A fail means that the car would not drive; a warning, that it would drive worse 
 check stands alone: one that breaks is its own fail, and the others go on.
 """
 
+import contextlib
 import fcntl
 import getpass
 import grp
@@ -22,8 +23,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from rover_lib.onboard.artifact import car_of, read_manifest
 from rover_lib.onboard.camera import Camera, path_of
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.car import car_file, this_car
+from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.host import Host, throttled_means
 from rover_lib.onboard.inference import PolicyProcess
 from rover_lib.onboard.params import params
@@ -102,6 +105,7 @@ def examine(
         "group dialout": lambda: access("group dialout", Path(port), "dialout"),
         "Arduino": lambda: arduino(port, dev=dev, proc_root=host.proc_root, boot_s=boot_s),
         "ModemManager": lambda: modem_manager(host.proc_root),
+        "car": lambda: car(artifact),
         "engines": lambda: engines_here(),
         "artifact": lambda: policy(artifact),
         "temperature": lambda: temperature(host),
@@ -400,6 +404,17 @@ def _failsafe(before: tuple[int | None, ...], after: tuple[int | None, ...], res
     if all(abs(a - (b or 0)) <= SAME_US for a, b in zip((steering_us, throttle_us), before, strict=True)):
         return Check(name, "warning", f"{found}, as before: nobody can tell, and an armed car drives on", remedy)
     return Check(name, "warning", f"{found}: an armed car is handed to nobody, and stands", remedy)
+
+
+def car(artifact: Path | str | None = None) -> Iterator[Check]:
+    """Which car this is, and whether the artifact was calibrated for another one. Raises CarError for a bad car.yml."""
+    this, path = this_car(), car_file()
+    yield Check("car", "ok", f"{this.name}, of {path}" if path else f"{this.name}: no car.yml is here")
+    if artifact and Path(artifact).is_file():
+        with contextlib.suppress(ArtifactError):  # which the artifact's own check tells
+            if not (meant := car_of(read_manifest(Path(artifact)))).drives_like(this):
+                remedy = "deploy one that was calibrated with recordings of this car, or put its car.yml here"
+                yield Check("car", "warning", f"the artifact was calibrated for {meant.name!r}", remedy)
 
 
 def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:

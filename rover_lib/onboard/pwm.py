@@ -194,7 +194,3 @@ class PwmCalibration:
     def us_per_unit(self, action_name: str) -> float:
         """Microseconds of pulse per unit of an action: turns an action's error into what the servo feels."""
         return self.channel(action_name).us_per_unit
-
-
-# A throttle pulse up to this is one of a stopped car: neutral, as an Arduino may have measured it. 124.
-STOPPED_THROTTLE_US = PwmCalibration().neutral().throttle_us + ARDUINO_STEP_US

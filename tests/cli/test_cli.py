@@ -33,6 +33,7 @@ def rover(*args):
         ["benchmark"],
         ["log"],
         ["doctor"],
+        ["calibrate"],
         ["world"],
         ["world", "record"],
         ["world", "train"],

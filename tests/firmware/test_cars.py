@@ -1,26 +1,18 @@
 """Other cars, in virtual time: what the firmware takes of them, and who drives them."""
 
+from pathlib import Path
+
 import needs
 import pytest
 
 from lab.arduino.native import STEERING, THROTTLE, NativeArduino
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car import Car, read_car
 from rover_lib.onboard.servo_link import State
 
+CARS = Path(__file__).parents[2] / "lab" / "cars"
 pytestmark = needs.gcc
 HUMAN_MS = 100
-CRAWLER = Car.of(  # 50 Hz servo and speed controller, with reverse
-    {
-        "steering": {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1000},
-        "throttle": {"period_us": 20000, "neutral_us": 1500, "forward_us": 2000, "reverse_us": 1000},
-    }
-)
-INVERTED = Car.of(  # as the default, but its steering servo is mounted upside down
-    {
-        "steering": {"period_us": 21316, "left_us": 900, "neutral_us": 1456, "right_us": 2012},
-        "throttle": {"period_us": 1016, "neutral_us": 120, "forward_us": 711},
-    }
-)
+CRAWLER, INVERTED = (read_car(CARS / f"{name}.yml") for name in ("crawler", "inverted"))
 BOAT = Car.of(  # no reverse, and its speed controller stops at 1000 us
     {
         "steering": {"period_us": 20000, "left_us": 1100, "neutral_us": 1480, "right_us": 1900},

@@ -345,7 +345,7 @@ def test_an_arduino_of_another_protocol(proc):
     with board_of(hello="<H 4 4.0.0 something else") as board:
         check = only(c for c in examine(port=board.port, boot_s=2, host=Host(proc_root=proc)) if c.name == "Arduino")
     assert check.verdict == "fail"
-    assert "firmware 3.0.0 (protocol 3)" in check.found and "make -C firmware flash" in check.remedy
+    assert "firmware 4.0.0 (protocol 4)" in check.found and "make -C firmware flash" in check.remedy
 
 
 def test_nothing_answers(proc):

@@ -105,6 +105,7 @@ class FakeLink:
     """An Arduino with a status every 20 ms of the clock; every fourth throttle pulse is lost."""
 
     port = "fake port"
+    car = Car()
 
     def __init__(self, clock=time.monotonic):
         self.start, self._clock = clock(), clock

@@ -1,11 +1,17 @@
 """The transmitter and the human who holds it, as the receiver hears them."""
 
 from lab.driving.bench import DrivingBench
-from lab.driving.pins import HUMAN, NEUTRAL_US, REFUSED, STOPPED
+from lab.driving.pins import HUMAN, NEUTRAL_US, PERIOD_US, REFUSED, STOPPED
 from lab.driving.row import FaultKind
 from rover_lib.world.standin import REST_US
 
 FAULTS = FaultKind("receiver")
+PRESET_US = 280  # of throttle, from rest
+
+
+def _moved(steering_us: float, throttle_us: float) -> tuple[float, float]:
+    """The transmitter's pulses with the sticks so far from rest."""
+    return REST_US[0] + steering_us, REST_US[1] + throttle_us
 
 
 @FAULTS.add("receiver lost", STOPPED, "transmitter's signal was lost", "no pulses on the receiver's pins")
@@ -34,22 +40,22 @@ def _lose_steering(bench: DrivingBench) -> None:
     "receiver comes back with presets",
     STOPPED,
     "transmitter's signal was lost",
-    "no pulses for 0.3 s, then 400 us of throttle that nobody sends",
+    "no pulses for 0.3 s, then throttle that nobody sends",
 )
 def _presets(bench: DrivingBench) -> None:
     bench.arduino.transmitter(0, 0)
     bench.wait(0.3)
-    bench.arduino.transmitter(REST_US[0], 400)
+    bench.arduino.transmitter(*_moved(0, PRESET_US))
 
 
 @FAULTS.add(
     "receiver begins with presets",
     REFUSED,
     "throttle stick is not at rest",
-    "400 us of throttle since before the Arduino's start",
+    "throttle that nobody sends, since before the Arduino's start",
 )
 def _begin_with_presets(bench: DrivingBench) -> None:
-    bench.arduino.transmitter(REST_US[0], 400)
+    bench.arduino.transmitter(*_moved(0, PRESET_US))
     bench.arduino.reset()
 
 
@@ -65,6 +71,8 @@ def _by_human(name: str, sent_us: tuple[float, float], human_us: tuple[float, fl
     )
 
 
-_by_human("human takes over by steering", (1600, 140), (1600, 140))
+# A slow throttle takes longer than the gate to have been at rest: there he moves the steering alone.
+_STEERED = _moved(144, 20 if PERIOD_US["throttle"] < 3000 else 0)
+_by_human("human takes over by steering", _STEERED, _STEERED)
 # His throttle passes once it has been at rest: a receiver without its transmitter looks the same.
-_by_human("human takes over by throttle", (1470, 200), (1470, NEUTRAL_US["throttle"]))
+_by_human("human takes over by throttle", _moved(14, 80), (_moved(14, 0)[0], NEUTRAL_US["throttle"]))

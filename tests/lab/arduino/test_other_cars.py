@@ -4,29 +4,20 @@ A 50 Hz servo and speed controller with reverse, and a car like the default whos
 """
 
 import random
+from pathlib import Path
 from types import SimpleNamespace
 
 import needs
 import pytest
 from uno import LINE_IN, RESET, Uno, pulses, widths
 
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car import Car, read_car
 from rover_lib.onboard.pwm import ARDUINO_STEP_US
 
+CARS = Path(__file__).parents[3] / "lab" / "cars"
 pytestmark = [pytest.mark.emulated, needs.simavr]
 
-CRAWLER = Car.of(
-    {
-        "steering": {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1000},
-        "throttle": {"period_us": 20000, "neutral_us": 1500, "forward_us": 2000, "reverse_us": 1000},
-    }
-)
-INVERTED = Car.of(
-    {
-        "steering": {"period_us": 21316, "left_us": 900, "neutral_us": 1456, "right_us": 2012},
-        "throttle": {"period_us": 1016, "neutral_us": 120, "forward_us": 711},
-    }
-)
+CRAWLER, INVERTED = (read_car(CARS / f"{name}.yml") for name in ("crawler", "inverted"))
 EDGE_US = 0.3
 STEP_US = ARDUINO_STEP_US + EDGE_US
 ANSWER_MS = 25

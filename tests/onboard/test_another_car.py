@@ -1,0 +1,164 @@
+"""A car that is not the first: its recordings, its artifacts, its reverse, and a drive on another one."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from lab.driving.policy import make_artifact
+from rover_lib.onboard import artifact as artifact_module
+from rover_lib.onboard import car as car_module
+from rover_lib.onboard import doctor
+from rover_lib.onboard.artifact import car_of
+from rover_lib.onboard.car import Car, yaml_of
+from rover_lib.onboard.cli import main
+from rover_lib.onboard.drive import another_car, arm_capped
+from rover_lib.onboard.errors import ArtifactError, CarError
+from rover_lib.onboard.pilot import ReplayPilot
+from rover_lib.onboard.plan import Follower, Plan, Settings
+from rover_lib.onboard.policy import action_limits
+from rover_lib.onboard.recording import Controls, EpisodeWriter, read_controls, recorded_car
+from rover_lib.workshop.episodes import load_recordings
+
+CRAWLER = Car.of(
+    {
+        "name": "crawler",
+        "steering": {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1000},
+        "throttle": {"period_us": 20000, "neutral_us": 1500, "forward_us": 2000, "reverse_us": 1000},
+    }
+)
+
+
+def episode(folder, car, name="episode_20260101_000000"):
+    with EpisodeWriter(folder / name, label="back and forth", resolution=(64, 36), car=car) as writer:
+        for n in range(60):
+            throttle = 0.1 if n < 30 or not car.reverses else -0.1
+            pulses = car.pwm.pulses(0.5, throttle)
+            periods = car.numbers[0], car.numbers[4]
+            writer.control(n / 30, n * 33, pulses.steering_us, pulses.throttle_us, *periods)
+            writer.frame(n / 30, np.full((36, 64, 3), n, np.uint8))
+    return folder / name
+
+
+def test_a_recording_carries_its_car(tmp_path):
+    folder = episode(tmp_path, CRAWLER)
+    assert recorded_car(folder) == CRAWLER
+    assert set(read_controls(folder).throttle_us.tolist()) == {1550, 1450}
+    actions = np.concatenate([s.chunk for s in load_recordings(tmp_path).samples])
+    assert actions[:, 1].min() == pytest.approx(-0.1)
+    assert actions[:, 1].max() == pytest.approx(0.1)
+    assert actions[:, 0] == pytest.approx(0.5)
+
+
+def test_a_recording_of_the_first_car_is_as_ever(tmp_path):
+    folder = episode(tmp_path, Car())
+    assert "car" not in json.loads((folder / "episode_data.json").read_text())["metadata"]
+    assert recorded_car(folder) == Car()
+
+
+def test_a_recording_of_no_car_is_left_out_and_said(tmp_path):
+    good, bad = episode(tmp_path, CRAWLER), episode(tmp_path, CRAWLER, "episode_20260101_000100")
+    content = json.loads((bad / "episode_data.json").read_text())
+    content["metadata"]["car"]["steering"]["neutral_us"] = 5
+    (bad / "episode_data.json").write_text(json.dumps(content))
+    recordings = load_recordings(tmp_path)
+    assert [e.id for e in recordings.episodes] == [good.name]
+    assert any(fault.kind == "no_car" for fault in recordings.faults)
+    with pytest.raises(CarError, match="between its two ends"):
+        read_controls(bad)
+
+
+def test_an_artifact_says_whose_it_is():
+    manifest = {"car": CRAWLER.description()}
+    assert car_of(manifest) == CRAWLER
+    assert car_of({}) == Car()
+    with pytest.raises(ArtifactError, match="steering is missing"):
+        car_of({"car": {"throttle": {}}})
+    assert "calibrated for 'crawler', and this car is" in another_car(manifest, Car())
+    assert another_car(manifest, CRAWLER) == another_car({}, Car()) == ""
+    assert action_limits(["throttle", "wrist"], CRAWLER).tolist() == [[-1, -np.inf], [1, np.inf]]
+
+
+def test_a_damaged_car_in_an_artifact_is_refused(tmp_path, monkeypatch):
+    checked = artifact_module.check_manifest
+    monkeypatch.setattr(artifact_module, "check_manifest", lambda m, where: m.update(car=3) or checked(m, where))
+    with pytest.raises(ArtifactError, match="must be a mapping, found 3"):
+        make_artifact(tmp_path / "policy.pt")
+
+
+def test_plans_with_reverse():
+    chunk = np.tile([0.2, -0.6], (8, 1))
+    follower = Follower(Settings(blend_ticks=0, throttle_limit=0.3), 30.0)
+    follower.add(Plan(1, 0.0, 0.0, chunk, CRAWLER.limits), 0.0)
+    assert follower.command(0.0).throttle == -0.3  # the limit is either way
+    follower = Follower(Settings(blend_ticks=0, throttle_limit=0.3), 30.0)
+    follower.add(Plan(1, 0.0, 0.0, chunk + np.array([0, 0.4])), 0.0)
+    assert follower.command(0.0).throttle == 0.0  # the first car has none
+
+
+def test_a_replay_with_reverse_is_limited_on_both_sides():
+    controls = Controls(np.arange(4) / 30, np.array([1500] * 4), np.array([1000, 1450, 1550, 2000]), 0)
+    pilot = ReplayPilot(controls, throttle_limit=0.2, calibration=CRAWLER.pwm)
+    sent = [pilot.order(n / 30).throttle_us for n in range(4)]
+    assert sent == [1400, 1450, 1550, 1600]
+    assert pilot.most_throttle == pytest.approx(0.2)
+
+
+class Link:
+    calibration = CRAWLER.pwm
+
+    def __init__(self, cap_us):
+        self.cap_us, self.lowered = cap_us, []
+
+    def lower_cap(self, us):
+        self.lowered.append(us)
+        return self
+
+    def arm(self):
+        return "armed"
+
+
+def test_the_cap_of_a_car_with_reverse():
+    said = []
+    assert arm_capped(Link(1600), 0.2, 0.2, said.append) == "armed"
+    assert not said
+    link = Link(1550)
+    arm_capped(link, 0.2, 0.2, said.append)
+    assert abs(link.lowered[0] - 1500) == 100
+    assert "at most throttle 0.10 (1550 us)" in said[0]
+
+
+@pytest.fixture
+def crawler_here(monkeypatch, tmp_path):
+    path = tmp_path / "crawler.yml"
+    path.write_text(yaml_of(CRAWLER))
+    monkeypatch.setenv(car_module.FILE_VARIABLE, str(path))
+    return path
+
+
+def test_a_replay_of_another_cars_pulses_is_refused(crawler_here, tmp_path):
+    folder = episode(tmp_path / "episodes", Car())
+    done = CliRunner().invoke(main, ["drive", "--replay", str(folder), "--dry-run", "--log", str(tmp_path / "log")])
+    assert done.exit_code == 1
+    assert "its pulses are of another car" in done.output
+
+
+def test_a_bad_car_file_ends_in_one_sentence(monkeypatch, tmp_path):
+    path = tmp_path / "car.yml"
+    path.write_text(yaml.safe_dump({"steering": {}}))
+    monkeypatch.setenv(car_module.FILE_VARIABLE, str(path))
+    done = CliRunner().invoke(main, ["record", str(tmp_path / "out"), "--camera", str(tmp_path), "--port", "/dev/none"])
+    assert done.exit_code == 1
+    assert done.output.startswith("rover: ")
+    assert [check.verdict for check in doctor.examine() if check.name == "car"] == ["fail"]
+
+
+def test_doctor_says_which_car(crawler_here, tmp_path):
+    make_artifact(tmp_path / "policy.pt")
+    first, second = doctor.car(tmp_path / "policy.pt")
+    assert (first.verdict, first.found) == ("ok", f"crawler, of {crawler_here}")
+    assert second.verdict == "warning"
+    assert 'calibrated for "the recordings\' car"' in second.found
+    assert len(list(doctor.car(None))) == 1
