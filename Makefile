@@ -11,7 +11,7 @@ NAME ?= mine
 # In a container there may be nobody but root, and what is loaded here was made here; see onboard/confine.py.
 export ROVER_AS_ROOT := 1
 
-.PHONY: help demo watch run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks tables clean
+.PHONY: help demo watch run test test-fast check-release coverage lint lab arm faults random pi-fast pi firmware flash notebooks tables docs clean
 
 help:
 	@echo "make demo                                   record, train, quantize, compare, benchmark, drive and distill in the balloon world"
@@ -19,6 +19,7 @@ help:
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make lab NAME=mine                          JupyterLab on the notebooks of a run, with its outputs"
 	@echo "make firmware; make flash PORT=/dev/ttyUSB0 build the Arduino's firmware, and put it on the board"
+	@echo "make docs                                   these pages and the notebooks as a site: runs/site/index.html"
 	@echo
 	@echo "For who changes something; CONTRIBUTING.md says what each proves and how long it takes:"
 	@echo "make test-fast                              what a minute and a half can prove"
@@ -31,15 +32,15 @@ help:
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the notebooks,"
-	@echo "                                            and the JSON behind them into results/, and README's tables from it"
-	@echo "make tables                                 README's tables alone"
+	@echo "                                            and the JSON behind them into results/, and the pages' tables from it"
+	@echo "make tables                                 the pages' tables alone"
 
 # uv installs the CUDA build of torch, gigabytes that its wheel insists on, in a minute where pip takes several.
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and f"Python 3.11 to 3.13 is needed, found {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet 'uv>=0.5'
-	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,view,dev]'
+	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,view,dev,docs]'
 	@touch $@
 
 demo: $(READY)
@@ -63,13 +64,15 @@ lint: $(READY)
 	$(VENV)/bin/ruff check --quiet
 	$(VENV)/bin/ruff format --quiet --check
 	$(VENV)/bin/mypy
+	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware lab notebooks rover_lib tests
 
 # The demo is the tests' whole run; it is made once, and tests/test_demo.py holds it to the gates of params.yml.
 test: lint demo
 	$(PYTEST)
 
+# Without nbval, whose import is three seconds in each process: no notebook is among these.
 test-fast: $(READY)
-	$(PYTEST) -m 'not slow and not emulated and not release' tests
+	$(PYTEST) -p no:nbval --override-ini 'addopts=-q -rs --strict-markers' -m 'not slow and not emulated and not release' tests
 
 # Real time, whole fleets and whole machines: for a quiet machine, before something is given to others.
 check-release: lint demo
@@ -109,6 +112,7 @@ flash:
 
 # The executed notebooks of a run, or where there is none of that name, those of the repository.
 lab: $(READY)
+	@test '$(origin NAME)' != 'command line' -o -f 'runs/$(NAME)/01_load.ipynb' || { echo 'there is no run runs/$(NAME): rover list' >&2; exit 2; }
 	$(VENV)/bin/jupyter lab $(if $(wildcard runs/$(NAME)/01_load.ipynb),'runs/$(NAME)',notebooks)
 
 notebooks: demo
@@ -117,6 +121,16 @@ notebooks: demo
 
 tables: $(READY)
 	$(VENV)/bin/python -m rover_lib.workshop.tables
+
+# What the pages link to travels with them; a link to anything else ends the build.
+PAGES = *.md params.yml lab/params.yml docs/* ansible/README.md firmware/README.md lab/README.md notebooks/*.ipynb pictures/* results/*/*.json
+
+docs: $(READY)
+	rm -rf runs/pages runs/site
+	mkdir -p runs/pages
+	cp --parents $(PAGES) runs/pages
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build
+	@echo 'open runs/site/index.html'
 
 clean:
 	rm -rf $(VENV) runs

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.cli import FILE, Rover, drive_options, run_drive, show
+from rover_lib.onboard.cli import ARTIFACT, FILE, Rover, drive_options, run_drive, show
 from rover_lib.onboard.confine import AS_ROOT
 from rover_lib.workshop.progress import terminal
 
@@ -32,6 +32,23 @@ def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> N
 
     build()  # here, where its errors are seen
     ctx.exit(run_drive(car=partial(VirtualCar, seed=seed, board=BOARD), latency_ms=latency_ms, **options))
+
+
+@main.command()
+@click.argument("artifact", type=ARTIFACT, required=False)
+@click.pass_context
+def doctor(ctx: click.Context, artifact: Path | None) -> None:
+    """`rover doctor`, then its ritual with the transmitter, with the real firmware on an emulated Arduino.
+
+    The camera is the balloon world's, and a script holds the transmitter. Exit code 1 if anything fails.
+    """
+    from lab.arduino.rehearsal import rehearse
+
+    failed = False
+    for check in rehearse(artifact, lambda what: click.echo(f"  asked: {what}")):
+        click.echo(str(check))
+        failed |= check.verdict == "fail"
+    ctx.exit(1 if failed else 0)
 
 
 @main.command()

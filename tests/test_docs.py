@@ -41,6 +41,23 @@ def test_troubleshooting_names_lines_that_the_doctor_has():
     assert len(named) > 10 and not [name for name in named if f'"{name}"' not in source]
 
 
+def test_the_first_hour_is_eight_commands_at_most_that_there_are():
+    from lab.__main__ import main as lab
+    from rover_lib.cli import main as rover
+
+    lines = re.findall(r"^    (\S.*?) +# (\d)\b", (ROOT / "docs" / "first_hour.md").read_text(), re.M)
+    assert [int(number) for _, number in lines] == list(range(1, len(lines) + 1)) and 5 < len(lines) <= 8
+    makefile = (ROOT / "Makefile").read_text()
+    for line, _ in lines:
+        program, *words = line.rpartition("&& ")[2].removeprefix("python -m ").split()
+        if program in ("rover", "lab"):
+            group = rover if program == "rover" else lab
+            known = {option for p in group.commands[words[0]].params for option in p.opts}
+            assert {word for word in words if word.startswith("--")} <= known, line
+        elif program == "make":
+            assert f"\n{words[0]}:" in makefile, line
+
+
 def test_commands_in_the_pages_are_commands():
     from rover_lib.cli import main
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from lab.arduino import emulator as arduino
+from rover_lib.onboard import car
 
 REPOSITORY = arduino.REPOSITORY
 symbol = arduino.symbol
@@ -110,6 +111,7 @@ class Uno:
         self._rest = b""
         self.sequence = 0
         self.boot = None
+        self.car_id = car.this_car().id  # that the host means when it arms
         self.heard_ms = None  # what the host says that it heard; None: of the newest status
 
     def close(self) -> None:
@@ -152,7 +154,7 @@ class Uno:
         self._c.uno_send(self._uno, (ctypes.c_uint16 * len(data))(*(b | flag for b in data)), len(data))
 
     def command(self, kind: str, *values: int, boot: int | None = None, sequence: int | None = None) -> bytes:
-        """Sends the next command: "A", "N", "L" with a throttle, or "D" with two pulses. Returns its line."""
+        """Sends the next command: "A", "N", "L" with a throttle, "D" with two pulses, "C". Returns its line."""
         text = self.next_line(kind, *values, boot=boot, sequence=sequence)
         if sequence is None:
             self.sequence += 1
@@ -161,6 +163,8 @@ class Uno:
 
     def next_line(self, kind: str, *values: int, boot: int | None = None, sequence: int | None = None) -> bytes:
         """What command() would send now."""
+        if kind == "A":
+            values = (self.car_id, *values)
         if kind in "AD":
             values = (self.status.uptime_ms if self.heard_ms is None else self.heard_ms, *values)
         numbers = (self.boot if boot is None else boot, self.sequence + 1 if sequence is None else sequence, *values)

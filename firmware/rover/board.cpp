@@ -6,6 +6,7 @@
 #include <avr/io.h>
 #include <avr/sleep.h>
 #include <avr/wdt.h>
+#include <string.h>
 #include <util/atomic.h>
 
 #if !defined(__AVR_ATmega328P__) || F_CPU != 16000000L
@@ -46,44 +47,151 @@ uint16_t boot_number() {
 void watchdog_begin() { wdt_enable(WDTO_60MS); }
 void watchdog_feed() { wdt_reset(); }
 
-/* ---- pulses out: Timer1 (steering, D10) and Timer2 (throttle, D3), both fast PWM up to OCRnA ------------------- */
+/* ---- the car ---------------------------------------------------------------------------------------------------- */
 
-static const uint16_t STEERING_TICKS = 42632; /* 21316 us of 0.5 us; the timer is also the clock */
-static const uint8_t THROTTLE_TICKS = 254;    /* 1016 us of 4 us */
+/* So that the pins have the car's neutral again right after a watchdog reset, and not the default's. */
+static struct car kept __attribute__((section(".noinit")));
+static uint32_t kept_check __attribute__((section(".noinit")));
 
-void pulses_begin() {
-    /* Stopped and in normal mode first: only there OCRnx take effect at once instead of with the next period. */
-    TCCR1A = 0;
-    TCCR1B = 0;
-    TIMSK1 = 0;
-    TCNT1 = 0;
-    OCR1A = STEERING_TICKS - 1;
-    OCR1B = STEERING_NEUTRAL_US * 2 - 1;
-    TCCR2A = 0;
+const struct car *car_kept() { return kept_check == ~car_id(&kept) && car_allowed(&kept) ? &kept : &DEFAULT_CAR; }
+
+void car_keep(const struct car *car) {
+    if (!memcmp(&kept, car, sizeof kept) && kept_check == ~car_id(&kept)) return;
+    kept = *car;
+    kept_check = ~car_id(car);
+}
+
+/* ---- pulses out: Timer1 (steering, D10), fast PWM up to OCR1A, and Timer2 (throttle, D3) --------------------------- */
+
+/* Timer2 counts 4 us to 256. A fast throttle's period fits in that: fast PWM up to OCR2A. A slow one's takes up to 25
+ * rounds, in normal mode: each edge is a compare match, made by hardware; after each match an interrupt, which has half a
+ * millisecond for it, sets the next. Ticks are Timer1's of 0.5 us, steps Timer2's of 4. */
+static const uint16_t STEP_US = 4, ROUND = 256, HALF_ROUND = 128;
+
+static volatile uint32_t period_start;   /* of Timer1's period, in its ticks of 0.5 us; wraps after 36 minutes */
+static volatile uint16_t steering_ticks; /* of Timer1's period that is on: the timer is also the clock */
+static uint16_t throttle_period;         /* us, that Timer2 has now */
+static uint16_t throttle_neutral;        /* steps, of that car */
+static bool fast;
+static volatile uint16_t slow_period, slow_high; /* steps; from the next rising edge on */
+static volatile uint16_t slow_low, slow_left;    /* of the period that is on; from the next match to the next edge */
+static volatile bool slow_rises;                 /* the next edge does */
+
+/* Timer2, from its start: a throttle's neutral. The pin is low, and interrupts are off. */
+static void throttle_begin(const struct car *car) {
+    const struct servo *throttle = &car->servos[THROTTLE];
+    throttle_period = throttle->period_us;
+    throttle_neutral = throttle->neutral_us / STEP_US;
+    fast = throttle_is_fast(car);
+    TCCR2A = 0; /* stopped and in normal mode first: only there OCR2x take effect at once */
     TCCR2B = 0;
     TIMSK2 = 0;
     ASSR = 0;
     TCNT2 = 0;
-    OCR2A = THROTTLE_TICKS - 1;
-    OCR2B = THROTTLE_NEUTRAL_US / 4 - 1;
-    TCCR2A = _BV(COM2B1) | _BV(WGM21) | _BV(WGM20);
-    TCCR2B = _BV(WGM22) | _BV(CS22); /* 16 MHz / 64 */
+    if (fast) {
+        OCR2A = (uint8_t)(throttle->period_us / STEP_US - 1);
+        OCR2B = (uint8_t)(throttle_neutral - 1);
+        TCCR2A = _BV(COM2B1) | _BV(WGM21) | _BV(WGM20);
+        TCCR2B = _BV(WGM22) | _BV(CS22); /* 16 MHz / 64 */
+        TIMSK2 = _BV(TOIE2);
+        return;
+    }
+    slow_period = throttle->period_us / STEP_US;
+    slow_high = throttle_neutral;
+    slow_left = 0; /* the first match is the first edge */
+    slow_rises = true;
+    OCR2B = HALF_ROUND - 1;
+    TIFR2 = _BV(OCF2B);
+    TCCR2A = _BV(COM2B1) | _BV(COM2B0); /* set at the match */
+    TIMSK2 = _BV(OCIE2B);
+    TCCR2B = _BV(CS22);
+}
+
+void pulses_begin(const struct car *car) {
+    TCCR1A = 0;
+    TCCR1B = 0;
+    TIMSK1 = 0;
+    TCNT1 = 0;
+    steering_ticks = (uint16_t)(car->servos[STEERING].period_us * 2);
+    OCR1A = steering_ticks - 1;
+    OCR1B = car->servos[STEERING].neutral_us * 2 - 1;
+    throttle_begin(car);
     TCCR1A = _BV(COM1B1) | _BV(WGM11) | _BV(WGM10);
     TCCR1B = _BV(WGM13) | _BV(WGM12) | _BV(CS11) | _BV(ICNC1) | _BV(ICES1); /* 16 MHz / 8 */
 }
 
-void pulses_set(uint16_t steering_us, uint16_t throttle_us) {
-    if (steering_us < RECEIVER_STEERING_MIN_US || steering_us > RECEIVER_STEERING_MAX_US ||
-        throttle_us < RECEIVER_THROTTLE_MIN_US || throttle_us > RECEIVER_THROTTLE_MAX_US) {
-        steering_us = STEERING_NEUTRAL_US;
-        throttle_us = THROTTLE_NEUTRAL_US;
+/* A match of the slow throttle has just been. Lets other interrupts in at once, and has time before the next one. */
+ISR(TIMER2_COMPB_vect, ISR_NOBLOCK) {
+    bool rises = slow_rises;
+    uint16_t left = slow_left;
+    if (!left) { /* it was an edge */
+        if (rises) {
+            uint16_t high = slow_high;
+            slow_low = slow_period - high;
+            left = high;
+        } else {
+            left = slow_low;
+        }
+        slow_rises = rises = !rises;
     }
-    uint16_t steering = (uint16_t)(steering_us * 2 - 1);
-    uint8_t throttle = (uint8_t)((throttle_us + 2) / 4 - 1);
+    uint16_t step = left <= ROUND ? left : left <= ROUND + HALF_ROUND ? HALF_ROUND : ROUND;
+    left -= step;
+    slow_left = left;
+    /* At the match the pin does what it is told, which is what it does already until the match is the edge. */
+    TCCR2A = rises == !left ? _BV(COM2B1) | _BV(COM2B0) : _BV(COM2B1);
+    OCR2B += (uint8_t)step;
+}
+
+/* Another car's, as soon as no pulse is on: one that is cut short could be another one's full reverse. */
+static void throttle_change(const struct car *car) {
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+        if (!(PIND & _BV(PIND3))) {
+            TCCR2A = 0; /* the pin stays low */
+            throttle_begin(car);
+        }
+    }
+}
+
+/* Another car's period of Timer1 begins with an overflow, and the clock has to know which one that was. */
+static void steering_change(uint16_t ticks) {
+    static uint16_t next_ticks;
+    static uint32_t before;
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+        if (next_ticks) { /* was written to OCR1A, in the period that began at `before` */
+            if (period_start != before) {
+                steering_ticks = next_ticks;
+                next_ticks = 0;
+            }
+        } else if (!(TIFR1 & _BV(TOV1)) && TCNT1 < steering_ticks - 1000) {
+            next_ticks = ticks;
+            before = period_start;
+            OCR1A = ticks - 1;
+        }
+    }
+}
+
+void pulses_set(const struct car *car, uint16_t steering_us, uint16_t throttle_us) {
+    const struct servo *throttle = &car->servos[THROTTLE];
+    bool is_fast = throttle_is_fast(car);
+    if (steering_us < PULSE_MIN_US || steering_us > PULSE_MAX_US ||
+        throttle_us < (is_fast ? FAST_PULSE_MIN_US : PULSE_MIN_US) ||
+        throttle_us > (is_fast ? FAST_PULSE_MAX_US : PULSE_MAX_US)) {
+        steering_us = car->servos[STEERING].neutral_us;
+        throttle_us = throttle->neutral_us;
+    }
+    uint16_t ticks = (uint16_t)(car->servos[STEERING].period_us * 2);
+    if (ticks != steering_ticks) steering_change(ticks);
+    if (throttle_period != throttle->period_us) throttle_change(car);
+    uint16_t steering = (uint16_t)(steering_us * 2 - 1), steps = (uint16_t)(throttle_us + 2) / STEP_US;
+    if (throttle_period != throttle->period_us) steps = throttle_neutral; /* a pulse is still on: another turn */
     /* 16-bit registers share one temporary byte, which the capture's interrupt uses as well. */
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
         if (OCR1B != steering) OCR1B = steering;
-        OCR2B = throttle;
+    }
+    if (fast) {
+        OCR2B = (uint8_t)(steps - 1);
+    } else if (slow_high != steps) {
+        ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { slow_high = steps; }
     }
 }
 
@@ -91,23 +199,39 @@ void pulses_set(uint16_t steering_us, uint16_t throttle_us) {
 
 /* Nothing but these interrupts may delay INT0 by more than about 3 us: a pulse that is measured by software is as good
  * as that. So the core's Timer0 is off, Timer1 is the only clock, and the longer interrupts let INT0 in. */
-static volatile uint32_t period_start; /* of Timer1's period, in its ticks of 0.5 us; wraps after 36 minutes */
+/* period_start += steering_ticks. In C it saves registers for a microsecond longer, which INT0 has not. */
+ISR(TIMER1_OVF_vect, ISR_NAKED) {
+    asm volatile("push r24 \n in r24, %2 \n push r24 \n push r25 \n"
+                 "lds r24, %0 \n lds r25, %1 \n add r24, r25 \n sts %0, r24 \n"
+                 "lds r24, %0+1 \n lds r25, %1+1 \n adc r24, r25 \n sts %0+1, r24 \n"
+                 "ldi r25, 0 \n" /* leaves the carry */
+                 "lds r24, %0+2 \n adc r24, r25 \n sts %0+2, r24 \n"
+                 "lds r24, %0+3 \n adc r24, r25 \n sts %0+3, r24 \n"
+                 "pop r25 \n pop r24 \n out %2, r24 \n pop r24 \n reti"
+                 :: "i"(&period_start), "i"(&steering_ticks), "I"(_SFR_IO_ADDR(SREG)));
+}
 
-ISR(TIMER1_OVF_vect) { period_start += STEERING_TICKS; }
-
-EMPTY_INTERRUPT(TIMER2_OVF_vect) /* wakes loop() every 1016 us */
+EMPTY_INTERRUPT(TIMER2_OVF_vect) /* wakes loop() every 1016 us; of a slow throttle, its matches do */
 
 /* Ticks at which TCNT1 was `tick`, at most half a period ago. With interrupts off. */
 static inline uint32_t ticks_at(uint16_t tick) {
     uint32_t start = period_start;
-    if ((TIFR1 & _BV(TOV1)) && tick < STEERING_TICKS / 2) start += STEERING_TICKS;
+    if ((TIFR1 & _BV(TOV1)) && tick < steering_ticks / 2) start += steering_ticks;
     return start + tick;
 }
 
 uint32_t clock_ms() {
     static uint32_t counted, ms;
     uint32_t now = 0;
-    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { now = ticks_at(TCNT1); }
+    uint16_t tick = 0;
+    uint8_t flags = 0;
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { /* as ticks_at(), but INT0 waits for no more than the reading */
+        tick = TCNT1;
+        flags = TIFR1;
+        now = period_start;
+    }
+    if (flags & _BV(TOV1) && tick < steering_ticks / 2) now += steering_ticks;
+    now += tick;
     for (; (int32_t)(now - counted) >= 2000; counted += 2000) ms++; /* signed: never a leap, whatever was misread */
     return ms;
 }
@@ -152,15 +276,16 @@ extern "C" void __vector_throttle_edge(void) {
     cli(); /* INT0 reads a 16-bit register too */
     bool high = TCCR1B & _BV(ICES1);
     uint16_t tick = ICR1, count = TCNT1;
-    bool overflow = (TIFR1 & _BV(TOV1)) && count < STEERING_TICKS / 2;
+    uint16_t ticks = steering_ticks; /* of the period now, or of the one before if its overflow still waits */
+    bool overflow = (TIFR1 & _BV(TOV1)) && count < ticks / 2;
     uint32_t start = period_start;
     TCCR1B ^= _BV(ICES1); /* wait for the other edge */
     TIFR1 = _BV(ICF1);    /* as the datasheet asks after a change of edge */
     bool missed = high != bool(PINB & _BV(PINB0)); /* the other edge is over already: wait for this one again */
     if (missed) TCCR1B ^= _BV(ICES1);
     sei();
-    if (overflow) start += STEERING_TICKS;     /* of the period now */
-    if (tick > count) start -= STEERING_TICKS; /* the edge was in the one before */
+    if (overflow) start += ticks;     /* of the period now */
+    if (tick > count) start -= ticks; /* the edge was in the one before */
     if (missed)
         captures[THROTTLE].high = false;
     else
@@ -175,7 +300,6 @@ void receiver_begin() {
     EIMSK = _BV(INT0);
     TIFR1 = _BV(ICF1) | _BV(TOV1);
     TIMSK1 = _BV(ICIE1) | _BV(TOIE1);
-    TIMSK2 = _BV(TOIE2);
     TIMSK0 = 0;
 }
 

@@ -4,10 +4,15 @@
 
 #include "vehicle.h"
 
-/* Neutral pulses on both pins. The first thing that setup() does. */
-void pulses_begin();
-/* What the pins do from their next pulse on. Anything that no servo should see becomes neutral. */
-void pulses_set(uint16_t steering_us, uint16_t throttle_us);
+/* The car that was told before a reset which left the memory's power on, or else the default. */
+const struct car *car_kept();
+void car_keep(const struct car *car);
+
+/* A car's neutral pulses on both pins. The first thing that setup() does. */
+void pulses_begin(const struct car *car);
+/* What the pins do from their next pulse on, that of another car once no pulse is on. Anything that no servo of it should
+ * see becomes neutral. Call it every 2 ms. */
+void pulses_set(const struct car *car, uint16_t steering_us, uint16_t throttle_us);
 
 /* The receiver's pulses, and the clock. */
 void receiver_begin();

@@ -42,9 +42,9 @@ static bool parse(const char *line, uint8_t length, struct command *command) {
     uint32_t crc = crc32(line, (size_t)(end - line));
     for (uint8_t i = 8; i; i--, crc >>= 4)
         if (end[i] != hex(crc & 15)) return false;
-    struct command found = {line[1], 0, 0, 0, 0, 0};
+    struct command found = {line[1], 0, 0, 0, 0, 0, 0, {0}};
     uint32_t *numbers[5] = {&found.boot, &found.sequence};
-    uint8_t count = 2;
+    uint8_t count = 2, shorts = 0;
     switch (found.kind) {
         case COMMAND_HELLO:
             count = 0;
@@ -53,6 +53,10 @@ static bool parse(const char *line, uint8_t length, struct command *command) {
             break;
         case COMMAND_ARM:
             numbers[count++] = &found.heard_ms;
+            numbers[count++] = &found.car;
+            break;
+        case COMMAND_CAR:
+            shorts = CAR_NUMBERS;
             break;
         case COMMAND_LOWER:
             numbers[count++] = &found.throttle_us;
@@ -68,6 +72,11 @@ static bool parse(const char *line, uint8_t length, struct command *command) {
     const char *at = line + 2;
     for (uint8_t i = 0; i < count; i++)
         if (!take_number(&at, end, numbers[i])) return false;
+    for (uint8_t i = 0; i < shorts; i++) {
+        uint32_t number;
+        if (!take_number(&at, end, &number) || number > UINT16_MAX) return false;
+        found.numbers[i] = (uint16_t)number;
+    }
     if (at != end) return false;
     *command = found;
     return true;

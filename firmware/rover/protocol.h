@@ -10,13 +10,14 @@
 extern "C" {
 #endif
 
-#define PROTOCOL_VERSION 2
-#define FIRMWARE_VERSION "2.1.0" /* rover_lib/onboard/servo_link.py drives no other: change both */
+#define PROTOCOL_VERSION 3
+#define FIRMWARE_VERSION "3.0.0" /* rover_lib/onboard/servo_link.py drives no other: change both */
 
 enum {
-    HOST_LINE_MAX = 66,     /* the longest line of the host without its end: five numbers of ten digits */
+    HOST_LINE_MAX = 87,     /* the longest line of the host without its end: two numbers of ten digits, nine of five */
     BOARD_LINE_MAX = 127,   /* the longest line of the Arduino, its end included */
-    LINE_LIFETIME_MS = 50   /* a line whose end comes later than this after its start is stale: 52 characters take 5 ms */
+    LINE_LIFETIME_MS = 50,  /* a line whose end comes later than this after its start is stale: 87 characters take 8 ms */
+    CAR_NUMBERS = 9
 };
 
 enum command_kind {
@@ -24,7 +25,8 @@ enum command_kind {
     COMMAND_ARM = 'A',
     COMMAND_DRIVE = 'D',
     COMMAND_NEUTRAL = 'N',
-    COMMAND_LOWER = 'L' /* the throttle's cap */
+    COMMAND_LOWER = 'L', /* the throttle's cap */
+    COMMAND_CAR = 'C'
 };
 
 struct command {
@@ -32,6 +34,8 @@ struct command {
     uint32_t boot, sequence;           /* not in COMMAND_HELLO */
     uint32_t heard_ms;                 /* in COMMAND_ARM and COMMAND_DRIVE: of the newest status that the host has seen */
     uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE, COMMAND_LOWER; any number, vehicle.c knows which are safe */
+    uint32_t car;                      /* in COMMAND_ARM: which one the host means */
+    uint16_t numbers[CAR_NUMBERS];     /* in COMMAND_CAR: the car, in the order of struct car */
 };
 
 enum reading { READING, READ_COMMAND, READ_BAD };

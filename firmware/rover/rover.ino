@@ -10,8 +10,9 @@ static uint32_t status_ms;
 static const uint16_t STATUS_MS = 20;
 
 void setup() {
-  pulses_begin();
-  vehicle_start(&vehicle, boot_number());
+  const struct car *car = car_kept();
+  pulses_begin(car);
+  vehicle_start(&vehicle, boot_number(), car);
   receiver_begin();
   serial_begin();
   serial_put("\n", 1);  /* ends a line that a reset cut, so that the hello is whole */
@@ -28,6 +29,7 @@ static bool take(uint8_t byte, uint32_t now_ms) {
         hello_due = true;
       } else {
         vehicle_command(&vehicle, &command, now_ms);
+        if (command.kind == COMMAND_CAR) car_keep(&vehicle.car);
         status_due = true;
       }
       return true;
@@ -50,7 +52,7 @@ void loop() {
   for (uint8_t n = 0; n < 32 && !read && (byte = serial_take()) >= 0; n++) read = take((uint8_t)byte, now_ms);
   for (uint8_t lost = serial_lost(); lost; lost--) count(&vehicle.lost_bytes);
   vehicle_tick(&vehicle, now_ms);
-  pulses_set(vehicle.steering_us, vehicle.throttle_us);
+  pulses_set(&vehicle.car, vehicle.steering_us, vehicle.throttle_us);
 
   /* A line that finds no room is tried again; a status is then the newest. One of these three a turn. */
   if (!read && hello_due) {

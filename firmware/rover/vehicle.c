@@ -1,5 +1,14 @@
 #include "vehicle.h"
 
+#include <string.h>
+
+const struct car DEFAULT_CAR = {
+    {{STEERING_PERIOD_US, STEERING_MIN_US, STEERING_NEUTRAL_US, STEERING_MAX_US},
+     {THROTTLE_PERIOD_US, THROTTLE_MIN_US, THROTTLE_NEUTRAL_US, THROTTLE_MAX_US}},
+    CAP_MAX_US,
+};
+_Static_assert(sizeof(struct car) == CAR_NUMBERS * sizeof(uint16_t), "a car is its numbers");
+
 void count(uint16_t *counter) {
     if (*counter < UINT16_MAX) (*counter)++;
 }
@@ -8,25 +17,72 @@ static bool within(uint32_t value, uint32_t low, uint32_t high) { return low <= 
 
 static uint16_t distance(uint16_t a, uint16_t b) { return a > b ? a - b : b - a; }
 
+static uint16_t towards(uint16_t from_us, uint16_t to_us, uint32_t step_us) {
+    if (distance(from_us, to_us) <= step_us) return to_us;
+    return (uint16_t)(to_us > from_us ? from_us + step_us : from_us - step_us);
+}
+
+uint32_t car_id(const struct car *car) { return crc32((const char *)car, sizeof *car); }
+
+bool throttle_is_fast(const struct car *car) { return car->servos[THROTTLE].period_us < PERIOD_MIN_US; }
+
+static bool slow_allowed(const struct servo *servo, uint16_t neutral_min_us) {
+    return within(servo->period_us, PERIOD_MIN_US, PERIOD_MAX_US) &&
+           within(servo->neutral_us, neutral_min_us, NEUTRAL_MAX_US) &&
+           within(servo->min_us, PULSE_MIN_US, servo->neutral_us) && within(servo->max_us, servo->neutral_us, PULSE_MAX_US);
+}
+
+bool car_allowed(const struct car *car) {
+    const struct servo *steering = &car->servos[STEERING], *throttle = &car->servos[THROTTLE];
+    if (!slow_allowed(steering, STEERING_NEUTRAL_MIN_US) ||
+        steering->neutral_us - steering->min_us < STEERING_THROW_US ||
+        steering->max_us - steering->neutral_us < STEERING_THROW_US)
+        return false;
+    if (!within(car->cap_us, 1, CAP_MAX_US)) return false;
+    if (!throttle_is_fast(car)) return slow_allowed(throttle, THROTTLE_NEUTRAL_MIN_US);
+    return within(throttle->period_us, FAST_PERIOD_MIN_US, FAST_PERIOD_MAX_US) &&
+           within(throttle->neutral_us, FAST_NEUTRAL_MIN_US, FAST_NEUTRAL_MAX_US) &&
+           throttle->min_us == throttle->neutral_us && within(throttle->max_us, throttle->neutral_us, THROTTLE_MAX_US);
+}
+
+static uint16_t neutral_us(const struct vehicle *vehicle, enum channel channel) {
+    return vehicle->car.servos[channel].neutral_us;
+}
+
+/* How many pulses make a signal. */
+static uint8_t signal_pulses(const struct vehicle *vehicle, enum channel channel) {
+    return channel == THROTTLE && throttle_is_fast(&vehicle->car) ? FAST_SIGNAL_PULSES : SIGNAL_PULSES;
+}
+
 static void enter(struct vehicle *vehicle, enum state state, enum reason reason) {
     vehicle->state = (char)state;
     vehicle->reason = (char)reason;
-    vehicle->wanted_us[STEERING] = STEERING_NEUTRAL_US;
-    vehicle->wanted_us[THROTTLE] = THROTTLE_NEUTRAL_US;
-    vehicle->steering_us = STEERING_NEUTRAL_US;
-    vehicle->throttle_us = THROTTLE_NEUTRAL_US;
+    vehicle->wanted_us[STEERING] = vehicle->steering_us = neutral_us(vehicle, STEERING);
+    vehicle->wanted_us[THROTTLE] = vehicle->throttle_us = neutral_us(vehicle, THROTTLE);
     vehicle->wary = false;
     vehicle->throttle_moved = 0;
     vehicle->throttle_free = false;
 }
 
-void vehicle_start(struct vehicle *vehicle, uint16_t boot) {
+void vehicle_start(struct vehicle *vehicle, uint16_t boot, const struct car *car) {
     *vehicle = (struct vehicle){0};
     vehicle->boot = boot;
     vehicle->result = NONE_YET;
-    vehicle->cap_us = THROTTLE_CAP_US;
+    vehicle->car = *car;
+    vehicle->car_id = car_id(car);
+    vehicle->car_told = vehicle->car_id == car_id(&DEFAULT_CAR);
+    vehicle->cap_us = car->cap_us;
+    vehicle->lowered_us = UINT16_MAX;
     vehicle->throttle_off_rest = 0xFF;
     enter(vehicle, MANUAL, AFTER_RESET);
+}
+
+static void forget_signal(struct vehicle *vehicle, struct received *received) {
+    received->present = false;
+    received->seen = 0;
+    vehicle->throttle_free = false;
+    vehicle->throttle_off_rest = 0xFF;
+    vehicle->sides[0].seen = vehicle->sides[1].seen = false;
 }
 
 /* Who comes back after a loss may be a receiver that makes up pulses, its transmitter switched off. */
@@ -34,11 +90,7 @@ static void judge_signal(struct vehicle *vehicle, uint32_t now_ms) {
     for (uint8_t channel = STEERING; channel <= THROTTLE; channel++) {
         struct received *received = &vehicle->received[channel];
         if (!received->present || now_ms - received->at_ms[received->oldest] <= SIGNAL_TIMEOUT_MS) continue;
-        received->present = false;
-        received->seen = 0;
-        vehicle->throttle_free = false;
-        vehicle->throttle_off_rest = 0xFF;
-        vehicle->sides[0].seen = vehicle->sides[1].seen = false;
+        forget_signal(vehicle, received);
     }
 }
 
@@ -48,8 +100,8 @@ static bool has_signal(const struct vehicle *vehicle) {
 
 /* Whether a stick has moved from where it was on arming. */
 static bool see_steering(struct vehicle *vehicle, uint16_t pulse_us, uint32_t now_ms) {
-    if (pulse_us <= STEERING_NEUTRAL_US - WIGGLE_US) vehicle->sides[0] = (struct side){true, now_ms};
-    if (pulse_us >= STEERING_NEUTRAL_US + WIGGLE_US) vehicle->sides[1] = (struct side){true, now_ms};
+    if (pulse_us <= neutral_us(vehicle, STEERING) - WIGGLE_US) vehicle->sides[0] = (struct side){true, now_ms};
+    if (pulse_us >= neutral_us(vehicle, STEERING) + WIGGLE_US) vehicle->sides[1] = (struct side){true, now_ms};
     if (distance(pulse_us, vehicle->still_us) > STEERING_DEAD_BAND_US / 2) {
         vehicle->still_us = pulse_us;
         vehicle->still_ms = now_ms;
@@ -58,26 +110,26 @@ static bool see_steering(struct vehicle *vehicle, uint16_t pulse_us, uint32_t no
 }
 
 static bool see_throttle(struct vehicle *vehicle, uint16_t pulse_us) {
-    bool off_rest = distance(pulse_us, THROTTLE_NEUTRAL_US) > THROTTLE_DEAD_BAND_US;
+    bool off_rest = distance(pulse_us, neutral_us(vehicle, THROTTLE)) > THROTTLE_DEAD_BAND_US;
     bool moved = distance(pulse_us, vehicle->rest_us[THROTTLE]) > THROTTLE_DEAD_BAND_US;
     vehicle->throttle_off_rest = (uint8_t)(vehicle->throttle_off_rest << 1 | off_rest);
     vehicle->throttle_moved = (uint8_t)(vehicle->throttle_moved << 1 | moved);
     if (!vehicle->throttle_off_rest && has_signal(vehicle)) vehicle->throttle_free = true;
     uint8_t pulses = 0;
     for (uint8_t bits = vehicle->throttle_moved; bits; bits >>= 1) pulses += bits & 1;
-    return pulses >= THROTTLE_MOVED_PULSES;
+    return pulses >= (throttle_is_fast(&vehicle->car) ? FAST_MOVED_PULSES : 1);
 }
 
 void vehicle_received(struct vehicle *vehicle, enum channel channel, uint16_t pulse_us, uint16_t period_us,
                       uint32_t now_ms) {
-    uint16_t nominal = channel == STEERING ? RECEIVER_STEERING_PERIOD_US : RECEIVER_THROTTLE_PERIOD_US;
-    if (channel == STEERING ? !within(pulse_us, RECEIVER_STEERING_MIN_US, RECEIVER_STEERING_MAX_US)
-                            : !within(pulse_us, RECEIVER_THROTTLE_MIN_US, RECEIVER_THROTTLE_MAX_US))
+    uint16_t nominal = vehicle->car.servos[channel].period_us;
+    if (channel == THROTTLE && throttle_is_fast(&vehicle->car) ? !within(pulse_us, FAST_PULSE_MIN_US, FAST_PULSE_MAX_US)
+                                                               : !within(pulse_us, PULSE_MIN_US, PULSE_MAX_US))
         return;
     if (distance(period_us, nominal) > nominal / 4) return;
     judge_signal(vehicle, now_ms); /* before this pulse makes it good again */
     struct received *received = &vehicle->received[channel];
-    uint8_t pulses = channel == STEERING ? STEERING_SIGNAL_PULSES : THROTTLE_SIGNAL_PULSES;
+    uint8_t pulses = signal_pulses(vehicle, channel);
     received->pulse_us = pulse_us;
     received->period_us = period_us;
     received->at_ms[received->oldest] = now_ms;
@@ -95,8 +147,9 @@ enum missing vehicle_missing(const struct vehicle *vehicle, uint32_t now_ms) {
     return wiggled ? NOTHING : WIGGLE;
 }
 
-static char arm(struct vehicle *vehicle, uint32_t now_ms) {
+static char arm(struct vehicle *vehicle, uint32_t car, uint32_t now_ms) {
     if (vehicle->state == AUTONOMOUS) return DONE; /* the host repeats itself: renews nothing */
+    if (!vehicle->car_told || car != vehicle->car_id) return OTHER_CAR;
     enum missing missing = vehicle_missing(vehicle, now_ms);
     if (missing != NOTHING) return (char)missing;
     vehicle->rest_us[STEERING] = vehicle->received[STEERING].pulse_us;
@@ -109,15 +162,15 @@ static char arm(struct vehicle *vehicle, uint32_t now_ms) {
 
 /* in_turn: it is the next after the last one, so that none was lost between them. */
 static enum result drive(struct vehicle *vehicle, const struct command *command, bool in_turn, uint32_t now_ms) {
-    if (!within(command->steering_us, STEERING_MIN_US, STEERING_MAX_US) ||
-        !within(command->throttle_us, THROTTLE_MIN_US, THROTTLE_MAX_US)) {
+    const struct servo *steering = &vehicle->car.servos[STEERING], *throttle = &vehicle->car.servos[THROTTLE];
+    if (!within(command->steering_us, steering->min_us, steering->max_us) ||
+        !within(command->throttle_us, throttle->min_us, throttle->max_us)) {
         count(&vehicle->out_of_range);
         return OUT_OF_RANGE;
     }
     if (vehicle->state != AUTONOMOUS) return IGNORED;
     vehicle->wanted_us[STEERING] = (uint16_t)command->steering_us;
-    bool capped = command->throttle_us > vehicle->cap_us;
-    vehicle->wanted_us[THROTTLE] = capped ? vehicle->cap_us : (uint16_t)command->throttle_us;
+    vehicle->wanted_us[THROTTLE] = towards(throttle->neutral_us, (uint16_t)command->throttle_us, vehicle->cap_us);
     /* What it is asked by is as old as what its host has heard: from then on it holds for FRESH_MS and the timeout. */
     bool fresh = now_ms - command->heard_ms <= FRESH_MS;
     vehicle->commanded_ms = fresh ? now_ms : command->heard_ms + FRESH_MS;
@@ -130,12 +183,37 @@ static enum result drive(struct vehicle *vehicle, const struct command *command,
 }
 
 static enum result lower_cap(struct vehicle *vehicle, uint32_t throttle_us) {
-    if (!within(throttle_us, THROTTLE_MIN_US, THROTTLE_MAX_US)) {
+    const struct servo *throttle = &vehicle->car.servos[THROTTLE];
+    if (!within(throttle_us, throttle->min_us, throttle->max_us)) {
         count(&vehicle->out_of_range);
         return OUT_OF_RANGE;
     }
     if (vehicle->state == AUTONOMOUS) return IGNORED;
-    if (throttle_us < vehicle->cap_us) vehicle->cap_us = (uint16_t)throttle_us;
+    uint16_t cap_us = distance((uint16_t)throttle_us, throttle->neutral_us);
+    if (cap_us < vehicle->cap_us) vehicle->cap_us = vehicle->lowered_us = cap_us;
+    return DONE;
+}
+
+/* Another car's pins are another's: what was seen of the transmitter, and of its human, counts no more. */
+static enum result take_car(struct vehicle *vehicle, const uint16_t *numbers) {
+    struct car car;
+    memcpy(&car, numbers, sizeof car);
+    if (!car_allowed(&car)) {
+        count(&vehicle->out_of_range);
+        return OUT_OF_RANGE;
+    }
+    if (vehicle->state == AUTONOMOUS) return IGNORED;
+    uint32_t id = car_id(&car);
+    vehicle->car_told = true;
+    if (id == vehicle->car_id) return DONE;
+    vehicle->car = car;
+    vehicle->car_id = id;
+    vehicle->cap_us = car.cap_us < vehicle->lowered_us ? car.cap_us : vehicle->lowered_us;
+    for (uint8_t channel = STEERING; channel <= THROTTLE; channel++) {
+        vehicle->received[channel] = (struct received){0};
+        forget_signal(vehicle, &vehicle->received[channel]);
+    }
+    enter(vehicle, (enum state)vehicle->state, (enum reason)vehicle->reason);
     return DONE;
 }
 
@@ -160,7 +238,7 @@ void vehicle_command(struct vehicle *vehicle, const struct command *command, uin
     vehicle->sequence = command->sequence;
     switch (command->kind) {
         case COMMAND_ARM:
-            vehicle->result = arm(vehicle, now_ms);
+            vehicle->result = arm(vehicle, command->car, now_ms);
             break;
         case COMMAND_DRIVE:
             vehicle->result = (char)drive(vehicle, command, in_turn, now_ms);
@@ -168,17 +246,15 @@ void vehicle_command(struct vehicle *vehicle, const struct command *command, uin
         case COMMAND_LOWER:
             vehicle->result = (char)lower_cap(vehicle, command->throttle_us);
             break;
+        case COMMAND_CAR:
+            vehicle->result = (char)take_car(vehicle, command->numbers);
+            break;
         default:
             vehicle->result = (char)neutral(vehicle);
     }
 }
 
 /* No servo, and no car, should be asked for more at once. */
-static uint16_t towards(uint16_t from_us, uint16_t to_us, uint32_t step_us) {
-    if (distance(from_us, to_us) <= step_us) return to_us;
-    return (uint16_t)(to_us > from_us ? from_us + step_us : from_us - step_us);
-}
-
 void vehicle_tick(struct vehicle *vehicle, uint32_t now_ms) {
     judge_signal(vehicle, now_ms);
     for (struct side *side = vehicle->sides; side < vehicle->sides + 2; side++)
@@ -201,10 +277,10 @@ void vehicle_tick(struct vehicle *vehicle, uint32_t now_ms) {
         vehicle->throttle_us = towards(vehicle->throttle_us, wanted_us[THROTTLE], ms * THROTTLE_SLEW_US_PER_MS);
     } else if (vehicle->state == MANUAL && has_signal(vehicle)) {
         vehicle->steering_us = vehicle->received[STEERING].pulse_us;
-        vehicle->throttle_us = vehicle->throttle_free ? vehicle->received[THROTTLE].pulse_us : THROTTLE_NEUTRAL_US;
+        vehicle->throttle_us = vehicle->throttle_free ? vehicle->received[THROTTLE].pulse_us : neutral_us(vehicle, THROTTLE);
     } else {
-        vehicle->steering_us = STEERING_NEUTRAL_US;
-        vehicle->throttle_us = THROTTLE_NEUTRAL_US;
+        vehicle->steering_us = neutral_us(vehicle, STEERING);
+        vehicle->throttle_us = neutral_us(vehicle, THROTTLE);
     }
 }
 
@@ -220,6 +296,7 @@ uint8_t vehicle_hello(const struct vehicle *vehicle, char reset_cause, struct li
     line_number(line, vehicle->boot);
     line_number(line, vehicle->sequence);
     put_char(line, reset_cause);
+    line_number(line, vehicle->car_id);
     return line_end(line);
 }
 
@@ -234,7 +311,7 @@ uint8_t vehicle_status(const struct vehicle *vehicle, uint32_t now_ms, struct li
     put_char(line, (char)vehicle_missing(vehicle, now_ms));
     line_number(line, vehicle->steering_us);
     line_number(line, vehicle->throttle_us);
-    line_number(line, vehicle->cap_us);
+    line_number(line, neutral_us(vehicle, THROTTLE) + vehicle->cap_us);
     for (uint8_t channel = STEERING; channel <= THROTTLE; channel++) {
         const struct received *received = &vehicle->received[channel];
         if (received->present) {

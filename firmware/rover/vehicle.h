@@ -10,33 +10,44 @@ extern "C" {
 #endif
 
 enum {
-    STEERING_NEUTRAL_US = 1456,
-    THROTTLE_NEUTRAL_US = 120, /* stopped */
-    /* What the host may ask for: actions -1 to 1 and 0 to 1 of rover_lib/onboard/pwm.py. */
+    /* The car that is driven before another is told: actions -1 to 1 and 0 to 1 of rover_lib/onboard/pwm.py. */
+    STEERING_PERIOD_US = 21316,
     STEERING_MIN_US = 900,
+    STEERING_NEUTRAL_US = 1456,
     STEERING_MAX_US = 2012,
+    THROTTLE_PERIOD_US = 1016,
     THROTTLE_MIN_US = 120,
+    THROTTLE_NEUTRAL_US = 120, /* stopped */
     THROTTLE_MAX_US = 711,
-    /* What it gets at most, however much it asks for: ../README.md has the recordings' figures behind these. */
-    THROTTLE_CAP_US = 238,     /* action 0.2 */
+    /* What a host gets at most, however much it asks for: ../README.md has the recordings' figures behind these. */
+    CAP_MAX_US = 118,          /* of throttle, from neutral, either way; of this car action 0.2, and no car's may be more */
     STEERING_SLEW_US_PER_MS = 4,
     THROTTLE_SLEW_US_PER_MS = 2,
+    /* What another car may be: rover_lib/onboard/car.py has the same. */
+    PERIOD_MIN_US = 3000,
+    PERIOD_MAX_US = 25000,
+    STEERING_NEUTRAL_MIN_US = 1300,
+    THROTTLE_NEUTRAL_MIN_US = 900, /* a speed controller without reverse may stop at 1000 */
+    NEUTRAL_MAX_US = 1700,
+    STEERING_THROW_US = 250,   /* from neutral to either end, at least: the wiggle must be possible */
+    FAST_PERIOD_MIN_US = 1000, /* a throttle like this car's, forward only */
+    FAST_PERIOD_MAX_US = 1020,
+    FAST_NEUTRAL_MIN_US = 80,
+    FAST_NEUTRAL_MAX_US = 160,
     /* What is a pulse of the transmitter: recordings have 1008 to 1948 us and up to 948 us; periods within a quarter. */
-    RECEIVER_STEERING_MIN_US = 800,
-    RECEIVER_STEERING_MAX_US = 2200,
-    RECEIVER_STEERING_PERIOD_US = 21316,
-    RECEIVER_THROTTLE_MIN_US = 40,
-    RECEIVER_THROTTLE_MAX_US = 980,
-    RECEIVER_THROTTLE_PERIOD_US = 1016,
+    PULSE_MIN_US = 800,
+    PULSE_MAX_US = 2200,
+    FAST_PULSE_MIN_US = 40,
+    FAST_PULSE_MAX_US = 980,
     /* A stick that moved this far from where it was on arming is the human's. The recordings' resting sticks stay
      * within 16 us. */
     STEERING_DEAD_BAND_US = 48,
     THROTTLE_DEAD_BAND_US = 32,
-    THROTTLE_MOVED_PULSES = 5, /* of the last eight, so that single ones may be misread; steering's one pulse must do */
-    /* A signal is there while its last two (steering) or eight (throttle) pulses are all younger than this. */
+    FAST_MOVED_PULSES = 5,     /* of the last eight, so that single ones may be misread; of a slow signal one must do */
+    /* A signal is there while its last two, or eight of a fast throttle's, are all younger than this. */
     SIGNAL_TIMEOUT_MS = 100,
-    STEERING_SIGNAL_PULSES = 2,
-    THROTTLE_SIGNAL_PULSES = 8,
+    SIGNAL_PULSES = 2,
+    FAST_SIGNAL_PULSES = 8,
     /* A wiggle of the steering stick: so far to either side of neutral, then held still for LET_GO_MS. */
     WIGGLE_US = 200,
     WIGGLE_LIFETIME_MS = 30000,
@@ -54,6 +65,16 @@ enum {
 
 enum channel { STEERING, THROTTLE };
 enum state { MANUAL = 'M', AUTONOMOUS = 'A', STOPPED = 'S' };
+/* A car's pulses in microseconds. Its CRC-32, as these 18 bytes lie in memory here and in the chip, is its name. */
+struct servo {
+    uint16_t period_us, min_us, neutral_us, max_us;
+};
+struct car {
+    struct servo servos[2]; /* steering, throttle */
+    uint16_t cap_us;        /* of throttle, from neutral, either way */
+};
+extern const struct car DEFAULT_CAR;
+
 /* Why the state is what it is. */
 enum reason { AFTER_RESET = 'r', HUMAN = 'h', ARMED = 'a', TIMEOUT = 't', PAUSES = 'p', NO_SIGNAL = 's',
               HOST_NEUTRAL = 'n' };
@@ -61,8 +82,9 @@ enum reason { AFTER_RESET = 'r', HUMAN = 'h', ARMED = 'a', TIMEOUT = 't', PAUSES
 enum result {
     NONE_YET = '-',
     DONE = 'k',
-    IGNORED = 'i',         /* a drive or neutral while not autonomous, a lower cap while autonomous */
-    OUT_OF_RANGE = 'r',
+    IGNORED = 'i',         /* a drive or neutral while not autonomous, a lower cap or another car while autonomous */
+    OUT_OF_RANGE = 'r',    /* or a car that may not be */
+    OTHER_CAR = 'c',       /* an arming for another car than the one that was told since the reset */
     OLD = 'o',             /* a sequence number that was there already, or another boot's */
     LATE = 'l'             /* it waited in the link for longer than LATE_MS */
 };
@@ -71,7 +93,7 @@ enum missing { NOTHING = '-', SIGNAL = 's', THROTTLE_AT_REST = 't', WIGGLE = 'w'
 
 struct received {
     uint16_t pulse_us, period_us;            /* of the newest */
-    uint32_t at_ms[THROTTLE_SIGNAL_PULSES];  /* of the last two or eight, in a ring */
+    uint32_t at_ms[FAST_SIGNAL_PULSES];      /* of the last two or eight, in a ring */
     uint8_t oldest, seen;                    /* seen: of those, how many came since the signal was lost */
     bool present;
 };
@@ -83,6 +105,9 @@ struct side {
 
 struct vehicle {
     char state, reason, result;
+    struct car car;
+    uint32_t car_id;
+    bool car_told;                      /* since the reset, or it is the default, which nobody needs to tell */
     uint16_t boot;                      /* tells this start of the firmware from others */
     uint32_t sequence;                  /* of the last command that was accepted as new */
     uint16_t steering_us, throttle_us;  /* for the pins, always safe */
@@ -94,7 +119,8 @@ struct vehicle {
     bool throttle_free;                 /* the human's throttle passes: it was seen at rest */
     uint16_t rest_us[2];                /* the sticks when the host armed */
     uint8_t throttle_moved;             /* the last eight pulses, a bit each: not where it was then */
-    uint16_t cap_us;
+    uint16_t cap_us;                    /* from neutral, either way: the car's, or lowered_us if that is less */
+    uint16_t lowered_us;                /* what the host lowered it to since the reset; another car raises it not again */
     uint16_t wanted_us[2];              /* of the last valid drive since arming */
     uint32_t commanded_ms, slewed_ms;
     uint32_t driven_ms;                 /* when the last valid drive, or else the arming, came */
@@ -103,7 +129,13 @@ struct vehicle {
     uint16_t bad_lines, old_commands, out_of_range, lost_bytes; /* stay at 65535 */
 };
 
-void vehicle_start(struct vehicle *vehicle, uint16_t boot);
+/* Whether a car may be driven by this firmware. */
+bool car_allowed(const struct car *car);
+uint32_t car_id(const struct car *car);
+/* Whether the throttle's signal is a fast one, like the default's. */
+bool throttle_is_fast(const struct car *car);
+/* car: that the pins have neutral of now. */
+void vehicle_start(struct vehicle *vehicle, uint16_t boot, const struct car *car);
 /* A pulse of the transmitter, as measured. Implausible ones are no pulse. */
 void vehicle_received(struct vehicle *vehicle, enum channel channel, uint16_t pulse_us, uint16_t period_us,
                       uint32_t now_ms);

@@ -26,8 +26,9 @@ from lab.a76.count_run import REFERENCE, chunks_here, errors_pct
 from lab.a76.report import artifact_metrics
 from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.artifact import read_manifest
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy import ACTION_LIMITS
+from rover_lib.onboard.policy import action_limits
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop import act
@@ -296,7 +297,7 @@ def peer_metrics(
     if not np.isfinite(counted.chunks).all():
         raise CountError("a peer gave actions that are not finite")
     names = manifest["action_names"]
-    low, high = np.array([ACTION_LIMITS.get(name, (-np.inf, np.inf)) for name in names], np.float32).T
+    low, high = action_limits(names, this_car())
     errors = errors_pct(reference, np.clip(counted.chunks, low, high), names, ranges)  # as predict_chunk clips
     frames = {"frames": len(reference), "frames_on_the_core": len(counted.chunks)}
     return artifact_metrics(counted, manifest) | errors | {"reference": REFERENCE} | frames

@@ -2,7 +2,7 @@
  *
  * As a library (cc -shared -fPIC): stepped from a test, no clock of this world in it.
  * As a program (cc -DPROGRAM): in real time, its serial line on a pty.
- *     arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] [--slow N]
+ *     arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] [--slow N] [--periods S T]
  *         --link           a symbolic link to the pty, for pyserial to open
  *         --log            on standard output, a line each: monotonic_s,event,pin,pulse_us,period_us
  *                          all: every pulse of a servo pin, every line of the host, every event
@@ -13,13 +13,14 @@
  *         --boot-ms        the boot loader's time: nothing runs for so long
  *         --slow           its clock runs N times slower than this world's, for an emulated Pi that needs so long too;
  *                          pulses and periods are by its own clock
+ *         --periods        of the transmitter's pulses, microseconds, where they are not those of the recordings' car
  *     Where this machine stalls for more than 20 ms, so does the Arduino; the log then has "stall" with microseconds.
  *     Standard input takes, a line each: transmitter STEERING_US THROTTLE_US (0: no signal), wiggle, ready 0|1, reset,
  *     hang ADDRESS, quit. ready 1: there is a human who wiggles the stick whenever that is all that arming lacks, but not
  *     in a stopped car that nobody has opened the port of since.
  *     It ends with whoever started it.
  *
- * Written against simavr 1.6, which needs help in three places, see on_compare, on_flags and INT1.
+ * Written against simavr 1.6, which needs help in four places, see on_compare, match, on_flags and INT1.
  */
 #include <stdbool.h>
 #include <stdint.h>
@@ -39,7 +40,7 @@
 enum { HZ = 16000000, BYTE_CYCLES = HZ / 11520, QUEUE = 1 << 16 }; /* 8N1 at 115200 */
 enum { STEERING, THROTTLE, CHANNELS };
 enum event_kind { PULSE = 1, CUT = 2, LINE_IN = 3, RESET = 4 }; /* CUT: a pulse that a reset ended */
-static const double PERIOD_US[CHANNELS] = {21316, 1016};
+static double period_us_of[CHANNELS] = {21316, 1016}; /* the transmitter's, unless a test asks for another */
 
 struct uno_event {
     double at_us; /* PULSE, CUT: when the pin rose. LINE_IN: when the host's line was wholly in. */
@@ -104,6 +105,28 @@ static void on_serial_out(struct avr_irq_t *irq, uint32_t value, void *param) {
     uno->output[uno->output_head++ % QUEUE] = (uint8_t)value;
 }
 
+/* In normal mode simavr 1.6 gives a timer's pins the overflows of fast PWM as well, and forgets a match when the next is
+ * written. So there the compare matches of Timer2's second output are made here: at each the pin is set, cleared or left
+ * alone as COM2B says then. */
+static avr_cycle_count_t match(avr_t *avr, avr_cycle_count_t when, void *param) {
+    avr_timer_comp_t *compare = param;
+    avr_timer_t *timer = compare->timer;
+    if (timer->wgm_op_mode_kind != avr_timer_wgm_normal || !timer->cs_div_value) return 0;
+    uint8_t does = avr_regbit_get(avr, compare->com);
+    if (does == avr_timer_com_clear || does == avr_timer_com_set)
+        avr_raise_irq(timer->io.irq + TIMER_IRQ_OUT_COMP + (compare - timer->comp), does == avr_timer_com_set);
+    avr_raise_interrupt(avr, &compare->interrupt);
+    return when + timer->tov_cycles;
+}
+
+static void on_match_written(struct avr_t *avr, avr_timer_comp_t *compare) {
+    avr_timer_t *timer = compare->timer;
+    compare->comp_cycles = 0; /* none of simavr's own */
+    avr_cycle_count_t round = timer->tov_cycles, due = (avr_cycle_count_t)(avr->data[compare->r_ocr] + 1) * timer->cs_div_value;
+    avr_cycle_count_t now = (avr->cycle - timer->tov_base) % round;
+    avr_cycle_timer_register(avr, due > now ? due - now : due + round - now, match, compare);
+}
+
 /* simavr 1.6 applies what is written to OCRnx in the fast PWM modes with TOP in a register either never (ICRn) or at
  * once, raising the pin again in the middle of a period (OCRnA). The chip takes it over at the next overflow, and so
  * does simavr if it finds it in comp_cycles then. */
@@ -111,9 +134,20 @@ static void on_compare(struct avr_t *avr, avr_io_addr_t address, uint8_t value, 
     avr_timer_comp_t *compare = param;
     avr_timer_t *timer = compare->timer;
     avr->data[address] = value;
+    if (timer->name == '2' && compare == &timer->comp[1]) {
+        avr_cycle_timer_cancel(avr, match, compare);
+        if (timer->wgm_op_mode_kind == avr_timer_wgm_normal && timer->tov_cycles) {
+            on_match_written(avr, compare);
+            return;
+        }
+    }
     uint32_t ticks = avr->data[compare->r_ocr] | (compare->r_ocrh ? avr->data[compare->r_ocrh] << 8 : 0);
     if (timer->tov_cycles) /* running; a stopped timer reads OCRnx when it is started */
         compare->comp_cycles = ticks <= timer->tov_top ? (ticks + 1) * timer->cs_div_value : 0;
+    if (timer->tov_cycles && timer->name == '1' && compare == timer->comp) { /* TOP, from the next period on */
+        timer->tov_top = ticks;
+        timer->tov_cycles = (ticks + 1) * timer->cs_div_value;
+    }
 }
 
 /* simavr 1.6 clears all flags of a timer when any is written; the chip clears those written as 1. */
@@ -254,7 +288,7 @@ void uno_transmitter(struct uno *uno, int index, double pulse_us, double period_
     struct channel *channel = &uno->channels[index];
     bool idle = channel->sent_us <= 0 && !channel->in_high;
     channel->sent_us = pulse_us;
-    channel->period_us = period_us > 0 ? period_us : PERIOD_US[index];
+    channel->period_us = period_us > 0 ? period_us : period_us_of[index];
     if (idle && pulse_us > 0) avr_cycle_timer_register(uno->avr, 1, transmit, channel);
 }
 
@@ -444,11 +478,15 @@ int main(int argc, char **argv) {
         else if (!strcmp(argv[i], "--boot-ms") && more) boot_s = atof(argv[++i]) * 1e-3;
         else if (!strcmp(argv[i], "--slow") && more) slow = atof(argv[++i]);
         else if (!strcmp(argv[i], "--reset-on-open")) reset_on_open = true;
-        else elf = argv[i];
+        else if (!strcmp(argv[i], "--periods") && i + 2 < argc) {
+            period_us_of[STEERING] = atof(argv[++i]);
+            period_us_of[THROTTLE] = atof(argv[++i]);
+        } else elf = argv[i];
     }
     if (log) pin_log.what = !strcmp(log, "all") ? PINS_ALL : !strcmp(log, "changes") ? PINS_CHANGES : PINS_NONE;
     if (!elf || !link_path || (log && !pin_log.what) || !(slow >= 1)) {
-        fprintf(stderr, "usage: arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] [--slow N]\n");
+        fprintf(stderr, "usage: arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] "
+                        "[--slow N] [--periods S T]\n");
         return 2;
     }
     pid_t parent = getppid();

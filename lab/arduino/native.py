@@ -10,13 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lab.arduino.emulator import CC, FIRMWARE, compile_c
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.servo_link import Hello, Telemetry, frame, parse
 from rover_lib.workshop.cache import cached_folder, key_of
-from rover_lib.world.standin import REST_US
 
 SOURCES = (FIRMWARE / "rover" / "protocol.c", FIRMWARE / "rover" / "vehicle.c")
 STEERING, THROTTLE = range(2)
-PERIOD_US = (21316, 1016)
 READ_COMMAND, READ_BAD = 1, 2
 WIGGLE_US = (1750, 1750, 1750, 1150, 1150, 1150)  # the stick's pulses, 21 ms apart
 LET_GO_MS = 300  # a little more than the firmware's
@@ -27,7 +26,8 @@ class Command(ctypes.Structure):
 
     _fields_ = (
         ("kind", ctypes.c_char),
-        *((name, ctypes.c_uint32) for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us")),
+        *((name, ctypes.c_uint32) for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us", "car")),
+        ("numbers", ctypes.c_uint16 * 9),
     )
 
 
@@ -35,7 +35,7 @@ class Reader(ctypes.Structure):
     """As in protocol.h."""
 
     _fields_ = (
-        ("line", ctypes.c_char * 66),
+        ("line", ctypes.c_char * 87),
         ("length", ctypes.c_uint8),
         ("noise", ctypes.c_bool),
         ("started_ms", ctypes.c_uint32),
@@ -46,6 +46,12 @@ class Line(ctypes.Structure):
     """As in protocol.h."""
 
     _fields_ = (("text", ctypes.c_char * 128), ("length", ctypes.c_uint8))
+
+
+class CarNumbers(ctypes.Structure):
+    """As `struct car` in vehicle.h."""
+
+    _fields_ = (("numbers", ctypes.c_uint16 * 9),)
 
 
 class Received(ctypes.Structure):
@@ -72,6 +78,9 @@ class Vehicle(ctypes.Structure):
 
     _fields_ = (
         *((name, ctypes.c_char) for name in ("state", "reason", "result")),
+        ("car", CarNumbers),
+        ("car_id", ctypes.c_uint32),
+        ("car_told", ctypes.c_bool),
         ("boot", ctypes.c_uint16),
         ("sequence", ctypes.c_uint32),
         ("steering_us", ctypes.c_uint16),
@@ -85,6 +94,7 @@ class Vehicle(ctypes.Structure):
         ("rest_us", ctypes.c_uint16 * 2),
         ("throttle_moved", ctypes.c_uint8),
         ("cap_us", ctypes.c_uint16),
+        ("lowered_us", ctypes.c_uint16),
         ("wanted_us", ctypes.c_uint16 * 2),
         ("commanded_ms", ctypes.c_uint32),
         ("slewed_ms", ctypes.c_uint32),
@@ -109,7 +119,11 @@ def library() -> ctypes.CDLL:
     native.crc32.restype = u32
     native.crc32.argtypes = [ctypes.c_char_p, ctypes.c_size_t]
     native.reader_take.argtypes = [ctypes.POINTER(Reader), ctypes.c_uint8, u32, ctypes.POINTER(Command)]
-    native.vehicle_start.argtypes = [vehicle, ctypes.c_uint16]
+    native.vehicle_start.argtypes = [vehicle, ctypes.c_uint16, ctypes.POINTER(CarNumbers)]
+    native.car_allowed.restype = ctypes.c_bool
+    native.car_allowed.argtypes = [ctypes.POINTER(CarNumbers)]
+    native.car_id.restype = u32
+    native.car_id.argtypes = [ctypes.POINTER(CarNumbers)]
     native.vehicle_received.argtypes = [vehicle, ctypes.c_int, ctypes.c_uint16, ctypes.c_uint16, u32]
     native.vehicle_command.argtypes = [vehicle, ctypes.POINTER(Command), u32]
     native.vehicle_tick.argtypes = [vehicle, u32]
@@ -131,11 +145,14 @@ class NativeArduino:
 
     sticks: the transmitter's pulses (us), may be set; 0 is no signal. misread: may be set; what the receiver makes of
     a throttle pulse, by its number (None: no pulse). now_ms: its clock, which wraps at 32 bits. sequence: of the last
-    command.
+    command. periods_us: of the transmitter's pulses, may be set. car: the transmitter's, the host's, and what the board
+    was told: nothing is told of the default.
     """
 
-    def __init__(self, now_ms: int = 0, sequence: int = 0):
-        self.sticks: list[float] = list(REST_US)
+    def __init__(self, now_ms: int = 0, sequence: int = 0, car: Car | None = None):
+        self.car = car or Car()
+        neutral = self.car.pwm.neutral()
+        self.sticks: list[float] = [neutral.steering_us, neutral.throttle_us]
         self.misread: Callable[[int, float], float | None] = lambda number, pulse_us: pulse_us
         self.now_ms = now_ms
         self.sequence = sequence
@@ -145,8 +162,15 @@ class NativeArduino:
         self._due_us = [0.0, 0.0]
         self._us = 0.0  # since the start
         self._pulses = 0
-        self._native.vehicle_start(self._vehicle, 7)
+        self.periods_us = self.car.numbers[0], self.car.numbers[4]
+        self.start(Car())
         self._vehicle.sequence = sequence
+        if not self.car.is_default:
+            assert self.command("C", *self.car.numbers) == "k"
+
+    def start(self, kept: Car) -> None:
+        """A reset. kept: the car that it knows of afterwards."""
+        self._native.vehicle_start(self._vehicle, 7, CarNumbers((ctypes.c_uint16 * 9)(*kept.numbers)))
 
     @property
     def status(self) -> Telemetry:
@@ -175,7 +199,7 @@ class NativeArduino:
         return pins
 
     def _receive(self) -> None:
-        for channel, period_us in enumerate(PERIOD_US):
+        for channel, period_us in enumerate(self.periods_us):
             while self._due_us[channel] <= self._us:
                 self._due_us[channel] += period_us
                 pulse_us: float | None = self.sticks[channel]
@@ -190,7 +214,7 @@ class NativeArduino:
         rest_us = self.sticks[STEERING]
         for pulse_us in WIGGLE_US:
             self.sticks[STEERING] = pulse_us
-            self.run(PERIOD_US[STEERING] // 1000)
+            self.run(self.periods_us[STEERING] // 1000)
         self.sticks[STEERING] = rest_us
         self.run(LET_GO_MS)
 
@@ -205,11 +229,13 @@ class NativeArduino:
         return self._vehicle.result.decode()
 
     def command(self, kind: str, *pulses_us: int, sequence: int | None = None) -> str:
-        """The host's next command: "A", "N", "L" with a throttle, "D" with both pulses. Its result."""
+        """The host's next command: "A", "N", "L" with a throttle, "D" with both pulses, "C". Its result."""
         if sequence is None:
             self.sequence = sequence = (self.sequence + 1) % (1 << 32)
         heard_ms = self.now_ms if self.heard_ms is None else self.heard_ms
-        dated = (heard_ms % (1 << 32),) if kind in "AD" else ()
+        dated: tuple[int, ...] = (heard_ms % (1 << 32),) if kind in "AD" else ()
+        if kind == "A":
+            dated += (self.car.id,)
         return self.send(frame(" ".join(map(str, (f">{kind}", self._vehicle.boot, sequence, *dated, *pulses_us)))))
 
     def drive(self, steering_us: int, throttle_us: int, ms: int, every_ms: int = 33) -> list[tuple[int, int]]:

@@ -19,7 +19,7 @@ struct transmitted {
     uint16_t misread_in; /* one pulse in so many is read as one at rest; 0: none */
 };
 
-static const uint32_t PERIOD_US[2] = {RECEIVER_STEERING_PERIOD_US, RECEIVER_THROTTLE_PERIOD_US};
+static const uint32_t PERIOD_US[2] = {STEERING_PERIOD_US, THROTTLE_PERIOD_US};
 static const uint16_t REST_US[2] = {STEERING_NEUTRAL_US, THROTTLE_NEUTRAL_US};
 static const double BYTES_PER_MS = 11.7647; /* 117647 baud */
 
@@ -38,8 +38,13 @@ static uint16_t pins[2];
 static struct event events[4096];
 static uint16_t event_count;
 
-void pulses_begin() { pulses_set(STEERING_NEUTRAL_US, THROTTLE_NEUTRAL_US); }
-void pulses_set(uint16_t steering_us, uint16_t throttle_us) {
+const struct car *car_kept() { return &DEFAULT_CAR; } /* each start is a power-on's */
+void car_keep(const struct car *car) { (void)car; }
+void pulses_begin(const struct car *car) {
+    pulses_set(car, car->servos[STEERING].neutral_us, car->servos[THROTTLE].neutral_us);
+}
+void pulses_set(const struct car *car, uint16_t steering_us, uint16_t throttle_us) {
+    (void)car;
     pins[STEERING] = steering_us;
     pins[THROTTLE] = throttle_us;
 }

@@ -2,10 +2,9 @@
 
 import click
 
-import rover_lib
 from rover_lib.cli import drive, prepare, world
 from rover_lib.onboard import cli as onboard
-from rover_lib.onboard.cli import Rover
+from rover_lib.onboard.cli import VERSION, Rover
 
 ROVERS = onboard.main.commands
 # By what a user does, as `rover --help` lists them; inspect, drive and log know more here than on the rover.
@@ -15,6 +14,7 @@ SECTIONS = {
         prepare.list_runs,
         prepare.inspect,
         prepare.report,
+        prepare.sweep,
         prepare.quantize,
         prepare.compare,
         ROVERS["benchmark"],
@@ -42,7 +42,7 @@ class Workstation(Rover):
     "rover", cls=Workstation, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
-@click.version_option(rover_lib.__version__)
+@VERSION
 def main(debug: bool) -> None:
     """Put a learned driving policy on a small computer.
 

@@ -128,6 +128,38 @@ def list_runs(runs_dir: Path, as_json: bool) -> None:
         click.echo(f"no run in {runs_dir}: make demo, or rover run, makes the first")
 
 
+@click.command(short_help="Many runs from one sheet, and which is best.")
+@click.argument("sheet", type=FILE)
+@click.option("--out", type=FILE, help="The sweep's folder [default: runs/<the sheet's name>].")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine [default: one for two cores].")
+@click.option("--scheduler", metavar="tcp://HOST:8786", help="A Dask cluster instead of this machine.")
+@AS_JSON
+def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | None, as_json: bool) -> None:
+    """Make each run that the file SHEET asks for, and say which are the best.
+
+    SHEET names checkpoints, recordings, students to teach and settings to vary; every combination is a run, in a folder
+    of its own in the sweep's. What is there is not made again: after Ctrl-C, a power cut or another line in SHEET the
+    same command goes on. Runs that fail are named at the end, and the others are whole.
+    """
+    from rover_lib.workshop import sweep as sweeping
+
+    if workers and scheduler:
+        raise click.UsageError("--workers are this machine's; a cluster has its own")
+    jobs, folder = sweeping.Sheet.read(sheet).jobs(), out or Path("runs") / sheet.stem
+    cluster = sweeping.on_cluster(scheduler) if scheduler else sweeping.on_this_machine(workers)
+    with cluster as client:
+        failed = sweeping.sweep(jobs, folder, client, together=bool(scheduler), progress=terminal())
+    content = sweeping.write_report(jobs, folder, failed)
+    if as_json:
+        click.echo(json.dumps(content, indent=2))
+    else:
+        click.echo("\n".join([*sweeping.table(content["metrics"]["runs"]), "", f"done: {folder / sweeping.REPORT}"]))
+    for name, sentence in failed.items():
+        click.echo(f"rover: {name} failed: {sentence}", err=True)
+    if failed:
+        raise click.exceptions.Exit(1)
+
+
 @click.command(short_help="Make one artifact of a checkpoint.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES)

@@ -112,4 +112,4 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
     execute("08_distill", teacher_run, **given, episodes=episodes)
     if as_json:
         return click.echo(json.dumps(content, indent=2))
-    click.echo("\n".join([table(content["metrics"]), "", *sentences(content["metrics"])]))
+    click.echo("\n".join([str(table(content["metrics"])), "", *sentences(content["metrics"])]))

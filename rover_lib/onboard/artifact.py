@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rover_lib.onboard.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.engines import HAILO, ONNXRUNTIME
-from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.errors import ArtifactError, CarError
 from rover_lib.onboard.onnx_file import check_model
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.onboard.torchscript import check_program
@@ -94,6 +95,19 @@ def _extra(path: Path | str, manifest: dict[str, Any], parity: "dict[str, np.nda
     vectors = io.BytesIO()
     np.savez_compressed(vectors, allow_pickle=False, **parity)
     return {"manifest.json": json.dumps(manifest, sort_keys=True, indent=1), "parity.npz": vectors.getvalue()}
+
+
+def car_of(manifest: dict[str, Any]) -> Car:
+    """Whose recordings an artifact was calibrated with; one that does not say it is for the first recordings' car.
+
+    Raises ArtifactError for a description of no car.
+    """
+    if "car" not in manifest:
+        return Car()
+    try:
+        return Car.of(manifest["car"], "the artifact's car")
+    except CarError as error:
+        raise ArtifactError(str(error), remedy="export it again") from None
 
 
 def content_hash(path: Path | str) -> str:
@@ -202,6 +216,7 @@ def check_manifest(manifest: Any, where: str) -> None:
                 found=repr(manifest[key])[:60],
                 remedy="quantize again",
             )
+    car_of(manifest)
     if not manifest["cameras"]:
         raise ArtifactError(f"{where}: manifest has no cameras", remedy="quantize again")
     for camera in manifest["cameras"]:

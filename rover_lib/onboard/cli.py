@@ -3,6 +3,7 @@
 Thin: it parses, calls the library and prints.
 """
 
+import contextlib
 import json
 import os
 import platform
@@ -10,11 +11,10 @@ import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO, cast
 
 import click
 
-import rover_lib
 from rover_lib.onboard.columns import aligned, benchmark_rows, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import PathTo
@@ -37,12 +37,58 @@ LOG_DRIVE = click.option(
 SECONDS = click.FloatRange(min=0, min_open=True)
 
 WORKSTATION_COMMANDS = frozenset(
-    {"run", "report", "list", "quantize", "compare", "distill", "export", "export-dataset", "wheelhouse", "world"}
+    {
+        "run",
+        "report",
+        "sweep",
+        "list",
+        "quantize",
+        "compare",
+        "distill",
+        "export",
+        "export-dataset",
+        "wheelhouse",
+        "world",
+    }
 )  # rover_lib.cli's
+
+
+class Unread:
+    """Standard output that nobody may read any more, as behind `| head`: that changes neither what a command does nor
+    its exit code.
+    """
+
+    def __init__(self, stream: Any):
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        try:
+            return self._stream.write(text)
+        except BrokenPipeError:
+            return self._closed(len(text))
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except BrokenPipeError:
+            self._closed(0)
+
+    def _closed(self, written: int) -> int:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self._stream.fileno())  # so that Python's own flush at the end finds a reader too
+        os.close(nowhere)
+        return written
 
 
 class Rover(click.Group):
     """A bad input ends in one sentence and exit code 1; --debug adds the traceback."""
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        with contextlib.redirect_stdout(cast(TextIO, Unread(sys.stdout))):
+            return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -59,9 +105,7 @@ class Rover(click.Group):
                 sentence = "the view needs aiohttp: provision the rover with -e rover_view=true; on a laptop, make demo"
             click.echo(f"rover: {sentence}", err=True)
         except (OSError, MemoryError) as e:
-            if ctx.params.get("debug") or isinstance(
-                e, BrokenPipeError
-            ):  # click ends quietly when `head` has seen enough
+            if ctx.params.get("debug"):
                 raise
             click.echo(f"rover: {type(e).__name__}: {e}", err=True)
         ctx.exit(1)
@@ -103,11 +147,29 @@ def show(value: Any, as_json: bool) -> None:
     lines(value, "")
 
 
+def _print_versions(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
+    if asked and not ctx.resilient_parsing:
+        from rover_lib.onboard.versions import versions
+
+        click.echo("\n".join(versions()))
+        ctx.exit()
+
+
+VERSION = click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_versions,
+    help="Show the versions of this program, Python and the engines.",
+)
+
+
 @click.group(
     "rover", cls=OnlyOnboard, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
-@click.version_option(rover_lib.__version__)
+@VERSION
 def main(debug: bool) -> None:
     """Drive a car by a learned policy: what works on the rover. A workstation's `rover` knows more commands."""
 
@@ -258,6 +320,50 @@ def doctor(
     elif failed:
         click.echo(f"rover: this car would not drive: {', '.join(failed)}", err=True)
     ctx.exit(1 if failed else 0)
+
+
+@main.command(short_help="Measure another car's transmitter; write its car.yml.")
+@PORT
+@click.option("--output", type=FILE, help="The file [default: where the other commands look for car.yml].")
+@click.option("--name", default="my car", show_default=True, help="What to call the car.")
+@click.option("--field-of-view-deg", type=float, help="Of the camera, from left to right [default: the first car's].")
+@click.option("--wheelbase-m", type=float, help="From axle to axle [default: the first car's].")
+@click.option("--force", is_flag=True, help="Replace a file that is there.")
+def calibrate(
+    port: str,
+    output: Path | None,
+    name: str,
+    field_of_view_deg: float | None,
+    wheelbase_m: float | None,
+    force: bool,
+) -> None:
+    """Lead a human, with the transmitter in hand, through both sticks, and write what was measured as car.yml.
+
+    Recorder, drive, doctor and the balloon world read it from then on, and the Arduino is told it. Take the wheels off
+    the ground and unplug the motor first. Ctrl-C leaves everything as it was.
+    """
+    from rover_lib.onboard.calibrate import measure, refuse_existing, write_car
+    from rover_lib.onboard.car import Car, default_place, yaml_of
+    from rover_lib.onboard.servo_link import ServoLink
+
+    path = output or default_place()
+    refuse_existing(path, force)
+    more: dict[str, Any] = {"name": name}
+    if field_of_view_deg is not None:
+        more["camera"] = {"field_of_view_deg": field_of_view_deg}
+    if wheelbase_m is not None:
+        more["wheelbase_m"] = wheelbase_m
+    with ServoLink(port, car=Car()) as link:
+        car = measure(
+            link,
+            lambda text: click.prompt(text + " Enter", "", show_default=False, err=True),
+            notify=lambda text: click.echo(text, err=True),
+            **more,
+        )
+        link.tell(car)  # and not the last one that was tried
+    write_car(car, path)
+    click.echo(yaml_of(car), nl=False)
+    click.echo(f"rover: written to {path}", err=True)
 
 
 @main.command(short_help="Say what an artifact is.")

@@ -18,8 +18,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.artifact import car_of, content_hash
 from rover_lib.onboard.camera import Camera, CameraError, path_of
+from rover_lib.onboard.car import Car as CarFile
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver
 from rover_lib.onboard.feed import Feed
 from rover_lib.onboard.host import default_log, default_view
@@ -29,7 +31,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import PolicyPilot, ReplayPilot
 from rover_lib.onboard.plan import Commanded, Settings
 from rover_lib.onboard.recorder import Recorder, room_for
-from rover_lib.onboard.recording import read_controls
+from rover_lib.onboard.recording import read_controls, recorded_car
 from rover_lib.onboard.service import CHECK_S, NotArmed, Service
 from rover_lib.onboard.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.signal_event import SignalEvent
@@ -114,7 +116,14 @@ def drive_car(
         blend_ticks=options.blend_ticks,
         ensemble=options.ensemble,
     )
+    this = this_car()
     controls = read_controls(options.replay) if options.replay else None
+    if options.replay and not (recorded := recorded_car(options.replay)).drives_like(this):
+        raise ParamsError(
+            f"{options.replay}: its pulses are of another car",
+            found=f"{recorded.name!r} there, and this car is {this.name!r}",
+            remedy="replay one of this car's",
+        )
     artifact = options.artifact.resolve() if options.artifact else None  # another may take its place meanwhile
     if not (controls or car or options.dry_run or options.film):
         _check_no_film(options.camera)
@@ -136,11 +145,11 @@ def drive_car(
         title = (options.artifact or options.replay or Path()).name
         feed = stack.enter_context(contextlib.closing(Feed(options.view or default_view(), log, title)))
         until = replace(until, over=_first_of(until.over, feed.over))
-        link = None if options.dry_run else stack.enter_context(ServoLink(options.port))
+        link = None if options.dry_run else stack.enter_context(ServoLink(options.port, car=this))
         run_loop = partial(drive, link=link, log=log, rate_hz=options.hz, until=until, report=report)
         if controls:
             limit = 1.0 if options.throttle_limit is None else options.throttle_limit
-            replay = ReplayPilot(controls, throttle_limit=limit)
+            replay = ReplayPilot(controls, throttle_limit=limit, calibration=this.pwm)
             warnings = _all_of(HealthWatch(report, link), MemoryWatch(report, [os.getpid()]))
             arm: Arm | None = None
             if link:
@@ -162,7 +171,11 @@ def drive_car(
             log.event(f"the policy's process is not confined: {policy.unconfined}", level=logging.WARNING)
         predict = delayed(policy.predict, options.latency_ms / 1e3) if options.latency_ms else policy.predict
         commanded = Commanded()
-        planner = stack.enter_context(Planner(camera, predict, commanded, policy.rate_hz, rest_s=REST_S))
+        planner = stack.enter_context(
+            Planner(camera, predict, commanded, policy.rate_hz, rest_s=REST_S, limits=this.limits)
+        )
+        if sentence := another_car(policy.manifest, this):
+            log.event(sentence, level=logging.WARNING)
         arming = partial(_Arming, options, settings, planner, camera, link, log, policy.manifest["mode"])
         said = ""
 
@@ -174,24 +187,26 @@ def drive_car(
 
         checks = [camera.latest, planner.newest, *([link.latest] if link else []), show_waiting]
         while True:
-            pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz)
+            pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz, calibration=this.pwm)
             warnings = _all_of(
                 artifact_changes(artifact),
                 pilot.warnings,
                 HealthWatch(report, link),
                 MemoryWatch(report, [os.getpid(), *policy.pids]),
             )
-            with arming(pilot) as this:
+            with arming(pilot) as attempt:
                 report.clear()
                 if service and link:
-                    this.still_wanted = service.check_request
-                    arm = partial(service.wait_for_human, this.arm, checks, partial(what_is_missing, link), said=said)
+                    attempt.still_wanted = service.check_request
+                    arm = partial(
+                        service.wait_for_human, attempt.arm, checks, partial(what_is_missing, link), said=said
+                    )
                 elif link and sys.stdin.isatty():
-                    arm = partial(arm_when_ready, this.arm, link, stop, log.event, checks)
+                    arm = partial(arm_when_ready, attempt.arm, link, stop, log.event, checks)
                 else:
-                    arm = this.arm
+                    arm = attempt.arm
                 show = partial(feed.tick, report, camera, pilot)
-                hooks = Hooks(arm, warnings, this.record if options.record else None, show)
+                hooks = Hooks(arm, warnings, attempt.record if options.record else None, show)
                 try:
                     run_loop(pilot, hooks=hooks)
                 except (DriveFault, TakenOver):
@@ -202,6 +217,20 @@ def drive_car(
             if not service or stop.is_set():
                 return
             said = report.ended
+
+
+def another_car(manifest: dict[str, Any], this: CarFile) -> str:
+    """A sentence where an artifact was calibrated for another car than this one, "" if not. It may be driven by.
+
+    An artifact that names none is for the recordings' car.
+    """
+    meant = car_of(manifest)
+    if meant.drives_like(this):
+        return ""
+    return (
+        f"this policy was calibrated for {meant.name!r}, and this car is {this.name!r}: it has not seen what this one "
+        "does; see that the way is free"
+    )
 
 
 def what_is_missing(link: ServoLink) -> str:
@@ -224,9 +253,13 @@ def arm_capped(
     LinkError as lower_cap() and arm().
     """
     channel = link.calibration.throttle
-    cap_us = link.lower_cap(channel.pulse_us(limit)).cap_us
-    if cap_us < channel.pulse_us(most):
-        cap = channel.action(cap_us) or 0.0
+    asked = max(
+        (limit, -limit) if channel.low < 0 else (limit,), key=lambda a: abs(channel.pulse_us(a) - channel.neutral_us)
+    )
+    cap_us = link.lower_cap(channel.pulse_us(asked)).cap_us
+    span_us = abs(channel.pulse_us(most) - channel.neutral_us)
+    if cap_us - channel.neutral_us < span_us:
+        cap = most * (cap_us - channel.neutral_us) / span_us
         notify(
             f"the Arduino gives at most throttle {cap:.2f} ({cap_us} us), and this drive may ask for {most:.2f}: what "
             "is above is cut. A cap that another drive has lowered is back after a reset of the Arduino"
@@ -325,6 +358,7 @@ class _Arming:
             rate_hz=self._options.hz,
             arduino_port=self._link.port if self._link else "",
             source="rover drive",
+            car=self._link.car if self._link else this_car(),
             most_bytes=self._room,
         )
 
@@ -349,7 +383,9 @@ def _flight_log(options: DriveOptions, settings: Settings, report: Report) -> It
     """An open flight log whose events are also lines on the terminal, above the report's status."""
     limits = params()["flight_log"]
     path = options.log_file or default_log()
-    header = {"artifact": str(options.artifact or options.replay), "hz": options.hz, **vars(settings)}
+    header: dict[str, Any] = {"artifact": str(options.artifact or options.replay), "hz": options.hz, **vars(settings)}
+    if not (car := this_car()).drives_like(CarFile()):
+        header["car"] = car.description()
     with StatusLine(lambda: report.status, sys.stderr) as status:
         logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status.handler], force=True)
         unfinished = unfinished_drive(path)

@@ -64,6 +64,10 @@ class ParamsError(RoverError):
     """params.yml or a parameter that makes no sense."""
 
 
+class CarError(RoverError):
+    """A car.yml that describes no car, or none that may be driven."""
+
+
 class TrainingError(RoverError):
     """A training that went wrong, or that cannot go on from what was saved of it."""
 

@@ -31,7 +31,7 @@ from rover_lib.onboard.camera import Camera
 from rover_lib.onboard.confine import confine, memory_mb, open_no_more
 from rover_lib.onboard.engines import UNCONFINED
 from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
-from rover_lib.onboard.plan import Commanded, Plan
+from rover_lib.onboard.plan import LIMITS, Commanded, Plan
 
 LOAD_S = 120.0  # an engine and a full policy from a slow card
 POLL_S = 0.05
@@ -50,7 +50,7 @@ class Planner:
     """Asks for a plan for the newest frame, again and again, in a thread; a context manager.
 
     predict: gives (chunk, 2) actions, unclipped, for a frame and a state, or raises. rate_hz: of the actions. rest_s:
-    pause after each plan, except in without_rest(); a car that stands would only get warm.
+    pause after each plan, except in without_rest(); a car that stands would only get warm. limits: of its actions.
     """
 
     def __init__(
@@ -61,8 +61,10 @@ class Planner:
         rate_hz: float,
         *,
         rest_s: float = 0.0,
+        limits: np.ndarray = LIMITS,
         clock: Callable[[], float] = time.monotonic,
     ):
+        self._limits = limits
         self._camera, self._predict, self._commanded, self._rate_hz = camera, predict, commanded, rate_hz
         self._rest_s, self._clock = rest_s, clock
         self._closing = threading.Event()
@@ -136,7 +138,7 @@ class Planner:
                 actions = self._predict(frame.image, state)
                 self._asked_s = None
                 number += 1
-                plan = Plan(number, frame.captured_s, self._clock(), actions)
+                plan = Plan(number, frame.captured_s, self._clock(), actions, self._limits)
                 with self._news:
                     self._plan = plan
                     self._news.notify_all()

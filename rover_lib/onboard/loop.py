@@ -19,9 +19,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, TakenOver, sentence_of
 from rover_lib.onboard.pilot import Order, Pilot
-from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
 from rover_lib.onboard.telemetry import ARMED, Tick
 
@@ -356,7 +356,7 @@ class _Loop:
         )
         self.log.tick(tick)
         if self.hooks.record:
-            calibration = self.link.calibration if self.link else PwmCalibration()
+            calibration = self.link.calibration if self.link else this_car().pwm
             self.hooks.record(
                 self.sent_s,
                 telemetry.uptime_ms if telemetry else round((now - self.start_s) * 1e3),

@@ -1,5 +1,6 @@
-"""Parameters: the rover's own defaults, and over them what a user has set on this machine."""
+"""Parameters: the rover's own defaults, over them what a user has set on this machine, over both what one run sets."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ PLACES = (  # of the user's params.yml; the first that exists counts
     Path("/etc/rover/params.yml"),  # an installed rover's
     Path(__file__).parents[1] / "params.yml",  # an installed workstation's
 )
+FOR_THIS_RUN = "ROVER_PARAMS"  # in the environment: a file put over the others, as `rover sweep` does for each run
 
 
 def params() -> dict[str, Any]:
@@ -25,6 +27,8 @@ def params() -> dict[str, Any]:
         if place.is_file():
             _set(values, read_params(place), str(place))
             break
+    if for_this_run := os.environ.get(FOR_THIS_RUN):
+        _set(values, read_params(for_this_run), for_this_run)
     return values
 
 

@@ -118,7 +118,7 @@ class PolicyPilot:
 
     def sent(self, at_s: float, order: Order) -> None:
         self._commanded.add(at_s, order.steering, order.throttle)
-        if order.throttle > MOVING:
+        if abs(order.throttle) > MOVING:
             self._throttle_s = at_s
             self._moving_s = at_s if self._moving_s is None else self._moving_s
         elif at_s - self._throttle_s > COASTS_S:
@@ -174,18 +174,21 @@ def blank(frame: Frame, settings: Settings) -> CameraError | None:
 class ReplayPilot:
     """Sends a recording's pulses at the times at which they were recorded; no policy, no camera.
 
-    throttle_limit: of the throttle, in [0, 1]. What is outside the range that the Arduino takes is clipped to it.
+    throttle_limit: of the throttle, in [0, 1], either way. What is outside the range that the Arduino takes is
+    clipped to it.
     """
 
     def __init__(self, controls: Controls, *, throttle_limit: float = 1.0, calibration: PwmCalibration | None = None):
         c = calibration or PwmCalibration()
         self._calibration = c
         self._times = np.asarray(controls.times_s)
-        steering = (c.steering.pulse_us(c.steering.low), c.steering.pulse_us(c.steering.high))
-        throttle = (c.throttle.neutral_us, c.throttle.pulse_us(min(c.throttle.high, throttle_limit)))
-        self._steering = np.clip(controls.steering_us, *steering)
-        self._throttle = np.clip(controls.throttle_us, *throttle)
-        self.most_throttle = c.throttle.action(int(self._throttle.max())) or 0.0
+        ends = [
+            c.throttle.pulse_us(a) for a in (max(c.throttle.low, -throttle_limit), min(c.throttle.high, throttle_limit))
+        ]
+        self._steering = np.clip(controls.steering_us, *c.steering.ends_us)
+        self._throttle = np.clip(controls.throttle_us, min(ends), max(ends))
+        actions = [c.throttle.action(int(us)) or 0.0 for us in (self._throttle.min(), self._throttle.max())]
+        self.most_throttle = max(map(abs, actions))
         self._start_s: float | None = None
 
     def ready(self, stop: threading.Event) -> None:

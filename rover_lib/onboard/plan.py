@@ -10,7 +10,7 @@ Nothing here knows a clock, a thread or a device: times come in as arguments, se
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -79,14 +79,16 @@ class Plan:
     """One inference's chunk. actions[i] is meant for captured_s + i / rate.
 
     number: 1, 2, ... captured_s: of the frame that it looked at. ready_s: when it was here. actions: (chunk, 2)
-    float, clipped to steering in [-1, 1] and throttle in [0, 1]. Raises PolicyError for what is not finite, or beyond
-    an end by more than OVERSHOOT: this is the last boundary before the servos.
+    float, clipped to limits, (2, 2): of a car without reverse steering in [-1, 1] and throttle in [0, 1]. Raises
+    PolicyError for what is not finite, or beyond an end by more than OVERSHOOT: this is the last boundary before the
+    servos.
     """
 
     number: int
     captured_s: float
     ready_s: float
     actions: np.ndarray
+    limits: np.ndarray = field(default_factory=lambda: LIMITS)
 
     def __post_init__(self):
         actions = np.asarray(self.actions, float)
@@ -96,13 +98,13 @@ class Plan:
             )
         if not np.isfinite(actions).all():
             raise PolicyError(f"plan {self.number} is not finite", remedy="stop the car and quantize again")
-        if (actions < LIMITS[0] - OVERSHOOT).any() or (actions > LIMITS[1] + OVERSHOOT).any():
+        if (actions < self.limits[0] - OVERSHOOT).any() or (actions > self.limits[1] + OVERSHOOT).any():
             raise PolicyError(
                 f"plan {self.number} has actions from {actions.min(0).round(3).tolist()} to "
                 f"{actions.max(0).round(3).tolist()}, outside the range of a servo",
                 remedy="stop the car",
             )
-        object.__setattr__(self, "actions", np.clip(actions, *LIMITS))
+        object.__setattr__(self, "actions", np.clip(actions, *self.limits))
 
     @property
     def latency_s(self) -> float:
@@ -122,7 +124,10 @@ class Plan:
 
 @dataclass(frozen=True)
 class Command:
-    """What to do at a tick. steering in [-1, 1], throttle in [0, 1]; fade: the throttle's factor for the plan's age."""
+    """What to do at a tick. steering in [-1, 1], throttle in [0, 1], or from -1 of a car with reverse.
+
+    fade: the throttle's factor for the plan's age.
+    """
 
     steering: float
     throttle: float
@@ -169,9 +174,10 @@ class Follower:
         if plan is None or not (age_s := now_s - plan.captured_s) < self.stop_s():
             return None
         fade = self._fade(age_s)
-        steering, throttle = np.clip(self._wanted(now_s) * [1.0, fade], *LIMITS)
+        steering, throttle = np.clip(self._wanted(now_s) * [1.0, fade], *plan.limits)
         self._blended += 1
-        return Command(float(steering), min(float(throttle), self.settings.throttle_limit), plan, age_s, fade)
+        limit = self.settings.throttle_limit  # either way
+        return Command(float(steering), max(min(float(throttle), limit), -limit), plan, age_s, fade)
 
     def _fade(self, age_s: float) -> float:
         stop_s = self.stop_s()

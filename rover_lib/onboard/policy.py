@@ -1,20 +1,24 @@
 """Run an artifact: a frame and a state in, a chunk of actions out, whichever engine computes it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.artifact import check_artifact, read_manifest, read_parity
+from rover_lib.onboard.artifact import car_of, check_artifact, read_manifest, read_parity
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.confine import refuse_root
 from rover_lib.onboard.engines import PACKAGES, Engine, module_of
 from rover_lib.onboard.errors import ArtifactError, PolicyError
 from rover_lib.onboard.memory import give_back_freed
 from rover_lib.onboard.preprocess import prepare_frame
 
-# What a pulse can express (facts of the car: steering both ways, throttle forward only). Others pass unclipped.
-ACTION_LIMITS = {"steering": (-1.0, 1.0), "throttle": (0.0, 1.0)}
+
+def action_limits(names: Sequence[str], car: Car) -> np.ndarray:
+    """(2, A) float32: the least and the most that a pulse of a car can express; of other actions the infinities."""
+    known = dict(zip(("steering", "throttle"), car.limits.T.tolist(), strict=True))
+    return np.array([known.get(name, (-np.inf, np.inf)) for name in names], np.float32).T
 
 
 class Policy:
@@ -30,16 +34,15 @@ class Policy:
         self.rate_hz = float(manifest["rate_hz"])
         self.image_size: tuple[int, int] = (manifest["cameras"][0]["height"], manifest["cameras"][0]["width"])
         self._engine = engine
-        limits = [ACTION_LIMITS.get(name, (-np.inf, np.inf)) for name in self.action_names]
-        self._low, self._high = np.array(limits, np.float32).T
+        self._low, self._high = action_limits(self.action_names, car_of(manifest))
 
     def predict_chunk(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
         """Next actions for one observation.
 
         frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it; a mapping by camera name if there are several.
         state: (S,) float, for this car [steering, throttle] as last commanded.
-        Returns (chunk, A) float32; steering in [-1, 1], throttle in [0, 1], other actions as predicted.
-        Raises as predict_unclipped().
+        Returns (chunk, A) float32; steering in [-1, 1], throttle in [0, 1] (from -1 if its car has reverse), other
+        actions as predicted. Raises as predict_unclipped().
         """
         return np.clip(self.predict_unclipped(frame_bgr, state), self._low, self._high)
 

@@ -1,7 +1,8 @@
 """Actions to servo pulses and back, with the constants that were checked on the recordings to 5e-5.
 
 A channel's pulse is a share ("duty") of its period: action = (duty% - neutral) / span, clipped to its range.
-Throttle 0 is *stopped*, 120 us, not the middle of the throttle's range.
+Throttle 0 is *stopped*, 120 us, not the middle of the throttle's range. Another car's channels come from its car.yml,
+see car.py; they may have another span on either side of neutral, and be inverted.
 """
 
 import math
@@ -34,7 +35,9 @@ class Channel:
     """One servo signal. A channel that exists is valid: PwmError says what is not.
 
     period_us: nominal period. neutral_pct: duty in percent of action 0. span_pct: duty in percent per unit of
-    action. low, high: range of the action, which includes 0.
+    action, below 0 where the signal is inverted. low, high: range of the action, which includes 0.
+    below_pct: the span of actions below 0, of the same sign; None: span_pct. by_pulse: a measured pulse is judged by
+    its microseconds, as a servo does, and not by its share of the measured period.
     """
 
     name: str
@@ -43,26 +46,41 @@ class Channel:
     span_pct: float
     low: float
     high: float
+    below_pct: float | None = None
+    by_pulse: bool = False
 
     def __post_init__(self):
         for key in ("period_us", "neutral_pct", "span_pct", "low", "high"):
             _finite(getattr(self, key), f"{self.name} {key}")
-        if self.period_us <= 0 or self.span_pct <= 0 or not self.low <= 0 <= self.high or self.low == self.high:
+        below = self._span_pct(-1.0)
+        if self.period_us <= 0 or self.span_pct * below <= 0 or not self.low <= 0 <= self.high or self.low == self.high:
             raise PwmError(
-                f"{self.name}: period {self.period_us} us, span {self.span_pct} %, range "
+                f"{self.name}: period {self.period_us} us, span {self.span_pct} and {below} %, range "
                 f"{self.low} to {self.high} is no servo channel",
-                remedy="period and span must be above 0",
+                remedy="the period must be above 0, and both spans other than 0 and of one sign",
             )
-        ends = self.neutral_pct + self.span_pct * self.low, self.neutral_pct + self.span_pct * self.high
+        ends = sorted(self._duty_pct(action) for action in (self.low, self.high))
         if ends[0] <= 0 or ends[1] >= 100:
             raise PwmError(
                 f"{self.name}: its ends must be inside a period", found=f"{ends[0]:.2f} % and {ends[1]:.2f} % of it"
             )
 
+    def _span_pct(self, action: float) -> float:
+        return self.span_pct if action >= 0 or self.below_pct is None else self.below_pct
+
+    def _duty_pct(self, action: float) -> float:
+        return self.neutral_pct + self._span_pct(action) * action
+
     @property
     def us_per_unit(self) -> float:
-        """Microseconds of pulse per unit of action."""
-        return self.span_pct / 100 * self.period_us
+        """Microseconds of pulse per unit of action; of the longer side where they differ."""
+        return max(abs(self.span_pct), abs(self._span_pct(-1.0))) / 100 * self.period_us
+
+    @property
+    def ends_us(self) -> tuple[int, int]:
+        """The shortest and the longest pulse of its actions, microseconds."""
+        first, second = self.pulse_us(self.low), self.pulse_us(self.high)
+        return min(first, second), max(first, second)
 
     @property
     def neutral_us(self) -> int:
@@ -78,7 +96,7 @@ class Channel:
                 found=f"{action:g}",
                 remedy="clip the plan first",
             )
-        return round((self.neutral_pct + self.span_pct * action) / 100 * self.period_us)
+        return round(self._duty_pct(action) / 100 * self.period_us)
 
     def measured(self, pulse_us: float, period_us: float) -> bool:
         """Whether the firmware saw a pulse: both above 0, and one period at a time, not none or two."""
@@ -98,8 +116,16 @@ class Channel:
         period_us = self.period_us if period_us is None else period_us
         if not self.measured(pulse_us, period_us):
             return None
-        duty_pct = float(pulse_us) / float(period_us) * 100
-        return min(max((duty_pct - self.neutral_pct) / self.span_pct, self.low), self.high)
+        duty_pct = float(pulse_us) / (self.period_us if self.by_pulse else float(period_us)) * 100
+        action = (duty_pct - self.neutral_pct) / self.span_pct
+        if action < 0:
+            action = (duty_pct - self.neutral_pct) / self._span_pct(action)
+        return min(max(action, self.low), self.high)
+
+    def moves(self, pulse_us: float) -> bool:
+        """Whether a throttle's pulse moves the car: neutral, as an Arduino may have measured it, does not."""
+        away_us = (pulse_us - self.neutral_us) * math.copysign(1, self.span_pct)
+        return away_us > ARDUINO_STEP_US or (self.low < 0 and away_us < -ARDUINO_STEP_US)
 
 
 @dataclass(frozen=True)
@@ -125,7 +151,7 @@ class Actions:
 
 @dataclass(frozen=True)
 class PwmCalibration:
-    """The rover's two channels, with the user's constants as defaults."""
+    """A car's two channels, with those of the user's car as defaults."""
 
     # (duty% - 6.83) / 2.37 * (2 / 2.2): one unit of steering is 2.37 * 1.1 percent of a 47 Hz period
     steering: Channel = field(default=Channel("steering", 21316, 6.83, 2.37 * 2.2 / 2, -1.0, 1.0))
@@ -141,11 +167,11 @@ class PwmCalibration:
         return getattr(self, action_name)
 
     def pulses(self, steering: float, throttle: float) -> Pulses:
-        """Pulses for steering in [-1, 1] and throttle in [0, 1]; PwmError for all else, never a guess."""
+        """Pulses for steering in [-1, 1] and throttle in [0, 1], from -1 with reverse; PwmError for all else."""
         return Pulses(self.steering.pulse_us(steering), self.throttle.pulse_us(throttle))
 
     def neutral(self) -> Pulses:
-        """Straight and stopped: 1456 us and 120 us."""
+        """Straight and stopped: 1456 us and 120 us on the user's car."""
         return self.pulses(*NEUTRAL)
 
     def actions_from_pulses(

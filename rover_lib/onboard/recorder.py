@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from rover_lib.onboard.camera import Camera
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
 from rover_lib.onboard.recording import EpisodeExists, EpisodeWriter
 from rover_lib.onboard.servo_link import ServoLink
@@ -41,7 +42,8 @@ class Recorder:
 
     folder: in which the episode appears on close(), as episode_YYYYMMDD_HHMMSS of the start in local time (a second
     later if that is taken). label: what was done. rate_hz: frames a second at most. source, arduino_port: who drove and
-    through what, for the metadata. most_bytes: limit of the episode, see room_for(); None: what the disk has.
+    through what, for the metadata. car: see EpisodeWriter. most_bytes: limit of the episode, see room_for(); None: what
+    the disk has.
     Raises EpisodeError if there is no room to record; later faults are in `failure`.
     """
 
@@ -55,6 +57,7 @@ class Recorder:
         arduino_port: str = "",
         source: str = "",
         most_bytes: int | None = None,
+        car: Car | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
         self._camera, self._clock, self._most_bytes = camera, clock, most_bytes
@@ -69,6 +72,7 @@ class Recorder:
             resolution=None,
             arduino_port=arduino_port,
             flags=True,
+            car=car,
         )
         self._writer.metadata["source"] = source
         self.folder = self._writer.folder
@@ -284,7 +288,16 @@ def record(
     lost = [0, 0]
     with contextlib.ExitStack() as stack:
         recorder = stack.enter_context(
-            Recorder(folder, camera, label=label, rate_hz=rate_hz, arduino_port=link.port, source="human", clock=clock)
+            Recorder(
+                folder,
+                camera,
+                label=label,
+                rate_hz=rate_hz,
+                arduino_port=link.port,
+                source="human",
+                car=link.car,
+                clock=clock,
+            )
         )
         start = heard_s = recorder.start_s  # a status from before is not of this episode
         if status:

@@ -28,6 +28,7 @@ from typing import IO, Any
 import cv2
 import numpy as np
 
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.stage import plain
@@ -66,7 +67,8 @@ class EpisodeWriter:
     label: what was done, e.g. "hit red balloon". fps: the camera's rate. resolution: (width, height); None for that of
     the first frame. start_time_s, end_time_s: system time of the recording's ends; the first and last sample's when
     left out.
-    flags: write the two columns that say what was measured (see above).
+    flags: write the two columns that say what was measured (see above). car: whose pulses they are, None: the first
+    recordings'; another one's description is in the metadata.
     Raises EpisodeError for an existing folder, frames of another size, times or pulses that are no finite
     numbers, an episode without a frame or a control, or a disk that takes no more.
     """
@@ -83,15 +85,19 @@ class EpisodeWriter:
         arduino_port: str = "",
         jpeg_quality: int = 95,
         flags: bool = False,
+        car: Car | None = None,
     ):
         self.folder = Path(folder)
         self.label, self.fps = str(label), fps
         self.resolution = resolution and (int(resolution[0]), int(resolution[1]))
         self.start_time_s, self.end_time_s = start_time_s, end_time_s
         self.arduino_port, self.jpeg_quality = arduino_port, jpeg_quality
-        self.pwm = PwmCalibration()
+        car = car or Car()
+        self.pwm = car.pwm
         self.flags = flags
         self.metadata: dict[str, Any] = {}  # what else is to be noted of this episode
+        if not car.drives_like(Car()):
+            self.metadata["car"] = car.description()
         self.controls = self.frames = self.picture_bytes = 0
         self._extra: dict[str, None] = {}  # names of further columns, in order
         self._first_s, self._last_s = math.inf, -math.inf
@@ -391,13 +397,28 @@ class Controls:
     left_out: int
 
 
+def recorded_car(folder: Path | str) -> Car:
+    """Whose pulses an episode folder has: what its metadata says, the first recordings' car where they say nothing.
+
+    Raises CarError for a description of no car.
+    """
+    try:
+        content = json.loads(_data_of(Path(folder) / "episode_data.json"))
+        described = content["metadata"]["car"]
+    except (ValueError, RecursionError, TypeError, KeyError):
+        return Car()
+    return Car.of(described, f"{folder}: its car")
+
+
 def read_controls(folder: Path | str, pwm: PwmCalibration | None = None) -> Controls:
     """The controls of an episode folder with both pulses measured, from control_data.csv, or else episode_data.json.
 
     Times are the system's, unless its clock was set meanwhile or controls arrived in a burst: then they are the
-    Arduino's. Raises EpisodeError where no control is left.
+    Arduino's. pwm: None: the recording's own car. Raises EpisodeError where no control is left, CarError as
+    recorded_car().
     """
-    folder, pwm = Path(folder), pwm or PwmCalibration()
+    folder = Path(folder)
+    pwm = pwm or recorded_car(folder).pwm
     for name, read in (("control_data.csv", _csv_rows), ("episode_data.json", _json_rows)):
         rows = read(folder / name)
         timed = [(row, t_s, arduino) for row in rows if (t_s := _found(row, "system_timestamp")) is not None

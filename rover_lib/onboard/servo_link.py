@@ -16,18 +16,19 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from numbers import Integral
 from typing import Any
 
 import serial
 
+from rover_lib.onboard.car import Car, this_car
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.pwm import Channel, Pulses, PwmCalibration
+from rover_lib.onboard.pwm import Channel, Pulses
 
-PROTOCOL_VERSION = 2
-FIRMWARE_VERSION = "2.1.0"  # what is known of an Arduino is known of this one; firmware/rover/protocol.h has the same
+PROTOCOL_VERSION = 3
+FIRMWARE_VERSION = "3.0.0"  # what is known of an Arduino is known of this one; firmware/rover/protocol.h has the same
 BAUD = 115200
 LINE_MAX = 128  # of the Arduino's lines
 SEQUENCES = 1 << 32
@@ -76,6 +77,7 @@ RESULTS = {
     "r": "out of range",
     "o": "an old command, or one for another start of the Arduino",
     "l": "late: it had waited in the link",
+    "c": "refused: the Arduino was not told of this car since its reset",
     "s": "refused: the transmitter gives no signal",
     "t": "refused: the throttle stick is not at rest",
     "w": "refused: nobody has just wiggled the steering stick",
@@ -91,13 +93,17 @@ RESETS = {"p": "power-on", "e": "reset pin", "b": "brown-out", "w": "watchdog", 
 
 @dataclass(frozen=True)
 class Hello:
-    """What the Arduino says after each reset, and when asked. boot: number of this start, 0 to 65535."""
+    """What the Arduino says after each reset, and when asked. boot: number of this start, 0 to 65535.
+
+    car: the id of the one that its pins are for.
+    """
 
     protocol: int
     firmware: str
     boot: int
     sequence: int
     reset: str  # a value of RESETS
+    car: int = 0
 
 
 @dataclass(frozen=True)
@@ -107,8 +113,9 @@ class Telemetry:
     host_s: time.monotonic() (or the link's clock) at which its line was complete here; uptime_ms: the Arduino's
     clock, which wraps at 2^32. sequence: of the last command that it took as new; result: what became of the last one,
     a key of RESULTS. missing: before it can be armed, a key of MISSING. steering_us, throttle_us: what its pins do.
-    cap_us: the most throttle that the host gets. receiver_*: the transmitter's pulses. The counters stay at 65535:
-    lines that were no command, commands that were replayed, late or another start's, pulses out of range, bytes lost.
+    cap_us: the most throttle that the host gets; as far on the other side of neutral. receiver_*: the transmitter's
+    pulses. The counters stay at 65535: lines that were no command, commands that were replayed, late or another
+    start's, pulses out of range, bytes lost.
     """
 
     host_s: float
@@ -149,7 +156,7 @@ def frame(body: str) -> bytes:
 
 _NUMBER = r"(0|[1-9][0-9]{0,9})"
 _PULSE = rf"(?:{_NUMBER} {_NUMBER}|- -)"
-_HELLO = re.compile(rf"<H {_NUMBER} (\S+)(?: {_NUMBER} {_NUMBER} ([pebw-]))?(?: .*)?", re.ASCII)
+_HELLO = re.compile(rf"<H {_NUMBER} (\S+)(?: {_NUMBER} {_NUMBER} ([pebw-]) {_NUMBER})?(?: .*)?", re.ASCII)
 _STATUS = re.compile(
     rf"<S {_NUMBER} {_NUMBER} {_NUMBER} ([{''.join(RESULTS)}]) ([MAS]) ([{''.join(REASONS)}]) "
     rf"([{''.join(MISSING)}]) {_NUMBER} {_NUMBER} {_NUMBER} {_PULSE} {_PULSE} {_NUMBER} {_NUMBER} {_NUMBER} {_NUMBER}",
@@ -169,11 +176,11 @@ def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
     except UnicodeDecodeError:
         return None
     if found := _HELLO.fullmatch(text):
-        protocol, firmware, boot, sequence, reset = found.groups()
+        protocol, firmware, boot, sequence, reset, car = found.groups()
         if int(protocol) == PROTOCOL_VERSION and boot is None:
             return None
         # Of another protocol only the first two are known to mean the same.
-        return Hello(int(protocol), firmware, int(boot or 0), int(sequence or 0), RESETS[reset or "-"])
+        return Hello(int(protocol), firmware, int(boot or 0), int(sequence or 0), RESETS[reset or "-"], int(car or 0))
     if not (found := _STATUS.fullmatch(text)):
         return None
     boot, uptime, sequence, result, state, reason, missing, *numbers = found.groups()
@@ -212,12 +219,15 @@ class ServoLink:
         self,
         port: str,
         *,
-        calibration: PwmCalibration | None = None,
+        car: Car | None = None,
         boot_s: float = BOOT_S,
         clock: Callable[[], float] = time.monotonic,
     ):
+        """car: None: this machine's. Raises CarError where that cannot be read."""
         self.port = port
-        self.calibration = calibration or PwmCalibration()
+        self.car = car or this_car()
+        self.calibration = self.car.pwm
+        self._told_boot: int | None = None  # the start of the Arduino that knows the car
         self.boot_s = boot_s
         self._clock = clock
         self._serial: serial.Serial | None = None
@@ -247,8 +257,9 @@ class ServoLink:
         """Opens the port, for nobody else meanwhile, and waits for the hello and a first status.
 
         The first time after it was plugged in, that resets most Arduinos; from then on it goes on with what it does.
-        Raises LinkError if the port cannot be opened, is in use, nothing there says hello within `boot_s` seconds, or
-        it has another firmware than this program knows.
+        Then it is told of the car, unless it is the one that it drives by itself.
+        Raises LinkError if the port cannot be opened, is in use, nothing there says hello within `boot_s` seconds, it
+        has another firmware than this program knows, or does not take this car.
         """
         if self._serial:
             raise LinkError(f"{self.port}: the link is open already", remedy="close it first")
@@ -272,7 +283,9 @@ class ServoLink:
         )
         self._reader.start()
         try:
-            return self._wait_for_hello()
+            hello = self._wait_for_hello()
+            self._tell_car(hello)
+            return hello
         except BaseException:
             self._release()
             raise
@@ -300,15 +313,38 @@ class ServoLink:
                 self._asked = now
                 self._write(frame(">Q"))
         if (hello.protocol, hello.firmware) != (PROTOCOL_VERSION, FIRMWARE_VERSION):
+            car = "" if self.car.is_default else f"; it cannot drive {self.car.name!r} of car.yml"
             raise LinkError(
                 f"{self.port}: the Arduino has firmware {hello.firmware} (protocol {hello.protocol}), this program "
-                f"knows {FIRMWARE_VERSION} (protocol {PROTOCOL_VERSION})",
+                f"knows {FIRMWARE_VERSION} (protocol {PROTOCOL_VERSION}){car}",
                 remedy=f"put the matching firmware on it: make -C firmware flash PORT={self.port}",
             )
         with self._heard:
             if not self._heard.wait_for(lambda: self._telemetry or self._failure, timeout=STALE_S):
                 raise LinkError(f"{self.port}: the Arduino sends no status", remedy="press its reset button")
         return hello
+
+    def tell(self, car: Car) -> None:
+        """The Arduino's pins are that car's from now on. Raises LinkError if it does not take it."""
+        self.car, self.calibration = car, car.pwm
+        if hello := self.hello:
+            self._tell_car(replace(hello, car=0))
+
+    def _tell_car(self, hello: Hello) -> None:
+        """So that the pins' neutral, the receiver's pulses and the cap are this car's; before that nothing is armed."""
+        if self.car.is_default and hello.car == self.car.id:
+            self._told_boot = hello.boot
+            return
+        for telemetry in self._ask(">C", *self.car.numbers):
+            if telemetry.result == "k":
+                self._told_boot = telemetry.boot
+                return
+            if telemetry.result == "r":
+                raise LinkError(
+                    f"{self.port}: the Arduino refuses {self.car.name!r} of car.yml, its firmware allows no such car",
+                    remedy="measure it with `rover calibrate`",
+                )
+        raise LinkError(f"{self.port}: the Arduino was not told of the car; {self._last_words()}")
 
     def close(self) -> None:
         """Neutral first, then the port. Raises nothing: an Arduino that cannot be reached stops by itself."""
@@ -342,11 +378,16 @@ class ServoLink:
 
         Raises LinkError if the Arduino refuses, with what is missing as its remedy, or does not answer within 0.5 s.
         """
-        for telemetry in self._ask(">A"):
+        hello = self.hello
+        if hello and self._told_boot != hello.boot:
+            self._tell_car(hello)
+        for telemetry in self._ask(">A", self.car.id):
             if telemetry.state is State.AUTONOMOUS:
                 return telemetry
             if telemetry.result == "s" and telemetry.uptime_ms < SIGNALS_MS:
                 continue  # it has just started, and nothing can have come yet
+            if telemetry.result == "c":
+                raise LinkError(f"{self.port}: arming was {RESULTS['c']}", remedy="start again, which tells it")
             if telemetry.result in MISSING and telemetry.result != "-":
                 raise LinkError(
                     f"{self.port}: arming was {RESULTS[telemetry.result]}",
@@ -367,11 +408,14 @@ class ServoLink:
     def lower_cap(self, throttle_us: int) -> Telemetry:
         """Lowers the most throttle that the host gets, until the Arduino's next reset. Returns the status that says so.
 
+        With reverse, it is as far from neutral there.
+
         Raises LinkError for a pulse out of range, while the car is armed, or without an answer within 0.5 s.
         """
         most_us = self._whole(self.calibration.throttle, throttle_us)
+        neutral_us = self.calibration.throttle.neutral_us
         for telemetry in self._ask(">L", most_us):
-            if telemetry.cap_us <= most_us:
+            if telemetry.cap_us - neutral_us <= abs(most_us - neutral_us):
                 return telemetry
             if telemetry.state is State.AUTONOMOUS:
                 raise LinkError(f"{self.port}: the throttle's cap is not changed while the car drives")
@@ -407,7 +451,7 @@ class ServoLink:
 
     @staticmethod
     def _whole(channel: Channel, pulse_us: object) -> int:
-        low, high = channel.pulse_us(channel.low), channel.pulse_us(channel.high)
+        low, high = channel.ends_us
         whole_us = int(pulse_us) if isinstance(pulse_us, Integral) and not isinstance(pulse_us, bool) else None
         if whole_us is None or not low <= whole_us <= high:
             raise LinkError(
@@ -418,7 +462,10 @@ class ServoLink:
         return whole_us
 
     def send_action(self, steering: float, throttle: float) -> int:
-        """Sends steering in [-1, 1] and throttle in [0, 1] as pulses. PwmError for all else; otherwise as send()."""
+        """Sends steering in [-1, 1] and throttle in [0, 1], or from -1 with reverse, as pulses.
+
+        PwmError for all else; otherwise as send().
+        """
         pulses = self.calibration.pulses(steering, throttle)
         return self.send(pulses.steering_us, pulses.throttle_us)
 
@@ -473,7 +520,7 @@ class ServoLink:
         if kind in DATED:
             if not heard:
                 raise LinkError(f"{self.port}: the Arduino has sent no status yet")
-            values = heard.uptime_ms, *values
+            values = (heard.uptime_ms, *values)
         with self._sending:
             self._sequence = number = (self._sequence + 1) % SEQUENCES
             with self._heard:  # before it is written: the answer may be here before this thread has its turn again

@@ -23,11 +23,11 @@ import numpy as np
 import torch
 
 from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.columns import number, ratio
 from rover_lib.onboard.errors import PolicyError, PwmError
-from rover_lib.onboard.policy import ACTION_LIMITS, Policy, load_policy
+from rover_lib.onboard.policy import Policy, action_limits, load_policy
 from rover_lib.onboard.preprocess import prepare_frame
-from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.workshop import judge
 from rover_lib.workshop.act import Affine, lerobot_act
 from rover_lib.workshop.checkpoint import Checkpoint
@@ -164,8 +164,7 @@ class LerobotEager:
         self._policy = lerobot_act(c)
         self._policy.model.load_state_dict(checkpoint.weights)
         self._policy.eval()
-        limits = [ACTION_LIMITS.get(name, (-np.inf, np.inf)) for name in c.action_names]
-        self._low, self._high = np.array(limits, np.float32).T
+        self._low, self._high = action_limits(c.action_names, this_car())
 
     def predict_chunk(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
         """As `Policy.predict_chunk`: (C, A) float32, clipped to what a pulse can express."""
@@ -190,7 +189,7 @@ def _affine(x: np.ndarray, affine: Affine | None) -> torch.Tensor:
 def us_per_unit(action: str) -> float:
     """Microseconds of pulse per unit of an action; NaN for an action that is no servo's."""
     try:
-        return PwmCalibration().us_per_unit(action)
+        return this_car().pwm.us_per_unit(action)
     except PwmError:
         return math.nan
 

@@ -24,9 +24,10 @@ import torch
 from torch import Tensor
 
 from rover_lib.onboard import preprocess
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy import ACTION_LIMITS
+from rover_lib.onboard.policy import action_limits
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path, sha256_of, write_stage
 from rover_lib.workshop import act, training
@@ -397,7 +398,7 @@ def _plans(work: _Work, config: ActConfig, weights: dict[str, Tensor], samples: 
         frames = torch.from_numpy(np.stack([prepare_frame(s.frame_bgr(), *config.image_sizes[0]) for s in block]))
         states = torch.from_numpy(np.stack([s.state for s in block]).astype(np.float32))
         plans.append(policy(frames.to(work.device), states.to(work.device)).cpu().numpy())
-    low, high = np.array([ACTION_LIMITS[name] for name in config.action_names], np.float32).T
+    low, high = action_limits(config.action_names, this_car())
     return np.concatenate(plans).clip(low, high)
 
 

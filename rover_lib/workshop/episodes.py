@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.pwm import NEUTRAL, PwmCalibration
 from rover_lib.onboard.recording import (
     BURST_MIN,
@@ -44,6 +44,7 @@ from rover_lib.onboard.recording import (
     arrived_late,
     no_pulse,
     number_of,
+    recorded_car,
 )
 from rover_lib.workshop import hub, lerobot_dataset
 from rover_lib.workshop.progress import Progress, silent
@@ -135,7 +136,6 @@ def load_recordings(
             remedy="leave it out",
         )
     root = root if root.name else root.resolve()  # "." has no name to give an episode
-    pwm = pwm or PwmCalibration()
     try:
         if any((root / name).exists() for name in DATA_FILES):
             root, folders = root.parent, [root]  # faults and hashes then still name the episode
@@ -169,7 +169,9 @@ def load_recordings(
     return Recordings(root, episodes, faults.listed(), source)
 
 
-def _load_episode(folder: Path, chunk: int, sync_s: float, pwm: PwmCalibration, faults: _Faults) -> Episode | None:
+def _load_episode(
+    folder: Path, chunk: int, sync_s: float, pwm: PwmCalibration | None, faults: _Faults
+) -> Episode | None:
     """One folder's episode, or None with a fault that says why."""
     try:
         present = any((folder / name).exists() for name in DATA_FILES)
@@ -178,6 +180,11 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, pwm: PwmCalibration, 
         return None
     if not present:
         faults.add(folder, "no_data", f"none of {', '.join(DATA_FILES)} is there")
+        return None
+    try:
+        pwm = pwm or recorded_car(folder).pwm
+    except CarError as e:
+        faults.add(folder, "no_car", str(e))
         return None
     label, tables = _read_tables(folder, faults)
     controls = _read_controls(*tables["control_samples"], pwm, faults)

@@ -15,11 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-import rover_lib
 from rover_lib.onboard import artifact
 from rover_lib.onboard.artifact import ONNX_SUFFIX
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.recording import recorded_car
+from rover_lib.onboard.wheel_version import release
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.episodes import Sample
@@ -112,6 +114,7 @@ class Exporter:
         if not samples:
             raise QuantizeError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
         self.checkpoint, self.parity = checkpoint, parity or Parity()
+        self.car = _car_of(samples)
         self.float_policy = ACT(checkpoint.config, checkpoint.weights)
         self.inputs = [inputs_of(s, checkpoint.config) for s in samples]
         self.stored = np.unique(np.linspace(0, len(samples) - 1, self.parity.vectors).round().astype(int))
@@ -137,18 +140,19 @@ class Exporter:
         config = checkpoint.config
         module: nn.Module = policy.module if isinstance(policy, QuantizedPolicy) else policy
         form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(module, config)
-        expected = predictions(module, self.inputs)
+        # A slow engine's eager form is not asked more than tells whether the writing went well.
+        expected = predictions(module, [self.inputs[i] for i in self.stored])
         actions = form.predict(self.inputs)
         if not torch.isfinite(actions).all():
             raise QuantizeError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
         # Float rounds in proportion: an arm's degrees are a hundred times a car's shares.
-        sizes = expected.abs().amax((0, 1)).clamp(min=1).tolist()
+        sizes = actions.abs().amax((0, 1)).clamp(min=1).tolist()
         allowed = {n: parity.tolerance * size for n, size in zip(config.action_names, sizes, strict=True)}
         if isinstance(policy, QuantizedPolicy):
             errors = (actions - self.float_actions).abs().amax((0, 1))
             for name, error in zip(config.action_names, errors, strict=True):
                 allowed[name] = max(allowed[name], parity.int8_errors * error.item())
-        gap = (actions - expected).abs().max().item()
+        gap = (actions[self.stored] - expected).abs().max().item()
         if gap > max(allowed.values()):
             raise QuantizeError(f"{path}: the written graph differs from the policy by {gap:.3g}; nothing was written")
         vectors = {
@@ -158,6 +162,7 @@ class Exporter:
         for at, camera in enumerate(config.cameras, 1):
             vectors[f"frame_{camera}"] = np.stack([self.inputs[i][at].numpy() for i in self.stored])
         manifest = _manifest(policy, checkpoint, calibration, form) | {
+            **({} if self.car.drives_like(Car()) else {"car": self.car.description()}),
             "weights_mb": _weights_mb(module),
             "gmac": self.gmac,
             "parity": {
@@ -213,8 +218,21 @@ def _manifest(
             "channel_scales": calibration.smooth,
             "float_blocks": list(scheme.float_blocks) if scheme else [],
         },
-        "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": rover_lib.__version__, **form.versions},
+        "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": release(), **form.versions},
     }
+
+
+def _car_of(samples: Sequence[Sample]) -> Car:
+    """Of whose recordings they are. Raises QuantizeError if several."""
+    cars: list[Car] = []
+    for folder in {s.frame_path.parent.parent for s in samples if isinstance(s, Sample)}:
+        car = recorded_car(folder)
+        if not any(car.drives_like(other) for other in cars):
+            cars.append(car)
+    if len(cars) > 1:
+        names = ", ".join(sorted(car.name for car in cars))
+        raise QuantizeError("the recordings are of several cars", found=names, remedy="take those of one")
+    return cars[0] if cars else Car()
 
 
 def _in_blocks(frame: Tensor, size: int = 4) -> Tensor:

@@ -11,15 +11,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.host import THROTTLED_BITS
-from rover_lib.onboard.pwm import Channel, PwmCalibration
+from rover_lib.onboard.pwm import Channel
 from rover_lib.onboard.servo_link import State
 from rover_lib.onboard.telemetry import Event, Flight
-from rover_lib.workshop.plots.style import BLACK, BLUE, GREEN, GREY, NOW_BITS, ORANGE, RED, SKY, new_figure
+from rover_lib.workshop.plots.style import BLACK, COLOURS, GREY, MIST, NOW_BITS, RED, SLATE, new_figure
 
 STATES = {
     State.MANUAL.value: ("human", GREY),
-    State.AUTONOMOUS.value: ("host", GREEN),
+    State.AUTONOMOUS.value: ("host", SLATE),
     State.STOPPED.value: ("nobody, stopped", RED),
     "": ("not known", "#F2F2F2"),
 }
@@ -39,15 +40,15 @@ def flight_figure(flight: Flight) -> Figure:
         len(rows), height_in=sum(heights) + 3.4 + 0.19 * len(listed), height_ratios=heights, sharex=True
     )
     panel = dict(zip(rows, axes[:, 0], strict=True))
-    t_s, calibration = ticks["t_s"], PwmCalibration()
+    t_s, calibration = ticks["t_s"], _car_of(flight).pwm
     times_s = [t_s, flight.machine["t_s"], np.array([e.t_s for e in flight.events])]
     end_s = max((float(t.max()) for t in times_s if len(t)), default=1.0) or 1.0
     start_s = float(t_s[0]) if len(t_s) else 0.0  # what was made ready before is listed, not drawn
     start_s = max(0.0, start_s - 0.02 * (end_s - start_s))
 
     _who(panel["who"], ticks, (flight.period_ms or 0) / 1000)
-    _pulses(panel["steering"], calibration.steering, ticks, BLUE)
-    _pulses(panel["throttle"], calibration.throttle, ticks, ORANGE)
+    _pulses(panel["steering"], calibration.steering, ticks, COLOURS["steering"])
+    _pulses(panel["throttle"], calibration.throttle, ticks, COLOURS["throttle"])
     if (ticks["fade"] < 1).any():
         ax = panel["throttle"]
         # Hanging from the top: the share of the height is the share of the throttle that is taken away.
@@ -71,6 +72,11 @@ def flight_figure(flight: Flight) -> Figure:
     if listed:
         fig.supxlabel(_event_list(listed), fontsize=9, x=0.01, ha="left", linespacing=1.4)
     return fig
+
+
+def _car_of(flight: Flight) -> Car:
+    described = flight.header.get("drive", {}).get("car")
+    return Car.of(described, f"{flight.path}: its car") if described else Car()
 
 
 def _title(flight: Flight, summary: Mapping[str, Any]) -> str:
@@ -121,11 +127,11 @@ def _pulses(ax: Axes, channel: Channel, ticks: Mapping[str, np.ndarray], colour:
 
 def _plan(ax: Axes, ticks: Mapping[str, np.ndarray], drive: Mapping[str, Any]) -> None:
     t_s, plans = ticks["t_s"], ticks["plan"]
-    ax.plot(t_s, ticks["plan_age_ms"], color=BLUE, lw=1.1, label="age of the plan")
+    ax.plot(t_s, ticks["plan_age_ms"], color=SLATE, lw=1.1, label="age of the plan")
     _, first = np.unique(plans, return_index=True)
     first = first[plans[first] > 0]
-    ax.plot(t_s[first], ticks["latency_ms"][first], ".", color=ORANGE, ms=4, label="latency of each")
-    for key, colour, label in (("fade_s", SKY, "fades from"), ("stop_s", RED, "stopped from")):
+    ax.plot(t_s[first], ticks["latency_ms"][first], ".", color=BLACK, ms=4, label="latency of each")
+    for key, colour, label in (("fade_s", MIST, "fades from"), ("stop_s", RED, "stopped from")):
         value = drive.get(key)
         if isinstance(value, (int, float)):
             ax.axhline(1000 * value, color=colour, lw=1.2, ls="--", label=f"{label} {1000 * value:g} ms on")
@@ -140,7 +146,7 @@ def _late(ax: Axes, ticks: Mapping[str, np.ndarray], summary: Mapping[str, Any])
         label += f": p50 {p50:.2f}, p99 {p99:.2f}, max {most:.2f} ms"
     if summary["missed"] is not None:
         label += f"; {summary['missed']} ticks missed"
-    ax.plot(ticks["t_s"], ticks["late_ms"], ".", color=BLUE, ms=2.5, label=label)
+    ax.plot(ticks["t_s"], ticks["late_ms"], ".", color=SLATE, ms=2.5, label=label)
     ax.set_ylim(0, None)
     ax.set_ylabel("late (ms)", fontsize=10)
 
@@ -159,7 +165,7 @@ def _temperature(ax: Axes, machine: Mapping[str, Any], summary: Mapping[str, Any
     if bits.any():
         names = [name for bit, name in THROTTLED_BITS.items() if (bits >> bit & 1).any()]
         options: dict[str, Any] = {"step": "post", "transform": ax.get_xaxis_transform()}
-        ax.fill_between(t_s, 0, bits > 0, label=", ".join(names), color=ORANGE, alpha=0.4, lw=0, **options)
+        ax.fill_between(t_s, 0, bits > 0, label=", ".join(names), color=RED, alpha=0.4, lw=0, **options)
     ax.set_ylabel("processor\n(°C)", fontsize=10)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
+from rover_lib.workshop.cells import Table
 
 THIS = "this machine"  # a committed figure need not name it
 NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
@@ -33,9 +34,10 @@ class Benchmarks:
         """Those with a time series."""
         return {host: b for host, b in self.by_host.items() if b["metrics"].get("series")}
 
-    def table(self) -> str:
+    def table(self) -> Table:
         """A line for each host and artifact, a dash where a host has no sensor; below what there is to say about it."""
-        rows = [("host", "artifact", "p50", "p95", "p99 ms", "n", "C, most", "MHz, least", "throttled")]
+        header = ("host", "artifact", "p50 ms", "p95 ms", "p99 ms", "n", "C, most", "MHz, least", "throttled")
+        rows, notes = [], []
         for host, b in self.by_host.items():
             m = b["metrics"]
             state = (_shown(m.get("temperature_c"), 1), _shown(m.get("clock_mhz"), 0), m.get("throttled") or "-")
@@ -43,18 +45,15 @@ class Benchmarks:
                 times = [f"{v[f'latency_{p}_ms']:.1f}" for p in ("p50", "p95", "p99")]
                 rows.append((host, name, *times, str(v["n"]), *state))
                 host, state = "", ("", "", "")  # once for each host
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        sides = "<<" + ">" * len(widths)
-        lines = ["  ".join(f"{c:{s}{w}}" for c, s, w in zip(row, sides, widths, strict=False)).rstrip() for row in rows]
         rovers = self.by_host.keys() - {THIS}
         if not rovers:
-            lines.append(NO_ROVER)
+            notes.append(NO_ROVER)
         elif not rovers & self.soaks().keys():
-            lines.append(NO_SOAK)
+            notes.append(NO_SOAK)
         if self.unusable:
             count = len(self.unusable)
-            lines += [f"{count} {'files are' if count > 1 else 'file is'} left out:", *self.unusable]
-        return "\n".join(lines)
+            notes += [f"{count} {'files are' if count > 1 else 'file is'} left out:", *self.unusable]
+        return Table(header, rows, notes=notes)
 
 
 def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.policy import ACTION_LIMITS
+from rover_lib.onboard.policy import action_limits
 from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import (
@@ -285,8 +286,9 @@ def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str,
             rows = np.stack(list(columns[key])).astype(np.float32).reshape(len(columns[key]), -1)
             columns[key] = np.ascontiguousarray(rows[:, list(order)])
     for key, labels in ((STATE, layout.state_names), (ACTION, layout.action_names)):
+        lows, highs = action_limits(labels, this_car())
         for i, name in enumerate(labels):
-            low, high = ACTION_LIMITS.get(name, (-np.inf, np.inf)) if key == ACTION else (-np.inf, np.inf)
+            low, high = (lows[i], highs[i]) if key == ACTION else (-np.inf, np.inf)
             values = columns[key][:, i]
             if wrong := np.flatnonzero(~np.isfinite(values) | (values < low) | (values > high)).tolist():
                 raise EpisodeError(

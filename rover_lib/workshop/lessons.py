@@ -17,7 +17,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torchvision.ops.misc import FrozenBatchNorm2d
 
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine, lerobot_act
@@ -55,6 +54,8 @@ class BatchedPolicy(nn.Module):
 
     def thaw(self) -> None:
         """Make what LeRobot freezes trainable: scale and shift of the batch norms; their statistics stay."""
+        from torchvision.ops.misc import FrozenBatchNorm2d  # importing it takes three seconds
+
         for norm in self.backbone.modules():
             if isinstance(norm, FrozenBatchNorm2d):
                 for name in ("weight", "bias"):

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.errors import PolicyError
+from rover_lib.workshop.cells import Table
 from rover_lib.workshop.compare import Fidelity, thinned
 from rover_lib.workshop.judge import follows, shown_pct
 from rover_lib.workshop.progress import Progress, silent
@@ -45,13 +46,13 @@ class Looking:
                     summary[f"{action}_{name}_us"] = float(moved[i]) * us
         return summary
 
-    def table(self) -> str:
+    def table(self) -> Table:
         """The same for a reader."""
-        found, lines = self.summary(), ["           another picture    another state    both"]
+        found, rows = self.summary(), []
         for action in self.report.action_names:
-            pct = [shown_pct(found[f"{action}_{name}_pct"]).strip() for name in ("by_picture", "by_state", "apart")]
-            lines.append(f"{action:9s}  {pct[0]:>15s}  {pct[1]:>15s}  {pct[2]:>8s}")
-        return "\n".join(lines)
+            pct = (shown_pct(found[f"{action}_{name}_pct"]).strip() for name in ("by_picture", "by_state", "apart"))
+            rows.append((action, *pct))
+        return Table(("a plan moves by", "another picture", "another state", "both"), rows)
 
     def warnings(self) -> list[str]:
         """What must be known before anybody drives it: an action that does not follow the camera."""

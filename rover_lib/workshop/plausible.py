@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from rover_lib.workshop.act import ACT, inputs_of, predictions
+from rover_lib.workshop.cells import Table
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.judge import Range, constant_actions
@@ -47,14 +48,12 @@ class Fit:
     actions: tuple[Action, ...]
     largest_state: dict[str, float] | None
 
-    def table(self) -> str:
+    def table(self) -> Table:
         """For a reader: where actions were recorded, and where this policy's lie on the same frames."""
-        wide = max(9, *(len(a.name) for a in self.actions))
-        lines = [f"{'':{wide}}  {'recorded':>20}  {'predicted':>20}"]
-        for a in self.actions:
-            recorded, predicted = (f"{low:.3g} to {high:.3g}" for low, high in (a.recorded, a.predicted))
-            lines.append(f"{a.name:{wide}}  {recorded:>20}  {predicted:>20}")
-        return "\n".join(lines)
+        spans = (
+            (a.name, *(f"{low:.3g} to {high:.3g}" for low, high in (a.recorded, a.predicted))) for a in self.actions
+        )
+        return Table(("", "recorded", "predicted"), list(spans))
 
     def warnings(self) -> list[str]:
         """A sentence for each number that does not fit; the remedy is always the same one."""

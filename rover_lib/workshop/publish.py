@@ -160,7 +160,7 @@ def _plain_output(output: Any) -> Any:
     if picture := output.get("data", {}).get("image/png"):
         output.data = {"image/png": _smaller(picture)}  # without "<Figure size ...>"
     if "metadata" in output:
-        output.metadata = {}
+        output.metadata = {kind: how for kind, how in output.metadata.items() if kind == "image/png"}  # its size
     return output
 
 

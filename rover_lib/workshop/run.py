@@ -54,10 +54,15 @@ class ThisPython(AsyncKernelManager):
 
 def parameters_of(notebook: Path) -> set[str]:
     """Names that the notebook's `parameters` cell sets."""
+    return {name for name, *_ in parameters_in(notebook)}
+
+
+def parameters_in(notebook: Path) -> list[tuple[str, str, str]]:
+    """(name, literal, comment) of each line of the notebook's `parameters` cell."""
     for cell in nbformat.read(notebook, as_version=4).cells:
         if "parameters" in cell.metadata.get("tags", []):
-            return set(re.findall(r"^(\w+) *=", cell.source, re.M))
-    return set()
+            return re.findall(r"^(\w+) *= *(.*?) *(?:# *(.*))?$", cell.source, re.M)
+    return []
 
 
 def run(
@@ -68,12 +73,13 @@ def run(
     runs_dir: Path | str = "runs",
     progress: Progress = silent,
     notebooks: Path | str = NOTEBOOKS,
+    timed: bool = True,
     **overrides: Any,
 ) -> Path:
     """Execute the five notebooks in order; return the run's folder.
 
     overrides: any of the notebooks' parameters, say worlds=40, samples=200, iterations=100. progress: called like
-    tqdm.tqdm(iterable, desc=, total=).
+    tqdm.tqdm(iterable, desc=, total=). timed: False leaves out the last notebook, the benchmark, for another moment.
 
     The new run is made beside the old one of that name, in .<name>.new, and takes its place when it is whole: stage by
     stage a run that fails at its third notebook would have cost the policies of the last good one, and left reports of
@@ -109,7 +115,8 @@ def run(
         others = _benchmarks_of_other_hosts(folder)
         for path in others:  # notebook 05 shows them
             shutil.copy2(path, new)
-        for source in progress(sources, desc="notebooks", total=len(sources)):
+        executed = sources if timed else sources[:-1]
+        for source in progress(executed, desc="notebooks", total=len(executed)):
             known_to_it = {k: v for k, v in given.items() if k in parameters_of(source)}
             _execute(source, new, known_to_it, progress is not silent)
         for path in others:
@@ -195,7 +202,7 @@ def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> N
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
     terminal = os.ttyname(sys.stderr.fileno()) if bars and _is_terminal(sys.stderr) else ""
-    with _environment({TTY_VARIABLE: terminal, **KERNEL_ENVIRONMENT}), atomic_path(folder / source.name) as temporary:
+    with environment({TTY_VARIABLE: terminal, **KERNEL_ENVIRONMENT}), atomic_path(folder / source.name) as temporary:
         try:
             papermill.execute_notebook(
                 str(source),
@@ -213,7 +220,7 @@ def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> N
 
 
 @contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
+def environment(values: dict[str, str]) -> Iterator[None]:
     """os.environ with these values inside, as before outside: a kernel inherits it."""
     before = {k: os.environ.get(k) for k in values}
     os.environ.update(values)

@@ -1,9 +1,10 @@
-"""README's tables of results, from the JSON in results/: each number there is written by this, and by nobody's hand.
+"""The pages' tables: of results, from the JSON in results/, and of the notebooks' parameters, from the notebooks. What
+is in them is written by this, and by nobody's hand.
 
     python -m rover_lib.workshop.tables        # what `make tables` does
 
-A table stands in README between `<!-- table NAME, by make tables -->` and `<!-- end -->`. A field without its JSON is
-empty; a row of which nothing was measured, as a count that was not made, is left out.
+A table stands in README.md or in a page of docs/ between `<!-- table NAME, by make tables -->` and `<!-- end -->`, each
+once. A field without its JSON is empty; a row of which nothing was measured, as a count that was not made, is left out.
 """
 
 import re
@@ -13,8 +14,9 @@ from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path, read_stage
+from rover_lib.workshop.run import parameters_in
 
-README = Path(__file__).parents[2] / "README.md"
+ROOT = Path(__file__).parents[2]
 MODES = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed"}
 BEST = "static"
 PLACE = re.compile(r"(<!-- table (\w+), by make tables -->\n)(.*?)(<!-- end -->)", re.S)
@@ -23,42 +25,50 @@ Row = tuple[str, ...]
 
 
 class TableError(RoverError):
-    """README or results/ without what a table needs."""
+    """Pages, notebooks or results/ without what a table needs."""
 
 
-def update(readme: Path = README, results: Path | None = None) -> bool:
-    """Write README's tables anew; returns whether it has changed. Raises TableError, and writes nothing then."""
-    old = readme.read_text()
-    new = written(old, results or readme.parent / "results")
-    if new != old:
-        with atomic_path(readme) as temporary:
-            temporary.write_text(new)
-    return new != old
+def pages(root: Path = ROOT) -> dict[Path, str]:
+    """The pages that may have tables, with their texts."""
+    return {path: path.read_text() for path in (root / "README.md", *sorted((root / "docs").glob("*.md")))}
 
 
-def written(text: str, results: Path) -> str:
-    """The text with its tables as results, a folder such as results/, has them. Raises TableError."""
-    names = [match[2] for match in PLACE.finditer(text)]
+def update(root: Path = ROOT) -> list[Path]:
+    """Write the tables of the pages in `root` anew; returns the pages that changed. Raises TableError, and writes
+    nothing then.
+    """
+    old = pages(root)
+    new = written(old, root)
+    changed = [path for path in old if new[path] != old[path]]
+    for path in changed:
+        with atomic_path(path) as temporary:
+            temporary.write_text(new[path])
+    return changed
+
+
+def written(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
+    """The pages with their tables as results/ and notebooks/ in `root` have them. Raises TableError."""
+    names = [match[2] for text in texts.values() for match in PLACE.finditer(text)]
     if sorted(names) != sorted(TABLES):
-        raise TableError("README must have each table once", found=names or "none", remedy=f"mark {sorted(TABLES)}")
+        raise TableError("the pages must have each table once", found=names or "none", remedy=f"mark {sorted(TABLES)}")
 
     def place(match: re.Match[str]) -> str:
-        header, *rows = TABLES[match[2]](results)
+        header, *rows = TABLES[match[2]](root)
         lines = [header, ("---",) * len(header), *rows]
         return match[1] + "".join(map(_line, lines)) + match[4]
 
-    return PLACE.sub(place, text)
+    return {path: PLACE.sub(place, text) for path, text in texts.items()}
 
 
 def _line(fields: Row) -> str:
     return "|" + "".join(f" {field} |" if field else " |" for field in fields) + "\n"
 
 
-def _demo(results: Path) -> list[Row]:
+def _demo(root: Path) -> list[Row]:
     """The demo's policy in each mode."""
-    compared = _metrics(results / "demo", "compare")
-    timed = _metrics(results / "demo", "benchmark-*")["artifacts"]
-    counted = _metrics(results / "demo", "arm", {"artifacts": {}})["artifacts"]
+    compared = _metrics(root / "results" / "demo", "compare")
+    timed = _metrics(root / "results" / "demo", "benchmark-*")["artifacts"]
+    counted = _metrics(root / "results" / "demo", "arm", {"artifacts": {}})["artifacts"]
     fp32, modes = compared["fp32"], {"fp32": compared["fp32"]} | compared["modes"]
 
     def row(what: str, text: Callable[[str], str | None]) -> Row:
@@ -92,9 +102,9 @@ def _demo(results: Path) -> list[Row]:
     return [("", *MODES.values()), *(fields for fields in rows if any(fields[1:]))]
 
 
-def _faults(results: Path) -> list[Row]:
+def _faults(root: Path) -> list[Row]:
     """What was done to a driving car, and what became of it."""
-    report = _metrics(results / "lab", "faults")
+    report = _metrics(root / "results" / "lab", "faults")
     of = {e: [f for f in report["faults"] if f["expected"] == e] for e in ("stopped", "continues", "refused", "human")}
 
     def right(expected: str) -> str:
@@ -111,14 +121,14 @@ def _faults(results: Path) -> list[Row]:
         ("faults from before the start, with which the car is never armed", right("refused")),
         ("human takes over by a stick, until the pins are the human's", f"at most {takeover:.0f} ms, by design 46"),
         ("pulses recorded, replayed and measured again", f"within {report['bytes']['worst_us']:.0f} us"),
-        ("drives with random faults in virtual time that broke a rule of safety", _random(results)),
-        *_view(results),
+        ("drives with random faults in virtual time that broke a rule of safety", _random(root)),
+        *_view(root),
     ]
 
 
-def _view(results: Path) -> list[Row]:
+def _view(root: Path) -> list[Row]:
     """What a view does to a drive; `python -m lab view`."""
-    report = _metrics(results / "lab", "view")
+    report = _metrics(root / "results" / "lab", "view")
     stop, late = report["stop"], report["late_ms"]
     cost = f"{late['with']['p99']:.2f} ms late at p99, {late['without']['p99']:.2f} without, in turns"
     picture = f"{report['delay_ms']['p95']:.0f} ms old at p95, {report['pictures_hz']:.0f} a second"
@@ -132,16 +142,16 @@ def _view(results: Path) -> list[Row]:
     ]
 
 
-def _random(results: Path) -> str:
-    report = _metrics(results / "lab", "random")
+def _random(root: Path) -> str:
+    report = _metrics(root / "results" / "lab", "random")
     return f"{len(report['broken'])} of {report['drives']:,}"
 
 
-def _drives(results: Path) -> list[Row]:
+def _drives(root: Path) -> list[Row]:
     """Hits of the demo's policy when its plans are late, and when the car is pushed."""
     rows = [
         r
-        for r in _metrics(results / "demo", "drive")["rows"]
+        for r in _metrics(root / "results" / "demo", "drive")["rows"]
         if r["compensate"] and r["ensemble"] is None and r["hits"]
     ]
     alone, pushed = ({r["latency_ms"]: r for r in rows if bool(r["pushes"]) == way} for way in (False, True))
@@ -154,9 +164,9 @@ def _drives(results: Path) -> list[Row]:
     ]
 
 
-def _students(results: Path) -> list[Row]:
+def _students(root: Path) -> list[Row]:
     """The full-size policy that has learned, and what was distilled from it."""
-    rows = _metrics(results / "full", "distill")["students"]
+    rows = _metrics(root / "results" / "full", "distill")["students"]
     actions = [key.removeprefix("recorded_").removesuffix("_pct") for key in rows[0] if key.startswith("recorded_")]
 
     def row(student: Mapping[str, Any]) -> Row:
@@ -177,11 +187,21 @@ def _students(results: Path) -> list[Row]:
     return [("", "MB", *counted, *driven, f"{' / '.join(actions)} error to the recordings, %"), *map(row, rows)]
 
 
+def _parameters(root: Path) -> list[Row]:
+    """What papermill's -p sets, as the cells of parameters say it."""
+    rows: list[Row] = []
+    for path in sorted((root / "notebooks").glob("*.ipynb")):
+        for name, default, why in parameters_in(path):
+            rows.append((f"[{path.stem}](../notebooks/{path.name})", f"`{name}`", f"`{default}`", why))
+    return [("notebook", "parameter", "if it is not given", "what it is"), *rows]
+
+
 TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "demo": _demo,
     "faults": _faults,
     "drives": _drives,
     "students": _students,
+    "parameters": _parameters,
 }
 
 
@@ -206,4 +226,5 @@ def _strong(text: str, strong: bool) -> str:
 
 
 if __name__ == "__main__":
-    print("README.md: written" if update() else "README.md: as it was")
+    for path in update():
+        print(f"{path.name}: written")

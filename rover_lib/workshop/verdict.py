@@ -19,6 +19,18 @@ from rover_lib.workshop import judge
 from rover_lib.workshop.compare import GATED, MODES, gate, gates
 
 CALLED = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed INT8"}
+OF_BENCHMARKS = {  # the original's acceptance table
+    "latency_mean_ms": "time of a plan, mean, ms",
+    "latency_p95_ms": "time of a plan, 95th percentile, ms",
+    "throughput_fps": "plans a second",
+    "control_rate_hz": "commands a second",
+    "model_size_mb": "size of the artifact, MB",
+    "memory_mb": "memory, MB",
+    "cpu_pct": "processor, % of all cores",
+    "accuracy_loss_pct": "largest error, % of the recorded range",
+    "temperature_c": "temperature, Celsius",
+    "throttled": "what the Pi's firmware throttled",
+}
 PREFERRED = ("fp32", "static", "mixed", "dynamic")  # where nothing else parts them: what was trained, then the simplest
 COUNTED = "counted on an emulated Cortex-A76"
 NEXT_COMMANDS = 3
@@ -161,13 +173,37 @@ def in_words(mode: str, key: str) -> str:
     if key.endswith("_mae_pct"):
         return f"{key.removesuffix('_mae_pct')} error of {of}, % of the recorded range"
     return {
+        "instructions_g": f"instructions of a plan of {of}, 10^9",
+        "simd_g": f"SIMD instructions of a plan of {of}, 10^9",
+        "peak_memory_mb": f"memory of {of} while it predicts, MB",
+        "peak_memory_loading_mb": f"memory of {of} while it is loaded, MB",
+        "error, x workstation's": f"error of {of} on the emulated core, times the workstation's",
+        "frames judged on the core": f"frames that judged {of} on the emulated core",
+        "tenth off the third, %": f"tenth plan of {of} against its third, % of instructions",
+        "backbone values that differ": f"values of the backbone of {of} that differ from the workstation's",
         "hits": f"balloons that {of} hits",
         "hits lost": f"balloons that {of} misses and FP32 hits",
         "size_mb": f"size of {of}, MB",
         "model_size_mb": f"size of {of}, MB",
         "accuracy_loss_pct": f"largest error of {of}, % of the recorded range",
         "floor_ms": f"a plan of {of} on a Pi 5 at the very best, ms (computed)",
-    }.get(key, f"{key} of {of}")
+    }.get(key, f"{key}, of {of}")
+
+
+def gate_in_words(gate: str) -> str:
+    """Any gate's name, as notebooks show it: of a comparison, a benchmark, a drive, a count or a student.
+
+    What is in words already stays as it is.
+    """
+    name, _, key = gate.partition(" ")
+    mode, _, size = name.removeprefix("policy_").partition("_")
+    if mode not in CALLED or not key:
+        for known, words in OF_BENCHMARKS.items():
+            gate = gate.replace(known, words)
+        return gate
+    original = ", as the original promised" if key in ("model_size_mb", "accuracy_loss_pct") else ""
+    words = in_words(mode, key) + original
+    return words.replace(CALLED[mode], f"{CALLED[mode]} at {'x'.join(reversed(size.split('x')))}") if size else words
 
 
 def _failed(

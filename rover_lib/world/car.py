@@ -29,8 +29,9 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import WorldError
-from rover_lib.onboard.pwm import NEUTRAL, STOPPED_THROTTLE_US, PwmCalibration
+from rover_lib.onboard.pwm import NEUTRAL
 from rover_lib.world.child import Child
 from rover_lib.world.record import JPEG_QUALITY
 from rover_lib.world.standin import PinEvent
@@ -352,7 +353,7 @@ class _Pins:
 
     def __init__(self, board: Board):
         self._board = board
-        self._calibration = PwmCalibration()
+        self._calibration = this_car().pwm
         self._coming: deque[PinEvent] = deque()
         self._action = dict(zip(("steering", "throttle"), NEUTRAL, strict=True))
         self.asked_for_motion = False
@@ -369,7 +370,7 @@ class _Pins:
             else:
                 # By the nominal period: the first pulse after a reset has none, and the servo measures the pulse.
                 self._action[event.pin] = self._calibration.channel(event.pin).action(event.pulse_us) or 0.0
-                self.asked_for_motion |= event.pin == "throttle" and event.pulse_us > STOPPED_THROTTLE_US
+                self.asked_for_motion |= event.pin == "throttle" and self._calibration.throttle.moves(event.pulse_us)
         return self._action["steering"], self._action["throttle"]
 
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rover_lib.workshop.cells import Table
 from rover_lib.workshop.compare import gate
 from rover_lib.workshop.judge import shown_pct, worst
 
@@ -83,23 +84,21 @@ def shape_of(row: Mapping[str, Any]) -> str:
     return f"{row['width']}x{row['height']}, {layers} of {row['feedforward']}{', QAT' if row['qat'] else ''}"
 
 
-def table(metrics: Mapping[str, Any]) -> str:
+def table(metrics: Mapping[str, Any]) -> Table:
     """A teacher and its students, a row each. metrics: of distill.json."""
-    rows = metrics["students"]
-    actions = _actions(rows[0])
-    wide = max(len(f"{row['name']}: {shape_of(row)}") for row in rows)
-    heads = f"{'':{wide}} {'MB':>6} {'GMAC':>6} {'10^9':>6} {'ms, computed':>14} {'left alone':>10} {'pushed':>20}"
-    lines = [heads + f"  {'to the teacher, %':>17}  {'to the recordings, %':>20}"]
-    for row in rows:
-        name = f"{row['name']}: {shape_of(row)}"
+    actions = _actions(metrics["students"][0])
+    header = ("", "MB", "GMAC", "10^9 instructions", "ms, computed", "left alone", "pushed")
+    rows = []
+    for row in metrics["students"]:
         counted = "-" if row["instructions_g"] is None else f"{row['instructions_g']:.3g}"
         span = "not counted" if row["computed_ms"] is None else "{:.3g} to {:.3g}".format(*row["computed_ms"])
         pushed = _of(row, "pushed_") + (f" at {row['pushed_latency_ms']:.0f} ms" if row["pushed_trials"] else "")
-        cells = f"{name:{wide}} {row['size_mb']:6.1f} {row['gmac']:6.3g} {counted:>6} {span:>14} {_of(row, ''):>10}"
-        errors = [" / ".join(_plain(row[f"{to}_{action}_pct"]) for action in actions) for to in ("teacher", "recorded")]
-        lines.append(f"{cells} {pushed:>20}  {errors[0]:>17}  {errors[1]:>20}")
-    lines.append(f"errors in {' / '.join(actions)}, of the static INT8 artifact, % of the recorded range")
-    return "\n".join([*lines, *metrics["notes"], *metrics["warnings"]])
+        errors = (" / ".join(_plain(row[f"{to}_{action}_pct"]) for action in actions) for to in ("teacher", "recorded"))
+        work = (f"{row['size_mb']:.1f}", f"{row['gmac']:.3g}", counted, span)
+        rows.append((f"{row['name']}: {shape_of(row)}", *work, _of(row, ""), pushed, *errors))
+    what = f"errors in {' / '.join(actions)}, of the static INT8 artifact, % of the recorded range"
+    notes = (what, *metrics["notes"], *metrics["warnings"])
+    return Table((*header, "to the teacher, %", "to the recordings, %"), rows, notes=notes)
 
 
 def sentences(metrics: Mapping[str, Any]) -> list[str]:

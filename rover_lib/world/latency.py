@@ -28,6 +28,7 @@ from rover_lib.onboard.pilot import Order, PolicyPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.stage import plain, read_stage, write_stage
+from rover_lib.workshop.cells import Table
 from rover_lib.workshop.compare import GATED, gate
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.world.trial import Trajectory, wilson_interval
@@ -390,17 +391,17 @@ def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]
     return [gate(f"{GATED} hits lost at {JUDGED_MS:g} ms", lost, "<=", limit)]
 
 
-def table(content: Mapping[str, Any]) -> str:
-    """drive.json for a terminal."""
-    lines = [f"{'latency':>10}  {'plan age p95':>12}  {'hits':>9}  {'stopped':>7}"]
+def table(content: Mapping[str, Any]) -> Table:
+    """drive.json for a reader."""
+    rows = []
     for r in content["metrics"]["rows"]:
-        how = "" if r["compensate"] else ", not compensated"
-        how += ", ensembling" if r["ensemble"] is not None else ""
-        how += f", {r['pushes']} pushes" if r["pushes"] else ""
+        how = [f"{r['pushes']} pushes"] if r["pushes"] else ["left alone"]
+        how += [] if r["compensate"] else ["not compensated"]
+        how += ["ensembling"] if r["ensemble"] is not None else []
         age = "-" if r["plan_age_p95_ms"] is None else f"{r['plan_age_p95_ms']:.0f} ms"
         hits = f"{r['hits']} of {r['trials']}"
-        lines.append(f"{r['latency_ms']:>7g} ms  {age:>12}  {hits:>9}  {r['stopped']:>7}{how}")
-    verdict = {True: "pass", False: "FAIL", None: "not measured"}
+        rows.append((", ".join(how), f"{r['latency_ms']:g} ms", age, hits, str(r["stopped"])))
+    notes, verdict = [], {True: "pass", False: "FAIL", None: "not measured"}
     for g in content["metrics"]["gates"]:
-        lines.append(f"{g['gate']}: {g['found']}, at most {g['limit']}: {verdict[g['passed']]}")
-    return "\n".join(lines)
+        notes.append(f"{g['gate']}: {g['found']}, at most {g['limit']}: {verdict[g['passed']]}")
+    return Table(("", "latency", "plan age, p95", "hits", "stopped"), rows, notes=notes)

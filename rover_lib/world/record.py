@@ -14,8 +14,9 @@ import numpy as np
 
 from rover_lib.onboard import pwm as pwm_module
 from rover_lib.onboard import recording
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import WorldError
-from rover_lib.onboard.pwm import ARDUINO_STEP_US, PwmCalibration
+from rover_lib.onboard.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.recording import EpisodeWriter
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.progress import Progress, silent
@@ -54,6 +55,7 @@ def record_episodes(
         "shoves": SHOVES,
         "jpeg_quality": JPEG_QUALITY,
         "cv2": cv2.__version__,
+        "car": this_car().description(),
     }
     key = key_of(params, world_module, recording, pwm_module, sys.modules[__name__])
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
@@ -99,7 +101,8 @@ def record_drive(folder: Path, index: int, seed: int) -> bool:
     world = World(FIRST_WORLD * (seed + 1) + index, shoves=SHOVES)
     start = FIRST_DRIVE + timedelta(days=seed) + index * BETWEEN_DRIVES
     start_s = start.timestamp()
-    pwm = PwmCalibration()
+    car = this_car()
+    pwm = car.pwm
     periods = [_measured_us(c.period_us) for c in (pwm.steering, pwm.throttle)]
     with EpisodeWriter(
         folder / f"episode_{start:%Y%m%d_%H%M%S}",
@@ -109,6 +112,7 @@ def record_drive(folder: Path, index: int, seed: int) -> bool:
         start_time_s=start_s,
         arduino_port="playground",
         jpeg_quality=JPEG_QUALITY,
+        car=car,
     ) as episode:
         while not world.done:
             t_s = world.state.time_s

@@ -5,6 +5,7 @@ import os
 import pty
 import re
 import select
+import struct
 import termios
 import threading
 import time
@@ -13,11 +14,12 @@ import zlib
 from collections import deque
 from typing import Any, NamedTuple
 
-from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.car import DEFAULT_NUMBERS, this_car
 from rover_lib.onboard.servo_link import FIRMWARE_VERSION, PROTOCOL_VERSION
 
 BOOT_S = 0.2  # of the boot loader; a board's takes 1 to 2 s
-REST_US = (1456.0, 120.0)  # a transmitter whose sticks nobody touches
+_NEUTRAL = this_car().pwm.neutral()
+REST_US = (float(_NEUTRAL.steering_us), float(_NEUTRAL.throttle_us))  # a transmitter whose sticks nobody touches
 
 
 class PinEvent(NamedTuple):
@@ -43,18 +45,18 @@ class PinEvent(NamedTuple):
 
 
 _NUMBER = r"(0|[1-9][0-9]{0,9})"
-_COMMAND = re.compile(rf">([ADLN]) {_NUMBER} {_NUMBER}((?: {_NUMBER})*)", re.ASCII)
-_NUMBERS = {"A": 1, "D": 3, "N": 0, "L": 1}  # after boot and sequence
+_COMMAND = re.compile(rf">([ACDLN]) {_NUMBER} {_NUMBER}((?: {_NUMBER})*)", re.ASCII)
+_NUMBERS = {"A": 2, "C": 9, "D": 3, "N": 0, "L": 1}  # after boot and sequence
 _STATUS_S = 0.02
 _TIMEOUT_S = 0.150
 LATE_MS = 150
-CAP_US = 238
+CAP_US = DEFAULT_NUMBERS[6] + DEFAULT_NUMBERS[8]
 _SEQUENCE_WINDOW = 65535
-_LINE_MAX = 64
+_LINE_MAX = 96
 
 
 class StandIn:
-    """A stand-in for the Arduino, for machines without simavr: protocol version 2 of firmware/README.md on a pty.
+    """A stand-in for the Arduino, for machines without simavr: protocol version 3 of firmware/README.md on a pty.
 
     It is no firmware and proves nothing about the firmware. Like it, it resets when its port is opened and DTR was not
     left up, starts in manual with a transmitter at rest, drives only when armed, within range and its throttle's cap,
@@ -65,10 +67,6 @@ class StandIn:
     """
 
     def __init__(self, boot_s: float = BOOT_S):
-        calibration = PwmCalibration()
-        self._channels = (calibration.steering, calibration.throttle)
-        self._neutral = tuple(channel.neutral_us for channel in self._channels)
-        self._ranges = [(c.pulse_us(c.low), c.pulse_us(c.high)) for c in self._channels]
         self._boot_s = boot_s
         self._master, slave = pty.openpty()
         tty.setraw(slave)
@@ -106,7 +104,8 @@ class StandIn:
     def _reset(self) -> None:
         self._boot = (self._boot + 1) % 65536
         self._sequence = 0
-        self._cap_us = CAP_US
+        self._cap_us = self._lowered_us = 65535
+        self._take_car(DEFAULT_NUMBERS)
         self._result, self._state, self._reason = "-", "M", "r"
         self._bad = self._old = self._out_of_range = 0
         self._line: bytes | None = None  # what came since a '>'
@@ -158,7 +157,7 @@ class StandIn:
             os.write(self._master, line.encode())
 
     def _hello(self, reset: str = "-") -> None:
-        self._send(f"<H {PROTOCOL_VERSION} {FIRMWARE_VERSION} {self._boot} {self._sequence} {reset}")
+        self._send(f"<H {PROTOCOL_VERSION} {FIRMWARE_VERSION} {self._boot} {self._sequence} {reset} {self._car_id}")
 
     @property
     def _uptime_ms(self) -> int:
@@ -166,12 +165,11 @@ class StandIn:
 
     def _status(self) -> None:
         self._status_due = time.monotonic() + _STATUS_S
-        receiver = " ".join(
-            f"{us} {channel.period_us}" for us, channel in zip(self._neutral, self._channels, strict=True)
-        )
+        receiver = " ".join(f"{us} {period_us}" for us, period_us in zip(self._neutral, self._periods_us, strict=True))
         self._send(
             f"<S {self._boot} {self._uptime_ms} {self._sequence} {self._result} {self._state} {self._reason} - "
-            f"{self._pins[0]} {self._pins[1]} {self._cap_us} {receiver} {self._bad} {self._old} {self._out_of_range} 0"
+            f"{self._pins[0]} {self._pins[1]} {self._neutral[1] + self._cap_us} {receiver} "
+            f"{self._bad} {self._old} {self._out_of_range} 0"
         )
 
     def _take(self, byte: int) -> None:
@@ -213,6 +211,10 @@ class StandIn:
 
     def _obey(self, kind: str, numbers: list[int]) -> str:
         armed = self._state == "A"
+        if kind == "C":
+            return "i" if armed else self._told(numbers)
+        if kind == "A" and numbers[1] != self._car_id:
+            return "c"
         pulses = {"D": numbers[1:], "L": [self._neutral[0], *numbers]}.get(kind, self._neutral)
         if not all(low <= us <= high for us, (low, high) in zip(pulses, self._ranges, strict=True)):
             self._out_of_range += 1
@@ -222,14 +224,29 @@ class StandIn:
         if kind == "N":
             self._enter("S", "n")
         elif kind == "L":
-            self._cap_us = min(self._cap_us, *numbers)
+            self._lowered_us = self._cap_us = min(self._cap_us, abs(numbers[0] - self._neutral[1]))
         elif kind == "D":
             self._commanded = time.monotonic()
-            self._set_pins(pulses[0], min(pulses[1], self._cap_us))
+            low, high = self._neutral[1] - self._cap_us, self._neutral[1] + self._cap_us
+            self._set_pins(pulses[0], min(max(pulses[1], low), high))
         elif not armed:  # a host that repeats itself renews nothing
             self._commanded = time.monotonic()
             self._enter("A", "a")
         return "k"
+
+    def _told(self, numbers: list[int]) -> str:
+        self._take_car(tuple(numbers))
+        self._pins = ()
+        self._set_pins(*self._neutral)
+        return "k"
+
+    def _take_car(self, numbers: tuple[int, ...]) -> None:
+        """The pins are that car's. No limits are here: the host refuses a car that has none."""
+        self._car_id = zlib.crc32(struct.pack("<9H", *numbers))
+        self._periods_us = numbers[0], numbers[4]
+        self._neutral = numbers[2], numbers[6]
+        self._ranges = [(numbers[1], numbers[3]), (numbers[5], numbers[7])]
+        self._cap_us = min(numbers[8], self._lowered_us)
 
     def _check_timeout(self) -> None:
         if self._state == "A" and time.monotonic() - self._commanded >= _TIMEOUT_S:
@@ -240,9 +257,9 @@ class StandIn:
         self._set_pins(*self._neutral)
 
     def _set_pins(self, *pulses: int) -> None:
-        for i, channel in enumerate(self._channels):
+        for i, pin in enumerate(("steering", "throttle")):
             if not self._pins or pulses[i] != self._pins[i]:
-                self._event("pulse", channel.name, pulses[i], channel.period_us)
+                self._event("pulse", pin, pulses[i], self._periods_us[i])
         self._pins = pulses
 
     def _event(self, kind: str, pin: str = "", *measured: Any) -> None:

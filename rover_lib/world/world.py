@@ -3,7 +3,7 @@
 A car stands on a floor, a red balloon floats some metres ahead, and the task is to drive into it. Floor,
 wall, light and the objects that are not red balloons differ from seed to seed. Lengths are metres, angles
 radians (positive to the left), actions the policy's: steering in [-1, 1] (positive to the left), throttle in
-[0, 1].
+[0, 1], or from -1 of a car with reverse. Wheelbase and field of view are car.yml's.
 """
 
 import math
@@ -13,7 +13,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import WorldError
+
+_CAR = this_car()  # whose wheels, camera and throttle
 
 RATE_HZ = 30.0
 FRAME_HEIGHT, FRAME_WIDTH = 360, 640
@@ -21,7 +24,7 @@ TIMEOUT_S = 8.0
 
 # Car. Full steering turns the wheels by 34 degrees, a throttle of 0.09 (a drive's most in real recordings) is
 # 1.1 m/s.
-WHEELBASE_M = 0.26
+WHEELBASE_M = _CAR.wheelbase_m
 WHEEL_ANGLE_RAD = 0.6
 STEERING_LAG_S = 0.12
 SPEED_PER_THROTTLE_MPS = 12.0
@@ -34,7 +37,7 @@ THROTTLE_RISE_PER_S = 0.20  # from a stand to full in half a second
 THROTTLE_FALL_PER_S = 0.30
 
 # Camera, a pinhole above the front bumper that looks straight ahead, with the horizon above the middle.
-FOCAL_PX = 400.0
+FOCAL_PX = _CAR.focal_px
 HORIZON_ROW = 125
 CENTRE_COLUMN = FRAME_WIDTH / 2
 CAMERA_HEIGHT_M = 0.20
@@ -139,8 +142,10 @@ class World:
 
     def step(self, steering: float, throttle: float, dt: float = 1 / RATE_HZ) -> None:
         """Drive for dt seconds. Raises WorldError for an action outside its range, or after the end."""
-        if not (-1 <= steering <= 1 and 0 <= throttle <= 1):
-            raise WorldError("steering must be in [-1, 1] and throttle in [0, 1]", found=f"({steering}, {throttle})")
+        (_, least), _ = _CAR.limits
+        if not (-1 <= steering <= 1 and least <= throttle <= 1):
+            found = f"({steering}, {throttle})"
+            raise WorldError(f"steering must be in [-1, 1] and throttle in [{least:g}, 1]", found=found)
         if self.done:
             raise WorldError(f"world {self.seed} has ended ({self.outcome})", remedy="make a new one")
         s = self.state

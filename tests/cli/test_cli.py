@@ -1,7 +1,7 @@
 """The command line: help that helps, one sentence for bad input, nothing half-written."""
 
-import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -58,15 +58,25 @@ def test_commands_are_said_whole_in_80_columns(group):
     assert max(map(len, lines)) <= 80 and not [line for line in lines if line.endswith("...")]
 
 
-def test_a_reader_who_has_seen_enough_is_no_error(monkeypatch):
+def test_a_reader_who_has_seen_enough_is_no_error():
     """`rover inspect X | head -1`: the pipe is closed while there is more to print."""
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as stream:
+        unread = onboard.Unread(stream)
+        for _ in range(3):
+            print("more", file=unread, flush=True)
 
-    def closed(*args, **options):
-        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
 
-    monkeypatch.setattr("rover_lib.workshop.describe.runs", closed)
-    result = rover("list")
-    assert "rover:" not in result.output and "Traceback" not in result.output
+def test_completion_is_of_commands_and_options(monkeypatch):
+    """What docs/install.md puts into ~/.bashrc asks this."""
+    words = {"_ROVER_COMPLETE": "bash_complete", "COMP_CWORD": "1"}
+    found = CliRunner().invoke(main, [], prog_name="rover", env=words | {"COMP_WORDS": "rover ins"})
+    assert found.output.split() == ["plain,inspect"]
+    found = CliRunner().invoke(
+        main, [], prog_name="rover", env=words | {"COMP_WORDS": "rover log --d", "COMP_CWORD": "2"}
+    )
+    assert found.output.split() == ["plain,--drive"]
 
 
 def test_inspects_each_kind_of_file(artifacts, tiny_file):

@@ -21,6 +21,19 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 
+def borrow(packages: Path, engine: str = "torch") -> None:
+    """What a Pi with that engine has, of this environment, linked: installing torch takes minutes."""
+    for name in re.findall(r"^([\w.-]+)==", REQUIREMENTS[engine].read_text(), re.MULTILINE):
+        try:
+            files = importlib.metadata.distribution(name).files or []
+        except importlib.metadata.PackageNotFoundError:  # only another Python needs it
+            continue
+        for top in {f.parts[0] for f in files} - {"..", "__pycache__"}:
+            there, here = Path(str(importlib.metadata.distribution(name).locate_file(top))), packages / top
+            if there.exists() and not here.exists():
+                here.symlink_to(there)
+
+
 class Installed:
     """A virtual environment with one wheel of ours, and of others those that a Pi with that engine has."""
 
@@ -29,21 +42,9 @@ class Installed:
         venv.create(folder / "venv", with_pip=False, symlinks=True)
         self.bin = folder / "venv" / "bin"
         self.packages = next((folder / "venv" / "lib").glob("python3*/site-packages"))
-        for name in re.findall(r"^([\w.-]+)==", REQUIREMENTS[engine].read_text(), re.MULTILINE):
-            self.borrow(name)
+        borrow(self.packages, engine)
         pip = [sys.executable, "-m", "pip", "--python", self.bin / "python", "install", "--no-deps", "--no-index"]
         subprocess.run([*pip, "--quiet", "--disable-pip-version-check", wheel], check=True)
-
-    def borrow(self, name: str) -> None:
-        """A package of this environment, linked: installing torch takes minutes."""
-        try:
-            files = importlib.metadata.distribution(name).files or []
-        except importlib.metadata.PackageNotFoundError:  # only another Python needs it
-            return
-        for top in {f.parts[0] for f in files} - {"..", "__pycache__"}:
-            there, here = Path(str(importlib.metadata.distribution(name).locate_file(top))), self.packages / top
-            if there.exists() and not here.exists():
-                here.symlink_to(there)
 
     def run(self, *command: object) -> subprocess.CompletedProcess:
         # Neither this checkout nor this environment is to be seen.
@@ -174,3 +175,53 @@ print(json.dumps([rover_lib.cli.__file__, params()]))
     assert Path(file).is_relative_to(tmp_path)
     assert {"calibration", "quantization", "benchmark", "drive", "flight_log"} <= set(params)
     assert {"steering_mae_pct", "original"} <= set(params["gates"])
+
+
+def test_says_its_version_pythons_and_the_engines(rover, rover_without_torch):
+    lines = rover.run("rover", "--version").stdout.splitlines()
+    assert re.fullmatch(r"rover \d+\.\d+\.\d+\+[0-9a-f]{12}", lines[0]) and lines[1].startswith("Python 3.")
+    assert re.fullmatch(r"engine qnnpack: torch 2\.8\.0.*", lines[2])
+    lines = rover_without_torch.run("rover", "--version").stdout.splitlines()
+    assert lines[2] == "engine qnnpack: torch is not installed"
+    assert re.fullmatch(r"engine onnxruntime: onnxruntime \d+\.\d+\.\d+", lines[3])
+
+
+@pytest.mark.parametrize(("command", "code"), [(["--help"], 0), (["doctor", "--json"], 1)])
+def test_a_reader_who_has_seen_enough_changes_no_exit_code(rover, command, code):
+    """As `rover log FILE | head -1`, which closes the pipe early."""
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as closed:
+        done = subprocess.run([rover.bin / "rover", *command], stdout=closed, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
+def test_the_way_by_hand(tmp_path, artifacts):
+    """docs/install.md's lines, as they stand there: but for what needs root, another machine, or minutes of pip."""
+    page = (ROOT / "docs" / "install.md").read_text()
+    blocks = re.findall(r"<!-- by hand: \w+ -->\n(.*?)<!-- end -->", page, re.S)
+    lines = [line.strip() for block in blocks for line in block.splitlines() if line.strip()]
+    assert len(lines) <= 10
+    env = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV", "COV"))}
+    env["PATH"] = f"{Path(sys.executable).parent}:{env['PATH']}"
+    (tmp_path / ".venv").symlink_to(sys.prefix)
+    (tmp_path / "policy_static.pt").symlink_to(artifacts["static"])
+    outputs = {}
+    for line in lines:
+        if line.startswith("sudo "):
+            continue
+        if line.startswith("scp "):
+            for path in (tmp_path / "wheels").glob("rover_policy-*.whl"):
+                path.rename(tmp_path / path.name)
+        elif "--require-hashes" in line:
+            assert line.endswith(f"-r {REQUIREMENTS['torch'].name}")
+            borrow(next((tmp_path / "rover" / "lib").glob("python3*/site-packages")))
+        else:
+            own = {"PYTHONPATH": str(ROOT)} if "wheelhouse" in line else {}
+            done = subprocess.run(line, shell=True, cwd=tmp_path, env=env | own, capture_output=True, text=True)
+            outputs[line] = done
+    *made, version, doctor, drive = outputs.values()
+    assert not [done.stderr for done in made if done.returncode]
+    assert version.stdout.startswith("rover ") and version.returncode == 0
+    assert re.search(r"^ok +artifact ", doctor.stdout, re.M) and doctor.returncode == 1, doctor.stdout  # no camera
+    assert drive.returncode == 1 and drive.stderr.startswith("rover: /dev/video0"), drive.stderr

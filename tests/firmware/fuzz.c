@@ -5,7 +5,7 @@
  * the transmitter's last pulses (its throttle only after it was at rest), or go towards the pulses of the last valid
  * drive as fast and as far as the limits let them, and the latter two only in their state and while there is a signal; a
  * moved stick ends autonomy; and nothing arms without a wiggle. The board starts anew now and then, often shortly before
- * its clock or the host's sequence wraps.
+ * its clock or the host's sequence wraps, and as another car; other cars are told too, some of which may not be.
  * Use: fuzz LINES SEED
  */
 #include <stdio.h>
@@ -25,7 +25,31 @@ static uint32_t rnd(uint32_t below) { /* xorshift64* */
 static struct vehicle vehicle;
 static struct reader reader;
 static uint32_t now_ms;
-static uint16_t stick_us[2] = {STEERING_NEUTRAL_US, THROTTLE_NEUTRAL_US};
+/* Of steering and of throttle period, least, neutral, most; and the cap. The first is what nobody needs to tell. */
+static const uint16_t CARS[][9] = {
+    {21316, 900, 1456, 2012, 1016, 120, 120, 711, 118},
+    {20000, 1000, 1500, 2000, 20000, 1000, 1500, 2000, 100},
+    {20000, 1100, 1480, 1900, 14000, 1000, 1000, 2000, 60},
+    {3003, 1050, 1550, 2100, 1010, 100, 100, 500, 80},
+};
+/* And some that may not be: each differs in one number from the one above of the same index modulo four. */
+static const uint16_t BAD_CARS[][9] = {
+    {21316, 900, 1456, 2012, 1016, 120, 120, 711, 119},
+    {20000, 1000, 1500, 2000, 20000, 700, 1500, 2000, 100},
+    {20000, 1100, 1480, 1729, 14000, 1000, 1000, 2000, 60},
+    {3003, 1050, 1550, 2100, 1010, 50, 100, 500, 80},
+    {21316, 900, 2012, 2012, 1016, 120, 120, 711, 118},
+    {2000, 1000, 1500, 2000, 20000, 1000, 1500, 2000, 100},
+    {20000, 1100, 1480, 1900, 14000, 1000, 2000, 2000, 60},
+    {3003, 1050, 1550, 2100, 1010, 100, 100, 712, 80},
+    {21316, 900, 1456, 2012, 1016, 170, 170, 711, 118},
+    {20000, 1000, 1500, 2000, 20000, 1000, 1500, 2000, 0},
+};
+static const uint16_t *car = CARS[0];
+static bool told = true; /* or it is the first */
+static bool fast(void) { return car[4] < 3000; }
+static uint32_t id_of(const uint16_t *numbers) { return crc32((const char *)numbers, 18); }
+static uint16_t stick_us[2] = {1456, 120};
 static uint16_t seen_us[2]; /* of them, the receiver's last pulses */
 static uint32_t seen_ms[2];
 static uint16_t rest_us[2]; /* the sticks on arming */
@@ -34,15 +58,16 @@ static bool misreading;           /* some throttle pulses are measured wrongly *
 static bool sides[2];             /* the steering stick was there since the last arming or loss */
 static uint32_t sides_ms[2];
 static unsigned at_rest, away;    /* throttle pulses in a row: at rest; not where they were on arming */
-static bool throttle_may_pass;
+static bool throttle_may_pass, was_lost;
 static uint32_t wanted_us[2];     /* of the last drive that must count */
 static uint32_t wanted_since_ms, wanted_heard_ms;
 static bool wanted;
-static uint32_t cap_us; /* as it was lowered */
+static uint32_t lowered_us; /* the cap, as it was lowered */
+static uint32_t cap_us(void) { return lowered_us < car[8] ? lowered_us : car[8]; }
 static char before_state;         /* at the last check */
 static uint16_t before_us[2];
 static uint32_t before_ms;
-static unsigned long lines, commands, driven, starts, clock_wraps, sequence_wraps;
+static unsigned long lines, commands, driven, starts, clock_wraps, sequence_wraps, cars;
 
 static void fail(const char *what) {
     fprintf(stderr, "line %lu, %u ms: %s: state %c %c, pins %u %u, sticks %u %u, wanted %d %u %u\n", lines, now_ms, what,
@@ -58,26 +83,29 @@ static bool on_the_way(int before, int now, int wanted_there, uint32_t most) {
 }
 
 static void check(void) {
-    bool neutral = vehicle.steering_us == 1456 && vehicle.throttle_us == 120;
+    bool neutral = vehicle.steering_us == car[2] && vehicle.throttle_us == car[6];
     bool lost = now_ms - seen_ms[0] > 100 || now_ms - seen_ms[1] > 100;
     if (!neutral && lost) fail("no signal, and not neutral");
-    if (lost) sides[0] = sides[1] = throttle_may_pass = false, at_rest = 0;
+    if (lost) sides[0] = sides[1] = throttle_may_pass = false;
+    if (lost && !was_lost) at_rest = 0; /* pulses of the one signal count while the other is awaited */
+    was_lost = lost;
     if (vehicle.state == MANUAL && before_state != MANUAL) throttle_may_pass = at_rest >= 8;
     if (vehicle.state == MANUAL) {
-        uint16_t throttle_us = throttle_may_pass ? seen_us[1] : 120;
-        bool throttle = vehicle.throttle_us == throttle_us || vehicle.throttle_us == 120;
+        uint16_t throttle_us = throttle_may_pass ? seen_us[1] : car[6];
+        bool throttle = vehicle.throttle_us == throttle_us || vehicle.throttle_us == car[6];
         if (!neutral && (vehicle.steering_us != seen_us[0] || !throttle)) fail("not the human's");
     } else if (vehicle.state == AUTONOMOUS) {
-        if (abs(seen_us[0] - rest_us[0]) > 48 || away >= 5) fail("the human was ignored");
+        if (abs(seen_us[0] - rest_us[0]) > 48 || away >= (fast() ? 5 : 1)) fail("the human was ignored");
         if (!neutral && !(wanted && now_ms - wanted_since_ms < 150 && now_ms - wanted_heard_ms < 200))
             fail("nobody asked for it");
         uint32_t ms = before_state == AUTONOMOUS ? now_ms - before_ms : 0;
-        int throttle_us = (int)(wanted_us[1] < cap_us ? wanted_us[1] : cap_us);
+        int least_us = car[6] - (int)cap_us(), most_us = car[6] + (int)cap_us(), throttle_us = (int)wanted_us[1];
+        throttle_us = throttle_us < least_us ? least_us : throttle_us > most_us ? most_us : throttle_us;
         if (!neutral && (!on_the_way(before_us[0], vehicle.steering_us, (int)wanted_us[0], 4 * ms) ||
                          !on_the_way(before_us[1], vehicle.throttle_us, throttle_us, 2 * ms)))
             fail("not what was asked for, or too fast");
-        if (vehicle.steering_us < 900 || vehicle.steering_us > 2012 || vehicle.throttle_us < 120 ||
-            vehicle.throttle_us > cap_us)
+        if (vehicle.steering_us < car[1] || vehicle.steering_us > car[3] || vehicle.throttle_us < car[5] ||
+            vehicle.throttle_us > car[7] || vehicle.throttle_us < least_us || vehicle.throttle_us > most_us)
             fail("out of range");
     } else if (vehicle.state != STOPPED || !neutral) {
         fail("stopped, and not neutral");
@@ -88,14 +116,14 @@ static void check(void) {
 }
 
 static void see_throttle(uint16_t us) {
-    if (us >= 40 && us <= 980) { /* else it is no pulse */
+    if (fast() ? us >= 40 && us <= 980 : us >= 800 && us <= 2200) { /* else it is no pulse */
         seen_us[1] = us;
         seen_ms[1] = now_ms;
-        at_rest = abs(us - 120) <= 32 ? at_rest + 1 : 0;
+        at_rest = abs(us - car[6]) <= 32 ? at_rest + 1 : 0;
         away = abs(us - rest_us[1]) > 32 ? away + 1 : 0;
         if (at_rest >= 8) throttle_may_pass = true;
     }
-    vehicle_received(&vehicle, THROTTLE, us, 1016, now_ms);
+    vehicle_received(&vehicle, THROTTLE, us, car[4], now_ms);
 }
 
 static void pass(uint32_t ms) { /* as the sketch's loop does */
@@ -105,10 +133,11 @@ static void pass(uint32_t ms) { /* as the sketch's loop does */
             seen_us[0] = stick_us[0];
             seen_ms[0] = now_ms;
             for (int side = 0; side < 2; side++)
-                if (side ? seen_us[0] >= 1656 : seen_us[0] <= 1256) sides[side] = true, sides_ms[side] = now_ms;
-            vehicle_received(&vehicle, STEERING, seen_us[0], 21316, now_ms);
+                if (side ? seen_us[0] >= car[2] + 200 : seen_us[0] <= car[2] - 200) sides[side] = true, sides_ms[side] = now_ms;
+            vehicle_received(&vehicle, STEERING, seen_us[0], car[0], now_ms);
         }
-        if (signal_on) see_throttle(misreading && !rnd(4) ? (uint16_t)rnd(1200) : stick_us[1]);
+        if (signal_on && (fast() || now_ms % 20 == 0))
+            see_throttle(misreading && !rnd(4) ? (uint16_t)rnd(fast() ? 1200 : 2600) : stick_us[1]);
         vehicle_tick(&vehicle, now_ms);
         check();
     }
@@ -118,6 +147,8 @@ static int print_command(char *text, const struct command *command) {
     int n = sprintf(text, ">%c %u %u", command->kind, command->boot, command->sequence);
     bool drive = command->kind == COMMAND_DRIVE;
     if (drive || command->kind == COMMAND_ARM) n += sprintf(text + n, " %u", command->heard_ms);
+    if (command->kind == COMMAND_ARM) n += sprintf(text + n, " %u", command->car);
+    for (int i = 0; command->kind == COMMAND_CAR && i < 9; i++) n += sprintf(text + n, " %u", command->numbers[i]);
     if (drive) n += sprintf(text + n, " %u", command->steering_us);
     if (drive || command->kind == COMMAND_LOWER) n += sprintf(text + n, " %u", command->throttle_us);
     return n + sprintf(text + n, "*%08X\n", crc32(text, (size_t)n));
@@ -125,6 +156,18 @@ static int print_command(char *text, const struct command *command) {
 
 static struct command half; /* the last line that was cut; what comes next may happen to be its end, once in 10^7 lines */
 static uint32_t half_ms;
+
+static void let_go(void) { stick_us[0] = car[2], stick_us[1] = car[6]; }
+
+/* What the pins do, and what counts as a pulse, is another car's from here on. */
+static void drives(const uint16_t *other) {
+    if (other == car) return;
+    car = other;
+    seen_ms[0] = seen_ms[1] = now_ms - 1000;
+    sides[0] = sides[1] = throttle_may_pass = false;
+    at_rest = 0, was_lost = true;
+    let_go();
+}
 
 /* genuine: what the line says if it is one that the host sent and that was not taken before. */
 static void feed(const uint8_t *bytes, int length, const struct command *genuine) {
@@ -134,27 +177,33 @@ static void feed(const uint8_t *bytes, int length, const struct command *genuine
         if (reading == READ_COMMAND) {
             commands++;
             if (command.kind == COMMAND_HELLO) continue;
-            char said[128], cut[128];
+            char said[160], cut[160];
             print_command(said, &command), print_command(cut, &half);
             if (!genuine && now_ms - half_ms <= 50 && !strcmp(said, cut)) genuine = &half;
             char before = vehicle.state;
             uint32_t sequence = vehicle.sequence;
-            if (genuine && command.kind == COMMAND_DRIVE && before == AUTONOMOUS && command.steering_us >= 900 &&
-                command.steering_us <= 2012 && command.throttle_us >= 120 && command.throttle_us <= 711 &&
-                now_ms - command.heard_ms <= 150) {
+            if (genuine && command.kind == COMMAND_DRIVE && before == AUTONOMOUS &&
+                command.steering_us >= car[1] && command.steering_us <= car[3] && command.throttle_us >= car[5] &&
+                command.throttle_us <= car[7] && now_ms - command.heard_ms <= 150) {
                 wanted = true;
                 wanted_us[0] = genuine->steering_us;
                 wanted_us[1] = genuine->throttle_us;
                 wanted_since_ms = now_ms;
                 wanted_heard_ms = command.heard_ms;
             }
-            if (genuine && command.kind == COMMAND_LOWER && before != AUTONOMOUS && command.throttle_us < cap_us)
-                cap_us = genuine->throttle_us;
+            uint32_t lowered = (uint32_t)abs((int)command.throttle_us - car[6]);
+            if (genuine && command.kind == COMMAND_LOWER && before != AUTONOMOUS && command.throttle_us >= car[5] &&
+                command.throttle_us <= car[7] && lowered < cap_us())
+                lowered_us = lowered;
             vehicle_command(&vehicle, &command, now_ms);
             if (!genuine && vehicle.sequence != sequence) fail("a line that nobody sent was taken");
+            if (genuine && command.kind == COMMAND_CAR && before != AUTONOMOUS)
+                for (int i = 0; i < 4; i++)
+                    if (!memcmp(command.numbers, CARS[i], 18)) told = true, drives(CARS[i]), cars++;
             sequence_wraps += vehicle.sequence < sequence;
             if (vehicle.state == AUTONOMOUS && before != AUTONOMOUS) {
                 if (!genuine || command.kind != COMMAND_ARM) fail("armed without being told");
+                if (!told || command.car != id_of(car)) fail("armed for another car");
                 for (int side = 0; side < 2; side++)
                     if (!sides[side] || now_ms - sides_ms[side] > 30000) fail("armed without a wiggle");
                 sides[0] = sides[1] = wanted = false;
@@ -174,34 +223,41 @@ static void wiggle(void) {
     pass(60);
     stick_us[0] = 1750;
     pass(60);
-    stick_us[0] = 1456, stick_us[1] = 120;
+    let_go();
     pass(300);
 }
 
 static void still_works(void) { /* from any state at all */
-    char text[128];
+    char text[160];
     reader_take(&reader, '\n', now_ms, &(struct command){0});
     signal_on = true;
     misreading = false;
+    struct command tell = {COMMAND_CAR, vehicle.boot, vehicle.sequence + 1, 0, 0, 0, 0, {0}};
+    memcpy(tell.numbers, car, sizeof tell.numbers);
+    feed((uint8_t *)text, print_command(text, &tell), &tell);
     wiggle();
-    struct command arm = {COMMAND_ARM, vehicle.boot, vehicle.sequence + 1, now_ms, 0, 0};
+    struct command arm = {COMMAND_ARM, vehicle.boot, vehicle.sequence + 1, now_ms, 0, 0, id_of(car), {0}};
     feed((uint8_t *)text, print_command(text, &arm), &arm);
-    struct command drive = {COMMAND_DRIVE, vehicle.boot, vehicle.sequence + 1, now_ms, 1600, 200};
+    struct command drive = {COMMAND_DRIVE, vehicle.boot, vehicle.sequence + 1, now_ms, car[2] + 144u, car[6] + 80u, 0, {0}};
     feed((uint8_t *)text, print_command(text, &drive), &drive);
     pass(60);
-    uint32_t throttle_us = cap_us < 200 ? cap_us : 200;
-    if (vehicle.state != AUTONOMOUS || vehicle.steering_us != 1600 || vehicle.throttle_us != throttle_us) fail("stuck");
+    uint32_t throttle_us = car[6] + (cap_us() < 80 ? cap_us() : 80);
+    if (vehicle.state != AUTONOMOUS || vehicle.steering_us != car[2] + 144 || vehicle.throttle_us != throttle_us) fail("stuck");
 }
 
 static void start(void) { /* a reset: of the board alone */
-    vehicle_start(&vehicle, (uint16_t)(65535 + starts++));
+    if (rnd(2)) drives(CARS[0]); /* else it has kept its car, and must be told again */
+    told = car == CARS[0];
+    struct car kept;
+    memcpy(&kept, car, sizeof kept);
+    vehicle_start(&vehicle, (uint16_t)(65535 + starts++), &kept);
     reader = (struct reader){0};
     now_ms = rnd(2) ? UINT32_MAX - rnd(10000) : rnd(1u << 31) * 2;
     vehicle.sequence = rnd(2) ? UINT32_MAX - rnd(300000) : rnd(1u << 31) * 2;
     seen_ms[0] = seen_ms[1] = now_ms - 1000;
     sides[0] = sides[1] = throttle_may_pass = wanted = false;
-    at_rest = 0;
-    cap_us = 238;
+    at_rest = 0, was_lost = true;
+    lowered_us = UINT32_MAX;
     before_state = 0;
 }
 
@@ -209,21 +265,27 @@ int main(int argc, char **argv) {
     unsigned long wanted_lines = argc > 1 ? strtoul(argv[1], NULL, 10) : 1000000;
     random_state = argc > 2 ? strtoul(argv[2], NULL, 10) * 2 + 1 : 1;
     start();
-    static char old[64][128];
+    static char old[64][160];
     int old_length[64] = {0};
     unsigned long kinds[8] = {0};
     while (lines < wanted_lines) {
         char text[512];
         struct command genuine = {COMMAND_DRIVE, vehicle.boot, vehicle.sequence + 1 + (rnd(20) ? 0 : rnd(65535)),
-                                  now_ms - rnd(100), 900 + rnd(1113), 120 + rnd(592)};
+                                  now_ms - rnd(100), car[1] + rnd(car[3] - car[1] + 1u),
+                                  car[5] + rnd(car[7] - car[5] + 1u), id_of(car), {0}};
         if (!rnd(12)) genuine.kind = COMMAND_ARM;
         if (!rnd(60)) genuine.kind = COMMAND_NEUTRAL;
         if (!rnd(600)) genuine.kind = COMMAND_LOWER;
+        if (!rnd(300)) {
+            genuine.kind = COMMAND_CAR;
+            memcpy(genuine.numbers, rnd(4) ? CARS[rnd(4)] : BAD_CARS[rnd(sizeof BAD_CARS / sizeof *BAD_CARS)], 18);
+        }
+        if (!rnd(40)) genuine.car = id_of(CARS[rnd(4)]);
         int length = print_command(text, &genuine);
         unsigned kind = rnd(8);
         kinds[kind]++;
         if (kind == 0) { /* random bytes, often of the protocol's own alphabet */
-            static const char ALPHABET[] = "><DANQ 0123456789*ABCDEF\n";
+            static const char ALPHABET[] = "><DANQC 0123456789*ABCDEF\n";
             length = 1 + (int)rnd(100);
             bool own = rnd(2);
             for (int i = 0; i < length; i++) text[i] = own ? ALPHABET[rnd(sizeof ALPHABET - 1)] : (char)rnd(256);
@@ -263,8 +325,8 @@ int main(int argc, char **argv) {
             feed((uint8_t *)text, print_command(text, &wrong), NULL);
         } else if (kind == 5) { /* out of range: taken as new, moves nothing */
             genuine.kind = COMMAND_DRIVE;
-            if (rnd(2)) genuine.steering_us = rnd(2) ? rnd(900) : 2013 + rnd(1u << 31);
-            else genuine.throttle_us = rnd(2) ? rnd(120) : 712 + rnd(1u << 31);
+            if (rnd(2)) genuine.steering_us = rnd(2) ? rnd(car[1]) : car[3] + 1 + rnd(1u << 31);
+            else genuine.throttle_us = rnd(2) ? rnd(car[5]) : car[7] + 1 + rnd(1u << 31);
             feed((uint8_t *)text, print_command(text, &genuine), &genuine);
         } else { /* valid */
             int i = (int)rnd(64);
@@ -277,11 +339,12 @@ int main(int argc, char **argv) {
         if (!rnd(300)) signal_on = !signal_on;
         if (!rnd(1000)) misreading = !misreading;
         if (!rnd(5000)) start();
-        if (!rnd(60) && vehicle.state != AUTONOMOUS) wiggle();
+        if (!rnd(40) && vehicle.state != AUTONOMOUS) wiggle();
         if (!rnd(200)) {
             bool moved = rnd(2);
-            stick_us[0] = (uint16_t)(moved ? 1000 + rnd(900) : STEERING_NEUTRAL_US);
-            stick_us[1] = (uint16_t)(moved ? 120 + rnd(800) : THROTTLE_NEUTRAL_US);
+            let_go();
+            if (moved) stick_us[0] = (uint16_t)(1000 + rnd(900));
+            if (moved) stick_us[1] = (uint16_t)(fast() ? 120 + rnd(800) : 1000 + rnd(1000));
             pass(22); /* both were seen */
         }
         if (!rnd(1000)) still_works();
@@ -289,6 +352,7 @@ int main(int argc, char **argv) {
     still_works();
     printf("%lu lines, %lu commands, %lu while autonomous; of each kind", lines, commands, driven);
     for (int i = 0; i < 8; i++) printf(" %lu", kinds[i]);
-    printf("; %lu starts, the clock wrapped %lu times, the sequence %lu\n", starts, clock_wraps, sequence_wraps);
+    printf("; %lu starts, the clock wrapped %lu times, the sequence %lu; %lu cars told\n", starts, clock_wraps,
+           sequence_wraps, cars);
     return 0;
 }

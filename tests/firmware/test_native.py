@@ -1,5 +1,6 @@
 """The firmware's parser and state machine, compiled for this machine: fuzzed, and held against the host's own code."""
 
+import ctypes
 import re
 import subprocess
 import zlib
@@ -10,9 +11,9 @@ import uno
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.arduino.native import READ_COMMAND, SOURCES, Command, Reader, Vehicle, library, said
-from rover_lib.onboard import servo_link
-from rover_lib.onboard.pwm import PwmCalibration
+from lab.arduino.native import READ_COMMAND, SOURCES, CarNumbers, Command, Reader, Vehicle, library, said
+from rover_lib.onboard import car, servo_link
+from rover_lib.onboard.errors import RoverError
 from rover_lib.world import standin
 
 pytestmark = needs.gcc
@@ -32,25 +33,37 @@ def test_random_and_mutated_lines(count):
     program = uno.compiled("fuzz", *SANITIZE, FUZZ, *SOURCES)
     done = fuzz(program, count, 1)
     assert done.returncode == 0, done.stderr
-    lines, commands, driven, *kinds, starts, clock_wraps, sequence_wraps = map(int, re.findall(r"\d+", done.stdout))
+    lines, commands, driven, *kinds, starts, clock_wraps, sequence_wraps, cars = map(
+        int, re.findall(r"\d+", done.stdout)
+    )
     assert lines >= count
     assert commands > 0.4 * count
     assert driven > 0.1 * count
     assert min(kinds) > 0.1 * count
+    assert cars > count / 1000
     assert min(starts, clock_wraps, sequence_wraps) > count / 50_000
 
 
 @pytest.mark.parametrize(
     ("name", "file", "good", "bad"),
     [
-        ("range", "vehicle.c", "!within(command->steering_us, STEERING_MIN_US, STEERING_MAX_US)", "false"),
+        ("range", "vehicle.c", "!within(command->steering_us, steering->min_us, steering->max_us)", "false"),
         ("late", "vehicle.c", "now_ms - command->heard_ms > LATE_MS", "false"),
-        ("cap", "vehicle.c", "command->throttle_us > vehicle->cap_us", "false"),
+        ("cap", "vehicle.c", "command->throttle_us, vehicle->cap_us)", "command->throttle_us, 2000)"),
+        ("car's cap", "vehicle.c", "within(car->cap_us, 1, CAP_MAX_US)", "within(car->cap_us, 1, 200)"),
+        ("car's neutral", "vehicle.c", "throttle->min_us == throttle->neutral_us &&", ""),
+        ("car's end", "vehicle.c", "throttle->neutral_us, THROTTLE_MAX_US)", "throttle->neutral_us, 980)"),
+        ("car's period", "vehicle.c", "within(servo->period_us, PERIOD_MIN_US, PERIOD_MAX_US) &&", ""),
+        ("armed", "vehicle.c", "AUTONOMOUS) return IGNORED;\n    uint32_t id", "0) return IGNORED;\n    uint32_t id"),
+        ("told", "vehicle.c", "!vehicle->car_told ||", ""),
+        ("other car", "vehicle.c", "|| car != vehicle->car_id) return OTHER_CAR", ") return OTHER_CAR"),
+        ("raised cap", "vehicle.c", "car.cap_us < vehicle->lowered_us ?", "true ?"),
+        ("old signal", "vehicle.c", "forget_signal(vehicle, &vehicle->received[channel]);\n    }\n    e", ";}\n    e"),
         ("slew", "vehicle.c", "ms * STEERING_SLEW_US_PER_MS", "ms * 5"),
         ("credit", "vehicle.c", "        vehicle->slewed_ms = now_ms;", "        vehicle->slewed_ms = now_ms - 1;"),
         ("rest", "vehicle.c", "vehicle->throttle_free ?", "true ?"),
         ("takeover", "vehicle.c", "    vehicle->throttle_free = false;\n}\n\nvoid", "}\n\nvoid"),
-        ("majority", "vehicle.c", "pulses >= THROTTLE_MOVED_PULSES", "pulses > THROTTLE_MOVED_PULSES"),
+        ("majority", "vehicle.c", "FAST_MOVED_PULSES : 1)", "FAST_MOVED_PULSES + 1 : 1)"),
         ("wiggle", "vehicle.c", "vehicle->sides[0].seen && vehicle->sides[1].seen && now_ms", "now_ms"),
         ("used up", "vehicle.c", "vehicle->sides[1].seen = false;\n    vehicle->comm", "true;\n    vehicle->comm"),
         ("sparse", "vehicle.c", "[received->oldest] <= SIGNAL_TIMEOUT_MS) cont", "[received->oldest] < 1u << 31) cont"),
@@ -91,7 +104,13 @@ def read(data: bytes) -> list[Command]:
 NUMBER = st.integers(0, 2**32 - 1)
 LINES = st.one_of(
     st.builds(lambda *v: servo_link.frame(">D " + " ".join(map(str, v))), NUMBER, NUMBER, NUMBER, NUMBER, NUMBER),
-    st.builds(lambda *v: servo_link.frame(">A " + " ".join(map(str, v))), NUMBER, NUMBER, NUMBER),
+    st.builds(lambda *v: servo_link.frame(">A " + " ".join(map(str, v))), NUMBER, NUMBER, NUMBER, NUMBER),
+    st.builds(
+        lambda boot, sequence, car: servo_link.frame(f">C {boot} {sequence} " + " ".join(map(str, car))),
+        NUMBER,
+        NUMBER,
+        st.lists(st.integers(0, 65535), min_size=9, max_size=9),
+    ),
 )
 
 
@@ -100,7 +119,7 @@ def test_crc_is_zlibs(data):
     assert library().crc32(data, len(data)) == zlib.crc32(data)
 
 
-FIELDS = {"A": ["heard_ms"], "N": [], "L": ["throttle_us"], "D": ["heard_ms", "steering_us", "throttle_us"]}
+FIELDS = {"A": ["heard_ms", "car"], "N": [], "L": ["throttle_us"], "D": ["heard_ms", "steering_us", "throttle_us"]}
 
 
 @given(st.sampled_from("ANDL"), st.lists(NUMBER, min_size=5, max_size=5))
@@ -108,8 +127,17 @@ def test_what_the_host_sends_is_what_the_firmware_reads(kind, numbers):
     sent = dict(zip(["boot", "sequence", *FIELDS[kind]], numbers, strict=False))
     (command,) = read(servo_link.frame(f">{kind} " + " ".join(map(str, sent.values()))))
     assert command.kind.decode() == kind
-    for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us"):
+    for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us", "car"):
         assert getattr(command, name) == sent.get(name, 0)
+
+
+@given(NUMBER, NUMBER, st.lists(st.integers(0, 70_000), min_size=8, max_size=10))
+def test_a_car_is_nine_numbers_of_16_bits(boot, sequence, numbers):
+    commands = read(servo_link.frame(f">C {boot} {sequence} " + " ".join(map(str, numbers))))
+    assert len(commands) == (len(numbers) == 9 and max(numbers) < 65536)
+    for command in commands:
+        assert (command.kind, command.boot, command.sequence) == (b"C", boot, sequence)
+        assert list(command.numbers) == numbers
 
 
 @given(st.binary(max_size=300))
@@ -140,7 +168,7 @@ U16 = st.integers(0, 65535)
         {
             "state": st.sampled_from("MAS"),
             "reason": st.sampled_from("rhatpsn"),
-            "result": st.sampled_from("-kirolstw"),
+            "result": st.sampled_from("-kirolstwc"),
             "sequence": NUMBER,
             **dict.fromkeys(["boot", "steering_us", "throttle_us", "cap_us", "bad_lines", "old_commands"], U16),
             **dict.fromkeys(["out_of_range", "lost_bytes"], U16),
@@ -166,24 +194,56 @@ def test_what_the_firmware_says_is_what_the_host_reads(fields, received, uptime_
     assert (parsed.receiver_throttle_us, parsed.receiver_throttle_period_us) == pulses[1]
 
 
-@given(st.integers(0, 65535), NUMBER, st.sampled_from("pebw-"))
-def test_hello_is_what_the_host_reads(boot, sequence, cause):
-    text = said(library().vehicle_hello, Vehicle(boot=boot, sequence=sequence), cause.encode())
+@given(st.integers(0, 65535), NUMBER, st.sampled_from("pebw-"), NUMBER)
+def test_hello_is_what_the_host_reads(boot, sequence, cause, car_id):
+    text = said(library().vehicle_hello, Vehicle(boot=boot, sequence=sequence, car_id=car_id), cause.encode())
     parsed = servo_link.parse(text[:-1], 0)
     known = servo_link.PROTOCOL_VERSION, servo_link.FIRMWARE_VERSION  # a host drives no other
-    assert parsed == servo_link.Hello(*known, boot, sequence, servo_link.RESETS[cause])
+    assert parsed == servo_link.Hello(*known, boot, sequence, servo_link.RESETS[cause], car_id)
 
 
 def test_both_sides_have_the_same_limits():
-    """vehicle.h and pwm.py are two files for two machines; the numbers are one."""
+    """vehicle.h and car.py are two files for two machines; the numbers are one."""
     text = (FOLDER / "vehicle.h").read_text()
-    limit = {name: int(value) for name, value in re.findall(r"(\w+_US) = (\d+)", text)}
-    pwm = PwmCalibration()
-    neutral = pwm.neutral()
-    assert (limit["STEERING_NEUTRAL_US"], limit["THROTTLE_NEUTRAL_US"]) == (neutral.steering_us, neutral.throttle_us)
-    for name, channel in (("STEERING", pwm.steering), ("THROTTLE", pwm.throttle)):
-        assert limit[f"{name}_MIN_US"] == channel.pulse_us(channel.low)
-        assert limit[f"{name}_MAX_US"] == channel.pulse_us(channel.high)
-        assert limit[f"RECEIVER_{name}_PERIOD_US"] == channel.period_us
-    assert limit["THROTTLE_CAP_US"] == standin.CAP_US
+    limit = {name: int(value) for name, value in re.findall(r"\b(\w+_US) = (\d+)", text)}
+    servos = [
+        [limit[f"{name}_{what}_US"] for what in ("PERIOD", "MIN", "NEUTRAL", "MAX")]
+        for name in ("STEERING", "THROTTLE")
+    ]
+    assert (*servos[0], *servos[1], limit["CAP_MAX_US"]) == car.DEFAULT_NUMBERS
+    assert car.DEFAULT_NUMBERS[6] + limit["CAP_MAX_US"] == standin.CAP_US
+    names = ["PERIOD_MIN", "PERIOD_MAX", "FAST_PERIOD_MIN", "FAST_PERIOD_MAX", "FAST_NEUTRAL_MIN", "FAST_NEUTRAL_MAX"]
+    names += ["PULSE_MIN", "PULSE_MAX", "STEERING_NEUTRAL_MIN", "THROTTLE_NEUTRAL_MIN", "NEUTRAL_MAX", "STEERING_THROW"]
+    assert {name: limit[f"{name}_US"] for name in [*names, "CAP_MAX"]} == {
+        name: getattr(car, f"{name}_US") for name in [*names, "CAP_MAX"]
+    }
+    assert limit["THROTTLE_MAX_US"] == car.FAST_PULSE_MAX_US
     assert int(re.search(r"LATE_MS = (\d+)", text)[1]) == standin.LATE_MS == servo_link.LATE_S * 1000
+
+
+@given(st.data())
+def test_both_sides_allow_the_same_cars(data):
+    """What car.py makes a Car of, the firmware takes, by the same name; what it refuses for its pulses, it refuses."""
+    around = {3000: 60, 20000: 9000, 25000: 60, 1010: 20}
+    period = st.sampled_from(list(around)).flatmap(lambda us: st.integers(us - around[us], us + around[us]))
+    pulse = st.integers(700, 2300)
+    fast = st.integers(30, 1000)
+    steering = data.draw(st.tuples(period, *[pulse] * 3))
+    throttle = data.draw(st.one_of(st.tuples(period, *[pulse] * 3), st.tuples(st.integers(990, 1030), *[fast] * 3)))
+    keys = ["period_us", "right_us", "neutral_us", "left_us", "period_us", "reverse_us", "neutral_us", "forward_us"]
+    values = dict(zip(keys[:4], steering, strict=True)), dict(zip(keys[4:], throttle, strict=True))
+    if data.draw(st.booleans()):
+        del values[1]["reverse_us"]
+    values[1]["cap_us"] = data.draw(st.integers(0, 150))
+    try:
+        found = car.Car.of({"steering": values[0], "throttle": values[1]})
+    except RoverError:
+        return
+    numbers = CarNumbers((ctypes.c_uint16 * 9)(*found.numbers))
+    assert library().car_allowed(numbers), found.numbers
+    assert library().car_id(numbers) == found.id
+    # And each of its numbers beyond a limit is one that the firmware refuses by itself.
+    for i, bad in ((0, 2999), (0, 25001), (1, 799), (2, 1299), (3, 2201), (4, 999), (4, 25001), (8, 119), (8, 0)):
+        other = list(found.numbers)
+        other[i] = bad
+        assert not library().car_allowed(CarNumbers((ctypes.c_uint16 * 9)(*other))), other

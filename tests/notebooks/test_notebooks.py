@@ -88,7 +88,7 @@ def test_all_know_the_run_folder():
 # --- rovers beside this machine ---
 
 
-def test_rovers_are_drawn(tmp_path, capsys):
+def test_rovers_are_drawn(tmp_path):
     """The cells that draw, without those that measure here: the demo executes these."""
     policy = {"latency_p50_ms": 60.0, "latency_p95_ms": 61.0, "latency_p99_ms": 62.0, "n": 16, "mode": "static"}
     series = [{"t_s": t_s, "artifacts": {"policy": policy}} for t_s in (1.0, 2.0)]
@@ -102,7 +102,7 @@ def test_rovers_are_drawn(tmp_path, capsys):
     cells = {c.id: c.source for c in nbformat.read(PATHS[4], as_version=4).cells}
     for cell in ("imports", "latency", "rovers", "soak"):
         exec(cells[cell], names)
-    text = capsys.readouterr().out
+    text = str(names["benchmarks"].table())
     assert re.search(r"rover1 +static, another +60.0 ", text) and "1 file is left out:\nbenchmark-rover2.json: " in text
     assert {p.stem for p in (run_dir / "figures").glob("*.png")} == {"05_latency", "05_soak"}
 

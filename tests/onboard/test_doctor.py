@@ -287,7 +287,7 @@ def test_an_arduino(proc, monkeypatch, receiver, verdict, found):
     monkeypatch.setattr(doctor, "SIGNAL_S", 0.1)
     with board_of(answer=talking(receiver)) as board:
         checks = {c.name: c for c in doctor.arduino(board.port, proc_root=proc, boot_s=2)}
-    assert checks["Arduino"].found == f"{board.port}: firmware 2.1.0, protocol 2"
+    assert checks["Arduino"].found == f"{board.port}: firmware 3.0.0, protocol 3"
     assert re.search(r"round trip \d+\.\d ms median, \d+\.\d ms at most of 20", checks["link"].found)
     assert checks["transmitter"].verdict == verdict and found in checks["transmitter"].found
     assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven
@@ -342,7 +342,7 @@ def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_trans
 
 
 def test_an_arduino_of_another_protocol(proc):
-    with board_of(hello="<H 3 3.0.0 something else") as board:
+    with board_of(hello="<H 4 4.0.0 something else") as board:
         check = only(c for c in examine(port=board.port, boot_s=2, host=Host(proc_root=proc)) if c.name == "Arduino")
     assert check.verdict == "fail"
     assert "firmware 3.0.0 (protocol 3)" in check.found and "make -C firmware flash" in check.remedy

@@ -185,7 +185,8 @@ def test_microseconds_per_unit(pwm):
     [
         {"period_us": 0},
         {"period_us": math.nan},
-        {"span_pct": -1},
+        {"span_pct": 0},
+        {"below_pct": -1},  # the other way than above 0
         {"low": 0.5},
         {"low": 0, "high": 0},
         {"neutral_pct": 99},

@@ -22,6 +22,7 @@ from needs import until
 
 from rover_lib.onboard import recorder as module
 from rover_lib.onboard.camera import Camera, CameraError, Frame
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recorder import Recorder, record
 from rover_lib.onboard.recording import EpisodeWriter, read_controls
@@ -455,7 +456,7 @@ def arduino():
         n, said = 40, False
         while not done.wait(0.02):
             if n % 25 == 0 or not said:
-                os.write(master, frame("<H 2 2.1.0 7 0 e"))
+                os.write(master, frame(f"<H 3 3.0.0 7 0 e {Car().id}"))
                 said = True
             os.write(master, status(n))
             n += 1

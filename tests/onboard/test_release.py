@@ -267,6 +267,7 @@ def packed(two, tmp_path, monkeypatch, keys) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_parts_make_the_artifact_again(releases, packed, two):
     staged = releases.stage(packed)
     assert staged.changed and staged.name == content_hash(two[1])
@@ -638,6 +639,7 @@ def test_a_disk_that_is_full_or_dying_at_some_step(releases, two, n, number, say
     assert_drives(releases, {deploy(releases, two[1])} - {old})
 
 
+@pytest.mark.slow
 def test_on_a_full_disk_a_rover_can_go_back_and_prune(releases, two):
     """What was switched is said to be, too, even when there is no room to write down that it was."""
     old, new = releases.current, releases.stage(two[1]).name

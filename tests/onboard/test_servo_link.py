@@ -19,9 +19,11 @@ from hypothesis import strategies as st
 from uno import body_of, line
 
 from lab.arduino.emulator import EmulatedArduino
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import PwmError, RoverError
 from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
 
+DEFAULT = Car().id
 until = functools.partial(needs.until, seconds=2.0)
 STATUS = "<S 7 1234 5 k M r w 1456 120 238 1460 21316 - - 1 2 3 4"
 
@@ -33,8 +35,8 @@ def test_frame_and_parse():
     assert said == Telemetry(2.5, 7, 1234, 5, "k", State.MANUAL, "r", "w", *pulses, 1, 2, 3, 4)
     assert said.why == "manual: after a reset"
     assert (said.pulses.steering_us, said.pulses.throttle_us) == (1456, 120)
-    assert parse(line("<H 2 2.1.0 7 0 w")[:-1], 0) == Hello(2, "2.1.0", 7, 0, "watchdog")
-    assert parse(line("<H 3 3.1 whatever comes then")[:-1], 0).protocol == 3
+    assert parse(line(f"<H 3 3.0.0 7 0 w {DEFAULT}")[:-1], 0) == Hello(3, "3.0.0", 7, 0, "watchdog", DEFAULT)
+    assert parse(line("<H 4 4.1 whatever comes then")[:-1], 0).protocol == 4
 
 
 @pytest.mark.parametrize(
@@ -47,7 +49,7 @@ def test_frame_and_parse():
         STATUS.replace("1460 21316", "1460 -"),
         STATUS.replace("1456", "-1456"),
         STATUS.replace("1456", "01456"),
-        "<H 2 2.1.0",
+        "<H 3 3.0.0",
         "<H",
         "",
     ],
@@ -81,7 +83,7 @@ STATUS_LINE = (
 class Board:
     """The other end of a pty: says what it is told to, and records what the host says."""
 
-    def __init__(self, hello="<H 2 2.1.0 7 0 e", answer=None):
+    def __init__(self, hello=f"<H 3 3.0.0 7 0 e {DEFAULT}", answer=None):
         self.master, slave = pty.openpty()
         tty.setraw(slave)
         self.port = os.ttyname(slave)
@@ -158,7 +160,7 @@ def board_of(**options):
 def test_a_drive_ends_in_neutral():
     with board_of(answer=obedient) as board:
         with ServoLink(board.port) as link:
-            assert link.hello == Hello(2, "2.1.0", 7, 0, "reset pin")
+            assert link.hello == Hello(3, "3.0.0", 7, 0, "reset pin", DEFAULT)
             assert link.arm().state is State.AUTONOMOUS
             number = link.send(1500, 200)
             until(lambda: link.latest().sequence == number)
@@ -199,7 +201,7 @@ def test_pulses_out_of_range_are_not_sent(steering_us, throttle_us):
 
 
 def test_sequence_numbers_go_on_where_the_arduino_was():
-    hello = "<H 2 2.1.0 9 4294967294 e"
+    hello = f"<H 3 3.0.0 9 4294967294 e {DEFAULT}"
     with board_of(hello=hello, answer=lambda b, _: b.status("S", "n", boot=9)) as board, ServoLink(board.port) as link:
         assert [link.send(1456, 120) for _ in range(3)] == [4294967295, 0, 1]
 
@@ -208,10 +210,10 @@ def test_sequence_numbers_go_on_where_the_arduino_was():
     ("hello", "sentence"),
     [
         (
-            "<H 3 3.0.0 something else",
-            r"firmware 3\.0\.0 \(protocol 3\), this program knows 2\.1\.0 \(protocol 2\); .*make",
+            "<H 4 4.0.0 something else",
+            r"firmware 4\.0\.0 \(protocol 4\), this program knows 3\.0\.0 \(protocol 3\); .*make",
         ),
-        ("<H 2 2.0.0 7 0 e", r"firmware 2\.0\.0 \(protocol 2\), this program knows 2\.1\.0"),
+        ("<H 2 2.1.0 7 0 e", r"firmware 2\.1\.0 \(protocol 2\), this program knows 3\.0\.0"),
         ("<H 1 1.0.0 7 0 e", r"firmware 1\.0\.0 \(protocol 1\)"),
     ],
 )
@@ -224,7 +226,7 @@ def test_another_firmware_is_refused(hello, sentence):
 
 def test_an_arduino_that_is_not_reset_is_asked():
     with board_of(hello=None) as board:
-        board.hello = "<H 2 2.1.0 7 40 p"
+        board.hello = f"<H 3 3.0.0 7 40 p {DEFAULT}"
 
         def go_on(board=board):
             for _ in range(60):
@@ -298,7 +300,7 @@ def test_a_reset_meanwhile_needs_arming_again():
     with board_of(answer=obedient) as board, ServoLink(board.port) as link:
         link.arm()
         link.send(1500, 200)
-        board.hello = "<H 2 2.1.0 8 0 w"
+        board.hello = f"<H 3 3.0.0 8 0 w {DEFAULT}"
         board.say(board.hello)
         until(lambda: link.resets == 1)
         link.send(1500, 200)
@@ -309,7 +311,7 @@ def test_a_reset_meanwhile_needs_arming_again():
 @pytest.mark.slow
 def test_a_reset_whose_hello_was_lost_is_noticed():
     with board_of(answer=obedient) as board, ServoLink(board.port) as link:
-        board.hello = "<H 2 2.1.0 8 0 w"
+        board.hello = f"<H 3 3.0.0 8 0 w {DEFAULT}"
         until(lambda: board.status(boot=8, sequence=0) or link.resets == 1)
 
 
@@ -388,7 +390,7 @@ def test_the_age_of_what_is_not_acknowledged():
         board.status("A", "a", sequence=second)
         until(lambda: link.unacknowledged_s(clock()) == 0)
         link.send(1500, 200)
-        board.hello = "<H 2 2.1.0 8 0 w"  # another start will never answer
+        board.hello = f"<H 3 3.0.0 8 0 w {DEFAULT}"  # another start will never answer
         board.say(board.hello)
         until(lambda: link.unacknowledged_s(clock()) == 0)
 
@@ -493,7 +495,7 @@ def drive(link, seconds, steering_us=1800, throttle_us=232):
 def test_the_real_firmware_arms_drives_and_stops(emulated):
     emulated.transmitter(1460, 124)
     with ServoLink(emulated.port) as link:
-        assert link.hello.firmware == "2.1.0"
+        assert link.hello.firmware == "3.0.0"
         until(lambda: link.latest() and link.latest().receiver_steering_us and link.latest().receiver_throttle_us)
         assert abs(link.latest().receiver_steering_us - 1460) <= 4
         assert link.latest().state is State.MANUAL

@@ -254,6 +254,7 @@ def test_a_cut_log_gives_what_is_whole(tmp_path_factory, good, data):
     assert flight.damaged <= 1
 
 
+@pytest.mark.slow
 @given(st.data())
 def test_damaged_lines_are_skipped_and_counted(tmp_path_factory, good, data):
     lines = good.splitlines(keepends=True)

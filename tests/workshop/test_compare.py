@@ -134,19 +134,19 @@ def test_an_action_that_is_not_judged_is_in_no_gate(still):
 
 @pytest.mark.filterwarnings("error")
 def test_figures_leave_out_what_is_not_judged(still):
-    """And name it; one in which nothing is judged is drawn too."""
+    """And name it; one in which nothing is judged is a sentence."""
     metrics, report = still
     error, worst = plots.action_error(report), plots.worst_frames(report, count=1)
-    gates = plots.gates(compare.gates(metrics, LIMITS))
-    for figure in (error, worst, gates):
+    for figure in (error, worst):
         figure.draw_without_rendering()
+    assert "throttle error of static INT8" in str(plots.gates(compare.gates(metrics, LIMITS)))
     steering, throttle = (ax for ax in error.axes if ax.get_title())
     assert steering.get_lines() and not throttle.get_lines()
     assert [t.get_text() for t in throttle.texts] == ["never changes in these\nrecordings: not judged"]
     nothing = replace(report, action_range={"steering": (0.1, 0.1), "throttle": (0.0, 0.0)})
     assert nothing.worst("static") == []
-    for figure in (plots.action_error(nothing), plots.worst_frames(nothing)):
-        figure.draw_without_rendering()
+    for sentence in (plots.action_error(nothing), plots.worst_frames(nothing)):
+        assert repr(sentence).startswith("no action changes in these recordings")
 
 
 @pytest.mark.filterwarnings("error")

@@ -62,7 +62,7 @@ def test_how_far_a_plan_moves():
     )
     us = found.report.us("steering")
     assert summary["steering_apart_us"] == pytest.approx(0.05 * us) and summary["frames"] == 10
-    assert found.warnings() == [] and "steering" in found.table() and "15.00 %" in found.table()
+    assert found.warnings() == [] and "steering" in str(found.table()) and "15.00 %" in str(found.table())
 
 
 def test_it_is_cheap():
@@ -96,7 +96,7 @@ def test_one_action_alone_may_be_blind():
 def test_an_action_that_never_changes_is_not_judged():
     found = looked(Known(looks=np.array([1, 0]), copies=1), action_range=RANGE | {"throttle": (0.1, 0.1)})
     assert found.warnings() == [] and found.summary()["throttle_by_picture_pct"] is None
-    assert "not judged" in found.table()
+    assert "not judged" in str(found.table())
 
 
 def test_an_action_that_is_no_servos_has_no_microseconds():

@@ -66,16 +66,13 @@ def test_float_policy_is_the_same(name, for_int8, tmp_path):
     assert not [i for i in written.graph.initializer if i.external_data]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scheme",
     [
         pytest.param(Scheme(), id="static"),
-        pytest.param(Scheme(kind="affine"), id="affine", marks=pytest.mark.slow),
-        pytest.param(
-            Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward")),
-            id="mixed",
-            marks=pytest.mark.slow,
-        ),
+        pytest.param(Scheme(kind="affine"), id="affine"),
+        pytest.param(Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward")), id="mixed"),
     ],
 )
 def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibration):
@@ -91,6 +88,7 @@ def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibrati
         assert np.array_equal(stored[f"{name}.weight"], layer.weight().int_repr().numpy())
 
 
+@pytest.mark.slow
 def test_int8_convolutions_and_pooling_are_the_same_but_for_ties(tiny, calibration):
     """Up to the backbone's first sum: nothing in it is float, but two engines round what lies in the middle."""
     part = copy.deepcopy(quantize(tiny, Scheme(), calibration).module)

@@ -96,7 +96,7 @@ def test_where_nobody_drove_errors_decide_and_it_is_said():
 def test_an_action_that_never_changes_does_not_judge():
     student, teacher = (row(n, recorded_throttle_pct=None, teacher_throttle_pct=None) for n in ("s", "teacher"))
     assert points_above(student, teacher) == 0
-    assert "5.00 / not judged" in table(metrics(student, teacher=teacher))
+    assert "5.00 / not judged" in str(table(metrics(student, teacher=teacher)))
 
 
 @pytest.mark.parametrize(("one", "other"), [(0, 0), (0, 1), (1, 0), (3, 3), (0, 6), (2, 9), (10, 1)])
@@ -128,6 +128,6 @@ def test_the_recommendation_is_said_in_words():
 
 
 def test_the_table_says_what_was_not_counted():
-    text = table(metrics(row("fast", instructions_g=None, computed_ms=None, qat=True)))
+    text = str(table(metrics(row("fast", instructions_g=None, computed_ms=None, qat=True))))
     assert "fast: 320x180, 2 decoder layers of 1600, QAT" in text and "not counted" in text
     assert "180 of 200 at 60 ms" in text and "0.10 / 0.10" in text and text.endswith("a note")

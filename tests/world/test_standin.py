@@ -9,6 +9,7 @@ import pytest
 import serial
 from uno import body_of, line, status_of
 
+from rover_lib.onboard.car import Car
 from rover_lib.world.standin import StandIn
 
 
@@ -40,6 +41,7 @@ class Raw:
     def command(self, kind, *values):
         self.sequence += 1
         dated = (self.heard_ms,) if kind in "AD" else ()
+        dated += (Car().id,) if kind == "A" else ()
         return line(f">{kind} {' '.join(map(str, (self.boot, self.sequence, *dated, *values)))}")
 
 

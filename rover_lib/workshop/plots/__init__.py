@@ -1,15 +1,16 @@
-"""One function per figure; each returns a matplotlib Figure and touches nothing else.
+"""One function per figure or table; each returns what a cell shows, and touches nothing else.
 
-    plots.save(plots.action_error(report), run_dir, "04_action_error")
+    plots.save(plots.action_error(report), run_dir, "04_action_error")  # a figure, or a sentence where it were empty
+    plots.gates(rows)                                                   # a table
 
 A module for each subject; `style` has what all figures share.
 """
 # ruff: noqa: F401, these are the names that notebooks use
 
+from rover_lib.workshop.cells import Table
 from rover_lib.workshop.plots.benchmarks import latency, soak
-from rover_lib.workshop.plots.comparison import action_error, drives_from_above, gates, hits, sizes, worst_frames
+from rover_lib.workshop.plots.comparison import action_error, drives_from_above, hits, sizes, worst_frames
 from rover_lib.workshop.plots.counting import (
-    computed_times,
     counted,
     counted_by_kernel,
     counted_by_size,
@@ -23,8 +24,10 @@ from rover_lib.workshop.plots.recordings import (
     checkpoint_size,
     episode_overview,
     faults,
+    frame,
     observer_ranges,
     work_per_block,
 )
 from rover_lib.workshop.plots.students import frontier, losses
 from rover_lib.workshop.plots.style import save
+from rover_lib.workshop.plots.tables import computed_times, gates

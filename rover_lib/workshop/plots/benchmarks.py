@@ -7,18 +7,16 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
     BLACK,
-    BLUE,
     COLOURS,
-    GREEN,
     GREY,
     NAMES,
     NOW_BITS,
-    ORANGE,
-    PURPLE,
+    OTHERS,
     RED,
-    SKY,
+    claim,
     legend_below,
     new_figure,
 )
@@ -30,7 +28,7 @@ def latency(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
     benchmarks: contents of benchmark-<host>.json by host, one panel each.
     """
     counts = [len(b["metrics"]["artifacts"]) for b in benchmarks.values()]
-    height_in = 0.9 + sum(0.7 + 0.36 * n for n in counts)
+    height_in = 1.2 + sum(0.7 + 0.36 * n for n in counts)
     fig, axes = new_figure(len(benchmarks), height_in=height_in, height_ratios=counts, sharex=True)
     floors = False
     for ax, (host, stage) in zip(axes[:, 0], benchmarks.items(), strict=True):
@@ -60,10 +58,8 @@ def latency(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
     if floors:
         first.plot([], [], "D", color=RED, mec="white", ms=6, ls="none", label="floor of a Pi 5")
     legend_below(fig, first, 3)
+    claim(fig, claims.speed(benchmarks))
     return fig
-
-
-HOST_COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY, BLACK)
 
 
 def soak(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
@@ -71,7 +67,7 @@ def soak(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
 
     benchmarks: contents of benchmark-<host>.json with a series, by host. What no host has a sensor for has no panel.
     """
-    hosts = dict(zip(benchmarks, itertools.cycle(HOST_COLOURS), strict=False))
+    hosts = dict(zip(benchmarks, itertools.cycle(OTHERS), strict=False))
     series = {host: b["metrics"]["series"] for host, b in benchmarks.items()}
 
     def has(key: str) -> bool:

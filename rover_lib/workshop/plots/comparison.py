@@ -1,6 +1,6 @@
-"""Notebook 04: INT8 beside FP32, in error, size and hits; and the table of gates, of every notebook."""
+"""Notebook 04: INT8 beside FP32, in error, size and hits."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from rover_lib.workshop.compare import Fidelity
+from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
     BLACK,
     BLUE,
@@ -16,11 +17,12 @@ from rover_lib.workshop.plots.style import (
     MOST_ACTIONS,
     NAMES,
     RED,
+    Note,
+    claim,
     figure_of,
     legend_below,
     new_figure,
     note,
-    plain_table,
     shown_picture,
 )
 
@@ -28,7 +30,7 @@ from rover_lib.workshop.plots.style import (
 def sizes(metrics: Mapping[str, Any]) -> Figure:
     """Artifact files, weights with weights. metrics: of compare.json."""
     sizes_mb = {"fp32": metrics["fp32"]["size_mb"]} | {m: v["size_mb"] for m, v in metrics["modes"].items()}
-    fig, axes = new_figure(1, height_in=1.0 + 0.34 * len(sizes_mb))
+    fig, axes = new_figure(1, height_in=1.3 + 0.34 * len(sizes_mb))
     ax, y = axes[0, 0], range(len(sizes_mb))
     ax.barh(y, list(sizes_mb.values()), color=[COLOURS.get(m, GREY) for m in sizes_mb])
     for at, size_mb in enumerate(sizes_mb.values()):
@@ -38,12 +40,15 @@ def sizes(metrics: Mapping[str, Any]) -> Figure:
     ax.set_yticks(y, [NAMES.get(m, m) for m in sizes_mb])
     ax.invert_yaxis()
     ax.set_xlabel("artifact file (MB, 10^6 bytes)")
+    claim(fig, claims.size(sizes_mb))
     return fig
 
 
-def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure:
+def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
     """Mean error of every mode against FP32 at each step of the plan: percent of the recorded range, and pulse."""
     actions, steps = report.action_names, report.reference.shape[1]
+    if all(report.pct(action) is None for action in actions):
+        return Note("no action changes in these recordings: nothing is judged")
     fig, fields = figure_of(len(actions), 2 if len(actions) < MOST_ACTIONS else MOST_ACTIONS, 3.6)
     times_s = np.arange(steps) / rate_hz
     for i, action in enumerate(actions):
@@ -61,24 +66,23 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure:
             other = ax.secondary_yaxis("right", functions=(lambda p, u=us: p * u, lambda e, u=us: e / u))
             other.set_ylabel("the same as pulse (us)")
             other.tick_params(labelsize=9)
-    judged = [ax for ax in fields if ax.get_lines()]
-    if judged:
-        legend_below(fig, judged[0], 5)
+    legend_below(fig, next(ax for ax in fields if ax.get_lines()), 5)
+    claim(fig, claims.error(report))
     return fig
 
 
-def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0) -> Figure:
+def worst_frames(
+    report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0, *, first: int = 0
+) -> Figure | Note:
     """The frames on which a mode differs most from FP32: the picture and both plans, with the recording's own.
 
-    Of a policy with many actions the one that is worst there.
+    Of a policy with many actions the one that is worst there. first: how many of the worst are left out before.
     """
-    frames = report.worst(mode, count)
-    every = report.action_names if len(report.action_names) <= MOST_ACTIONS else ()
-    fig, axes = new_figure(max(len(frames), 1), 1 + max(len(every), 1), height_in=0.9 + 1.9 * max(len(frames), 1))
+    frames = report.worst(mode, first + count)[first:]
     if not frames:
-        for ax in axes[0]:
-            note(ax, "not judged")
-        return fig
+        return Note("no action changes in these recordings: no frame is the worst")
+    every = report.action_names if len(report.action_names) <= MOST_ACTIONS else ()
+    fig, axes = new_figure(len(frames), 1 + max(len(every), 1), height_in=1.2 + 1.9 * len(frames))
     times_s = np.arange(report.reference.shape[1]) / rate_hz
     for row, worst in zip(axes, frames, strict=True):
         row[0].imshow(shown_picture(worst.sample))
@@ -105,6 +109,7 @@ def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz
     for ax in axes[-1, 1:]:
         ax.set_xlabel("step of the plan (s ahead)")
     legend_below(fig, axes[0, 1], 3)
+    claim(fig, "" if first else claims.worst_frame(frames[0]))
     return fig
 
 
@@ -112,7 +117,7 @@ def hits(metrics: Mapping[str, Any]) -> Figure:
     """Balloons hit in unseen worlds, with Wilson's 95 % interval: how little so few drives say. metrics: of compare."""
     rows = {"fp32": metrics["fp32"]} | dict(metrics["modes"])
     rows = {m: v for m, v in rows.items() if v["trials"]}
-    fig, axes = new_figure(1, height_in=1.2 + 0.36 * max(len(rows), 1))
+    fig, axes = new_figure(1, height_in=1.5 + 0.36 * max(len(rows), 1))
     ax = axes[0, 0]
     for y, (mode, v) in enumerate(rows.items()):
         colour = COLOURS.get(mode, GREY)
@@ -130,6 +135,7 @@ def hits(metrics: Mapping[str, Any]) -> Figure:
     lows = [100 * v["hits_wilson_low"] for v in rows.values()]
     ax.set_xlim(max(0, min(lows, default=0) - 5), 101)
     ax.set_xlabel("worlds in which the balloon was hit (%), with the 95 % interval")
+    claim(fig, claims.hits(metrics))
     return fig
 
 
@@ -162,38 +168,5 @@ def drives_from_above(trials: Mapping[str, Any], count: int = 4) -> Figure:
         ax.set_title(f"{100 * apart(i):.0f} cm apart, {outcome}", fontsize=9)
     axes[0, 0].set_ylabel("ahead of the start (m)")
     legend_below(fig, axes[0, 0], 5)
+    claim(fig, claims.apart(max(map(apart, worlds), default=0.0), len(trials["fp32"].per_world)))
     return fig
-
-
-def gates(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """The gates as a table: what was promised, what was found."""
-    verdict = {True: ("pass", "#DCF0E8"), False: ("FAIL", "#F9DDCB"), None: ("not measured", "#EFEFEF")}
-
-    def shown(value: Any) -> str:
-        return "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
-
-    cells = [[r["gate"], _limit(r), shown(r["found"]), verdict[r["passed"]][0]] for r in rows]
-    fig, axes = new_figure(1, height_in=0.5 + 0.27 * (len(rows) + 1))
-    axes[0, 0].axis("off")
-    table = axes[0, 0].table(
-        cells,
-        colLabels=["gate", "promised", "found", "verdict"],
-        colWidths=(0.46, 0.2, 0.16, 0.18),
-        cellLoc="left",
-        colLoc="left",
-        bbox=(0, 0, 1, 1),
-    )
-    plain_table(table)
-    for (row, column), cell in table.get_celld().items():
-        if row and column == 3:
-            cell.set_facecolor(verdict[rows[row - 1]["passed"]][1])
-    return fig
-
-
-def _limit(row: Mapping[str, Any]) -> str:
-    """A gate's limit in words; a promised range as it was promised."""
-    limit = row["limit"]
-    if isinstance(limit, (list, tuple)):
-        return f"{limit[0]:g} to {limit[1]:g}"
-    words = {"<=": "at most ", ">=": "at least "}.get(row.get("relation", ""), "")
-    return words + (f"{limit:g}" if isinstance(limit, (int, float)) else str(limit))

@@ -7,23 +7,23 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
-    BLACK,
     BLUE,
-    GREEN,
     GREY,
+    MIST,
     NAMES,
-    ORANGE,
-    PURPLE,
+    OTHERS,
     RED,
     SKY,
+    SLATE,
     action_colour,
     bar_values,
+    claim,
     judged_keys,
     legend,
     legend_below,
     new_figure,
-    plain_table,
     simd_bars,
 )
 
@@ -39,7 +39,7 @@ COUNTED = (
 )
 
 NEAR = 2  # times the fewest instructions: shown once more, closer
-GROUP_COLOURS = (BLUE, SKY, BLACK, RED, PURPLE, ORANGE, "#F0E442", GREEN, "#8C6D31", GREY)
+GROUP_COLOURS = (BLUE, SKY, *OTHERS[1:], MIST, GREY)  # the first two are the INT8 products
 
 
 def whole_size(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -56,7 +56,7 @@ def whole_size(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 def counted(metrics: Mapping[str, Any]) -> Figure:
     """Instructions against the floor, and beside them the error on the same core. metrics: of arm.json."""
     rows = whole_size(metrics)
-    fig, axes = new_figure(1, 2, height_in=1.4 + 0.4 * len(rows), sharey=True, width_ratios=(1.5, 1))
+    fig, axes = new_figure(1, 2, height_in=1.7 + 0.4 * len(rows), sharey=True, width_ratios=(1.5, 1))
     (left, right), y = axes[0], np.arange(len(rows))
     total, simd = (np.array([m[key] for m in rows.values()]) for key in ("instructions_g", "simd_g"))
     simd_bars(left, y, total, simd)
@@ -84,6 +84,7 @@ def counted(metrics: Mapping[str, Any]) -> Figure:
     right.set_title(f"computed on it, {over} frames", fontsize=11)
     legend(left, loc="lower right")
     legend(right, loc="upper right")
+    claim(fig, claims.instructions(rows))
     return fig
 
 
@@ -115,9 +116,9 @@ def counted_by_size(metrics: Mapping[str, Any]) -> Figure:
     """What a smaller image saves: static INT8 and its floor by image size. metrics: of arm.json."""
     rows = [m for stem, m in metrics["artifacts"].items() if re.fullmatch(r"policy_static(_\d+x\d+)?", stem)]
     rows.sort(key=lambda m: m["gmac"])
-    fig, axes = new_figure(1, height_in=3.4)
+    fig, axes = new_figure(1, height_in=3.7)
     ax, x = axes[0, 0], np.array([m["image_height"] * m["image_width"] for m in rows]) / 1e3
-    lines = (("instructions_g", BLUE, "o-", "all instructions"), ("simd_g", SKY, "s-", "SIMD instructions"))
+    lines = (("instructions_g", BLUE, "o-", "all instructions"), ("simd_g", SLATE, "s-", "SIMD instructions"))
     for key, colour, style, label in (*lines, ("floor_g", RED, "--", "floor: dot products alone")):
         ax.plot(x, [m[key] for m in rows], style, color=colour, lw=1.8, label=label)
     for at, m in zip(x, rows, strict=True):
@@ -129,24 +130,7 @@ def counted_by_size(metrics: Mapping[str, Any]) -> Figure:
     ax.set_title("static INT8, counted on an emulated Cortex-A76", fontsize=11)
     ax.set_xlim(0, None)
     legend(ax, loc="lower right")
-    return fig
-
-
-def computed_times(metrics: Mapping[str, Any]) -> Figure:
-    """The computed range of a Raspberry Pi 5's time, in a table of its own. metrics: of arm.json."""
-    rows = sorted(metrics["artifacts"].items(), key=lambda item: -item[1]["instructions_g"])
-    cells = []
-    for stem, m in rows:
-        mode, time_ms = re.sub(r"^policy_|_\d+x\d+$", "", stem), m["computed_pi5_ms"]
-        size = f"{m['image_width']}x{m['image_height']}"
-        cells.append([NAMES.get(mode, mode), size, f"{time_ms['low']:.3g} to {time_ms['high']:.3g}"])
-    fig, axes = new_figure(1, height_in=0.4 + 0.27 * (len(rows) + 1))
-    axes[0, 0].axis("off")
-    heads = ["artifact", "image", "computed time on a Pi 5 (ms), not measured"]
-    table = axes[0, 0].table(
-        cells, colLabels=heads, colWidths=(0.35, 0.2, 0.45), cellLoc="left", colLoc="left", bbox=(0, 0, 1, 1)
-    )
-    plain_table(table)
+    claim(fig, claims.smaller_picture(rows))
     return fig
 
 

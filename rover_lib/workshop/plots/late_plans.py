@@ -8,9 +8,21 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from rover_lib.onboard.plan import Follower, Plan, Settings
-from rover_lib.workshop.plots.style import BLACK, BLUE, ORANGE, RED, legend, legend_below, new_figure
+from rover_lib.workshop.plots import claims
+from rover_lib.workshop.plots.style import (
+    BLACK,
+    BLUE,
+    MIST,
+    RED,
+    SLATE,
+    Note,
+    claim,
+    legend,
+    legend_below,
+    new_figure,
+)
 
-HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", ORANGE, "s", 1)}  # label, colour, marker, side
+HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", SLATE, "s", 1)}  # label, colour, marker, side
 
 
 def _late(rows: Sequence[Mapping[str, Any]], *, pushed: bool = False) -> list[Mapping[str, Any]]:
@@ -32,7 +44,7 @@ def throttle_over_age(rows: Sequence[Mapping[str, Any]], settings: Settings, chu
     heights = (1.6, 0.3 + 0.22 * len(ages))
     fig, axes = new_figure(2, height_in=2.6 + 0.26 * len(ages), sharex=True, height_ratios=heights)
     upper, lower = axes[:, 0]
-    upper.plot(1e3 * ages_s, [100 * c.fade if c else 0 for c in commands], color=BLUE, lw=2)
+    upper.plot(1e3 * ages_s, [100 * c.fade if c else 0 for c in commands], color=SLATE, lw=2)
     upper.set_ylabel("throttle left (%)")
     stop_ms = 1e3 * follower.stop_s()
     for ax in axes[:, 0]:
@@ -51,7 +63,7 @@ def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
     sets = [(title, _late(rows, pushed=pushed)) for title, pushed in (("left alone", False), ("pushed", True))]
     sets = [(title, drives) for title, drives in sets if drives]
     counts = [len({r["latency_ms"] for r in drives}) for _, drives in sets]
-    fig, axes = new_figure(1, len(sets), height_in=3.8, sharey=True, width_ratios=[c + 1 for c in counts])
+    fig, axes = new_figure(1, len(sets), height_in=4.1, sharey=True, width_ratios=[c + 1 for c in counts])
     for ax, (title, drives) in zip(axes[0], sets, strict=True):
         places = {ms: x for x, ms in enumerate(sorted({r["latency_ms"] for r in drives}))}
         for compensate, (label, colour, marker, side) in HOW.items():
@@ -73,6 +85,7 @@ def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
         ax.set(xlabel="an inference takes (ms)", xlim=(-0.6, len(places) - 0.4), ylim=(-4, 104))
     axes[0, 0].set_ylabel(f"worlds in which the balloon was hit\n(% of {rows[0]['trials']}), with the 95 % interval")
     legend_below(fig, axes[0, 0], 2)
+    claim(fig, claims.late_hits([r for r in _late(rows) if r["compensate"]]))
     return fig
 
 
@@ -83,7 +96,7 @@ def beside_the_path(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """
     drives = [r for r in _late(rows) if not r["stopped"]]
     places = {ms: x for x, ms in enumerate(sorted({r["latency_ms"] for r in drives}))}
-    fig, axes = new_figure(1, height_in=3.0)
+    fig, axes = new_figure(1, height_in=3.3)
     ax = axes[0, 0]
     for compensate, (label, colour, _, side) in HOW.items():
         shown = [r for r in drives if r["compensate"] == compensate]
@@ -98,15 +111,26 @@ def beside_the_path(rows: Sequence[Mapping[str, Any]]) -> Figure:
     ax.set(xlabel="an inference takes (ms)", ylabel=f"beside the path of\n{min(places, default=0):g} ms, at most (cm)")
     ax.set_title("bar and number: median of the worlds; line: 90 % of them", fontsize=11)
     legend(ax, loc="upper left")
+    medians = [{r["latency_ms"]: r["aside_p50_cm"] for r in drives if r["compensate"] == how} for how in HOW]
+    claim(fig, claims.beside(*medians))
     return fig
 
 
-def plans_from_above(drives: Sequence[Mapping[str, Any]]) -> Figure:
-    """Drives of one world with all their plans, each from where it looked. drives: `from_above` of drive.json."""
-    fig, axes = new_figure(max(len(drives), 1), height_in=0.5 + 3.1 * max(len(drives), 1))
-    for ax, drive in zip(axes[:, 0], drives, strict=False):
+def plans_from_above(drives: Sequence[Mapping[str, Any]], tick: int | None = None) -> Figure | Note:
+    """Drives of one world with all their plans, each from where it looked. drives: `from_above` of drive.json.
+
+    tick: draw where the cars are then, with what they drove until then.
+    """
+    if not drives:
+        return Note("no drive was kept to be shown from above")
+    fig, axes = new_figure(len(drives), height_in=0.5 + 3.1 * len(drives))
+    for ax, drive in zip(axes[:, 0], drives, strict=True):
         label, colour, _, _ = HOW[drive["compensate"]]
-        ax.plot(drive["x_m"], drive["y_m"], color=colour, lw=7, alpha=0.35, label="driven")
+        until = len(drive["x_m"]) if tick is None else min(tick + 1, len(drive["x_m"]))
+        ax.plot(drive["x_m"][:until], drive["y_m"][:until], color=colour, lw=7, alpha=0.35, label="driven")
+        if tick is not None:
+            ax.plot(drive["x_m"], drive["y_m"], color=MIST, lw=1, zorder=0)
+            ax.plot(drive["x_m"][until - 1], drive["y_m"][until - 1], ">", color=colour, ms=11)
         for i, plan in enumerate(drive["plans"]):
             ax.plot(plan["x_m"], plan["y_m"], color=BLACK, lw=0.9, label=None if i else "a plan, from where it looked")
             ax.plot(plan["x_m"][0], plan["y_m"][0], "o", color=colour, mec=BLACK, mew=0.7, ms=5)

@@ -8,21 +8,23 @@ import torch
 from matplotlib.figure import Figure
 
 from rover_lib.workshop.observe import Calibration
+from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
     BLACK,
-    BLUE,
-    GREEN,
     GREY,
-    ORANGE,
+    MIST,
+    PARTS,
     RED,
-    SKY,
+    SLATE,
     action_colour,
     bar_values,
+    claim,
     few_actions,
     judged_keys,
     legend,
     legend_below,
     new_figure,
+    part_colours,
 )
 
 
@@ -45,12 +47,12 @@ def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
     worst, side = max(pairs, key=lambda row: peak(layers[row[0]][f"{row[1]}_max"]))
     uneven = sorted(layers, key=lambda n: max(peak(layers[n][f"{s}_max"]) for s in sides[n]), reverse=True)[:count]
     layers = {n: c for n, c in layers.items() if n in uneven}  # in the order of the data
-    fig, axes = new_figure(1, 2, height_in=max(3.4, 1.0 + 0.2 * len(layers)))
+    fig, axes = new_figure(1, 2, height_in=max(3.7, 1.3 + 0.2 * len(layers)))
     left, right = axes[0]
     y = {name: i for i, name in enumerate(layers)}
     for at, where, marker in (("in", "input", "o"), ("out", "output", "s")):
         shown = [n for n in layers if at in sides[n]]
-        for key, colour, label in ((f"{at}_max", RED, "before"), (f"{at}_max_scaled", BLUE, "after")):
+        for key, colour, label in ((f"{at}_max", MIST, "before"), (f"{at}_max_scaled", SLATE, "after")):
             peaks = [peak(layers[n][key]) for n in shown]
             face = "none" if label == "before" else colour
             left.scatter(
@@ -61,8 +63,8 @@ def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
     left.set(xscale="log", xlabel="largest channel / median channel")
     left.set_title(f"the {len(layers)} most uneven projections", fontsize=11)
     for key, colour, label in (
-        (f"{side}_max", RED, "before"),
-        (f"{side}_max_scaled", BLUE, "after channel scales"),
+        (f"{side}_max", MIST, "before"),
+        (f"{side}_max_scaled", SLATE, "after channel scales"),
     ):
         x = np.sort(np.asarray(layers[worst][key]))[::-1]
         right.plot(np.arange(1, len(x) + 1), 100 * x / x[0], color=colour, lw=1.8, label=label)
@@ -70,6 +72,7 @@ def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
     right.set_title(f"{worst}, {'input' if side == 'in' else 'output'}", fontsize=11)
     legend(right)
     legend_below(fig, left, 4)
+    claim(fig, claims.even(*(peak(layers[worst][key]) for key in (f"{side}_max", f"{side}_max_scaled"))))
     return fig
 
 
@@ -79,7 +82,7 @@ def errors_by_choice(
     """Error of each action for each choice, say of observers. table: {choice: {<action>_mae_pct}}."""
     table, what = few_actions(table)
     choices = list(table)
-    fig, axes = new_figure(1, height_in=1.3 + 0.42 * len(choices))
+    fig, axes = new_figure(1, height_in=1.6 + 0.42 * len(choices))
     ax = axes[0, 0]
     keys = judged_keys(ax, next(iter(table.values())))
     height = 0.8 / max(len(keys), 1)
@@ -95,6 +98,7 @@ def errors_by_choice(
     ax.set_xlabel(f"{what} against FP32 (% of the recorded range)")
     ax.set_title(title, fontsize=11)
     legend(ax, loc="upper left", bbox_to_anchor=(1, 1))
+    claim(fig, claims.least_wrong(table))
     return fig
 
 
@@ -108,7 +112,7 @@ def sensitivity(
     table, what = few_actions(table)
     shown, _ = few_actions({str(i): step for i, step in enumerate(steps)})
     blocks = list(table)
-    fig, axes = new_figure(1, 2, height_in=max(3.6, 1.2 + 0.26 * len(blocks)), width_ratios=(1.5, 1))
+    fig, axes = new_figure(1, 2, height_in=max(3.9, 1.5 + 0.26 * len(blocks)), width_ratios=(1.5, 1))
     left, right = axes[0]
     keys = judged_keys(right, next(iter(table.values())))
     height = 0.8 / max(len(keys), 1)
@@ -127,16 +131,16 @@ def sensitivity(
     right.margins(x=0.15)
     right.set_title("blocks left in float, one by one", fontsize=11)
     legend(right)
+    claim(fig, claims.most_sensitive(table))
     return fig
 
 
 def layers(rows: Sequence[Mapping[str, Any]], clipped_warn_pct: float) -> Figure:
     """Signal to noise and clipped share of every INT8 layer, in the order of the data. rows: `inspect_layers`."""
-    fig, axes = new_figure(2, 1, height_in=4.6, sharex=True)
+    fig, axes = new_figure(2, 1, height_in=4.9, sharex=True)
     upper, lower = axes[:, 0]
     x = np.arange(len(rows))
-    parts = [r["block"].split(".")[0] for r in rows]
-    colours = [{"backbone": SKY, "encoder": GREEN, "decoder": ORANGE}.get(p, GREY) for p in parts]
+    parts, colours = {r["block"].split(".")[0] for r in rows}, part_colours(r["block"] for r in rows)
     upper.bar(x, [r["snr_db"] for r in rows], color=colours)
     upper.set_ylabel("signal to noise (dB)")
     upper.set_title("higher is better; errors from earlier layers are included", fontsize=11)
@@ -145,8 +149,9 @@ def layers(rows: Sequence[Mapping[str, Any]], clipped_warn_pct: float) -> Figure
     lower.text(len(rows) - 0.5, clipped_warn_pct, "warning ", color=RED, ha="right", va="bottom", fontsize=9)
     lower.set(ylabel="clipped (% of values)", xlabel="INT8 layer, in the order of the data")
     lower.set_ylim(0, 1.25 * max(clipped_warn_pct, *(r["clipped_pct"] for r in rows)))
-    for part, colour in (("backbone", SKY), ("encoder", GREEN), ("decoder", ORANGE), ("image_project", GREY)):
+    for part, colour in (*PARTS.items(), ("image_project", GREY)):
         if part in parts:
             lower.bar(0, 0, color=colour, label=part)
     legend_below(fig, lower, 4)
+    claim(fig, claims.clipped(rows, clipped_warn_pct))
     return fig

@@ -9,26 +9,31 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.car import this_car
 from rover_lib.workshop.episodes import Episode, Recordings, Sample
 from rover_lib.workshop.observe import Calibration, RangeObserver
+from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
-    BLACK,
     BLUE,
+    COLOURS,
     DPI,
-    GREEN,
     GREY,
-    ORANGE,
+    MIST,
+    OTHERS,
+    PARTS,
     RED,
-    SKY,
+    SLATE,
     WIDTH_IN,
+    Drawn,
+    Note,
     action_colour,
     bar_values,
+    claim,
     figure_of,
     legend,
     legend_below,
     new_figure,
-    note,
+    part_colours,
     shown_picture,
 )
 from rover_lib.workshop.samples import ACTION_NAMES
@@ -41,27 +46,27 @@ def checkpoint_size(report: Mapping[str, Any]) -> Figure:
     training_mb = 4 * report["parameters"] / 1e6 - acting_mb
     other_mb = max(report["file_mb"] - report["optimizer_mb"] - acting_mb - training_mb, 0)
     parts = {
-        "weights that act": (acting_mb, BLUE),
-        "weights of training only (VAE)": (training_mb, SKY),
-        "optimizer state": (report["optimizer_mb"], ORANGE),
+        "weights that act": (acting_mb, SLATE),
+        "weights of training only (VAE)": (training_mb, MIST),
+        "optimizer state": (report["optimizer_mb"], OTHERS[1]),
         "everything else": (other_mb, GREY),
     }
     rows = ["checkpoint file", "FP32, only what acts", "INT8, a byte per weight"]
-    fig, axes = new_figure(1, height_in=2.8)
+    fig, axes = new_figure(1, height_in=3.1)
     ax, left = axes[0, 0], 0.0
     for name, (size_mb, colour) in parts.items():
         if size_mb > 0.005 * report["file_mb"]:
             ax.barh(0, size_mb, left=left, color=colour, label=name)
             left += size_mb
-    ax.barh([1, 2], [acting_mb, report["int8_floor_mb"]], color=BLUE)
+    ax.barh([1, 2], [acting_mb, report["int8_floor_mb"]], color=[SLATE, BLUE])
     bar_values(ax, range(3), [report["file_mb"], acting_mb, report["int8_floor_mb"]], "{:.1f} MB")
     ax.set_yticks(range(3), rows)
     ax.invert_yaxis()
     ax.set_xlabel("size (MB, 10^6 bytes)")
-    ax.set_title(
+    claim(
+        fig,
         f"{report['file_mb'] / report['int8_floor_mb']:.1f}x in all: {report['file_mb'] / acting_mb:.1f}x left out, "
         f"{acting_mb / report['int8_floor_mb']:.1f}x by INT8",
-        fontsize=11,
     )
     legend(ax, loc="lower right")
     return fig
@@ -70,10 +75,10 @@ def checkpoint_size(report: Mapping[str, Any]) -> Figure:
 def work_per_block(parameters: Mapping[str, int], macs: Mapping[str, int]) -> Figure:
     """Parameters and multiply-accumulates of every block, in the order of the data."""
     blocks = [b for b in macs if macs[b] or parameters.get(b)]
-    fig, axes = new_figure(1, 2, height_in=1.2 + 0.21 * len(blocks), sharey=True)
+    fig, axes = new_figure(1, 2, height_in=1.5 + 0.21 * len(blocks), sharey=True)
     left, right = axes[0]
     y = np.arange(len(blocks))
-    colours = [{"backbone": SKY, "encoder": GREEN, "decoder": ORANGE}.get(b.split(".")[0], GREY) for b in blocks]
+    colours = part_colours(blocks)
     left.barh(y, [parameters.get(b, 0) / 1e6 for b in blocks], color=colours)
     right.barh(y, [macs[b] / 1e6 for b in blocks], color=colours)
     left.set_yticks(y, blocks)
@@ -82,9 +87,10 @@ def work_per_block(parameters: Mapping[str, int], macs: Mapping[str, int]) -> Fi
     right.set_xlabel(f"multiply-accumulates (10^6), {sum(macs.values()) / 1e6:.0f} in all")
     left.set_title("what must be stored", fontsize=11)
     right.set_title("what must be computed", fontsize=11)
-    for part, colour in (("backbone", SKY), ("encoder", GREEN), ("decoder", ORANGE)):
+    for part, colour in PARTS.items():
         right.barh(0, 0, color=colour, label=part)
     legend(right, loc="lower right")
+    claim(fig, claims.work(parameters, macs))
     return fig
 
 
@@ -94,7 +100,9 @@ def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pi
     shown = [samples[i] for i in np.linspace(0, len(samples) - 1, pictures).round().astype(int)]
     car = tuple(actions) == ACTION_NAMES
     rows = 2 if car else len(actions)
-    fig = plt.figure(figsize=(WIDTH_IN, 6.2 if car else 2.0 + 0.9 * rows), dpi=DPI, layout="constrained")
+    fig = plt.figure(
+        figsize=(WIDTH_IN, 6.2 if car else 2.0 + 0.9 * rows), dpi=DPI, layout="constrained", FigureClass=Drawn
+    )
     plt.close(fig)
     grid = fig.add_gridspec(1 + rows, pictures, height_ratios=(1.1, *([1.3] if car else [0.6]) * rows))
     for i, sample in enumerate(shown):
@@ -108,6 +116,22 @@ def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pi
         f"{episode.id}: {episode.label or 'no label'}, {len(samples)} samples of {episode.frames} frames",
         fontsize=11,
     )
+    return fig
+
+
+def frame(sample: Sample, actions: Sequence[str] = ACTION_NAMES, rate_hz: float = 30.0) -> Figure:
+    """What one sample saw, and what was done from there on: the plan that a perfect policy would have made."""
+    fig, axes = new_figure(1, 2, height_in=2.6)
+    left, right = axes[0]
+    left.imshow(shown_picture(sample))
+    left.axis("off")
+    known = ~sample.is_pad
+    times_s = np.arange(len(sample.chunk)) / rate_hz
+    for i, name in enumerate(actions):
+        right.plot(times_s[known], sample.chunk[known, i], color=action_colour(name, i), lw=1.8, label=name)
+    right.set(xlabel="s ahead", ylabel="what was done")
+    right.set_title(f"{sample.time_s:.1f} s in the episode", fontsize=10)
+    legend(right)
     return fig
 
 
@@ -125,7 +149,7 @@ def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) 
     """A car's steering and throttle, and their pulses."""
     times_s = [s.time_s for s in samples]
     actions = np.stack([s.chunk[0] for s in samples])
-    pulses = [PwmCalibration().pulses(*(float(v) for v in a)) for a in actions]
+    pulses = [this_car().pwm.pulses(*(float(v) for v in a)) for a in actions]
     upper, lower = fields
     rows = (
         (upper, actions[:, 0], actions[:, 1], "{} (share of full)"),
@@ -133,33 +157,32 @@ def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) 
     )
     for ax, steering, throttle, unit in rows:
         other = ax.twinx()
-        ax.plot(times_s, steering, color=BLUE, lw=1.5)
-        other.plot(times_s, throttle, color=ORANGE, lw=1.5, ls="--")
-        ax.set_ylabel(unit.format("steering"), color=BLUE)
-        other.set_ylabel(unit.format("throttle"), color="#8A5F00")  # the same orange, dark enough to read
+        ax.plot(times_s, steering, color=COLOURS["steering"], lw=1.5)
+        other.plot(times_s, throttle, color=COLOURS["throttle"], lw=1.5, ls="--")
+        ax.set_ylabel(unit.format("steering"), color=COLOURS["steering"])
+        other.set_ylabel(unit.format("throttle"), color="#8F4A74")  # the same pink, dark enough to read
         ax.spines["top"].set_visible(False)
         other.spines["top"].set_visible(False)
     lower.set_xlabel("time in the episode (s)")
 
 
-def faults(recordings: Recordings) -> Figure:
+def faults(recordings: Recordings) -> Figure | Note:
     """What was wrong in the recordings, by kind; every count was skipped, none became an action."""
     counts: dict[str, int] = {}
     for fault in recordings.faults:
         counts[fault.kind] = counts.get(fault.kind, 0) + fault.count
     kinds = sorted(counts, key=lambda k: -counts[k])
-    fig, axes = new_figure(1, height_in=1.3 + 0.28 * max(len(kinds), 1))
+    used = f"{len(recordings.episodes)} episodes give {len(recordings.samples)} samples"
+    if not kinds:
+        return Note(f"{used}; no fault was found in them")
+    fig, axes = new_figure(1, height_in=1.6 + 0.28 * len(kinds))
     ax = axes[0, 0]
-    used = len(recordings.samples)
-    if kinds:
-        ax.barh(range(len(kinds)), [counts[k] for k in kinds], color=RED)
-        bar_values(ax, range(len(kinds)), [counts[k] for k in kinds], "{:d}")
-        ax.set_yticks(range(len(kinds)), [k.replace("_", " ") for k in kinds])
-        ax.invert_yaxis()
-        ax.set_xlabel("times")
-    else:
-        note(ax, "no faults found")
-    ax.set_title(f"{len(recordings.episodes)} episodes give {used} samples; faults that were skipped:", fontsize=11)
+    ax.barh(range(len(kinds)), [counts[k] for k in kinds], color=RED)
+    bar_values(ax, range(len(kinds)), [counts[k] for k in kinds], "{:d}")
+    ax.set_yticks(range(len(kinds)), [k.replace("_", " ") for k in kinds])
+    ax.invert_yaxis()
+    ax.set_xlabel("times")
+    claim(fig, f"{used}; {sum(counts.values())} faults were skipped")
     return fig
 
 
@@ -175,8 +198,8 @@ def calibration_coverage(
     unit = " (share of full)" if tuple(names) == ACTION_NAMES else ""
     sets = (
         ("could calibrate", pool, GREY, "o", 8),
-        ("held out", held_out, ORANGE, "x", 14),
-        ("calibrate", chosen, BLUE, "o", 10),
+        ("held out", held_out, OTHERS[1], "x", 14),
+        ("calibrate", chosen, SLATE, "o", 10),
     )
     for label, samples, colour, marker, size in sets:
         first = np.stack([s.chunk[0] for s in samples])
@@ -195,7 +218,7 @@ def calibration_coverage(
     for i, ax in enumerate(fields[1:]):
         every = np.concatenate([s.chunk[:, i] for s in pool])
         bins = np.linspace(every.min(), every.max(), 25) if every.max() > every.min() else 25
-        for samples, colour, style in ((pool, GREY, "stepfilled"), (chosen, BLUE, "step")):
+        for samples, colour, style in ((pool, GREY, "stepfilled"), (chosen, SLATE, "step")):
             values = np.concatenate([s.chunk[:, i] for s in samples])
             ax.hist(
                 values,
@@ -208,6 +231,7 @@ def calibration_coverage(
         ax.set(xlabel=f"{names[i]}{unit}", ylabel="actions (%)")
         ax.set_title(f"{names[i]} over whole plans", fontsize=11)
     legend_below(fig, fields[0], 3)
+    claim(fig, claims.coverage([s.chunk[0] for s in chosen], [s.chunk[0] for s in pool], names))
     return fig
 
 
@@ -227,15 +251,15 @@ def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
         worst_of_part.setdefault(row[1].split(".")[0], row)
     shown = list(worst_of_part.values())[:count]
     fig, axes = new_figure(1, len(shown), height_in=3.6)
-    styles = {"minmax": (BLACK, ":"), "percentile": (ORANGE, "--"), "histogram": (BLUE, "-")}
+    styles = {"minmax": ":", "percentile": "--", "histogram": "-"}
     for ax, (_, layer, seen, ranges) in zip(axes[0], shown, strict=False):
         share = 100 * seen.histogram / seen.histogram.sum()
         limit = seen.limit.item()
         edges = np.linspace(-limit, limit, 129)
         ax.bar(edges[:-1], share.view(128, -1).sum(1), np.diff(edges), align="edge", color=GREY)
-        for name, (colour, style) in styles.items():
+        for name, style in styles.items():
             for i, x in enumerate(ranges[name]):
-                ax.axvline(x, color=colour, ls=style, lw=1.6, label=name if i == 0 else None)
+                ax.axvline(x, color=SLATE, ls=style, lw=1.6, label=name if i == 0 else None)
         low, high = ranges["minmax"]
         ax.set_xlim(low - 0.06 * (high - low), high + 0.06 * (high - low))
         ax.set_yscale("log")

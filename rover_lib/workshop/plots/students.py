@@ -7,20 +7,21 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    SKY,
+    MIST,
+    OTHERS,
+    SLATE,
+    Note,
     action_colour,
     bar_values,
+    claim,
     legend,
     new_figure,
 )
 
-DRIVES = (("", "left alone", BLUE, "o", -0.16), ("pushed_", "pushed", ORANGE, "s", 0.16))  # of a row's keys
+# of a row's keys: the mark is full or hollow
+DRIVES = (("", "left alone", SLATE, "o", -0.16), ("pushed_", "pushed", "white", "s", 0.16))
 
 
 def frontier(students: Sequence[Mapping[str, Any]], chosen: str) -> Figure:
@@ -30,7 +31,7 @@ def frontier(students: Sequence[Mapping[str, Any]], chosen: str) -> Figure:
     """
     drove = any(row["trials"] for row in students)
     rows = sorted(students, key=lambda row: -row["gmac"])
-    height_in, widths = 1.7 + 0.75 * len(rows), (1, 1.35, 1.2) if drove else (1, 1.2)
+    height_in, widths = 2.0 + 0.75 * len(rows), (1, 1.35, 1.2) if drove else (1, 1.2)
     fig, axes = new_figure(1, len(widths), height_in=height_in, sharey=True, width_ratios=widths)
     _work(axes[0, 0], rows)
     if drove:
@@ -41,7 +42,8 @@ def frontier(students: Sequence[Mapping[str, Any]], chosen: str) -> Figure:
     first.set_ylim(len(rows) - 0.4, -0.6)
     for label, row in zip(first.get_yticklabels(), rows, strict=True):
         if row["name"] == chosen:
-            label.set(color=GREEN, weight="bold")
+            label.set(weight="bold")
+    claim(fig, claims.student(students, chosen))
     return fig
 
 
@@ -54,29 +56,29 @@ def _label(row: Mapping[str, Any]) -> str:
 
 def _work(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     if not all(row["computed_ms"] for row in rows):
-        ax.barh(range(len(rows)), [row["gmac"] for row in rows], 0.5, color=SKY)
+        ax.barh(range(len(rows)), [row["gmac"] for row in rows], 0.5, color=MIST)
         bar_values(ax, range(len(rows)), [row["gmac"] for row in rows], "{:.3g}")
         ax.set_xlabel("multiply-accumulates of a plan\n(10^9); not all are counted")
         return
     for y, row in enumerate(rows):
         low, high = row["computed_ms"]
-        ax.plot([low, high], [y, y], color=SKY, lw=9, solid_capstyle="butt")
+        ax.plot([low, high], [y, y], color=MIST, lw=9, solid_capstyle="butt")
         ax.annotate(f"{low:.3g} to {high:.3g}", (low, y), (0, 9), textcoords="offset points", fontsize=9)
     ax.set_xlim(0, 1.35 * max(row["computed_ms"][1] for row in rows))
     ax.set_xlabel("a plan on a Raspberry Pi 5,\ncomputed (ms)")
 
 
 def _hits(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
-    for key, label, colour, marker, aside in DRIVES:
+    for key, label, face, marker, aside in DRIVES:
         driven = [(y + aside, row) for y, row in enumerate(rows) if row[f"{key}trials"]]
         share = np.array([100 * row[f"{key}hits"] / row[f"{key}trials"] for _, row in driven])
         ends = 100 * np.array([[row[f"{key}hits_wilson_{end}"] for end in ("low", "high")] for _, row in driven])
         bars = np.clip(np.abs(ends.reshape(-1, 2).T - share), 0, None)
         y = [at for at, _ in driven]
-        ax.errorbar(share, y, xerr=bars, fmt=marker, ms=6, color=colour, elinewidth=2, capsize=3, label=label)
+        ax.errorbar(share, y, xerr=bars, fmt=marker, ms=6, color=SLATE, mfc=face, elinewidth=2, capsize=3, label=label)
         for at, (low, _), (_, row) in zip(y, ends.reshape(-1, 2), driven, strict=True):
             late = f", {row['pushed_latency_ms']:.0f} ms late" if key else ""
-            ax.annotate(f"{row[f'{key}hits']}{late}", (low, at), (-6, 0), textcoords="offset points", color=colour,
+            ax.annotate(f"{row[f'{key}hits']}{late}", (low, at), (-6, 0), textcoords="offset points", color=SLATE,
                         ha="right", va="center", fontsize=8)  # fmt: skip
     left, right = ax.get_xlim()
     ax.set_xlim(left - 0.55 * (right - left), right)
@@ -102,20 +104,21 @@ def _errors(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     legend(ax, loc="lower center", bbox_to_anchor=(0.5, 1))
 
 
-def losses(by_student: Mapping[str, Mapping[str, Sequence[float]]], means: int = 40) -> Figure:
+def losses(by_student: Mapping[str, Mapping[str, Sequence[float]]], means: int = 40) -> Figure | Note:
     """How each student learned: a panel for each phase, means of neighbouring steps.
 
     by_student: {name: {phase: losses}}. means: points of a curve, at most.
     """
     phases = list(dict.fromkeys(phase for found in by_student.values() for phase, steps in found.items() if steps))
-    fig, axes = new_figure(1, max(len(phases), 1), height_in=2.8)
-    colours = (BLUE, ORANGE, GREEN, BLACK, GREY)
+    if not phases:
+        return Note("no student has a step of training behind it")
+    fig, axes = new_figure(1, len(phases), height_in=2.8)
     for ax, phase in zip(axes[0], phases, strict=False):
         for i, (name, found) in enumerate(by_student.items()):
             if steps := found.get(phase):
                 parts = np.array_split(np.arange(len(steps)), min(means, len(steps)))
                 x, y = zip(*((part.mean() + 1, np.asarray(steps)[part].mean()) for part in parts), strict=True)
-                ax.plot(x, y, color=colours[i % len(colours)], lw=1.5, label=name)
+                ax.plot(x, y, color=OTHERS[i % len(OTHERS)], lw=1.5, label=name)
         ax.set_title(phase, fontsize=11)
         ax.set(xlabel="step", ylim=(0, None))
     axes[0, 0].set_ylabel("loss")

@@ -1,10 +1,16 @@
 """What all figures share: axes, legends, colours, names of artifacts.
 
-Colours are Okabe and Ito's, which colour-blind people can tell apart; a mode has the same one in every figure.
-Figures are drawn for a notebook's width at 100 dots per inch.
+A colour has one meaning in every figure: a mode, an action, a part of the policy, or an alarm. What is none of these is
+slate or grey, and told apart by marker or line; categories that only one figure has take theirs from OTHERS. Colours
+are Okabe and Ito's and Paul Tol's, which colour-blind people can tell apart.
+
+Figures are drawn for a notebook's width at 100 dots per inch, and shown and saved with twice the pixels.
 """
 
+import io
+from base64 import b64encode
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,31 +19,38 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.table import Table
 
 from rover_lib.onboard.host import THROTTLED_BITS
 from rover_lib.workshop.judge import worst
 
-WIDTH_IN, DPI = 9.0, 100
+WIDTH_IN, DPI, SHARPER = 9.0, 100, 2
 BLACK = "#333333"
 ORANGE = "#E69F00"
 SKY = "#56B4E9"
 GREEN = "#009E73"
 BLUE = "#0072B2"
-RED = "#D55E00"
-PURPLE = "#CC79A7"
+RED = "#D55E00"  # a limit, a floor, a fault, a stopped car; and the balloon
+INDIGO = "#332288"
+PINK = "#CC79A7"
+OLIVE = "#999933"
+SAND = "#DDCC77"
+WINE = "#882255"
+SLATE = "#4A5A6A"  # a figure that belongs to no mode, action or part
+MIST = "#AAB7C4"  # beside it: before, without, the rest
 GREY = "#B0B0B0"
+OTHERS = (SLATE, "#8C6D31", "#AA4499", "#117733", "#6699CC", "#994455", "#997700")  # hosts, students, more actions
 NOW_BITS = sum(1 << bit for bit in THROTTLED_BITS)  # of get_throttled; the others are since the machine's start
 COLOURS = {
     "fp32": BLACK,
     "dynamic": ORANGE,
     "static": BLUE,
     "mixed": GREEN,
-    "static_affine": RED,
-    "lerobot": PURPLE,
-    "steering": BLUE,
-    "throttle": ORANGE,
+    "static_affine": SKY,
+    "lerobot": "#777777",
+    "steering": INDIGO,
+    "throttle": PINK,
 }
+PARTS = {"backbone": OLIVE, "encoder": SAND, "decoder": WINE}  # of the policy; every other is grey
 NAMES = {
     "fp32": "FP32",
     "dynamic": "dynamic",
@@ -51,10 +64,38 @@ NAMES = {
 }
 
 
+class Drawn(Figure):
+    """A figure that shows itself in a notebook with four pixels where it takes one: sharp, and of the same size."""
+
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=SHARPER * DPI)
+        width, height = (round(DPI * inches) for inches in self.get_size_inches())
+        shown = {"image/png": {"width": width, "height": height}}
+        return {"image/png": b64encode(buffer.getvalue()).decode()}, shown
+
+
+@dataclass(frozen=True)
+class Note:
+    """A sentence in the place of a figure that would show nothing."""
+
+    text: str
+
+    def __repr__(self) -> str:
+        return self.text
+
+
 def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: Any) -> tuple[Figure, np.ndarray]:
     """A figure and its (rows, columns) axes, closed for pyplot: who shows the figure is the caller's affair."""
     fig, axes = plt.subplots(
-        rows, columns, figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained", squeeze=False, **options
+        rows,
+        columns,
+        figsize=(WIDTH_IN, height_in),
+        dpi=DPI,
+        layout="constrained",
+        squeeze=False,
+        FigureClass=Drawn,
+        **options,
     )
     plt.close(fig)
     for ax in axes.flat:
@@ -129,28 +170,36 @@ def few_actions(
     return worst_of, f"mean error of the worst of {len(keys)} actions"
 
 
-def save(figure: Figure, run_dir: Path | str, name: str) -> Figure:
-    """Write run_dir/figures/<name>.png and return the figure, so that a cell that ends with this also shows it."""
+def claim(fig: Figure, sentence: str) -> None:
+    """What a figure shows, above it. Sentences are computed of what is drawn, by `claims`."""
+    if sentence:
+        fig.suptitle(sentence, fontsize=12, weight="bold")
+
+
+def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:
+    """Write run_dir/figures/<name>.png and return the figure, so that a cell that ends with this also shows it.
+
+    Of a Note no file is written, and one that is there is removed: it would be of an earlier run.
+    """
     path = Path(run_dir) / "figures" / f"{name}.png"
+    if isinstance(shown, Note):
+        path.unlink(missing_ok=True)
+        return shown
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=DPI)
-    return figure
+    shown.savefig(path, dpi=SHARPER * DPI)
+    return shown
 
 
 def simd_bars(ax: Axes, y: np.ndarray, total: np.ndarray, simd: np.ndarray) -> None:
-    ax.barh(y, simd, color=BLUE, label="SIMD (vector) instructions")
-    ax.barh(y, total - simd, left=simd, color=SKY, label="all others")
+    ax.barh(y, simd, color=SLATE, label="SIMD (vector) instructions")
+    ax.barh(y, total - simd, left=simd, color=MIST, label="all others")
     bar_values(ax, y, total, "{:.3g}")
 
 
 def action_colour(key: str, index: int) -> str:
-    return COLOURS.get(key.split("_")[0], (BLUE, ORANGE, GREEN, RED, PURPLE, SKY)[index % 6])
+    return COLOURS.get(key.split("_")[0], OTHERS[index % len(OTHERS)])
 
 
-def plain_table(table: Table) -> None:
-    table.auto_set_font_size(False)
-    table.set_fontsize(10)
-    for (row, _), cell in table.get_celld().items():
-        cell.set_edgecolor("#DDDDDD")
-        if row == 0:
-            cell.set_text_props(weight="bold")
+def part_colours(blocks: Iterable[str]) -> list[str]:
+    """Of blocks such as "encoder.0.attention"."""
+    return [PARTS.get(block.split(".")[0], GREY) for block in blocks]

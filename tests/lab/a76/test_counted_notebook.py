@@ -51,7 +51,7 @@ def test_counts_are_drawn(tmp_path):
     text = printed(runs.execute("06_arm", tmp_path))
     assert report.LABEL in text and "cannot drive" in text and "0 of 123,456 INT8 values" in text
     assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {
-        f"06_{figure}" for figure in ("counted", "by_kernel", "by_size", "computed_times", "gates")
+        f"06_{figure}" for figure in ("counted", "by_kernel", "by_size")
     }
 
 

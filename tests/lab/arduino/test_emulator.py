@@ -118,7 +118,7 @@ def test_a_program_that_lets_dtr_fall_resets_it(kind):
 @pytest.mark.parametrize("name", ["gcc-avr", "libsimavr-dev"])
 def test_missing_packages_are_named_with_the_command(monkeypatch, name):
     monkeypatch.setitem(arduino.NEEDS, "/nowhere", name)
-    with pytest.raises(ArduinoError, match=rf"{name}, which are not here; sudo apt-get install .*{name}"):
+    with pytest.raises(ArduinoError, match=rf"{name}.*, which are not here; sudo apt-get install .*{name}"):
         arduino.build.__wrapped__()
 
 

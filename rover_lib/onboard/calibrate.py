@@ -1,0 +1,209 @@
+"""Measures another car's transmitter, through the Arduino's receiver pins: what `rover calibrate` writes into car.yml.
+
+    with ServoLink(port) as link:
+        car = measure(link, ask=input)
+
+Nothing is armed. But the human's pulses go through to the servo and the speed controller, and while the Arduino is told
+one kind of car after the other, they get the neutral of each: so the wheels are off the ground, the motor unplugged.
+"""
+
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from rover_lib.onboard.car import (
+    FAST_PULSE_MAX_US,
+    PERIOD_MIN_US,
+    STEERING_THROW_US,
+    THROTTLE_THROW_US,
+    Car,
+    yaml_of,
+)
+from rover_lib.onboard.errors import CarError
+from rover_lib.onboard.servo_link import Telemetry
+from rover_lib.onboard.stage import atomic_path
+
+LOOK_S = 0.5  # for both signals, as one kind of car; two pulses of 25 ms, or eight, are there long before
+MEASURE_S = 1.0
+STEP_S = 0.02  # of the Arduino's statuses
+STEADY_US = 24  # a stick that is held; the recordings' resting sticks stay within 16
+RETURNS_US = 40  # throttle that does not move back so far has no reverse
+NAMES = ("steering", "throttle")
+
+
+class Link(Protocol):
+    """What this needs of a ServoLink."""
+
+    def tell(self, car: Car) -> None:
+        """The Arduino's pins are that car's from now on."""
+
+    def latest(self) -> Telemetry | None:
+        """The newest status."""
+
+
+def _slow(steering_us: int, throttle_us: int) -> Car:
+    """A servo and a speed controller with periods around these; only to see pulses with."""
+    return Car.of(
+        {
+            "name": "any car",
+            "steering": {"period_us": steering_us, "right_us": 1000, "neutral_us": 1500, "left_us": 2000},
+            "throttle": {"period_us": throttle_us, "neutral_us": 1500, "forward_us": 2000, "cap_us": 1},
+        }
+    )
+
+
+# A pulse counts whose period is within a quarter of the car's: these have all from 3 to 25 ms, likely ones first.
+PERIODS_US = (20000, 12500, 7900, 5000, 3200)
+KINDS = (Car(), *(_slow(us, us) for us in PERIODS_US), *(_slow(a, b) for a in PERIODS_US for b in PERIODS_US if a != b))
+
+
+class Held(NamedTuple):
+    """What both channels did for a while: the middle of each, microseconds."""
+
+    steering_us: int
+    throttle_us: int
+    steering_period_us: int
+    throttle_period_us: int
+
+
+def measure(
+    link: Link,
+    ask: Callable[[str], object],
+    *,
+    notify: Callable[[str], None] = lambda text: None,
+    sleep: Callable[[float], None] = time.sleep,
+    **more: Any,
+) -> Car:
+    """Leads a human through both sticks' ends and centres; the car that they make.
+
+    ask: tells the human what to do, and returns when it is done. notify: is told what was measured. more: what cannot
+    be measured here, `name`, `camera` and `wheelbase_m` as car.yml has them.
+    Raises CarError with what was seen and what to do where that is no car, LinkError as the link does.
+    """
+    ask("Take the wheels off the ground and unplug the motor. Switch the transmitter on, and let go of both sticks.")
+    _find(link, sleep)
+    rest = _hold(link, "at rest", sleep)
+    notify(f"at rest: steering {rest.steering_us} us, throttle {rest.throttle_us} us; periods "
+           f"{rest.steering_period_us} and {rest.throttle_period_us} us")  # fmt: skip
+    ends = {}
+    for where, stick in (
+        ("left", "Move the steering stick fully to the left"),
+        ("right", "Move the steering stick fully to the right"),
+        ("forward", "Let go of it, and push the throttle fully forward"),
+        ("back", "Pull the throttle fully back (leave it at rest if this car has no reverse)"),
+    ):
+        ask(f"{stick}, and hold it there.")
+        held = _hold(link, f"with the stick {where}", sleep)
+        ends[where] = held.throttle_us if where in ("forward", "back") else held.steering_us
+        notify(f"{where}: {ends[where]} us")
+    ask("Let go of both sticks.")
+    for name, ways, neutral_us, least_us in (
+        ("steering", ("left", "right"), rest.steering_us, STEERING_THROW_US),
+        ("throttle", ("forward",), rest.throttle_us, THROTTLE_THROW_US),
+    ):
+        for where in ways:
+            if abs(ends[where] - neutral_us) < least_us:
+                raise CarError(
+                    f"{name} hardly moved {where}: it must be {least_us} us from rest at least",
+                    found=f"{neutral_us} us at rest and {ends[where]} us {where}",
+                    remedy="hold the stick at its end, and set the transmitter's dual rate and end points to 100 %",
+                )
+    if (ends["left"] > rest.steering_us) == (ends["right"] > rest.steering_us):
+        raise CarError(
+            "both ends of steering are on the same side of its centre",
+            found=f"left {ends['left']}, rest {rest.steering_us} and right {ends['right']} us",
+            remedy="let go of the stick before it is measured at rest, and set the trim to its middle",
+        )
+    fast = rest.throttle_period_us < PERIOD_MIN_US
+    if fast and ends["forward"] > FAST_PULSE_MAX_US:
+        notify(f"full throttle is {ends['forward']} us; the firmware takes {FAST_PULSE_MAX_US} for it on such a car")
+        ends["forward"] = FAST_PULSE_MAX_US
+    throttle = {
+        "period_us": rest.throttle_period_us,
+        "neutral_us": rest.throttle_us,
+        "forward_us": ends["forward"],
+    }
+    backwards_us = (rest.throttle_us - ends["back"]) * (1 if ends["forward"] > rest.throttle_us else -1)
+    if backwards_us > RETURNS_US and not fast:
+        throttle["reverse_us"] = ends["back"]
+    elif backwards_us < -RETURNS_US:
+        raise CarError(
+            "the throttle went the same way backwards as forwards",
+            found=f"rest {rest.throttle_us}, forward {ends['forward']} and back {ends['back']} us",
+            remedy="move the stick from its rest to the other end",
+        )
+    steering = {
+        "period_us": rest.steering_period_us,
+        "left_us": ends["left"],
+        "neutral_us": rest.steering_us,
+        "right_us": ends["right"],
+    }
+    return Car.of({**more, "steering": steering, "throttle": throttle}, "the measured car")
+
+
+def _find(link: Link, sleep: Callable[[float], None]) -> None:
+    """Tells the Arduino one kind of car after the other until both signals are there."""
+    seen: dict[str, int] = {}
+    for kind in KINDS:
+        link.tell(kind)
+        for _ in range(round(LOOK_S / STEP_S)):
+            sleep(STEP_S)
+            pulses = _pulses(link.latest())
+            seen |= {name: us for name, us in zip(NAMES, pulses, strict=True) if us is not None}
+            if None not in pulses:
+                return
+    silent = [name for name in NAMES if name not in seen]
+    raise CarError(
+        f"no pulse of {' and '.join(silent) or 'both channels at a time'} came from the receiver",
+        found=", ".join(f"{name} {us} us" for name, us in seen.items()) or "nothing on either channel",
+        remedy="is the transmitter on, and are the receiver's channels on D2 and D8 (firmware/README.md)?",
+    )
+
+
+def _pulses(status: Telemetry | None) -> tuple[int | None, int | None]:
+    return (status.receiver_steering_us, status.receiver_throttle_us) if status else (None, None)
+
+
+def _hold(link: Link, where: str, sleep: Callable[[float], None]) -> Held:
+    """What both channels do for MEASURE_S. Raises CarError where a signal fails, or a stick moves."""
+    rows: list[tuple[int, ...]] = []
+    for _ in range(round(MEASURE_S / STEP_S)):
+        sleep(STEP_S)
+        status = link.latest()
+        for name, pulse_us in zip(NAMES, _pulses(status), strict=True):
+            if status is None or pulse_us is None:
+                raise CarError(
+                    f"no pulse of {name} {where}",
+                    found="none that a servo would take, 800 to 2200 us",
+                    remedy="set the transmitter's end points to 100 %, and keep it on",
+                )
+        assert status is not None
+        values = (status.receiver_steering_us, status.receiver_throttle_us)
+        periods = (status.receiver_steering_period_us, status.receiver_throttle_period_us)
+        rows.append(tuple(v or 0 for v in (*values, *periods)))
+    for name, column in zip(NAMES, zip(*rows, strict=True), strict=False):
+        if max(column) - min(column) > STEADY_US:
+            raise CarError(
+                f"{name} moved while it was measured {where}",
+                found=f"{min(column)} to {max(column)} us",
+                remedy="hold the stick still, and start again",
+            )
+    return Held(*(round(statistics.median(column)) for column in zip(*rows, strict=True)))
+
+
+def refuse_existing(path: Path, force: bool) -> None:
+    """Raises CarError for a car.yml that is there, unless it may be replaced."""
+    if path.exists() and not force:
+        raise CarError(f"{path}: exists already", remedy="--force replaces it")
+
+
+def write_car(car: Car, path: Path) -> None:
+    """All of it or nothing. Raises CarError where it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary:
+            temporary.write_text(yaml_of(car))
+    except OSError as error:
+        raise CarError(f"{path}: cannot be written ({error.strerror})", remedy="name another with --output") from None

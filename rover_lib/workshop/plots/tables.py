@@ -1,0 +1,48 @@
+"""Gates and computed times, as tables for notebooks."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rover_lib.workshop.cells import Table
+from rover_lib.workshop.plots.style import NAMES
+from rover_lib.workshop.verdict import gate_in_words
+
+KEPT = {True: "kept", False: "MISSED", None: "not measured"}
+SHADES = {True: "#009E7333", False: "#D55E0044", None: "#88888833"}  # translucent: readable on a dark page too
+
+
+def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """What was promised and what was found, a gate in words to a row. rows: of `compare.gate` or `check_gates`."""
+    kept = sum(row["passed"] is True for row in rows)
+    missed = sum(row["passed"] is False for row in rows)
+    unknown = len(rows) - kept - missed
+    caption = f"{kept} of {len(rows)} promises kept"
+    caption += f", {missed} missed" if missed else ""
+    caption += f", {unknown} not measured" if unknown else ""
+    cells = [(gate_in_words(row["gate"]), _limit(row), _shown(row["found"]), KEPT[row["passed"]]) for row in rows]
+    shades = tuple(SHADES[row["passed"]] for row in rows)
+    return Table(("gate", "promised", "found", "verdict"), tuple(cells), caption, shades=shades)
+
+
+def computed_times(metrics: Mapping[str, Any]) -> Table:
+    """The computed range of a Raspberry Pi 5's time, in a table of its own. metrics: of arm.json."""
+    rows = []
+    for stem, m in sorted(metrics["artifacts"].items(), key=lambda item: -item[1]["instructions_g"]):
+        mode, time_ms = re.sub(r"^policy_|_\d+x\d+$", "", stem), m["computed_pi5_ms"]
+        size = f"{m['image_width']}x{m['image_height']}"
+        rows.append((NAMES.get(mode, mode), size, f"{time_ms['low']:.3g} to {time_ms['high']:.3g}"))
+    return Table(("artifact", "picture", "ms on a Pi 5"), tuple(rows), "computed from the counts, never measured")
+
+
+def _shown(value: Any) -> str:
+    return "-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _limit(row: Mapping[str, Any]) -> str:
+    """A gate's limit in words; a promised range as it was promised."""
+    limit = row["limit"]
+    if isinstance(limit, (list, tuple)):
+        return f"{limit[0]:g} to {limit[1]:g}"
+    words = {"<=": "at most ", ">=": "at least "}.get(row.get("relation", ""), "")
+    return words + (f"{limit:g}" if isinstance(limit, (int, float)) else str(limit))

@@ -1,0 +1,433 @@
+"""Many runs from one sheet: checkpoints, students, settings and seeds, as `rover run` makes each, on Dask.
+
+    rows = sweep(Sheet.read("sweep.yml"), "runs/sweep", on_this_machine(workers=2))
+
+Each run is a folder as any other, with job.json beside its stages. What is there is not made again, so that a sweep
+that was ended goes on where it was. docs/sweep.md has the sheet, clusters, and what a thousand policies take.
+"""
+
+import fcntl
+import hashlib
+import itertools
+import json
+import logging
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import yaml
+
+from rover_lib.onboard.columns import aligned, number
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.params import FOR_THIS_RUN, read_params
+from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
+from rover_lib.workshop import judge
+from rover_lib.workshop.hub import absolute
+from rover_lib.workshop.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+JOB, REPORT, FIGURE = "job.json", "sweep.json", "sweep.png"
+TIMING = "timing"  # the resource of a worker that has a machine to itself while it works
+STUDENT_OPTIONS = ("size", "decoder_layers", "feedforward", "qat", "steps", "samples", "seed")  # as of `rover distill`
+OF_A_RUN = ("run_dir", "checkpoint", "episodes")  # parameters that the sweep itself sets
+MODE = "static"  # the artifact that a run is judged by
+
+
+class SweepError(RoverError):
+    """A sheet that cannot be run, or a cluster that cannot run it."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run. student: options of `rover distill` for the policy that is taught first, {}: the checkpoint itself.
+
+    notebooks: parameters of the notebooks. params: values of params.yml by their place, say "calibration.seed".
+    """
+
+    checkpoint: str
+    episodes: str
+    student: Mapping[str, Any]
+    notebooks: Mapping[str, Any]
+    params: Mapping[str, Any]
+
+    @property
+    def name(self) -> str:
+        """What it varies, and a few digits that no other has: stays the same while the sheet grows."""
+        settings = {**self.student, **self.notebooks, **self.params}
+        parts = [Path(self.checkpoint).stem, *(f"{key.split('.')[-1]}{value}" for key, value in settings.items())]
+        digits = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:6]
+        return re.sub(r"[^\w.-]+", "_", "-".join([*parts, digits])).lstrip(".-")
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Everything that may differ between two runs, for a table."""
+        return {"checkpoint": self.checkpoint, **self.student, **self.notebooks, **self.params}
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """sweep.yml: every combination of its values is a run."""
+
+    checkpoints: Sequence[str]
+    episodes: str
+    students: Sequence[Mapping[str, Any]]
+    notebooks: Mapping[str, Sequence[Any]]
+    params: Mapping[str, Sequence[Any]]
+
+    @classmethod
+    def read(cls, path: Path | str) -> "Sheet":
+        """Paths in the file are taken from where the command is typed. Raises SweepError, ParamsError."""
+        from rover_lib.workshop.run import NAMES, NOTEBOOKS, parameters_of
+
+        content = read_params(path)
+        if unknown := sorted(set(content) - set(cls.__dataclass_fields__)):
+            raise SweepError(f"{path}: {unknown[0]!r} is nothing that a sheet has",
+                             remedy=f"known are {', '.join(cls.__dataclass_fields__)}")  # fmt: skip
+        for key in ("checkpoints", "episodes"):
+            if not content.get(key):
+                raise SweepError(f"{path}: no {key!r} in it", remedy="docs/sweep.md has a sheet to begin with")
+        if not isinstance(content["episodes"], str):
+            raise SweepError(f"{path}: episodes must be one folder", found=content["episodes"])
+        of_notebooks = _lists(content.get("notebooks"), f"{path}: notebooks")
+        known = set().union(*(parameters_of(NOTEBOOKS / f"{name}.ipynb") for name in NAMES)) - set(OF_A_RUN)
+        if unknown := sorted(set(of_notebooks) - known):
+            raise SweepError(f"{path}: no notebook has a parameter {unknown[0]!r}", remedy=f"known are {sorted(known)}")
+        students = content.get("students") or [{}]
+        if not isinstance(students, list) or not all(isinstance(s, dict) for s in students):
+            raise SweepError(f"{path}: students must be a list of mappings", found=students)
+        if unknown := sorted(set().union(*students) - set(STUDENT_OPTIONS)):
+            raise SweepError(f"{path}: no student has {unknown[0]!r}", remedy=f"known are {', '.join(STUDENT_OPTIONS)}")
+        of_params = _lists(content.get("params"), f"{path}: params")
+        if wrong := [key for key in of_params if "." not in key]:
+            raise SweepError(f"{path}: params are named by their place, say calibration.seed", found=wrong[0])
+        checkpoints = content["checkpoints"] if isinstance(content["checkpoints"], list) else [content["checkpoints"]]
+        return cls([absolute(c) for c in checkpoints], absolute(content["episodes"]), students, of_notebooks, of_params)
+
+    def jobs(self) -> list[Job]:
+        """Raises SweepError if two are the same."""
+        jobs = [
+            Job(checkpoint, self.episodes, student, notebooks, params)
+            for checkpoint in self.checkpoints
+            for student in self.students
+            for notebooks in _combinations(self.notebooks)
+            for params in _combinations(self.params)
+        ]
+        names = [job.name for job in jobs]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise SweepError("a run stands in the sheet twice", found=sorted(twice)[0])
+        return jobs
+
+
+def _lists(values: Any, where: str) -> dict[str, list[Any]]:
+    """Each name with its values; a single value is a list of one. Raises SweepError."""
+    if not isinstance(values, dict | None):
+        raise SweepError(f"{where} must be a mapping of names to values", found=values)
+    lists = {str(key): value if isinstance(value, list) else [value] for key, value in (values or {}).items()}
+    if empty := [key for key, value in lists.items() if not value]:
+        raise SweepError(f"{where}: {empty[0]} has no value")
+    return lists
+
+
+def _combinations(values: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
+    for chosen in itertools.product(*values.values()):
+        yield dict(zip(values, chosen, strict=True))
+
+
+# --- what a worker does -----------------------------------------------------------------------------------------------
+
+
+class Work(Protocol):
+    """What is done for a job in the sweep's folder; both parts leave nothing half-made and may be done again."""
+
+    def prepare(self, job: Job, folder: Path) -> None: ...
+
+    def benchmark(self, job: Job, folder: Path) -> None: ...
+
+
+class Notebooks:
+    """The work of `rover distill` and `rover run`."""
+
+    def prepare(self, job: Job, folder: Path) -> None:
+        """All but the benchmark."""
+        from rover_lib.workshop.run import run
+
+        with _settings_of(job, folder):
+            checkpoint = self._taught(job, folder) if job.student else job.checkpoint
+            run(checkpoint, job.episodes, job.name, runs_dir=folder, timed=False, **job.notebooks)
+
+    def benchmark(self, job: Job, folder: Path) -> None:
+        """The benchmark, and the verdict."""
+        from rover_lib.workshop.run import NAMES, NOTEBOOKS, execute, parameters_of
+        from rover_lib.workshop.run_report import write
+
+        own = parameters_of(NOTEBOOKS / f"{NAMES[-1]}.ipynb")
+        with _settings_of(job, folder):
+            execute(NAMES[-1], folder / job.name, **{k: v for k, v in job.notebooks.items() if k in own})
+            write(folder / job.name)
+
+    def _taught(self, job: Job, folder: Path) -> Path:
+        """The student's checkpoint, in the run's own folder; what was begun goes on."""
+        from dataclasses import replace
+
+        from rover_lib.onboard.params import params
+        from rover_lib.workshop.distill import Recipe, distill
+        from rover_lib.workshop.student import StudentShape
+
+        options = dict(job.student)
+        recipe = Recipe(**params()["distill"])
+        if steps := options.pop("steps", None):
+            recipe = recipe.of_steps(steps)
+        recipe = replace(recipe, **{key: options.pop(key) for key in ("samples", "seed") if key in options})
+        width, _, height = str(options.pop("size", "x")).partition("x")
+        qat = bool(options.pop("qat", False))
+        try:
+            shape = StudentShape(int(height) if height else None, int(width) if width else None, **options)
+        except ValueError:
+            raise SweepError("a student's size is WIDTHxHEIGHT", found=job.student["size"]) from None
+        made = distill(
+            job.checkpoint, job.episodes, job.name, shape, runs_dir=folder, recipe=recipe, qat=qat, device="cpu"
+        )
+        return made / "best_model.pth"
+
+
+@contextmanager
+def _settings_of(job: Job, folder: Path) -> Iterator[None]:
+    """The job's own values of params.yml, for this process and the kernels that it starts."""
+    from rover_lib.workshop.run import environment
+
+    values: dict[str, Any] = {}
+    for place, value in job.params.items():
+        *sections, last = place.split(".")
+        section = values
+        for name in sections:
+            section = section.setdefault(name, {})
+        section[last] = value
+    path = folder / f".{job.name}.yml"
+    path.write_text(yaml.safe_dump(values))
+    try:
+        with environment({FOR_THIS_RUN: str(path)}):
+            yield
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def do(part: str, work: Work, job: Job, folder: Path) -> str:
+    """Do one part of a job, "prepare" or "benchmark", unless it is done. Returns its name.
+
+    One process at a time works on a job: where a lost worker is still alive, its successor waits for it, and then finds
+    the work done.
+    """
+    with (folder / f".{job.name}.lock").open("w") as lock:
+        fcntl.lockf(lock, fcntl.LOCK_EX)  # which works on a network's file systems too
+        if part not in parts_done(job, folder):
+            getattr(work, part)(job, folder)
+            done = ["prepare"] if part == "prepare" else ["prepare", "benchmark"]
+            content = {"fingerprint": fingerprint(job), "done": done, **asdict(job)}
+            with atomic_path(folder / job.name / JOB) as temporary:
+                temporary.write_text(json.dumps(content, indent=2) + "\n")
+    return job.name
+
+
+def parts_done(job: Job, folder: Path) -> list[str]:
+    """What is done of a job, of the very files that it names. A job.json that cannot be read counts as none."""
+    try:
+        content = json.loads((folder / job.name / JOB).read_text())
+        return list(content["done"]) if content["fingerprint"] == fingerprint(job) else []
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def fingerprint(job: Job) -> str:
+    """Changes with the checkpoint's and the recordings' files: by name, size and time, as hashing them takes long."""
+    digest = hashlib.sha256()
+    for place in (Path(job.checkpoint), Path(job.episodes)):
+        files = [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.is_file())
+        for path in files:
+            at = path.stat()
+            digest.update(f"{path} {at.st_size} {at.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
+
+
+# --- the cluster ------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def on_this_machine(workers: int | None = None) -> Iterator["Client"]:
+    """A Dask of this machine's own: that many processes, or one for each two cores; the first may time."""
+    from distributed import Client, Nanny, Scheduler, SpecCluster
+
+    count = workers or max(1, (os.cpu_count() or 1) // 2)
+    # A run's memory is its kernels', which Dask does not see: its own limit would only end workers that hold nothing.
+    options = {"nthreads": 1, "memory_limit": 0, "dashboard": False, "silence_logs": logging.ERROR}
+    specs = {
+        i: {"cls": Nanny, "options": {**options, "resources": {TIMING: 1} if i == 0 else {}}} for i in range(count)
+    }
+    quiet = {"host": "127.0.0.1", "dashboard": False}
+    with (
+        SpecCluster(specs, scheduler={"cls": Scheduler, "options": quiet}, silence_logs=logging.ERROR) as cluster,
+        Client(cluster) as client,
+    ):
+        client.wait_for_workers(count, timeout=60)
+        yield client
+
+
+@contextmanager
+def on_cluster(address: str) -> Iterator["Client"]:
+    """A Dask that somebody else runs. Raises SweepError where it does not answer, or no worker of it may time."""
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, ValueError, TimeoutError) as e:
+        raise SweepError(
+            f"{address}: no Dask scheduler answers",
+            found=type(e).__name__,
+            remedy="start one: dask scheduler; dask worker tcp://HOST:8786 --nthreads 1",
+        ) from None
+    with client:
+        workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        if not any(w.get("resources", {}).get(TIMING) for w in workers):
+            raise SweepError(f"{address}: no worker may time", found=f"{len(workers)} workers",
+                             remedy=f"start one on a machine of its own: dask worker {address} --nthreads 1 "
+                             f'--resources "{TIMING}=1"')  # fmt: skip
+        yield client
+
+
+def sweep(
+    jobs: Sequence[Job],
+    folder: Path | str,
+    client: "Client",
+    *,
+    together: bool = False,
+    work: Work | None = None,
+    progress: Progress = silent,
+) -> dict[str, str]:
+    """Do what is missing of these jobs. Returns a sentence for each that failed, by its name; the others are whole.
+
+    together: time a run as soon as it is prepared, on a worker with a machine of its own, while others prepare; else
+    all benchmarks come after all that would disturb them. A worker that dies costs what it was doing: another does it
+    again, three times at most. Ended at any moment, the same call goes on.
+    """
+    from distributed import as_completed
+
+    folder, work, failed = Path(folder).resolve(), work or Notebooks(), dict[str, str]()
+    folder.mkdir(parents=True, exist_ok=True)
+    by_name = {job.name: job for job in jobs}
+
+    def submit(part: str, job: Job) -> "Future":
+        needs = {"resources": {TIMING: 1}} if part == "benchmark" else {}
+        return client.submit(do, part, work, job, folder, key=f"{part}-{job.name}", pure=False, **needs)
+
+    def follow(futures: Sequence["Future"], then: Callable[[str], "Future | None"], desc: str, total: int) -> None:
+        completed = as_completed(futures)
+        for future in progress(completed, desc=desc, total=total):
+            name = str(future.key).partition("-")[2]
+            if (error := future.exception()) is None:
+                if (after := then(name)) is not None:
+                    completed.add(after)
+            else:
+                failed[name] = _sentence(error)
+
+    missing = {name: parts_done(job, folder) for name, job in by_name.items()}
+    prepare = [name for name, done in missing.items() if "prepare" not in done]
+    first = [submit("prepare", by_name[name]) for name in prepare]
+    if together:
+        rest = [n for n, done in missing.items() if "prepare" in done and "benchmark" not in done]
+        first += [submit("benchmark", by_name[name]) for name in rest]
+        prepared = set(rest)
+
+        def then(name: str) -> "Future | None":
+            if name in prepared:
+                return None
+            prepared.add(name)
+            return submit("benchmark", by_name[name])
+
+        follow(first, then, "runs", 2 * len(prepare) + len(rest))
+    else:
+        follow(first, lambda _: None, "runs", len(first))
+        rest = [n for n, done in missing.items() if "benchmark" not in done and n not in failed]
+        follow([submit("benchmark", by_name[n]) for n in rest], lambda _: None, "benchmarks", len(rest))
+    return failed
+
+
+def _sentence(error: BaseException) -> str:
+    if type(error).__name__ == "KilledWorker":
+        return "its worker died each time; is there enough memory?"
+    return str(error) if isinstance(error, RoverError) else f"{type(error).__name__}: {error}"
+
+
+# --- what came out ----------------------------------------------------------------------------------------------------
+
+
+def rows(jobs: Sequence[Job], folder: Path | str) -> list[dict[str, Any]]:
+    """One for each whole run, from the JSON that it left: its settings, and figures of its static INT8 artifact.
+
+    error_pct: the worse action's, against FP32; to_recorded_pct: against what the driver did. best: no other is at
+    least as good in error to the recordings, time and size, and better in one of them.
+    """
+    found = []
+    for job in jobs:
+        run = Path(folder) / job.name
+        if "benchmark" not in parts_done(job, Path(folder)):
+            continue
+        compared = read_stage(run / "compare.json", "compare")["metrics"]
+        timed = next(read_stage(p, "benchmark") for p in sorted(run.glob("benchmark-*.json")))
+        mode = compared["modes"][MODE]
+        ours = [mode[f"{action}_mae_pct"] for action in compared["action_range"]]
+        recorded = [mode.get(f"{action}_vs_recorded_pct") for action in compared["action_range"]]
+        found.append(
+            {
+                "name": job.name,
+                "settings": job.settings,
+                "error_pct": judge.worst(ours),
+                "to_recorded_pct": judge.worst(recorded),
+                "hits": mode["hits"],
+                "trials": mode["trials"],
+                "size_mb": mode["size_mb"],
+                "latency_p50_ms": timed["metrics"]["artifacts"][MODE]["latency_p50_ms"],
+                "host": timed["env"]["host"],
+            }
+        )
+    for row in found:
+        row["best"] = not any(_beats(other, row) for other in found)
+    return found
+
+
+def _beats(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """A figure that nobody has counts as equal."""
+    keys = ("to_recorded_pct", "latency_p50_ms", "size_mb")
+    pairs = [(one[k], other[k]) for k in keys if one[k] is not None and other[k] is not None]
+    return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
+
+
+def write_report(jobs: Sequence[Job], folder: Path | str, failed: Mapping[str, str]) -> dict[str, Any]:
+    """Leave sweep.json and sweep.png in the sweep's folder; returns the JSON's content."""
+    from rover_lib.workshop.plots.sweep import pareto
+
+    folder, found = Path(folder), rows(jobs, folder)
+    inputs = {name: fingerprint(job) for name, job in ((job.name, job) for job in jobs)}
+    metrics = {"runs": found, "failed": dict(failed), "missing": len(jobs) - len(found) - len(failed)}
+    content = write_stage(folder / REPORT, "sweep", params={"mode": MODE}, metrics=metrics, inputs=inputs)
+    if found:
+        with atomic_path(folder / FIGURE) as temporary:
+            pareto(found).savefig(temporary, format="png", dpi=200)
+    return content
+
+
+def table(found: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The rows as text, the best error to the recordings first; a star marks those that none beats in everything."""
+    header = ["", "run", "to recorded %", "to FP32 %", "p50 ms", "MB", "hits"]
+    lines = [header]
+    for row in sorted(found, key=lambda r: (r["to_recorded_pct"] is None, r["to_recorded_pct"])):
+        hits = "-" if not row["trials"] else f"{row['hits']} of {row['trials']}"
+        figures = [number(row["to_recorded_pct"], ".2f"), number(row["error_pct"], ".2f")]
+        times = [number(row["latency_p50_ms"]), number(row["size_mb"])]
+        lines.append(["*" if row["best"] else "", row["name"], *figures, *times, hits])
+    names = max(len(line[1]) for line in lines)
+    return aligned([[line[0], line[1].ljust(names), *line[2:]] for line in lines])

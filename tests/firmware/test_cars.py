@@ -1,0 +1,182 @@
+"""Other cars, in virtual time: what the firmware takes of them, and who drives them."""
+
+import needs
+import pytest
+
+from lab.arduino.native import STEERING, THROTTLE, NativeArduino
+from rover_lib.onboard.car import Car
+from rover_lib.onboard.servo_link import State
+
+pytestmark = needs.gcc
+HUMAN_MS = 100
+CRAWLER = Car.of(  # 50 Hz servo and speed controller, with reverse
+    {
+        "steering": {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1000},
+        "throttle": {"period_us": 20000, "neutral_us": 1500, "forward_us": 2000, "reverse_us": 1000},
+    }
+)
+INVERTED = Car.of(  # as the default, but its steering servo is mounted upside down
+    {
+        "steering": {"period_us": 21316, "left_us": 900, "neutral_us": 1456, "right_us": 2012},
+        "throttle": {"period_us": 1016, "neutral_us": 120, "forward_us": 711},
+    }
+)
+BOAT = Car.of(  # no reverse, and its speed controller stops at 1000 us
+    {
+        "steering": {"period_us": 20000, "left_us": 1100, "neutral_us": 1480, "right_us": 1900},
+        "throttle": {"period_us": 14000, "neutral_us": 1000, "forward_us": 1800, "cap_us": 60},
+    }
+)
+
+
+def armed_board(car):
+    board = NativeArduino(car=car)
+    board.run(400)
+    board.wiggle()
+    assert board.command("A") == "k"
+    return board
+
+
+@pytest.fixture(params=[CRAWLER, INVERTED, BOAT], ids=["crawler", "inverted", "boat"])
+def armed(request):
+    return armed_board(request.param)
+
+
+def neutral_of(board):
+    pulses = board.car.pwm.neutral()
+    return pulses.steering_us, pulses.throttle_us
+
+
+def away_ms(board, pins):
+    """How long the throttle was not neutral."""
+    away = [n for n, (_, throttle_us) in enumerate(pins) if throttle_us != neutral_of(board)[1]]
+    return away[-1] + 1 if away else 0
+
+
+def test_each_action_is_its_cars_pulse(armed):
+    car = armed.car
+    for steering, throttle in ((1, 0.06), (-1, 0.0), (0.5, car.cap), (0, -0.1 if car.reverses else 0.0)):
+        wanted = car.pwm.pulses(steering, throttle)
+        assert armed.drive(wanted.steering_us, wanted.throttle_us, 400)[-1] == (wanted.steering_us, wanted.throttle_us)
+
+
+def test_the_cap_is_as_far_from_neutral_on_either_side(armed):
+    least_us, neutral_us, most_us, cap_us = armed.car.numbers[5:]
+    steering_us = armed.car.numbers[2]
+    assert max(us for _, us in armed.drive(steering_us, most_us, 600)) == neutral_us + cap_us
+    assert min(us for _, us in armed.drive(steering_us, least_us, 600)) == max(least_us, neutral_us - cap_us)
+    assert armed.status.state is State.AUTONOMOUS
+    assert armed.status.cap_us == neutral_us + cap_us
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_stopped_is_neutral_and_not_zero(armed, backwards):
+    low, _, high = armed.car.numbers[5:8]
+    armed.drive(armed.car.numbers[3], low if backwards else high, 300)
+    assert away_ms(armed, armed.run(400)) <= 150
+    assert armed.run(100)[-1] == neutral_of(armed)
+    assert (armed.status.state, armed.status.reason) == (State.STOPPED, "t")
+
+
+@pytest.mark.parametrize("channel", [STEERING, THROTTLE])
+@pytest.mark.parametrize("direction", [-1, 1])
+def test_either_stick_either_way_takes_over(armed, channel, direction):
+    """The throttle's on a 50 Hz signal took over after five pulses of eight, 100 ms; and no signal was ever there, as
+    eight pulses never came within 100 ms."""
+    armed.drive(armed.car.numbers[3], armed.car.numbers[7], 300)
+    armed.sticks[channel] += direction * (70 if channel == THROTTLE else 120)
+    pins = armed.drive(armed.car.numbers[3], armed.car.numbers[7], 400)
+    assert away_ms(armed, pins) <= 25  # his throttle passes once it was at rest
+    assert (armed.status.state, armed.status.reason) == (State.MANUAL, "h")
+
+
+def test_a_lost_signal_stops(armed):
+    armed.drive(armed.car.numbers[3], armed.car.numbers[7], 300)
+    armed.sticks = [0, 0]
+    assert away_ms(armed, armed.drive(armed.car.numbers[3], armed.car.numbers[7], 500)) <= HUMAN_MS + 2
+    assert (armed.status.state, armed.status.reason) == (State.STOPPED, "s")
+
+
+# ---- being told
+
+
+def test_a_board_that_was_not_told_drives_by_its_default():
+    board = NativeArduino()
+    assert set(board.run(50)) == {(1456, 120)}
+    assert board.hello.car == Car().id
+    board.wiggle()
+    board.car = CRAWLER
+    assert board.command("A") == "c"
+    board.car = Car()
+    assert board.command("A") == "k"
+
+
+def test_no_other_car_while_armed(armed):
+    before = neutral_of(armed)
+    assert armed.command("C", *Car().numbers) == "i"
+    assert armed.status.state is State.AUTONOMOUS
+    assert armed.hello.car == armed.car.id
+    armed.command("N")
+    assert armed.run(1) == [before]
+    assert armed.command("C", *Car().numbers) == "k"
+    assert armed.run(1) == [(1456, 120)]
+
+
+def test_another_car_forgets_the_gesture_and_the_signal():
+    board = NativeArduino()
+    board.run(100)
+    board.wiggle()
+    assert board.status.missing == "-"
+    assert board.command("C", *INVERTED.numbers[:8], 60) == "k"
+    assert board.status.missing == "s"
+    board.run(400)
+    assert board.status.missing == "w"
+
+
+def test_the_same_car_again_forgets_nothing():
+    board = NativeArduino(car=CRAWLER)
+    board.run(400)
+    board.wiggle()
+    assert board.command("C", *CRAWLER.numbers) == "k"
+    assert board.command("A") == "k"
+
+
+@pytest.mark.parametrize("kept", [CRAWLER, Car()], ids=["kept", "lost"])
+def test_after_a_reset_it_must_be_told_again(kept):
+    """Its pins may still have that car's neutral; but nobody arms it before they have said which car they mean."""
+    board = armed_board(CRAWLER)
+    board.start(kept)
+    assert set(board.run(300)) == {(kept.numbers[2], kept.numbers[6])}
+    board.wiggle()
+    assert board.command("A", sequence=board.status.sequence + 1) == "c"
+    board.sequence = board.status.sequence
+    assert board.command("C", *CRAWLER.numbers) == "k"
+    board.run(400)
+    board.wiggle()
+    assert board.command("A") == "k"
+
+
+def test_another_car_raises_no_cap_again():
+    board = NativeArduino()
+    board.run(50)
+    assert board.command("L", 160) == "k"
+    for car, cap_us in ((CRAWLER, 1540), (Car(), 160), (BOAT, 1040)):
+        assert board.command("C", *car.numbers) == "k"
+        assert board.status.cap_us == cap_us
+
+
+LIMITS = {  # by the place of the number: the last values on either side that are none
+    **{0: (2999, 25001), 1: (799, 1251), 2: (1299, 1701), 3: (1749, 2201)},
+    **{4: (999, 25001), 5: (799, 1501), 6: (899, 1701), 7: (1499, 2201), 8: (0, 119)},
+}
+
+
+@pytest.mark.parametrize(("index", "bad"), [(i, bad) for i, values in LIMITS.items() for bad in values])
+def test_a_car_beyond_the_compiled_limits_is_refused(index, bad):
+    board = NativeArduino(car=CRAWLER)
+    numbers = list(CRAWLER.numbers)
+    numbers[index] = bad
+    before = board.status.out_of_range
+    assert board.command("C", *numbers) == "r"
+    assert board.status.out_of_range == before + 1
+    assert board.hello.car == CRAWLER.id

@@ -1,0 +1,180 @@
+"""`rover calibrate`: a human's sticks, through the firmware's own state machine, become a car.yml, or a sentence."""
+
+import needs
+import pytest
+from click.testing import CliRunner
+
+from lab.arduino.native import NativeArduino
+from rover_lib.onboard import calibrate as module
+from rover_lib.onboard import car as car_module
+from rover_lib.onboard import cli, servo_link
+from rover_lib.onboard.calibrate import measure
+from rover_lib.onboard.car import Car, read_car, yaml_of
+from rover_lib.onboard.errors import CarError
+
+pytestmark = needs.gcc
+CRAWLER = {"rest": (1504, 1496), "left": 1996, "right": 1012, "forward": 1990, "back": 1004}
+OURS = {"rest": (1456, 120), "left": 1948, "right": 1008, "forward": 640, "back": 120}
+
+
+class Desk:
+    """A transmitter on a desk, whose human does what he is asked, and the Arduino that it talks to."""
+
+    def __init__(self, sticks, periods_us=(20000, 20000)):
+        self.board, self.sticks, self.asked = NativeArduino(), dict(sticks), []
+        self.board.periods_us = periods_us
+        self.board.sticks = list(self.sticks["rest"])
+
+    def ask(self, text):
+        self.asked.append(text)
+        steering_us, throttle_us = self.sticks["rest"]
+        for where, words in (("left", "to the left"), ("right", "to the right")):
+            if words in text:
+                steering_us = self.sticks[where]
+        for where, words in (("forward", "fully forward"), ("back", "fully back")):
+            if words in text:
+                throttle_us = self.sticks[where]
+        self.board.sticks = [steering_us, throttle_us]
+        self.board.run(100)
+
+    def tell(self, car):
+        assert self.board.command("C", *car.numbers) == "k"
+
+    def latest(self):
+        return self.board.status
+
+    def sleep(self, seconds):
+        self.board.run(round(seconds * 1000))
+
+    def measure(self, **more):
+        return measure(self, self.ask, sleep=self.sleep, **more)
+
+
+def test_a_crawler():
+    desk = Desk(CRAWLER, (20010, 19980))
+    car = desk.measure(name="crawler", wheelbase_m=0.3)
+    assert car.numbers == (20010, 1012, 1504, 1996, 19980, 1004, 1496, 1990, 99)
+    assert (car.name, car.wheelbase_m, car.reverses) == ("crawler", 0.3, True)
+    assert "unplug the motor" in desk.asked[0]
+    assert len(desk.asked) == 6
+
+
+def test_an_inverted_transmitter():
+    """Left is what the human called left, whichever pulse that is."""
+    car = Desk(CRAWLER | {"left": 1012, "right": 1996, "forward": 1004, "back": 1990}).measure()
+    assert car.pwm.pulses(1, 1).steering_us == 1012
+    assert car.pwm.pulses(1, 1).throttle_us == 1004
+    assert car.pwm.pulses(-1, -1).steering_us == 1996
+    assert car.pwm.pulses(-1, -1).throttle_us == 1990
+
+
+@pytest.mark.parametrize("periods_us", [(3100, 3300), (24900, 24000), (20000, 9000), (21316, 1016)])
+def test_other_periods(periods_us):
+    car = Desk(OURS if periods_us[1] < 3000 else CRAWLER, periods_us).measure()
+    assert (car.numbers[0], car.numbers[4]) == periods_us
+
+
+def test_a_car_without_reverse():
+    assert not Desk(CRAWLER | {"back": 1490}).measure().reverses
+
+
+def test_more_throttle_than_a_fast_one_may_have_is_said():
+    said = []
+    assert Desk(OURS | {"forward": 948}, (21316, 1016)).measure(notify=said.append).numbers[7] == 711
+    assert any("948" in text and "711" in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("sticks", "sentence"),
+    [
+        (CRAWLER | {"rest": (0, 0)}, "no pulse of steering and throttle came from the receiver, found nothing"),
+        (CRAWLER | {"rest": (1500, 0)}, r"no pulse of throttle came .*, found steering 1500 us; .*D2 and D8"),
+        (CRAWLER | {"left": 1504}, r"steering hardly moved left: .* found 1504 us at rest and 1504 us left; .*hold"),
+        (CRAWLER | {"right": 1400}, "steering hardly moved right"),
+        (CRAWLER | {"right": 1900}, "both ends of steering are on the same side of its centre, found left 1996"),
+        (CRAWLER | {"rest": (1250, 1500)}, r"hardly moved right|neutral_us must be from 1300"),
+        (CRAWLER | {"forward": 1500}, "throttle hardly moved forward"),
+        (CRAWLER | {"back": 1800}, "the throttle went the same way backwards as forwards"),
+        (CRAWLER | {"left": 2400}, r"no pulse of steering with the stick left, found none .* 800 to 2200 us; .*100 %"),
+    ],
+)
+def test_what_is_no_car_says_what_was_seen(sticks, sentence):
+    with pytest.raises(CarError, match=sentence):
+        Desk(sticks).measure()
+
+
+def test_a_stick_that_moves_is_not_measured():
+    desk = Desk(CRAWLER)
+
+    def sleep(seconds):
+        desk.board.sticks[0] += 1
+        desk.sleep(seconds)
+
+    with pytest.raises(CarError, match=r"steering moved while it was measured at rest, found \d+ to \d+ us; hold"):
+        measure(desk, desk.ask, sleep=sleep)
+
+
+# ---- the command
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path):
+    """Runs `rover calibrate` on a desk; gives its result and the file."""
+    path = tmp_path / "etc" / "car.yml"
+    monkeypatch.setattr(car_module, "PLACES", (tmp_path / "checkout" / "car.yml", path))
+    monkeypatch.delenv(car_module.FILE_VARIABLE, raising=False)
+    monkeypatch.setattr(module.time, "sleep", lambda seconds: None)
+
+    def run(desk, *options):
+        class Link:
+            def __init__(self, port, car):
+                self.tell, self.latest = desk.tell, lambda: (desk.sleep(0.02), desk.latest())[1]
+
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *exc):
+                pass
+
+        monkeypatch.setattr(servo_link, "ServoLink", Link)
+        monkeypatch.setattr(cli.click, "prompt", lambda text, *args, **more: desk.ask(text))
+        return CliRunner().invoke(cli.main, ["calibrate", *options]), path
+
+    return run
+
+
+def test_the_command_writes_what_it_measured(run):
+    desk = Desk(CRAWLER)
+    result, path = run(desk, "--name", "crawler", "--field-of-view-deg", "100", "--wheelbase-m", "0.3")
+    assert result.exit_code == 0, result.output
+    car = read_car(path)
+    assert (car.name, car.field_of_view_deg, car.wheelbase_m, car.cap_us) == ("crawler", 100, 0.3, 99)
+    assert desk.board.hello.car == car.id  # and not one of those that were tried
+
+
+def test_it_replaces_nothing_without_force(run):
+    _, path = run(Desk(CRAWLER))
+    path.write_text(yaml_of(Car()))
+    result, _ = run(desk := Desk(CRAWLER))
+    assert result.exit_code == 1
+    assert "exists already; --force replaces it" in result.output
+    assert not desk.asked
+    assert read_car(path) == Car()
+    assert run(Desk(CRAWLER), "--force")[0].exit_code == 0
+    assert not read_car(path).is_default
+
+
+@pytest.mark.parametrize("at", range(6))
+def test_ctrl_c_leaves_everything_as_it_was(run, at):
+    desk = Desk(CRAWLER)
+    ask = desk.ask
+
+    def interrupted(text):
+        if len(desk.asked) == at:
+            raise KeyboardInterrupt
+        ask(text)
+
+    desk.ask = interrupted
+    result, path = run(desk)
+    assert result.exit_code == 1
+    assert not path.parent.exists() or not list(path.parent.iterdir())

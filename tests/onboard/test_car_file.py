@@ -1,0 +1,163 @@
+"""car.yml: the car that it describes, and what it may not be."""
+
+import copy
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rover_lib.onboard import car as module
+from rover_lib.onboard.car import Car, read_car, this_car, yaml_of
+from rover_lib.onboard.errors import CarError
+from rover_lib.onboard.pwm import PwmCalibration
+
+CRAWLER = {
+    "name": "crawler",
+    "steering": {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1100},
+    "throttle": {"period_us": 20000, "neutral_us": 1500, "forward_us": 2000, "reverse_us": 1000},
+    "camera": {"field_of_view_deg": 100},
+    "wheelbase_m": 0.31,
+}
+
+
+def changed(where, value):
+    """CRAWLER with another value, None: without it."""
+    content = copy.deepcopy(CRAWLER)
+    *sections, key = where.split(".")
+    section = content
+    for name in sections:
+        section = section[name]
+    if value is None:
+        del section[key]
+    else:
+        section[key] = value
+    return content
+
+
+@pytest.fixture
+def no_file(monkeypatch, tmp_path):
+    monkeypatch.setattr(module, "PLACES", (tmp_path / "car.yml",))
+    monkeypatch.delenv(module.FILE_VARIABLE, raising=False)
+    return tmp_path / "car.yml"
+
+
+def test_without_a_file_it_is_the_recordings_car(no_file):
+    car = this_car()
+    assert car.pwm == PwmCalibration()
+    assert car.is_default
+    assert car.focal_px == 400
+    assert (car.wheelbase_m, car.cap, car.reverses) == (0.26, pytest.approx(0.2, abs=1e-3), False)
+    np.testing.assert_array_equal(car.limits, [[-1, 0], [1, 1]])
+
+
+def test_the_default_written_down_is_the_same_to_the_bit(no_file):
+    no_file.write_text(yaml_of(Car()))
+    assert this_car() == Car()
+    assert this_car().pwm.steering.neutral_pct == 6.83
+
+
+def test_a_file_that_is_named_counts_before_all_places(no_file, monkeypatch, tmp_path):
+    no_file.write_text(yaml_of(Car()))
+    other = tmp_path / "other.yml"
+    other.write_text(yaml.safe_dump(CRAWLER))
+    monkeypatch.setenv(module.FILE_VARIABLE, str(other))
+    assert this_car().name == "crawler"
+    monkeypatch.setenv(module.FILE_VARIABLE, str(tmp_path / "gone.yml"))
+    with pytest.raises(CarError, match=r"gone\.yml: not found; .*calibrate"):
+        this_car()
+
+
+def test_each_side_of_neutral_has_its_own_span():
+    car = Car.of(CRAWLER)
+    assert [car.pwm.steering.pulse_us(a) for a in (-1, -0.5, 0, 0.5, 1)] == [1100, 1300, 1500, 1750, 2000]
+    assert car.pwm.neutral() == car.pwm.pulses(0, 0)
+    assert car.numbers == (20000, 1100, 1500, 2000, 20000, 1000, 1500, 2000, 100)
+    assert car.reverses
+    assert car.limits.tolist() == [[-1, -1], [1, 1]]
+    assert car.focal_px == pytest.approx(268.5, abs=0.05)
+
+
+def test_an_inverted_steering():
+    content = changed("steering.left_us", 1000)
+    content["steering"]["right_us"] = 1900
+    car = Car.of(content)
+    assert [car.pwm.steering.pulse_us(a) for a in (-1, 0, 1)] == [1900, 1500, 1000]
+    assert car.numbers[1:4] == (1000, 1500, 1900)
+
+
+@given(st.floats(-1, 1), st.floats(-1, 1), st.booleans())
+def test_an_action_comes_back_from_its_pulse(steering, throttle, inverted):
+    content = copy.deepcopy(CRAWLER)
+    if inverted:
+        content["steering"] |= {"left_us": 1100, "right_us": 2000}
+    pwm = Car.of(content).pwm
+    pulses = pwm.pulses(steering, throttle)
+    # A receiver's frame may be a little longer or shorter; a servo knows the pulse alone.
+    actions = pwm.actions_from_pulses(pulses.steering_us, pulses.throttle_us, 19000, 22000)
+    assert actions.steering == pytest.approx(steering, abs=0.6 / 400)
+    assert actions.throttle == pytest.approx(throttle, abs=0.6 / 500)
+
+
+def test_what_moves_a_car():
+    both = Car.of(CRAWLER).pwm.throttle
+    assert [both.moves(us) for us in (1490, 1496, 1500, 1504, 1510)] == [True, False, False, False, True]
+    assert [Car().pwm.throttle.moves(us) for us in (0, 104, 120, 124, 125)] == [False] * 4 + [True]
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "sentence"),
+    [
+        ("steering", None, "steering is missing"),
+        ("steering.left_us", None, "steering: left_us is missing"),
+        ("steering.left", 1, "unknown left"),
+        ("colour", "red", "unknown colour"),
+        ("steering.left_us", "wide", "left_us must be whole microseconds, found 'wide'"),
+        ("steering.left_us", 1500.5, "whole microseconds"),
+        ("steering.left_us", True, "whole microseconds"),
+        ("steering.left_us", 1500, "neutral_us must lie between its two ends, found 1100, 1500 and 1500"),
+        ("steering.neutral_us", 2100, "between its two ends"),
+        ("steering.neutral_us", 1250, "steering's neutral_us must be from 1300 to 1700, found 1250"),
+        ("steering.right_us", 1300, "to an end, us, must be from 250"),
+        ("steering.left_us", 2400, "an end of steering must be from 800 to 2200, found 2400"),
+        ("steering.period_us", 50000, "steering's period_us must be from 3000 to 25000"),
+        ("steering.period_us", 1900, "longer than its pulses, found 1900 and 2000"),
+        ("throttle.period_us", 2500, "fast throttle's period_us must be from 1000 to 1020"),
+        ("throttle.neutral_us", 850, "between its two ends"),
+        ("throttle.reverse_us", 700, "an end of throttle must be from 800"),
+        ("throttle.forward_us", 1550, "forward, us, must be from 100"),
+        ("throttle.cap_us", 119, "cap, us from neutral, must be from 1 to 118, found 119"),
+        ("throttle.cap_us", 0, "cap"),
+        ("camera.field_of_view_deg", 200, "field_of_view_deg must be from 20 to 160"),
+        ("wheelbase_m", float("nan"), "wheelbase_m must be a number"),
+        ("name", "", "1 to 60 characters"),
+    ],
+)
+def test_what_is_no_car_is_said_in_a_sentence(where, value, sentence, tmp_path):
+    path = tmp_path / "car.yml"
+    path.write_text(yaml.safe_dump(changed(where, value)))
+    with pytest.raises(CarError) as error:
+        read_car(path)
+    assert sentence in str(error.value)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("text", ["- a list", "a: [", "\x00", "just words"])
+def test_a_file_that_is_no_mapping(tmp_path, text):
+    path = tmp_path / "car.yml"
+    path.write_text(text)
+    with pytest.raises(CarError, match=r"car\.yml"):
+        read_car(path)
+
+
+def test_an_empty_file(tmp_path):
+    (tmp_path / "car.yml").write_text("")
+    with pytest.raises(CarError, match="steering, throttle is missing"):
+        read_car(tmp_path / "car.yml")
+
+
+def test_what_is_written_is_read_again():
+    for content in (CRAWLER, changed("throttle.reverse_us", None)):
+        car = Car.of(content)
+        assert Car.of(yaml.safe_load(yaml_of(car))) == car

@@ -1,0 +1,82 @@
+"""The site that `make docs` builds: strictly, so that a dead link ends it, and with nothing from elsewhere."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[1]
+GATHERED = (
+    "Makefile",
+    "mkdocs.yml",
+    "*.md",
+    "docs",
+    "pictures",
+    "notebooks",
+    "results",
+    "params.yml",
+    "lab/params.yml",
+)
+READMES = ("ansible/README.md", "firmware/README.md", "lab/README.md")
+ELSEWHERE = re.compile(r"""<(?:script|img|iframe|link)\b[^>]*\b(?:src|href)=["'](?:https?:)?//[^>]*>""")
+
+
+def gather(folder: Path) -> None:
+    """A copy of what `make docs` reads."""
+    for path in (path for pattern in (*GATHERED, *READMES) for path in ROOT.glob(pattern)):
+        target = folder / path.relative_to(ROOT)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            shutil.copytree(path, target, dirs_exist_ok=True)
+        else:
+            shutil.copy(path, target)
+
+
+def make_docs(folder: Path) -> subprocess.CompletedProcess:
+    """By the packages of this environment, which make is told not to set up again."""
+    command = ["make", f"VENV={sys.prefix}", f"--old-file={sys.prefix}/.ready", "docs"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("checkout")
+    gather(folder)
+    done = make_docs(folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder / "runs" / "site"
+
+
+def test_each_page_and_notebook_is_there(site):
+    sources = [p for pattern in ("*.md", "docs/*.md", *READMES, "notebooks/*.ipynb") for p in ROOT.glob(pattern)]
+    assert len(sources) > 15
+    for source in sources:
+        name = str(source.relative_to(ROOT).with_suffix(".html")).replace("README", "index")
+        assert (site / name).is_file(), name
+
+
+def test_nothing_is_fetched_from_elsewhere_and_no_machine_is_named(site):
+    for page in site.rglob("*.html"):
+        text = page.read_text()
+        assert not ELSEWHERE.findall(text), page.name
+        assert not re.search(r"/(?:home|root|tmp|Users|work|var|opt|mnt)/[^ ]*runs/", text), page.name
+
+
+def test_tables_are_tables_and_outputs_are_shown(site):
+    start = (site / "index.html").read_text()
+    assert start.count("<table>") >= 2 and "| --- |" not in start
+    assert "<img" in (site / "notebooks" / "04_compare.html").read_text()
+
+
+def test_dead_links_end_the_build(tmp_path):
+    gather(tmp_path)
+    for notebook in (tmp_path / "notebooks").glob("*.ipynb"):  # they take most of the time
+        notebook.write_text('{"cells": [], "metadata": {}, "nbformat": 4, "nbformat_minor": 5}')
+    page, dead = tmp_path / "CONTRIBUTING.md", ("docs/nothing.md", "docs/data.md#nothing", "results")
+    page.write_text(page.read_text() + "".join(f"\n[there]({target})\n" for target in dead))
+    done = make_docs(tmp_path)
+    assert done.returncode != 0 and not [target for target in dead if f"'{target}'" not in done.stderr], done.stderr

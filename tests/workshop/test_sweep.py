@@ -1,0 +1,154 @@
+"""A sweep: what its sheet asks for, and that each run is made once, whoever dies on the way."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import yaml
+from click.testing import CliRunner
+from sweep_work import Stub
+
+from rover_lib.cli import main
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.params import params
+from rover_lib.workshop import sweep as sweeping
+from rover_lib.workshop.sweep import Job, Sheet, SweepError
+
+
+@pytest.fixture
+def sheet(tmp_path):
+    """A function that writes a sheet of an empty checkpoint and recordings, with these values changed."""
+    (tmp_path / "best_model.pth").touch()
+    (tmp_path / "episodes").mkdir()
+    content = {
+        "checkpoints": [str(tmp_path / "best_model.pth")],
+        "episodes": str(tmp_path / "episodes"),
+        "notebooks": {"samples": [100, 200]},
+        "params": {"calibration.seed": [0, 1, 2], "quantization.scheme": ["symmetric", "affine"]},
+    }
+
+    def write(**changes):
+        path = tmp_path / "sheet.yml"
+        path.write_text(yaml.safe_dump({k: v for k, v in {**content, **changes}.items() if v != "left out"}))
+        return path
+
+    return write
+
+
+def test_every_combination_is_a_run(sheet):
+    jobs = Sheet.read(sheet(students=[{}, {"size": "320x180"}])).jobs()
+    assert len(jobs) == len({job.name for job in jobs}) == 2 * 2 * 3 * 2
+    assert {job.notebooks["samples"] for job in jobs} == {100, 200}
+    assert jobs[-1].student == {"size": "320x180"}
+    assert jobs[0].name.startswith("best_model-samples100-seed0-schemesymmetric-")
+
+
+def test_names_stay_while_the_sheet_grows(sheet):
+    few = {job.name for job in Sheet.read(sheet()).jobs()}
+    more = {job.name for job in Sheet.read(sheet(notebooks={"samples": [100, 200, 300]})).jobs()}
+    assert few < more
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"checkpoints": "left out"}, "no 'checkpoints' in it"),
+        ({"episodes": ["a", "b"]}, "episodes must be one folder"),
+        ({"checkpoint": "a.pth"}, "'checkpoint' is nothing that a sheet has"),
+        ({"notebooks": {"sample": 1}}, "no notebook has a parameter 'sample'"),
+        ({"notebooks": {"run_dir": "x"}}, "no notebook has a parameter 'run_dir'"),
+        ({"notebooks": [1]}, "notebooks must be a mapping"),
+        ({"notebooks": {"samples": []}}, "samples has no value"),
+        ({"params": {"seed": 1}}, "named by their place"),
+        ({"students": {"size": "1x1"}}, "students must be a list of mappings"),
+        ({"students": [{"layers": 1}]}, "no student has 'layers'"),
+    ],
+)
+def test_a_wrong_sheet_is_a_sentence(sheet, changes, said):
+    with pytest.raises(SweepError, match=said):
+        Sheet.read(sheet(**changes))
+
+
+def test_a_run_twice_is_refused(sheet):
+    with pytest.raises(SweepError, match="twice"):
+        Sheet.read(sheet(notebooks={"samples": [100, 100]})).jobs()
+
+
+def test_a_command_on_a_wrong_sheet_makes_nothing(sheet, tmp_path):
+    result = CliRunner().invoke(main, ["sweep", str(sheet(checkpoints="left out")), "--out", str(tmp_path / "out")])
+    assert (result.exit_code, (tmp_path / "out").exists()) == (1, False)
+    assert result.output.startswith("rover: ") and result.output.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_no_scheduler_is_a_sentence():
+    with pytest.raises(SweepError, match="no Dask scheduler answers"), sweeping.on_cluster("tcp://127.0.0.1:1"):
+        pass
+
+
+def test_a_run_has_its_own_values_of_params_yml(tmp_path):
+    before = params()["calibration"]
+    job = Job("a", "b", {}, {}, {"calibration.seed": 7, "quantization.smooth": 0.3})
+    with sweeping._settings_of(job, tmp_path):
+        inside = params()
+    assert inside["calibration"] == {**before, "seed": 7} and inside["quantization"]["smooth"] == 0.3
+    assert params()["calibration"] == before and not list(tmp_path.iterdir())
+
+
+def test_what_was_made_of_other_files_is_made_again(tmp_path, sheet):
+    job = Sheet.read(sheet()).jobs()[0]
+    stub = Stub(tmp_path / "log")
+    for part in ("prepare", "prepare"):
+        sweeping.do(part, stub, job, tmp_path)
+    assert stub.log.read_text().count("prepared") == 1
+    (tmp_path / "best_model.pth").write_text("another")
+    sweeping.do("prepare", stub, job, tmp_path)
+    assert stub.log.read_text().count("prepared") == 2
+    (tmp_path / job.name / "job.json").write_text("{")
+    assert sweeping.parts_done(job, tmp_path) == []
+
+
+def test_the_best_are_those_that_no_other_beats():
+    row = {"to_recorded_pct": 5.0, "latency_p50_ms": 10.0, "size_mb": 12.0}
+    assert not sweeping._beats(row, row)
+    assert sweeping._beats(row, {**row, "size_mb": 13.0})
+    assert not sweeping._beats({**row, "latency_p50_ms": 11.0}, {**row, "size_mb": 13.0})
+    assert not sweeping._beats(row, {**row, "to_recorded_pct": None})
+
+
+@pytest.mark.slow
+def test_twelve_runs_on_two_workers_of_which_one_dies(tmp_path, sheet):
+    """All twelve are there, none was made twice; the one that failed is named, and made once it can be."""
+    jobs, out = Sheet.read(sheet()).jobs(), tmp_path / "out"
+    stub = Stub(tmp_path / "log", dies=1, fails=2)
+    stub.log.touch()
+    with sweeping.on_this_machine(2) as client:
+        failed = sweeping.sweep(jobs, out, client, work=stub)
+        assert {name for name in failed} == {job.name for job in jobs if job.params["calibration.seed"] == 2}
+        assert set(failed.values()) == {"ValueError: seed 2"}
+        content = sweeping.write_report(jobs, out, failed)["metrics"]
+        assert (len(content["runs"]), len(content["failed"]), content["missing"]) == (8, 4, 0)
+        assert sweeping.sweep(jobs, out, client, together=True, work=replace(stub, fails=-1)) == {}
+    said = stub.log.read_text().splitlines()
+    assert sum(line.startswith("dies") for line in said) == 4
+    for word in ("prepared", "timed"):
+        assert sorted(line.split()[1] for line in said if line.startswith(word)) == sorted(job.name for job in jobs)
+    content = sweeping.write_report(jobs, out, {})["metrics"]
+    assert len(content["runs"]) == 12 and {r["error_pct"] for r in content["runs"]} == {0.2}
+    # of every seed the same figures: seed 0 has the least error, seed 2 the least time, and none beats another
+    assert all(row["best"] for row in content["runs"])
+    assert (out / "sweep.png").stat().st_size > 10_000
+    assert len(sweeping.table(content["runs"])) == 13
+    assert json.loads((out / "sweep.json").read_text())["stage"] == "sweep"
+
+
+@pytest.mark.slow
+def test_a_cluster_without_a_worker_that_times_is_refused():
+    from distributed import LocalCluster
+
+    with (
+        LocalCluster(1, processes=False, dashboard_address=None) as cluster,
+        pytest.raises(RoverError, match="no worker may time"),
+        sweeping.on_cluster(cluster.scheduler_address),
+    ):
+        pass
