@@ -106,7 +106,7 @@ def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...], kinds
     """Break what can break while the car drives, and see on the pins of an emulated Arduino whether it stops.
 
     About 6 minutes for all. With OUTPUT, the rows are left there as JSON. Exit code 1 if anything is not as expected.
-    Needs Debian's packages for the Arduino's firmware and simavr, see README.
+    Needs Debian's packages for the Arduino's firmware and simavr, see docs/first_hour.md.
     """
     from lab.driving.faults import run_faults
 

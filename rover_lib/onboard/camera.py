@@ -83,13 +83,17 @@ class Camera:
         rate_hz: float = 30.0,
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
+        held: bool = False,
     ):
+        """held: a folder or a file of pictures is shown again and again until begin(), and once from there on."""
         self.source = str(source)
         self.size, self.wanted_hz = size, rate_hz
         self._stamps = _Stamps(clock, wall_clock)
         self._shown = np.zeros((REMEMBERED, 0), np.uint64)  # the newest pictures' blocks, as block_sums()
         self._refusal: PictureError | None = None
-        self._closing = threading.Event()
+        self._closing, self._begun = threading.Event(), threading.Event()
+        if not held:
+            self._begun.set()
         self._changed = threading.Condition()  # guards the four below
         self._frame: Frame | None = None
         self._failure: CameraError | None = None
@@ -104,7 +108,7 @@ class Camera:
 
     def open(self) -> "Camera":
         """Starts reading. Raises CameraError if there is no such source, or no frame within 5 s."""
-        reader = _reader(self.source, self.size, self.wanted_hz, self._closing)
+        reader = _reader(self.source, self.size, self.wanted_hz, self._closing, self._begun)
         self._thread = threading.Thread(target=self._read, args=(reader,), name=f"camera {self.source}", daemon=True)
         self._thread.start()
         try:
@@ -120,6 +124,10 @@ class Camera:
             self.close()
             raise
         return self
+
+    def begin(self) -> None:
+        """Shows held pictures from the first on. Nothing to a camera, which shows what is there."""
+        self._begun.set()
 
     def close(self) -> None:
         """Ends reading. A camera that hangs inside its driver is left behind."""
@@ -281,7 +289,9 @@ def path_of(source: str, dev: Path = Path("/dev")) -> Path:
     return dev / f"video{source}" if source.isdigit() else Path(source)
 
 
-def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:
+def _reader(
+    source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event, begun: threading.Event
+) -> Reader:
     path = path_of(source)
     source = str(path)
     try:
@@ -295,9 +305,9 @@ def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threadi
     if stat.S_ISFIFO(mode):
         return _fifo(path, closing)
     if stat.S_ISDIR(mode):
-        return _folder(path, rate_hz, closing)
+        return _paced(_folder(path), rate_hz, closing, begun)
     if path.suffix == ".mjpeg":
-        return _paced(_split(_contents(path)), rate_hz, closing)
+        return _paced(lambda: _split(_contents(path)), rate_hz, closing, begun)
     raise CameraError(
         f"{source}: neither a camera nor a folder, a FIFO or an .mjpeg file of JPEGs",
         remedy=f"ffmpeg -i {path.name} -q:v 3 {path.stem}.mjpeg makes one of a video",
@@ -327,14 +337,14 @@ def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
         device.release()
 
 
-def _folder(path: Path, rate_hz: float, closing: threading.Event) -> Reader:
+def _folder(path: Path) -> Callable[[], Iterator[bytes]]:
     folder = path / "frames" if (path / "frames").is_dir() else path
     files = sorted(f for f in folder.iterdir() if f.suffix.lower() in PICTURES and f.is_file())
     if not files:
         raise CameraError(
             f"{folder}: no pictures in it ({', '.join(PICTURES)})", remedy="give /dev/videoN or another folder"
         )
-    return _paced((next(_contents(f, MOST_BYTES + 1), b"") for f in files), rate_hz, closing)
+    return lambda: (next(_contents(f, MOST_BYTES + 1), b"") for f in files)
 
 
 def _contents(path: Path, piece: int = 1 << 20) -> Iterator[bytes]:
@@ -344,13 +354,21 @@ def _contents(path: Path, piece: int = 1 << 20) -> Iterator[bytes]:
             yield data
 
 
-def _paced(jpegs: Iterable[bytes], rate_hz: float, closing: threading.Event) -> Reader:
-    """Pictures that are all there, at a camera's rate."""
-    start = time.monotonic()
-    for i, jpeg in enumerate(jpegs):
-        if closing.wait(max(0.0, start + i / rate_hz - time.monotonic())):
-            return
-        yield jpeg, None
+def _paced(
+    pictures: Callable[[], Iterable[bytes]], rate_hz: float, closing: threading.Event, begun: threading.Event
+) -> Reader:
+    """Pictures that are all there, at a camera's rate: again and again until `begun`, and then once."""
+    last = False
+    while not last:
+        last, start, count = begun.is_set(), time.monotonic(), 0
+        for jpeg in pictures():
+            if closing.wait(max(0.0, start + count / rate_hz - time.monotonic())):
+                return
+            count += 1
+            if begun.is_set() and not last:
+                break
+            yield jpeg, None
+        last |= not count  # an empty file
 
 
 def _fifo(path: Path, closing: threading.Event) -> Reader:

@@ -165,7 +165,7 @@ def drive_car(
             return
         if not artifact:
             raise ParamsError("a drive needs an artifact or a replay")
-        camera = stack.enter_context(Camera(options.camera))
+        camera = stack.enter_context(Camera(options.camera, held=options.film))
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:
             log.event(f"the policy's process is not confined: {policy.unconfined}", level=logging.WARNING)
@@ -206,7 +206,8 @@ def drive_car(
                 else:
                     arm = attempt.arm
                 show = partial(feed.tick, report, camera, pilot)
-                hooks = Hooks(arm, warnings, attempt.record if options.record else None, show)
+                record = attempt.record if options.record else None
+                hooks = Hooks(_then(arm, camera.begin), warnings, record, show)
                 try:
                     run_loop(pilot, hooks=hooks)
                 except (DriveFault, TakenOver):
@@ -231,6 +232,17 @@ def another_car(manifest: dict[str, Any], this: CarFile) -> str:
         f"this policy was calibrated for {meant.name!r}, and this car is {this.name!r}: it has not seen what this one "
         "does; see that the way is free"
     )
+
+
+def _then(arm: Arm, begin: Callable[[], object]) -> Arm:
+    """Arms, and then begins: a film starts when the loop does, not while somebody looks for the transmitter."""
+
+    def armed() -> Telemetry | None:
+        telemetry = arm()
+        begin()
+        return telemetry
+
+    return armed
 
 
 def what_is_missing(link: ServoLink) -> str:

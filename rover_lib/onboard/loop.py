@@ -32,7 +32,8 @@ SPARE_S = 0.004  # before a deadline nothing is sent again
 READ_S = 0.005  # for the thread that reads the port, after a pause of the whole process
 # A single pause of 150 ms is the Arduino's affair, which stops the car then, and so is a second one soon after one of
 # 100 ms. Shorter ones it lets pass. Together they may take no more time out of half a second than one: a machine that
-# is busy but healthy misses a tick now and then (4 of 55,801 beside builds, README), never several again and again.
+# is busy but healthy misses a tick now and then (4 of 55,801 beside builds, docs/driving.md), never several again and
+# again.
 LATE_MOST_S = 0.15
 LATE_WITHIN_S = 0.5
 

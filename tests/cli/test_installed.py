@@ -197,7 +197,7 @@ def test_a_reader_who_has_seen_enough_changes_no_exit_code(rover, command, code)
 
 
 def test_the_way_by_hand(tmp_path, artifacts):
-    """docs/install.md's lines, as they stand there: but for what needs root, another machine, or minutes of pip."""
+    """docs/install.md's lines as they stand there, but for what needs root, a car, another machine or minutes."""
     page = (ROOT / "docs" / "install.md").read_text()
     blocks = re.findall(r"<!-- by hand: \w+ -->\n(.*?)<!-- end -->", page, re.S)
     lines = [line.strip() for block in blocks for line in block.splitlines() if line.strip()]
@@ -208,7 +208,7 @@ def test_the_way_by_hand(tmp_path, artifacts):
     (tmp_path / "policy_static.pt").symlink_to(artifacts["static"])
     outputs = {}
     for line in lines:
-        if line.startswith("sudo "):
+        if line.startswith("sudo ") or " drive " in line:  # there may be an Arduino on this machine
             continue
         if line.startswith("scp "):
             for path in (tmp_path / "wheels").glob("rover_policy-*.whl"):
@@ -220,8 +220,8 @@ def test_the_way_by_hand(tmp_path, artifacts):
             own = {"PYTHONPATH": str(ROOT)} if "wheelhouse" in line else {}
             done = subprocess.run(line, shell=True, cwd=tmp_path, env=env | own, capture_output=True, text=True)
             outputs[line] = done
-    *made, version, doctor, drive = outputs.values()
+    *made, version, doctor = outputs.values()
     assert not [done.stderr for done in made if done.returncode]
     assert version.stdout.startswith("rover ") and version.returncode == 0
-    assert re.search(r"^ok +artifact ", doctor.stdout, re.M) and doctor.returncode == 1, doctor.stdout  # no camera
-    assert drive.returncode == 1 and drive.stderr.startswith("rover: /dev/video0"), drive.stderr
+    assert re.search(r"^ok +artifact ", doctor.stdout, re.M), doctor.stdout
+    assert re.fullmatch(r"rover/bin/rover drive policy_static\.pt .*", lines[-1])

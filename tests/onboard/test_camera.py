@@ -142,6 +142,16 @@ def test_a_folder_and_its_end(tmp_path):
     assert numbers == sorted(set(numbers))
 
 
+def test_a_film_begins_when_it_is_told_to():
+    """Until then its pictures come again and again, so that arming may take its time; then once, from the first on."""
+    begun, pictures = threading.Event(), [b"a", b"b", b"c"]
+    reader = c._paced(lambda: iter(pictures), 1000, threading.Event(), begun)
+    assert [next(reader)[0] for _ in range(7)] == [b"a", b"b", b"c", b"a", b"b", b"c", b"a"]
+    begun.set()
+    assert [picture for picture, _ in reader] == pictures
+    assert list(c._paced(lambda: iter(()), 1000, threading.Event(), threading.Event())) == []
+
+
 def test_an_empty_folder(tmp_path):
     with pytest.raises(CameraError, match="no pictures"):
         Camera(tmp_path).open()
