@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
+from rover_lib.onboard.car import WIDTH_PX, Car, this_car
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.params import params
 
@@ -17,7 +18,9 @@ NEAR_M = 0.15  # before the camera; what is nearer is not on the picture
 
 @dataclass(frozen=True)
 class CarShape:
-    """The section `view` of params.yml. Lengths in metres; what is of the picture, as a share of it.
+    """A car's wheelbase and camera, by its car.yml, and the section `view` of params.yml.
+
+    Lengths in metres; what is of the picture, as a share of it.
 
     wheel_angle_rad: of the front wheels at full steering. speed_mps: at throttle 1. focal: of the picture's width.
     horizon: its row, of the picture's height from the top.
@@ -38,13 +41,15 @@ class CarShape:
                 raise ParamsError(f"view: {name} must be a number above 0", found=repr(value), remedy="see params.yml")
 
     @classmethod
-    def of_params(cls) -> "CarShape":
-        """Raises ParamsError for what makes no car."""
+    def of(cls, car: Car | None = None) -> "CarShape":
+        """Of this car, or another. Raises ParamsError for what makes none, CarError as this_car()."""
+        car = car or this_car()
         section: dict[str, Any] = params()["view"]
-        if (names := {f.name for f in fields(cls)}) != set(section):
+        measured = {"wheelbase_m": car.wheelbase_m, "focal": car.focal_px / WIDTH_PX}
+        if (names := {f.name for f in fields(cls)} - measured.keys()) != set(section):
             odd = sorted(names ^ set(section))
             raise ParamsError(f"view: {odd} must be there once", found=sorted(section), remedy="see params.yml")
-        return cls(**section)
+        return cls(**section, **measured)
 
     def track(self, actions: Iterable[Sequence[float]], step_s: float) -> list[tuple[float, float, float]]:
         """(ahead, left, heading) in metres and radians from here on, a point before each action and one at the end.

@@ -35,9 +35,10 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from rover_lib.onboard.ahead import CarShape, from_now
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.host import throttled_means
-from rover_lib.onboard.pwm import STOPPED_THROTTLE_US, PwmCalibration
+from rover_lib.onboard.pwm import ARDUINO_STEP_US
 
 PORT = 8470
 MESSAGE_BYTES = 1 << 20  # more than a drive's socket takes
@@ -131,8 +132,8 @@ class View:
             except KeyError:
                 raise ViewError(f"no user {drive_user!r} is known here", remedy="provision the rover") from None
         self._open_to_all = drive_user is not None  # the socket; who comes is looked at
-        self._shape = CarShape.of_params()
-        self._pwm = PwmCalibration()
+        car = this_car()
+        self._shape, self._pwm = CarShape.of(car), car.pwm
         self._drives: list[socket.socket] = []  # the newest last, which is the one that is shown
         self._number = 0
         self._head: dict[str, Any] = {"phase": "no drive", "text": "no drive has come yet", "replay": replay}
@@ -196,7 +197,7 @@ class View:
             "replay": self._replay,
             "pins": pins,
             "pins_actions": self._actions(pins),
-            "stopped": pins is not None and pins[1] <= STOPPED_THROTTLE_US,
+            "stopped": pins is not None and abs(pins[1] - self._pwm.throttle.neutral_us) <= ARDUINO_STEP_US,
             "throttled": ", ".join(means) if means else "",
         }
         self._head, self._picture = head, picture

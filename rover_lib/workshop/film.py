@@ -15,8 +15,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from rover_lib.onboard.ahead import CarShape, from_now
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.replay import AHEAD, Moment
@@ -62,7 +62,7 @@ def write_film(
 def _pictures(moments: Sequence[Moment], rate_hz: float, width: int, progress: Progress) -> Iterator[np.ndarray]:
     """One for each time of the film, (h, w, 3) uint8 RGB with even sides, all of one size."""
     times_s = np.array([m.t_s for m in moments])
-    shape = CarShape.of_params()
+    shape = CarShape.of()
     size: tuple[int, int] | None = None
     for at_s in progress(np.arange(0.0, times_s[-1] + 1e-9, 1 / rate_hz), "drawing"):
         moment = moments[int(np.searchsorted(times_s, at_s + 1e-9, side="right")) - 1]
@@ -135,7 +135,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 
 def _draw_panel(draw: ImageDraw.ImageDraw, head: dict[str, Any], top: int) -> None:
-    tick, pins, calibration = head["tick"], head.get("pins") or [None, None], PwmCalibration()
+    tick, pins, calibration = head["tick"], head.get("pins") or [None, None], this_car().pwm
     for row, (name, us) in enumerate(zip(("steering", "throttle"), pins, strict=True)):
         y = top + 10 + 30 * row
         pin = None if us is None else calibration.channel(name).action(us)

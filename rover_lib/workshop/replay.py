@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.kinds import kinds_of
 from rover_lib.onboard.picture import PictureError, read_jpeg
-from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.servo_link import REASONS
 from rover_lib.onboard.telemetry import Flight, LogError, Tick, read_log
 from rover_lib.workshop.episodes import load_recordings
@@ -132,10 +132,10 @@ def _of_flight(flight: Flight, episode: Path) -> list[Moment]:
 
 def _of_recording(folder: Path) -> list[Moment]:
     episode = load_recordings(folder).episodes[0]
-    calibration, found = PwmCalibration(), []
+    car, found = this_car(), []
     for number, sample in enumerate(episode.samples, 1):
         steering, throttle = (float(v) for v in sample.chunk[0])
-        pulses = calibration.pulses(float(np.clip(steering, -1, 1)), float(np.clip(throttle, 0, 1)))
+        pulses = car.pwm.pulses(*(float(v) for v in np.clip([steering, throttle], *car.limits)))
         tick = dict.fromkeys(Tick._fields) | {"t_s": sample.time_s, "steering": steering, "throttle": throttle}
         tick |= {"frame": number, "plan": 0, "fade": 1.0}
         ahead = sample.chunk[~sample.is_pad].tolist()

@@ -1,15 +1,16 @@
 """Where a plan leads: against the balloon world's physics and camera, whose car the default is."""
 
+import math
 from dataclasses import replace
 
 import pytest
 
 from rover_lib.onboard.ahead import CarShape, from_now
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import ParamsError
-from rover_lib.onboard.params import params
 from rover_lib.world import world as w
 
-SHAPE = CarShape.of_params()
+SHAPE = CarShape.of()
 STEP_S = 1 / w.RATE_HZ
 ASPECT = w.FRAME_WIDTH / w.FRAME_HEIGHT
 
@@ -49,7 +50,15 @@ def test_from_now_leaves_out_what_is_over():
     assert from_now(plan, 9.9)[0] == [0, 0] and from_now(plan, 12.0) == []
 
 
+def test_another_car_is_drawn_as_it_is():
+    car = Car(field_of_view_deg=120.0, wheelbase_m=0.5)
+    shape = CarShape.of(car)
+    turn = [s.track([(0.3, 0.05)] * 30, STEP_S)[-1][2] for s in (SHAPE, shape)]
+    assert turn[0] / turn[1] == pytest.approx(0.5 / 0.26)
+    assert shape.focal == pytest.approx(0.5 / math.tan(math.radians(60)), abs=1e-4)
+
+
 @pytest.mark.parametrize("change", [{"focal": 0}, {"width_m": "wide"}, {"horizon": float("nan")}, {"speed_mps": True}])
-def test_what_is_no_car(change, monkeypatch):
+def test_what_is_no_car(change):
     with pytest.raises(ParamsError, match=f"view: {next(iter(change))} must be a number above 0"):
-        CarShape(**{**params()["view"], **change})
+        CarShape(**{**vars(SHAPE), **change})

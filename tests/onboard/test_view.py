@@ -316,6 +316,26 @@ def test_a_drive_that_talks_nonsense_ends_nothing_but_its_own_line(tmp_path, sai
     asyncio.run(scene())
 
 
+def test_stopped_is_the_neutral_of_this_car(tmp_path, monkeypatch):
+    """A speed controller with reverse stands at 1500 us, and 120 is no pulse of it."""
+    (tmp_path / "car.yml").write_text("""
+steering: {period_us: 20000, left_us: 2000, neutral_us: 1500, right_us: 1000}
+throttle: {period_us: 20000, neutral_us: 1500, forward_us: 2000, reverse_us: 1000}
+""")
+    monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
+
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            page, drive = await bench.page(), bench.drive()
+            for throttle_us, stands in ((1560, False), (1500, True), (1440, False), (1503, True)):
+                drive.send(HEAD | {"pins": [1500, throttle_us]})
+                while (head := (await message(page))[0]).get("pins") != [1500, throttle_us]:
+                    pass
+                assert head["stopped"] is stands
+
+    asyncio.run(scene())
+
+
 def test_a_stop_goes_to_every_drive_and_the_newest_is_shown(tmp_path):
     async def scene():
         async with Bench(tmp_path) as bench:

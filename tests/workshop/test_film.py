@@ -83,7 +83,7 @@ def test_the_ribbon_and_the_bars_are_of_the_moment():
     head = {"tick": {"steering": 0.5, "throttle": 0.1, "plan_age_ms": 150, "latency_ms": 90, "late_ms": 0.4},
             "pins": [1456, 120], "who": "A", "missed": 0,
             "events": [[1.0, "armed"]], "sent_s": 0.0, "plan": plan}  # fmt: skip
-    shape = CarShape.of_params()
+    shape = CarShape.of()
     picture = f.drawn(head, frame, shape)
     assert picture.shape == (360 + f.PANEL, 640, 3)
     way = np.argwhere(picture[:360, :, 1].astype(int) > picture[:360, :, 0] + 15)
@@ -109,7 +109,7 @@ def test_a_film_has_the_drives_pace_and_pictures(tmp_path):
         images = [image.to_ndarray(format="rgb24") for image in container.decode(video=0)]
     assert len(images) == 39 and images[0].shape == (240, 320, 3)
     means = [image[5:60].mean() for image in images]  # above the horizon: each picture is lighter than the one before
-    assert abs(means[0] - 30) < 4 and abs(means[-1] - 125) < 4 and np.all(np.diff(means) > -1)
+    assert abs(means[0] - 30) < 4 and 115 < means[-1] < 129 and np.all(np.diff(means) > -1)
     done = CliRunner().invoke(main, ["log", str(log), "--video", str(tmp_path / "out.webp"), "--video-hz", "5"])
     assert done.exit_code == 0, done.output
     with Image.open(tmp_path / "out.webp") as film:
