@@ -23,7 +23,13 @@ SECTIONS = {
         prepare.export_dataset,
     ),
     "Drive": (ROVERS["doctor"], ROVERS["record"], drive.drive, drive.view, drive.log),
-    "Set up a rover, and arm it": (prepare.wheelhouse, ROVERS["release"], ROVERS["arm-car"], ROVERS["heartbeat"]),
+    "Set up a rover, and arm it": (
+        ROVERS["calibrate"],
+        prepare.wheelhouse,
+        ROVERS["release"],
+        ROVERS["arm-car"],
+        ROVERS["heartbeat"],
+    ),
     "Try it without a car": (world.world,),
 }
 
