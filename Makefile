@@ -84,9 +84,9 @@ check-release: lint demo
 coverage: demo
 	$(VENV)/bin/pytest --cov=rover_lib --cov=lab --cov-report=term
 
-# NAME=full needs no checkpoint: it makes one. quantize.json is the last that a run of it leaves.
+# NAME=full needs no checkpoint: it makes one. policy_static.onnx.zip is the last that is made of it.
 arm: $(READY)
-	@test '$(NAME)' != full -o -f runs/full/quantize.json || $(LAB) full runs/full $(if $(LEARNED),--learned)
+	@test '$(NAME)' != full -o -f runs/full/policy_static.onnx.zip || $(LAB) full runs/full $(if $(LEARNED),--learned)
 	$(LAB) arm 'runs/$(NAME)' $(if $(PEERS),--peers)
 
 faults: $(READY)

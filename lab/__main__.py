@@ -186,10 +186,15 @@ def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
 @pi.command("fast")
 @click.argument("output", type=FILE, default="runs/pi-fast.json")
 @click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifacts are deployed.")
+@click.option("--engine", type=click.Choice(["torch", "onnxruntime"]), default="torch", help="Of the Pi.")
 @click.option("--short", is_flag=True, help="Only provision, deploy, meet one fault of a deployment, and drive.")
-@click.option("--faults/--no-faults", default=True, help="Leave out a deployment's faults and the fleet.")
+@click.option(
+    "--faults/--no-faults",
+    default=True,
+    help="Leave out a deployment's faults and the fleet, which are met with torch only.",
+)
 @click.pass_context
-def pi_fast(ctx: click.Context, output: Path, demo: Path, short: bool, faults: bool) -> None:
+def pi_fast(ctx: click.Context, output: Path, demo: Path, **options: Any) -> None:
     """Run every playbook on an emulated Pi in a container, and prove from within what they promise.
 
     Real systemd and sshd, aarch64 programs, the real firmware on an emulated Arduino. OUTPUT is JSON, what the
@@ -197,7 +202,7 @@ def pi_fast(ctx: click.Context, output: Path, demo: Path, short: bool, faults: b
     """
     from lab.pi.container_run import run_container
 
-    outcome = run_container(output, demo, short=short, faults=faults, say=click.echo)
+    outcome = run_container(output, demo, **options, say=click.echo)
     for gate in outcome.metrics.get("gates", []):
         click.echo(f"{'ok  ' if gate['holds'] else 'FAIL'}  {gate['gate']}: {gate['wanted']}")
     _end_pi(ctx, outcome.wrong, output)

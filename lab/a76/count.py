@@ -17,6 +17,7 @@ from rover_lib.onboard import engines
 from rover_lib.onboard.artifact import read_manifest
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.progress import Progress
+from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
 COUNTED = 10  # inferences after loading, each for itself
 STEADY = 3  # the first whose count is what all later ones cost
@@ -32,17 +33,16 @@ class Guest:
 
 
 OURS = Guest()
-ONNXRUNTIME = "onnxruntime==1.31.1"  # of requirements_pi_onnxruntime.txt
 
 
 def onnxruntime_there() -> Path:
-    """The folder of ONNX Runtime's package for the emulated Pi, from the cache or fetched now; numpy is there."""
-    made = {"packages": (ONNXRUNTIME,), "for": FOR_GUEST}
+    """The folder of what a Pi without torch installs, for the emulated one: from the cache or fetched now."""
+    wheels = REQUIREMENTS["onnxruntime"]
 
     def make(folder: Path) -> None:
-        fetch_wheels(folder, *FOR_GUEST, ONNXRUNTIME)
+        fetch_wheels(folder, "--require-hashes", *FOR_GUEST, "--requirement", wheels)
 
-    return cached_folder("arm-peer-onnxruntime", key_of(made), make)
+    return cached_folder("arm-onnxruntime", key_of({"for": FOR_GUEST}, wheels), make)
 
 
 def guest_of(artifact: Path) -> Guest:

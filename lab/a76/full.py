@@ -8,19 +8,28 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.artifact import ONNX_SUFFIX
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.observe import calibrate
-from rover_lib.workshop.pipeline import Recipe, export_policies, write_calibrate, write_load, write_quantize
+from rover_lib.workshop.pipeline import (
+    Recipe,
+    export_onnx,
+    export_policies,
+    write_calibrate,
+    write_load,
+    write_quantize,
+)
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.quantize import quantize
 from rover_lib.workshop.session import Opened, load
 from rover_lib.world.record import record_episodes
 from rover_lib.world.train import train
 
+LAST = f"policy_static{ONNX_SUFFIX}"  # that is made; the Makefile looks for it
 NOTE = "trained for a few steps only, so that activations have real ranges: this policy does not drive"
 LEARNED_NOTE = "trained whole on the balloon world's drives: this policy has learned to drive there"
 STEPS = 24
@@ -52,7 +61,8 @@ def full_run(
     tqdm.tqdm(iterable, desc=, total=).
 
     Leaves what the notebooks leave, as far as counting needs it: episodes, best_model.pth, load.json,
-    calibrate.json, calibration.pt, policy_fp32.pt, policy_static.pt and, when all is there, quantize.json; for each of
+    calibrate.json, calibration.pt, policy_fp32.pt, policy_static.pt, quantize.json and, last, these two policies for
+    ONNX Runtime as policy_fp32.onnx.zip and policy_static.onnx.zip; for each of
     `sizes` calibration_<height>x<width>.pt, policy_fp32_<height>x<width>.pt and policy_static_<height>x<width>.pt; for
     each of `curve` only the last. load.json says whether this policy drives. Recordings and checkpoint come from
     the cache if they were made before. Raises WorldError if run_dir holds another kind of run, and what the steps
@@ -64,7 +74,8 @@ def full_run(
         raise WorldError(
             f"{run_dir}: holds a run on another checkpoint", remedy="name another folder, or move it away first"
         )
-    (run_dir / "quantize.json").unlink(missing_ok=True)
+    for name in ("quantize.json", LAST):
+        (run_dir / name).unlink(missing_ok=True)
     drives = drives or (DRIVES if steps else LEARNED_DRIVES)
     episodes = record_episodes(run_dir / "episodes", drives, progress=progress)
     checkpoint = train(episodes, run_dir / "best_model.pth", size, steps=steps, progress=progress)
@@ -79,6 +90,7 @@ def full_run(
         modes |= _quantized(run_dir, loaded, at, recipe, progress=progress)
     modes |= _quantized(run_dir, loaded, None, recipe, progress=progress)
     write_quantize(run_dir, loaded.checkpoint, {"modes": modes})
+    export_onnx(run_dir, progress)
     return run_dir
 
 

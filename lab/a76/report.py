@@ -9,7 +9,7 @@ from rover_lib.workshop.compare import gate
 from rover_lib.workshop.judge import worst
 
 LABEL = "counted on an emulated Cortex-A76"
-STATIC = "policy_static"
+STATIC, STATIC_ONNX = "policy_static", "policy_static.onnx"
 SDOT_MACS = 16  # multiply-accumulates of one SDOT: the floor is as if nothing else ran
 
 PI5_CORES, PI5_GHZ, SIMD_PER_CYCLE = 4, 2.4, 2
@@ -97,37 +97,41 @@ def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any
     lab/params.yml.
 
     A gate that this run has no artifact for is left out: the instructions are for the user's policy, known by its
-    multiply-accumulates. Errors are divided by this machine's, and the worse of the actions is judged.
+    multiply-accumulates. Errors are divided by this machine's, ONNX Runtime's by torch's too, and the worse of the
+    actions is judged.
     """
     rows = []
     for stem, artifact in metrics["artifacts"].items():
-        known = limits["policies"].get(stem, {})
-        if known and abs(artifact["gmac"] / known["gmac"] - 1) < SAME_POLICY:
-            rows += [gate(f"{stem} {key}", artifact[key], "<=", known[key]) for key in known if key != "gmac"]
-        if not re.fullmatch(rf"{STATIC}(_\d+x\d+)?", stem) or artifact.get("reference") is None:
+        own = dict(limits["policies"].get(stem, {}))
+        if not own or abs(artifact["gmac"] / own.pop("gmac") - 1) >= SAME_POLICY:
+            own = {}
+        rows += [gate(f"{stem} {key}", artifact[key], "<=", limit) for key, limit in own.items()]
+        if not re.fullmatch(rf"{STATIC}(_\d+x\d+)?(\.onnx)?", stem) or artifact.get("reference") is None:
             continue
-        times = []
-        for key, here in artifact.items():
-            if key.startswith("workstation_") and here is not None:
-                times.append(artifact[key.removeprefix("workstation_")] / here if here else float("inf"))
+        here = {k.removeprefix("workstation_"): v for k, v in artifact.items() if k.startswith("workstation_")}
         off_pct = 100 * abs(artifact["tenth_g"] / artifact["instructions_g"] - 1)
         rows += [
-            gate(f"{stem} error, x workstation's", worst(times), "<=", limits["x_workstation_error"]),
+            gate(f"{stem} error, x workstation's", _times(artifact, here), "<=", limits["x_workstation_error"]),
             gate(f"{stem} frames judged on the core", artifact["frames_on_the_core"], ">=", limits["frames"]),
             gate(f"{stem} tenth off the third, %", off_pct, "<=", limits["tenth_pct"]),
-            gate(f"{stem} peak_memory_mb", artifact["peak_memory_mb"], "<=", limits["peak_memory_mb"]),
-            gate(
-                f"{stem} peak_memory_loading_mb",
-                artifact["peak_memory_loading_mb"],
-                "<=",
-                limits["peak_memory_loading_mb"],
-            ),
         ]
+        for key in ("peak_memory_mb", "peak_memory_loading_mb"):
+            if key not in own:
+                rows.append(gate(f"{stem} {key}", artifact[key], "<=", limits[key]))
+        if stem == STATIC_ONNX and (torchs := metrics["artifacts"].get(STATIC)):
+            errors = {key: torchs[key] for key in here}
+            rows.append(gate(f"{stem} error, x torch's", _times(artifact, errors), "<=", limits["x_torch_error"]))
     if bits := metrics.get("backbone_bits"):
         rows.append(
             gate(f"{STATIC} backbone values that differ", bits["differing"], "<=", limits["backbone_differing"])
         )
     return rows
+
+
+def _times(artifact: dict[str, Any], errors: dict[str, float | None]) -> float | None:
+    """The artifact's errors as multiples of these, the worst of them; None if no action is judged."""
+    judged = [(artifact[key], error) for key, error in errors.items() if error is not None]
+    return worst(mine / error if error else float("inf") for mine, error in judged)
 
 
 def group_kernels(counts: dict[str, Any]) -> dict[str, float]:

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rover_lib.onboard.artifact import SCHEMA, save_artifact
-from rover_lib.onboard.engines import TORCH
+from rover_lib.onboard.artifact import SCHEMA, save_artifact, save_onnx
+from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
 
 SIZE = (160, 320)  # height and width of the camera's pictures
 CHUNK, RATE_HZ = 32, 30.0
@@ -25,23 +25,26 @@ def make_artifact(
 ) -> None:
     """An artifact with the constant plan PLAN.
 
-    camera, size: its name, and height and width of what the policy looks at. engine: in the manifest; torch if None.
+    camera, size: its name, and height and width of what the policy looks at. engine: in the manifest, torch if None;
+    ONNX Runtime's makes it one for that.
     """
     import torch
 
     class Constant(torch.nn.Module):
         plan: torch.Tensor
+        nothing: torch.Tensor
 
         def __init__(self):
             super().__init__()
             self.register_buffer("plan", torch.tensor([PLAN] * CHUNK)[None])
+            self.register_buffer("nothing", torch.zeros(1))
 
         def forward(self, state, frame):
-            return self.plan + 0 * state[:, None]
+            return self.plan + self.nothing * state[:, None]
 
     height, width = size
-    inputs = torch.zeros(1, 2), torch.zeros((height, width, 3), dtype=torch.uint8)
-    module = torch.jit.freeze(torch.jit.trace(Constant().eval(), inputs))
+    module = Constant().eval()
+    inputs = {"state": torch.zeros(1, 2), f"frame_{camera}": torch.zeros((height, width, 3), dtype=torch.uint8)}
     names = ["steering", "throttle"]
     manifest = {
         "schema": SCHEMA,
@@ -67,7 +70,12 @@ def make_artifact(
         f"frame_{camera}": frames,
         "chunk": np.full((1, CHUNK, 2), PLAN, np.float32),
     }
-    save_artifact(path, module, manifest, parity)
+    if engine == ONNXRUNTIME:
+        from rover_lib.workshop.onnx_graph import graph_of, onnx_model
+
+        save_onnx(path, onnx_model(graph_of(module), inputs, ("chunk",)).SerializeToString(), manifest, parity)
+    else:
+        save_artifact(path, torch.jit.freeze(torch.jit.trace(module, tuple(inputs.values()))), manifest, parity)
 
 
 def obey_pictures() -> None:

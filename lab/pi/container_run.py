@@ -19,7 +19,8 @@ runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
     second_run     Ansible's own recap of provisioning a second time, as lines
     driving_after_s  from switching on until a human could arm the car; plays_s: of all playbooks before the proofs
     system_cached  whether the Pi's file system was in the cache
-    environment    {packages: [{name, version, from}], unhashed, lerobot, size_mb}
+    engine         what computes the policy there
+    environment    {packages: [{name, version, from}], unhashed, lerobot, missing, others, size_mb}
     sandbox        {exposure, writable, probes: [{probe, inside, outside}]}; inside: "" is "it worked"
     service        {hang: {...}, start_limit: {...}, boot: {...}}, in seconds, see the functions of those names
     drive          {ticks, driven, ended} of the fetched flight log; recorded: {episodes, left, frames, commands}
@@ -53,6 +54,8 @@ from lab.pi.playbooks import Play
 from lab.pi.pulses import Pins, moving
 from lab.pi.report import PiReport
 from lab.pi.service_proofs import READY_S, STATE, VENV, environment, hang, sandbox, show, start_limit
+from rover_lib.onboard.artifact import ONNX_SUFFIX
+from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.recording import read_controls
 from rover_lib.onboard.service import UNIT
@@ -63,7 +66,11 @@ from rover_lib.world.standin import REST_US
 
 STAGE = "pi-fast"
 ROVER = "rover1"
-ARTIFACTS = ("policy_static.pt", "policy_mixed.pt")
+ARTIFACTS = {  # by engine: what is deployed first, and after it
+    "torch": ("policy_static.pt", "policy_mixed.pt"),
+    "onnxruntime": (f"policy_static{ONNX_SUFFIX}", f"policy_fp32{ONNX_SUFFIX}"),
+}
+MAKES = {"torch": "make demo leaves them", "onnxruntime": "rover export RUN --onnx leaves them"}
 HZ = 10  # of the service: what the emulator manages on a busy machine; a Pi has 30
 NICE = -5  # of the emulated Pi, which has a processor of its own
 ONE_FAULT = "a byte flipped in what has arrived"  # of those in deployment_faults.py the one that CI meets
@@ -73,20 +80,22 @@ def run_container(
     output: Path | str,
     demo: Path | str,
     *,
+    engine: str = "torch",
     short: bool = False,
     faults: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> PiReport:
     """All of it; the report is written to `output` whatever fails.
 
-    demo: a run's folder with ARTIFACTS. short: provision, deploy, one fault of a deployment and an armed drive, which
-    is what CI has time for. faults: of deployments, and the fleet, too. say: told a line for each step.
+    demo: a run's folder with ARTIFACTS. engine: what computes the policy on the Pi, as rover_engine. short: provision,
+    deploy, one fault of a deployment and an armed drive, which is what CI has time for. faults: of deployments, and the
+    fleet, too, which are met with torch's artifacts only. say: told a line for each step.
     Raises RoverError where it cannot begin: no root, packages that cannot be installed, no artifacts.
     """
     output, demo = Path(output), Path(demo)
-    artifacts = [demo / name for name in ARTIFACTS]
+    artifacts = [demo / name for name in ARTIFACTS[engine]]
     if gone := [a.name for a in artifacts if not a.is_file()]:
-        raise EmulationError(f"{demo}: no {' and no '.join(gone)} to deploy", remedy="make demo leaves them")
+        raise EmulationError(f"{demo}: no {' and no '.join(gone)} to deploy", remedy=MAKES[engine])
     require()
     require_arduino()
     report = PiReport(STAGE, output, say, {a.name: sha256_of(a) for a in artifacts})
@@ -97,7 +106,7 @@ def run_container(
         tempfile.TemporaryDirectory(prefix="rover-plays-") as folder,  # ssh's sockets want a short path
         output.with_suffix(".log").open("w") as log,
     ):
-        run = _Run(report, Path(folder), log)
+        run = _Run(report, Path(folder), log, engine)
         try:
             run.all(artifacts[0], artifacts[1], short=short, faults=faults)
         except RoverError as error:
@@ -108,10 +117,12 @@ def run_container(
 
 
 class _Run:
-    def __init__(self, report: PiReport, folder: Path, log: Any):
-        self.report, self.folder, self.log = report, folder, log
+    def __init__(self, report: PiReport, folder: Path, log: Any, engine: str):
+        self.report, self.folder, self.log, self.engine = report, folder, log, engine
         self.metrics = report.metrics
+        self.metrics["engine"] = engine
         self.variables: dict[str, Any] = {
+            "rover_engine": engine,
             "rover_wheels": str(folder / "wheels"),
             "rover_packed": str(folder / "packed"),
             "rover_fetched": str(folder / "fetched"),
@@ -123,7 +134,7 @@ class _Run:
             "rover_record": True,
         }
 
-    def all(self, static: Path, mixed: Path, *, short: bool, faults: bool) -> None:
+    def all(self, static: Path, other: Path, *, short: bool, faults: bool) -> None:
         begun = time.monotonic()
         with self.report.step("system") as row:
             debian_image()
@@ -135,19 +146,19 @@ class _Run:
                 if short:
                     self.one_fault(pi, static)
                     return
-                driving_s = self.playbooks(pi, static, mixed)
+                driving_s = self.playbooks(pi, static, other)
                 self.metrics["driving_after_s"] = round(driving_s - begun, 1)
                 self.metrics["plays_s"] = round(time.monotonic() - begun, 1)
                 what = f"from nothing to a driving service, image {'' if cached else 'not '}cached"
                 minutes = self.report.gates["minutes" if cached else "minutes_uncached"]
                 self.report.limit(what, round((driving_s - begun) / 60, 1), minutes, "min")
                 self.proofs(pi, pins)
-            if faults:
-                self.deployment_faults(pi, static, mixed)
+            if faults and self.engine == "torch":
+                self.deployment_faults(pi, static, other)
 
     # The playbooks
 
-    def playbooks(self, pi: Container, static: Path, mixed: Path) -> float:
+    def playbooks(self, pi: Container, static: Path, other: Path) -> float:
         """All playbooks; when the service could drive for the first time (monotonic seconds)."""
         gate = self.report.gate
         self.play("provision", pi)
@@ -169,7 +180,7 @@ class _Run:
         gate("benchmark fetched", "a file", fetched.name, fetched.is_file())
         current = pi.root / "var/lib/rover/models/current"
         first = current.readlink().name
-        self.play("deploy", pi, "deploy another", rover_artifact=str(mixed))
+        self.play("deploy", pi, "deploy another", rover_artifact=str(other), rover_allow=["mode"])
         second = current.readlink().name
         gate("another model deployed", "another content hash", second[:12], first != second != "")
         self.play("rollback", pi)
@@ -200,8 +211,9 @@ class _Run:
 
     def quick(self) -> Path:
         """A policy that an emulated Pi can drive by."""
-        path = self.folder / "policy_quick.pt"
-        make_artifact(path, camera="cam_front", size=(72, 128), engine="qnnpack")
+        engine, suffix = (TORCH, ".pt") if self.engine == "torch" else (ONNXRUNTIME, ONNX_SUFFIX)
+        path = self.folder / f"policy_quick{suffix}"
+        make_artifact(path, camera="cam_front", size=(72, 128), engine=engine)
         return path
 
     def play(self, book: str, pi: Container, name: str = "", *, check: bool = False, **variables: Any) -> Play:
@@ -242,10 +254,12 @@ class _Run:
     def proofs(self, pi: Container, pins: Pins) -> None:
         gate, gates = self.report.gate, self.report.gates
         with self.report.step("environment"):
-            installed = self.metrics["environment"] = environment(pi.root)
-        size_mb, limit_mb = installed["size_mb"], gates["environment_mb"]
+            installed = self.metrics["environment"] = environment(pi.root, self.engine)
+        size_mb, limit_mb = installed["size_mb"], gates["environment_mb"][self.engine]
         gate("the Pi's environment", f"under {limit_mb} MB", size_mb, size_mb < limit_mb)
         gate("all of it hashed, no lerobot", "none else", installed["unhashed"], not installed["unhashed"])
+        lacks_or_has = installed["missing"] + installed["others"]
+        gate(f"{self.engine}, and no other engine", "so installed", lacks_or_has or "so installed", not lacks_or_has)
         with self.report.step("sandbox"):
             sandboxed = self.metrics["sandbox"] = sandbox(pi)
         self.report.limit("systemd-analyze security", sandboxed["exposure"], gates["exposure"], "of 10")

@@ -17,26 +17,29 @@ from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
-from lab.pi import playbooks
 from lab.pi.container import Container
 from lab.pi.emulation import EmulationError, wait_for
 from lab.pi.pulses import Pins, moving, stopped
 from rover_lib.onboard.service import UNIT
+from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
 VENV, STATE = "/opt/rover/venv", "/var/lib/rover-drive"
 READY_S = 600  # torch under emulation on a busy machine
 
 
-def environment(root: Path) -> dict[str, Any]:
-    """What is installed for the policy: name, version and who vouches for it; unhashed: what nobody does."""
+def environment(root: Path, engine: str = "torch") -> dict[str, Any]:
+    """What is installed for the policy: name, version and who vouches for it; unhashed: what nobody does.
+
+    engine: of REQUIREMENTS. others: engines that are there beside it.
+    """
     site = next((root / VENV.lstrip("/") / "lib").glob("python3*/site-packages"))
-    pinned = hashed(playbooks.REPOSITORY / "requirements_pi.txt")
+    pinned = hashed(REQUIREMENTS[engine])
     packages = []
     for found in sorted(distributions(path=[str(site)]), key=lambda d: d.metadata["Name"].lower()):
         name, version = re.sub(r"[-_.]+", "-", found.metadata["Name"]).lower(), found.version
         origin = ""
         if version in pinned.get(name, ()):
-            origin = "requirements_pi.txt, by hash"
+            origin = f"{REQUIREMENTS[engine].name}, by hash"
         elif name == "rover-policy":
             origin = "the rover's own wheel"
         elif name in ("pip", "setuptools"):
@@ -49,7 +52,8 @@ def environment(root: Path) -> dict[str, Any]:
         "packages": packages,
         "unhashed": [p["name"] for p in packages if not p["from"] or p["name"] == "lerobot"],
         "lerobot": "lerobot" in names,
-        "missing": sorted({"torch", "numpy", "opencv-python-headless", "pyserial"} - names),
+        "missing": sorted({engine, "numpy", "opencv-python-headless", "pyserial"} - names),
+        "others": sorted((REQUIREMENTS.keys() - {engine}) & names),
         "size_mb": round(sum(sizes.values()) / 1e6),
     }
 

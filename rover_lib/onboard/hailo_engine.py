@@ -86,12 +86,9 @@ class HailoEngine:
         self._threads, self._rest = threads, None
         if self._rest_model is None:
             return
-        import onnxruntime
+        from rover_lib.onboard.onnx_engine import session_of  # here, because a whole network on the chip does without
 
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # as onnx_engine does, and why
-        self._rest = onnxruntime.InferenceSession(self._rest_model, options, providers=["CPUExecutionProvider"])
+        self._rest = session_of(self._rest_model, threads)
 
     def _matched(self, model: Any, streams: list[Any], shapes: dict[str, list[int]]) -> dict[str, str]:
         """HailoRT's name of the stream for each of ours: by its size; where several have it, by the original name."""

@@ -14,6 +14,19 @@ from rover_lib.onboard.errors import ArtifactError
 ERRORS_ONLY = 3  # of ONNX Runtime's log, which warns of what a machine without a graphics card lacks
 
 
+def session_of(model: bytes, threads: int) -> onnxruntime.InferenceSession:
+    """A model of ours in ONNX Runtime, on the processor. Raises one of its dozen exceptions if it cannot load it."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = ERRORS_ONLY
+    # A thread that waits for work by spinning takes the control loop's turn, and warms the processor for nothing.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    # It keeps the bytes, beside the weights that it has packed, for making itself anew with other providers: 68 MB.
+    session._model_bytes = None
+    return session
+
+
 class OnnxEngine:
     """The model of an ONNX artifact. Use `load`."""
 
@@ -41,16 +54,9 @@ class OnnxEngine:
 
     def set_threads(self, threads: int) -> None:
         """As engines.Engine: a session has its threads for life, so it is made anew. Raises ArtifactError."""
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-        options.log_severity_level = ERRORS_ONLY
-        # A thread that waits for work by spinning takes the control loop's turn, and warms the processor for nothing.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             with open_archive(self._path) as z:
-                self._session = onnxruntime.InferenceSession(
-                    read_record(z, ONNX), options, providers=["CPUExecutionProvider"]
-                )
+                self._session = session_of(read_record(z, ONNX), threads)
         except ArtifactError:
             raise
         except Exception as e:

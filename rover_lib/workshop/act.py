@@ -569,14 +569,20 @@ class ACT(nn.Module):
         for i, image_input in enumerate(self.image_input):  # by index: FX cannot iterate over frames while it traces
             x = self.image_project(self.backbone(image_input(frames[i])))  # (1, D, h, w)
             tokens.append(x.flatten(2).transpose(1, 2))  # (1, h * w, D)
-        x = torch.cat(tokens, 1)
-        for layer in self.encoder:
-            x = layer(x, self.pos)
-        key, value = self.memory(self.encoder_norm(x), self.pos)
-        y = None
-        for layer in self.decoder:
-            y = layer(y, self.q_pos, key, value)
-        return self.action_unnorm(self.head(self.norm(y)))
+        return self.action_unnorm(transform(self, torch.cat(tokens, 1)))
+
+
+def transform(parts: Any, x: Tensor) -> Tensor:
+    """Tokens (1, T, D) -> actions (1, C, A) before their normalisation is undone. parts: what ACT calls encoder,
+    encoder_norm, memory, decoder, norm, head, pos and q_pos.
+    """
+    for layer in parts.encoder:
+        x = layer(x, parts.pos)
+    key, value = parts.memory(parts.encoder_norm(x), parts.pos)
+    y = None
+    for layer in parts.decoder:
+        y = layer(y, parts.q_pos, key, value)
+    return parts.head(parts.norm(y))
 
 
 def blocks(config: ActConfig) -> list[str]:

@@ -71,15 +71,14 @@ class Onnx:
         import onnx
         import onnxruntime
 
+        from rover_lib.onboard.onnx_engine import session_of
         from rover_lib.workshop.onnx_graph import graph_of, onnx_model
 
         self.versions = {"onnx": onnx.__version__, "onnxruntime": onnxruntime.__version__}
         self.names = ["state", *(f"frame_{name}" for name in config.cameras)]
         inputs = dict(zip(self.names, example_inputs(config), strict=True))
         self.model = onnx_model(graph_of(module), inputs, ("chunk",)).SerializeToString(deterministic=True)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = torch.get_num_threads()
-        self.session = onnxruntime.InferenceSession(self.model, options, providers=["CPUExecutionProvider"])
+        self.session = session_of(self.model, torch.get_num_threads())
 
     def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
         named = ({k: v.numpy() for k, v in zip(self.names, x, strict=True)} for x in inputs)

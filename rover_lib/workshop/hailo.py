@@ -34,6 +34,7 @@ from rover_lib.workshop.act import (
     inputs_of,
     multiply_accumulates,
     parameters_by_block,
+    transform,
     zero_colour,
 )
 from rover_lib.workshop.compare import thinned
@@ -130,14 +131,7 @@ class Transformer(nn.Module):
 
     def forward(self, state: Tensor, *images: Tensor) -> Tensor:
         """state: (1, 1, D); images: (1, h * w, D) each. Returns (1, C, A)."""
-        x = torch.cat([self.latent, state, *images], 1)
-        for layer in self.encoder:
-            x = layer(x, self.pos)
-        key, value = self.memory(self.encoder_norm(x), self.pos)
-        y = None
-        for layer in self.decoder:
-            y = layer(y, self.q_pos, key, value)
-        return self.head(self.norm(y))
+        return transform(self, torch.cat([self.latent, state, *images], 1))
 
 
 class Rest(nn.Module):

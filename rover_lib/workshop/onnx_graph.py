@@ -13,6 +13,7 @@ The graph has static shapes, one domain and operators of opset 17, which ONNX Ru
 know; weights are initializers inside. Same module, same bytes.
 """
 
+import itertools
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
@@ -144,6 +145,9 @@ class _Writer(Interpreter):
     def _name(self, n: Any) -> str:
         return self._names[n]
 
+    def _is_columns(self, n: Any) -> bool:
+        return n.op == "call_module" and isinstance(self.fetch_attr(n.target), Columns)
+
     def _float(self, n: Any, user: str = "output") -> str:
         """The value as floats; each user of an INT8 one gets a DequantizeLinear of its own, as QDQ wants it."""
         value = self._value(n)
@@ -184,52 +188,68 @@ def _lowest(value: Tensor) -> int:
 
 
 def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
-    """Windows of 8 pixels (24 bytes) that begin at every second pixel.
+    """Windows of 8 pixels in each of 4 rows, 96 bytes, that begin at every second pixel of every second row.
 
-    Those with numbers p, p + 4, p + 8, ... follow each other in a row without a gap, so a row from pixel 2 p on is a
-    quarter of the windows, as it lies; the four are then laid between each other in pieces of 24 bytes.
+    The stem's 7x1 convolution over 24 channels becomes one of 2x1 over these 96 (see `stacked`): ONNX Runtime's kernels
+    for a convolution want 64 channels, and copy and round once more what has fewer. Windows with numbers p, p + 4,
+    p + 8, ... follow each other in a row without a gap, so a row from pixel 2 p on is a quarter of its windows, as it
+    lies; quarters of rows are then laid between each other in pieces of 24 bytes.
     """
     (frame,) = _args(n)
     height, width, channels = w._value(frame).shape
-    name, bytes_of_row = n.name, [height, width * channels]
-    flat = w._add("Reshape", [w._name(frame), w._ints(f"{name}_rows", bytes_of_row)], f"{name}_pixels")
-    fours, phases = -(-m.out_width // 4), m.WINDOW // 2
+    name = n.name
+    flat = w._add("Reshape", [w._name(frame), w._ints(f"{name}_rows", [height, width * channels])], f"{name}_pixels")
+    fours, phases, out_rows = -(-m.out_width // 4), m.WINDOW // 2, (m.rows - 5) // 2
+    stacks = out_rows + STRIDE  # each of 4 rows; a row of the output takes two of them
     surplus = 4 * fours - m.out_width  # windows that nobody asked for, where there are no whole fours
     right = torch.cat([m.right, m.top[:1, : 6 * surplus].expand(height, -1)], 1)
     top, bottom = (torch.cat([e, e[:, : 6 * surplus]], 1) for e in (m.top, m.bottom))
+    bottom = torch.cat([bottom, top[:1]])  # the eighth row, of weight 0
     edges = {"left": m.left, "right": right, "top": top, "bottom": bottom}
-    if m.dtype == torch.qint8:  # pixel - 128; through floats, as no operator of this opset does it on bytes
-        one = w._constant(f"{name}_one", np.array(1, np.float32))
-        shift = w._constant(f"{name}_128", np.array(128, np.uint8))
-        zero = w._constant(f"{name}_0", np.array(0, np.int8))
-        flat = w._add("DequantizeLinear", [flat, one, shift], f"{name}_shifted")
-        flat = w._add("QuantizeLinear", [flat, one, zero], f"{name}_signed")
+    if m.dtype == torch.qint8:  # pixel - 128, by bits: 128 more without a carry, and taken for signed
+        shifted = w._add("Add", [flat, w._constant(f"{name}_128", np.array(128, np.uint8))], f"{name}_shifted")
+        flat = w._add("Cast", [shifted], f"{name}_signed", to=TensorProto.INT8)
         edges = {side: (edge.to(torch.int16) - 128).to(torch.int8) for side, edge in edges.items()}
     before, after, above, below = (w._constant(f"{name}_{side}", edge) for side, edge in edges.items())
     rows = w._add("Concat", [before, flat, after], f"{name}_wide", axis=1)
     rows = w._add("Concat", [above, rows, below], f"{name}_high", axis=0)
-    axis, shape = w._ints(f"{name}_axis", [1]), w._ints(f"{name}_quarter", [m.rows, fours, 1, 3 * m.WINDOW])
-    quarters = []
-    for p in range(phases):
-        start, end = w._ints(f"{name}_from_{p}", [6 * p]), w._ints(f"{name}_to_{p}", [6 * p + 24 * fours])
-        part = w._add("Slice", [rows, start, end, axis], f"{name}_slice_{p}")
-        quarters.append(w._add("Reshape", [part, shape], f"{name}_quarter_{p}"))
-    columns = w._add("Concat", quarters, f"{name}_windows", axis=2)
-    whole = w._ints(f"{name}_whole", [1, m.rows, 4 * fours, 3 * m.WINDOW])
+    shape = w._ints(f"{name}_part", [stacks, fours, 1, 3 * m.WINDOW])
+    axes, steps = w._ints(f"{name}_axes", [0, 1]), w._ints(f"{name}_steps", [STRIDE, 1])
+    parts = []
+    for p, r in itertools.product(range(phases), range(STACK)):
+        start = w._ints(f"{name}_from_{p}_{r}", [r, 6 * p])
+        end = w._ints(f"{name}_to_{p}_{r}", [r + STRIDE * stacks - 1, 6 * p + 24 * fours])
+        part = w._add("Slice", [rows, start, end, axes, steps], f"{name}_slice_{p}_{r}")
+        parts.append(w._add("Reshape", [part, shape], f"{name}_part_{p}_{r}"))
+    columns = w._add("Concat", parts, f"{name}_windows", axis=2)
+    whole = w._ints(f"{name}_whole", [1, stacks, 4 * fours, STACK * 3 * m.WINDOW])
     columns = w._add("Reshape", [columns, whole], f"{name}_columns")
     if surplus:
         start, end, axis = (
             w._ints(f"{name}_{k}", [v]) for k, v in (("first", 0), ("last", m.out_width), ("across", 2))
         )
         columns = w._add("Slice", [columns, start, end, axis], f"{name}_asked")
-    if result.is_quantized:
-        return w._add("Transpose", [columns], name, perm=[0, 3, 1, 2])
-    scale = w._constant(f"{name}_scale", np.array(m.scale, np.float32))
-    floats = [columns, scale, w._constant(f"{name}_zero_point", np.array(m.zero_pixel, np.uint8))]
-    return w._add("Transpose", [w._add("DequantizeLinear", floats, f"{name}_floats")], name, perm=[0, 3, 1, 2])
+    if not result.is_quantized:
+        scale = w._constant(f"{name}_scale", np.array(m.scale, np.float32))
+        floats = [columns, scale, w._constant(f"{name}_zero_point", np.array(m.zero_pixel, np.uint8))]
+        columns = w._add("DequantizeLinear", floats, f"{name}_floats")
+    return w._add("Transpose", [columns], name, perm=[0, 3, 1, 2])
 
 
-def _geometry(m: nn.Conv2d | int8.Conv2d | nn.MaxPool2d) -> dict[str, list[int]]:
+STACK, STRIDE = 4, 2  # rows in a stack of columns, and between the first rows of two
+
+
+def stacked(weight: Tensor) -> Tensor:
+    """The stem's weight over columns, (out, 24, 7, 1), as one over stacks of 4 of their rows: (out, 96, 2, 1)."""
+    out_channels, in_channels, _, _ = weight.shape
+    eight = F.pad(weight, (0, 0, 0, 1)).reshape(out_channels, in_channels, 2, STACK)
+    return eight.permute(0, 3, 1, 2).reshape(out_channels, STACK * in_channels, 2, 1)
+
+
+def _geometry(m: nn.Conv2d | int8.Conv2d | nn.MaxPool2d, *, of_stacks: bool = False) -> dict[str, list[int]]:
+    if of_stacks:
+        return {"kernel_shape": [2, 1], "strides": [1, 1], "pads": [0] * 4, "dilations": [STACK // STRIDE, 1]}
+
     def both(value: Any) -> list[int]:
         return [value, value] if isinstance(value, int) else list(value)
 
@@ -243,9 +263,11 @@ def _geometry(m: nn.Conv2d | int8.Conv2d | nn.MaxPool2d) -> dict[str, list[int]]
 
 def _conv(w: _Writer, n: Node, result: Tensor, m: Any, output: str = "") -> str:
     assert m.bias is not None
-    inputs = [w._float(_args(n)[0], n.name), w._constant(f"{n.target}.weight", m.weight)]
+    source, of_stacks = _args(n)[0], w._is_columns(_args(n)[0])
+    weight = stacked(m.weight) if of_stacks else m.weight
+    inputs = [w._float(source, n.name), w._constant(f"{n.target}.weight", weight)]
     inputs.append(w._constant(f"{n.target}.bias", m.bias))
-    return w._add("Conv", inputs, output or n.name, **_geometry(m))
+    return w._add("Conv", inputs, output or n.name, **_geometry(m, of_stacks=of_stacks))
 
 
 def _conv_relu(w: _Writer, n: Node, result: Tensor, m: ConvReLU2d) -> str:
@@ -259,16 +281,17 @@ def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
     scales, zeros = weight.q_per_channel_scales(), weight.q_per_channel_zero_points()
     sums = scales * w._value(source).q_scale()
     whole_bias = torch.quantize_per_channel(bias.detach(), sums, torch.zeros_like(zeros), 0, torch.qint32).int_repr()
+    of_stacks = w._is_columns(source)
     inputs = [w._float(source, n.name)]
     for part, values, steps, zero_type in (
-        ("weight", weight.int_repr(), scales, np.int8),
+        ("weight", stacked(weight.int_repr()) if of_stacks else weight.int_repr(), scales, np.int8),
         ("bias", whole_bias, sums, np.int32),
     ):
         name = f"{n.target}.{part}"
         scale = w._constant(f"{name}_scale", steps.float())
         zero = w._constant(f"{name}_zero_point", np.zeros(len(steps), zero_type))
         inputs.append(w._add("DequantizeLinear", [w._constant(name, values), scale, zero], f"{name}_floats", axis=0))
-    sums_name = w._add("Conv", inputs, f"{n.name}_sums", **_geometry(m))
+    sums_name = w._add("Conv", inputs, f"{n.name}_sums", **_geometry(m, of_stacks=of_stacks))
     return _rounded(w, n, result, sums_name, relu=isinstance(m, fused_int8.ConvReLU2d))
 
 

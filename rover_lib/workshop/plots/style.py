@@ -60,6 +60,8 @@ NAMES = {
     "lerobot": "LeRobot, eager FP32",
     "torch_affine": "torch, affine",
     "onnxruntime": "ONNX Runtime INT8",
+    "fp32.onnx": "FP32, for ONNX Runtime",
+    "static.onnx": "static INT8, for ONNX Runtime",
     "executorch": "ExecuTorch INT8",
 }
 

@@ -27,11 +27,12 @@ from rover_lib.workshop.act import ACT
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.export import export
 from rover_lib.workshop.observe import calibrate
+from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
 
 # Of the tiny policy, in 1e6 instructions on an emulated Cortex-A76; a count may leave it by 2 %.
-BUDGETS_M = {"policy_fp32": 195.7, "policy_static": 35.2}
+BUDGETS_M = {"policy_fp32": 195.7, "policy_static": 35.2, "policy_static.onnx": 35.2}
 SVC = 0xD4000001
 START, ROUNDS, SECTION = 0x400000, 1000, 7
 
@@ -126,7 +127,7 @@ def core() -> Core:
 
 @pytest.fixture(scope="module")
 def tiny_run(tiny_file, tmp_path_factory) -> Path:
-    """A run's folder with two artifacts of the tests' small policy, always the same."""
+    """A run's folder with artifacts of the tests' small policy, always the same."""
     folder = tmp_path_factory.mktemp("run")
     checkpoint, samples = load_checkpoint(tiny_file), memory_samples(16)
     scheme, options = q.Scheme("static"), {"samples": samples[:3]}
@@ -140,6 +141,7 @@ def tiny_run(tiny_file, tmp_path_factory) -> Path:
     export(ACT(checkpoint.config, checkpoint.weights), checkpoint, folder / "policy_fp32.pt", **options)
     static = q.quantize(checkpoint, scheme, calibration)
     digest = export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
+    export(static, checkpoint, folder / "policy_static.onnx.zip", calibration=calibration, **options)
     modes = {"static": {"scheme": asdict(scheme), "content_hash": digest}}
     inputs = {"calibration.pt": sha256_of(folder / "calibration.pt")}
     write_stage(folder / "quantize.json", "quantize", params={}, metrics={"modes": modes}, inputs=inputs)
@@ -192,6 +194,19 @@ def test_a_run_is_counted(report, tiny_run):
     low_ms, high_ms = reports.predicted_ms(static["simd_g"], static["instructions_g"])
     assert static["computed_pi5_ms"] == {"low": low_ms, "high": high_ms, "formula": reports.PREDICTED}
     assert "policy_static" in reports.table(report)
+
+
+def test_what_onnx_runtime_runs_is_counted_like_the_rest(report):
+    torchs, onnx = (report["metrics"]["artifacts"][f"policy_static{kind}"] for kind in ("", ".onnx"))
+    assert onnx.keys() == torchs.keys() and onnx["reference"] == torchs["reference"]
+    assert (
+        onnx["versions"]["onnxruntime"] in REQUIREMENTS["onnxruntime"].read_text() and "torch" not in onnx["versions"]
+    )
+    assert onnx["sdot_g"] == pytest.approx(torchs["sdot_g"], rel=0.1)  # the same products, in stacks of columns
+    for error in ("steering_mae_pct", "throttle_mae_pct"):
+        assert 0 < onnx[error] < 1.5 * torchs[error]
+    assert onnx["peak_memory_mb"] < torchs["peak_memory_mb"] - 100  # torch alone is more
+    assert "policy_static.onnx" in reports.table(report)
 
 
 def test_an_image_size_without_fp32_is_only_counted(report):

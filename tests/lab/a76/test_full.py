@@ -34,10 +34,12 @@ def run_dir(cache, tmp_path_factory):
 
 
 def test_leaves_what_counting_needs(run_dir):
-    artifacts = {p.stem: load_policy(p) for p in run_dir.glob("policy_*.pt")}
+    artifacts = {p.stem: load_policy(p) for p in run_dir.glob("policy_*") if p.is_file()}
     assert {name: p.image_size for name, p in artifacts.items()} == {
         "policy_fp32": (72, 128),
+        "policy_fp32.onnx": (72, 128),
         "policy_static": (72, 128),
+        "policy_static.onnx": (72, 128),
         "policy_fp32_54x96": (54, 96),
         "policy_static_54x96": (54, 96),
         "policy_static_36x64": (36, 64),

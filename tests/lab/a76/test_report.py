@@ -123,6 +123,18 @@ def test_each_gate_can_fail(changed, failing):
     assert [name for name, passed in passed_by_gate.items() if not passed] == [f"policy_static {failing}"]
 
 
+def test_gates_of_the_cars_policy_without_torch():
+    torchs = artifact()
+    held = artifact(instructions_g=1.59, tenth_g=1.59, peak_memory_mb=249)
+    dear = artifact(instructions_g=1.61, tenth_g=1.61, peak_memory_mb=251, throttle_mae_pct=0.221)
+    dear |= {"workstation_throttle_mae_pct": 0.221}
+    name = "policy_static.onnx"
+    assert all(gates(policy_static=torchs, **{name: held}).values())
+    failed = {gate for gate, passed in gates(policy_static=torchs, **{name: dear}).items() if not passed}
+    assert failed == {f"{name} {what}" for what in ("instructions_g", "peak_memory_mb", "error, x torch's")}
+    assert f"{name} error, x torch's" not in gates(**{name: held})
+
+
 def test_a_flipped_bit_fails():
     assert [n for n, passed in gates(bits=1, policy_static=artifact()).items() if not passed] == [
         "policy_static backbone values that differ"

@@ -80,6 +80,10 @@ def test_pip_finds_packages_elsewhere_as_it_does_here():
 def test_no_artifacts(tmp_path):
     with pytest.raises(EmulationError, match=r"no policy_static.pt and no policy_mixed.pt to deploy; make demo leaves"):
         run_container(tmp_path / "pi-fast.json", tmp_path)
+    with pytest.raises(
+        EmulationError, match=r"no policy_static.onnx.zip and no policy_fp32.onnx.zip to deploy; rover exp"
+    ):
+        run_container(tmp_path / "pi-fast.json", tmp_path, engine="onnxruntime")
     assert not (tmp_path / "pi-fast.json").exists()
 
 
@@ -121,6 +125,9 @@ def test_what_nobody_vouches_for_is_found(tmp_path):
     assert found["unhashed"] == ["lerobot", "numpy"] and found["lerobot"]
     assert found["missing"] == ["opencv-python-headless", "pyserial"]
     assert {p["name"]: p["from"] for p in found["packages"]}["torch"] == "requirements_pi.txt, by hash"
+    assert found["others"] == []
+    without = environment(tmp_path, "onnxruntime")
+    assert "torch" in without["unhashed"] and without["others"] == ["torch"] and "onnxruntime" in without["missing"]
 
 
 def test_a_pin_without_a_hash_is_none(tmp_path):
