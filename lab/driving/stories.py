@@ -335,7 +335,7 @@ KEPT: dict[str, tuple[Story, str]] = {  # stories that once broke an invariant, 
     ),
     "a link further and further behind": (
         Story((H(1100, "to the Arduino: further and further behind", 80, 4000),)),
-        "no valid command",
+        "no valid command|has not answered",  # a millisecond decides who stops it first
     ),
     "armed by a line that waited": (
         Story((H(600, "to the Arduino: further and further behind", 50, 4000),)),
