@@ -13,7 +13,7 @@ from torch import nn
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
 from rover_lib.workshop.checkpoint import load_checkpoint
-from rover_lib.workshop.onnx_graph import graph_of, onnx_model
+from rover_lib.workshop.onnx_graph import graph_of, onnx_model, stacked
 from rover_lib.workshop.quantize import int8_layers, quantize
 from rover_lib.workshop.scheme import Scheme
 
@@ -88,7 +88,9 @@ def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibrati
     assert np.abs(answers(written, inputs, tiny.config) - torchs).max() < 2 * own_error
     stored = {i.name: onnx.numpy_helper.to_array(i) for i in written.graph.initializer}
     for name, layer in int8_layers(quantized.module).items():
-        assert np.array_equal(stored[f"{name}.weight"], layer.weight().int_repr().numpy())
+        weight = layer.weight().int_repr()
+        weight = stacked(weight) if name == "backbone.stem.0" else weight
+        assert np.array_equal(stored[f"{name}.weight"], weight.numpy())
 
 
 def test_int8_convolutions_and_pooling_are_the_same_but_for_ties(tiny, calibration):
