@@ -34,7 +34,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from lab.a76.core import CORES, CPUINFO
+from lab.a76.core import CORES
 from lab.pi.debian_image import debian_image
 from lab.pi.emulation import EmulationError, emulation, free_port, in_cgroup
 from rover_lib.workshop.cache import cache_root
@@ -47,7 +47,6 @@ BENCH, PTS = "/srv/bench", "/srv/pts"  # in the container: what is plugged in, a
 CAMERA, PORT = f"{BENCH}/camera", "/dev/rover-arduino"
 DIALOUT = 20  # Debian's number for the group
 # The network is the host's, which has its own; and nothing begins to update itself while something is measured.
-QEMU_LOOKS_HERE_FIRST = "etc/qemu-binfmt/aarch64"  # for each file that an emulated program opens; as Debian built it
 MASKED = ("systemd-networkd.service", "systemd-resolved.service", "apt-daily.timer", "apt-daily-upgrade.timer")
 # Their own programs, which may make no memory executable: an emulator must.
 TRANSLATED = ("systemd-journald", "systemd-logind", "systemd-hostnamed", "systemd-timedated", "systemd-localed")
@@ -127,6 +126,9 @@ class Container:
         command += ["--capability=CAP_SYS_RESOURCE"]  # for limits, of which one is the drive loop's real-time priority
         command += ["--resolv-conf=replace-host", "--timezone=off", "--console=pipe"]
         command += [f"--bind={self.bench}:{BENCH}", f"--bind=/dev/pts:{PTS}"]
+        # With this machine's, and its /proc/cpuinfo, ONNX Runtime's wheel for arm64 dies when it is imported.
+        for cpus in ("possible", "present"):
+            command += [f"--bind-ro={self._own / 'cpus'}:/sys/devices/system/cpu/{cpus}"]
         with console:
             process = self._process = subprocess.Popen(
                 command,
@@ -232,10 +234,7 @@ class Container:
         (self.root / "etc" / "ssh" / "sshd_config.d" / "emulated.conf").write_text(settings)
         # What udev would do, and no udev can do here
         (self.root / "etc" / "tmpfiles.d" / "emulated.conf").write_text(f"L {PORT} - - - - {BENCH}/arduino\n")
-        # Else they read of this machine's processor, for which ONNX Runtime's wheel for arm64 dies when it is imported.
-        cpuinfo = self.root / QEMU_LOOKS_HERE_FIRST / "proc" / "cpuinfo"
-        cpuinfo.parent.mkdir(parents=True, exist_ok=True)
-        cpuinfo.write_text("".join(CPUINFO.format(core=i) for i in range(CORES)))
+        (self._own / "cpus").write_text(f"0-{CORES - 1}\n")
         _lend_systemd(self.root)
         _lend_registries(self.root)
 

@@ -11,6 +11,7 @@ import onnxruntime
 from rover_lib.onboard.archive import ONNX, open_archive, read_record
 from rover_lib.onboard.errors import ArtifactError
 
+onnxruntime.disable_telemetry_events()  # nobody was asked
 ERRORS_ONLY = 3  # of ONNX Runtime's log, which warns of what a machine without a graphics card lacks
 
 

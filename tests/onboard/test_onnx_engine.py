@@ -10,9 +10,11 @@ from archives import manifest_with, rewritten, vectors_with
 from policies import memory_samples
 
 from rover_lib.onboard import load_policy
+from rover_lib.onboard.archive import ONNX, open_archive, read_record
 from rover_lib.onboard.artifact import content_hash, read_manifest
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.inference import PolicyProcess
+from rover_lib.onboard.onnx_engine import session_of
 from rover_lib.onboard.release import Expected, ReleaseError, Releases, pack
 
 FRAME, STATE = np.full((360, 640, 3), 99, np.uint8), np.array([0.1, 0.2], np.float32)
@@ -35,6 +37,13 @@ def test_engines_agree(artifacts, onnx_static):
     assert np.abs(other - exact).max() <= 1.5 * np.abs(torchs - exact).max()
     known = {k: v for k, v in static.manifest.items() if k not in ("engine", "versions", "parity")}
     assert onnx.manifest | known == onnx.manifest and onnx.manifest["engine"] == "onnxruntime"
+
+
+def test_a_session_lets_the_bytes_go_that_it_was_made_from(onnx_static):
+    with open_archive(onnx_static) as z:
+        model = read_record(z, ONNX)
+    held = [value for value in vars(session_of(model, 1)).values() if isinstance(value, bytes) and len(value) > 1000]
+    assert not held
 
 
 def test_threads_can_be_chosen_later(onnx_static):

@@ -13,7 +13,7 @@ from torch import nn
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
 from rover_lib.workshop.checkpoint import load_checkpoint
-from rover_lib.workshop.onnx_graph import graph_of, onnx_model
+from rover_lib.workshop.onnx_graph import graph_of, onnx_model, stacked
 from rover_lib.workshop.quantize import int8_layers, quantize
 from rover_lib.workshop.scheme import Scheme
 
@@ -61,7 +61,9 @@ def test_float_policy_is_the_same(name, for_int8, tmp_path):
     inputs = observations(checkpoint.config)
     written = onnx_model(graph_of(model), named(inputs[0], checkpoint.config), ("chunk",))
     expected = predictions(model, inputs).numpy()
-    assert np.abs(answers(written, inputs, checkpoint.config) - expected).max() < 2e-5  # sums in another order
+    # Sums in another order, which a ResNet-50 has many of
+    tolerance = 2e-5 if name == "dilation" else 4e-6
+    assert np.abs(answers(written, inputs, checkpoint.config) - expected).max() < tolerance
     assert {o.domain for o in written.opset_import} == {""}
     assert not [i for i in written.graph.initializer if i.external_data]
 
@@ -81,11 +83,13 @@ def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibrati
     written = onnx_model(graph_of(quantized.module), named(inputs[0], tiny.config), ("chunk",))
     torchs = predictions(quantized.module, inputs).numpy()
     own_error = np.abs(torchs - predictions(ACT(tiny.config, tiny.weights), inputs).numpy()).max()
-    # Within twice its own error to FP32: a rounding that flips grows over the layers
-    assert np.abs(answers(written, inputs, tiny.config) - torchs).max() < 2 * own_error
+    # A rounding that flips grows over the layers: 0.4 times its own error to FP32, and 1.3 times where most is float
+    assert np.abs(answers(written, inputs, tiny.config) - torchs).max() < 1.5 * own_error
     stored = {i.name: onnx.numpy_helper.to_array(i) for i in written.graph.initializer}
     for name, layer in int8_layers(quantized.module).items():
-        assert np.array_equal(stored[f"{name}.weight"], layer.weight().int_repr().numpy())
+        weight = layer.weight().int_repr()
+        weight = stacked(weight) if name == "backbone.stem.0" else weight
+        assert np.array_equal(stored[f"{name}.weight"], weight.numpy())
 
 
 @pytest.mark.slow
