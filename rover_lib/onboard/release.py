@@ -28,7 +28,6 @@ import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -37,7 +36,7 @@ from rover_lib.onboard.artifact import check_artifact, content_hash, read_manife
 from rover_lib.onboard.confine import less_memory
 from rover_lib.onboard.engines import PACKAGES, TORCH
 from rover_lib.onboard.errors import ArtifactError, RoverError
-from rover_lib.onboard.stage import open_plain, sha256_of
+from rover_lib.onboard.stage import open_plain, sha256_of, version_of
 
 MODELS = Path("/var/lib/rover/models")
 POLICY, DIGEST, ORIGIN = "policy.pt", "policy.pt.sha256", "release.json"
@@ -89,7 +88,7 @@ class Expected:
             refusals["camera"] = f"it looks through {cameras}, this rover has {self.camera} at {self.aspect:.2f} to 1"
         engine, made_with = manifest["engine"], str(manifest["versions"].get("torch", "?"))
         package = PACKAGES.get(engine)
-        here = _version(package) if package else None
+        here = version_of(package) if package else None
         if package is None:
             refusals["engine"] = f"it needs the engine '{engine}', rovers have {' or '.join(PACKAGES)}"
         elif here is None:
@@ -102,13 +101,6 @@ class Expected:
 
 
 THIS_CAR = Expected()
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Iterable[str] = ()) -> dict[str, Any]:

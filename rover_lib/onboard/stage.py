@@ -16,7 +16,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -61,8 +61,16 @@ def sha256_of(path: Path | str) -> str:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
 
+def version_of(package: str) -> str | None:
+    """Of an installed package; None if it is not."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
 def environment() -> dict[str, Any]:
-    """Where a figure comes from: host, machine, processor, torch, engine, commit (None outside a checkout)."""
+    """Where a figure comes from: host, machine, processor, torch, ONNX Runtime, engine, commit; None: not there."""
     try:
         git = subprocess.run(
             ["git", "rev-parse", "--short", "HEAD"],
@@ -80,7 +88,8 @@ def environment() -> dict[str, Any]:
         "machine": platform.machine(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "torch": torch.__version__ if torch else version("torch"),
+        "torch": torch.__version__ if torch else version_of("torch"),
+        "onnxruntime": version_of("onnxruntime"),
         "engine": torch.backends.quantized.engine if torch else None,
         "commit": commit,
     }

@@ -14,6 +14,7 @@ import pytest
 
 from rover_lib import cli as workstation
 from rover_lib.onboard import cli as onboard
+from rover_lib.onboard.stage import read_stage
 from rover_lib.onboard.telemetry import FlightLog, Tick
 from rover_lib.workshop.wheelhouse import REQUIREMENTS, make
 
@@ -128,12 +129,14 @@ def test_all_of_it_can_be_imported_but_the_engines_that_it_lacks(which, others, 
 
 
 def test_a_rover_without_torch_runs_what_onnx_runtime_runs_and_says_what_it_lacks(
-    rover_without_torch, onnx_static, artifacts
+    rover_without_torch, onnx_static, artifacts, tmp_path
 ):
     assert rover_without_torch.run("python", "-c", "import torch").returncode != 0
-    timed = ("rover", "benchmark", "--warmup", "1", "--iterations", "2")
-    done = rover_without_torch.run(*timed, onnx_static)  # it is loaded, so that its parity vectors are right
+    timed, left = ("rover", "benchmark", "--warmup", "1", "--iterations", "2"), tmp_path / "benchmark.json"
+    done = rover_without_torch.run(*timed, "--output", left, onnx_static)  # loaded, so its parity vectors are right
     assert done.returncode == 0, done.stderr
+    where = read_stage(left, "benchmark")["env"]
+    assert where["torch"] is None and where["onnxruntime"]
     done = rover_without_torch.run(*timed, artifacts["static"])
     assert done.returncode == 1 and "needs torch" in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
 

@@ -100,7 +100,7 @@ def test_says_what_to_install(onnx_static, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     monkeypatch.delitem(sys.modules, "rover_lib.onboard.onnx_engine", raising=False)
     assert "install onnxruntime, or use an artifact of another engine" in refused(onnx_static)
-    monkeypatch.setattr("rover_lib.onboard.release._version", lambda package: None)
+    monkeypatch.setattr("rover_lib.onboard.release.version_of", lambda package: None)
     with pytest.raises(ReleaseError, match="it needs onnxruntime, which is not installed here"):
         pack(onnx_static, tmp_path / "packed")
 
