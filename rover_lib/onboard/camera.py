@@ -90,8 +90,10 @@ class Camera:
         self.size, self.wanted_hz = size, rate_hz
         self._stamps = _Stamps(clock, wall_clock)
         self._shown = np.zeros((REMEMBERED, 0), np.uint64)  # the newest pictures' blocks, as block_sums()
+        self._remembered = 0  # how many there have been, of which it has the last
         self._refusal: PictureError | None = None
         self._closing, self._begun = threading.Event(), threading.Event()
+        self._held = held
         if not held:
             self._begun.set()
         self._changed = threading.Condition()  # guards the four below
@@ -219,8 +221,11 @@ class Camera:
         shown, number = block_sums(image), self.frames + 1
         if before is None:
             self._shown = np.zeros((REMEMBERED, len(shown)), np.uint64)
-        same = (self._shown[: number - 1] == shown).mean(axis=1).max(initial=0.0)
-        self._shown[(number - 1) % REMEMBERED] = shown
+        if self._held and self._begun.is_set():  # a film begins: what it showed until now may come again
+            self._held, self._remembered = False, 0
+        same = (self._shown[: self._remembered] == shown).mean(axis=1).max(initial=0.0)
+        self._shown[self._remembered % REMEMBERED] = shown
+        self._remembered += 1
         repeats = before.repeats + 1 if before and same >= SAME else 0
         frame = Frame(image, captured_s, number, repeats, *brightness(image), jpeg)
         with self._changed:

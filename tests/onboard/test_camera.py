@@ -152,6 +152,25 @@ def test_a_film_begins_when_it_is_told_to():
     assert list(c._paced(lambda: iter(()), 1000, threading.Event(), threading.Event())) == []
 
 
+def test_a_film_that_begins_again_is_no_frozen_camera():
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 255, (36, 64, 3), np.uint8) for _ in range(6)]
+    camera = Camera("film", held=True)
+
+    def repeats() -> list[int]:
+        shown = []
+        for picture in pictures:
+            camera._add(picture, 0.0, None)
+            shown.append(camera.latest().repeats)
+        return shown
+
+    assert repeats() == [0] * 6
+    assert repeats() == [1, 2, 3, 4, 5, 6]  # nobody drives by it yet
+    camera.begin()
+    assert repeats() == [0] * 6
+    assert repeats() == [1, 2, 3, 4, 5, 6]
+
+
 def test_an_empty_folder(tmp_path):
     with pytest.raises(CameraError, match="no pictures"):
         Camera(tmp_path).open()
