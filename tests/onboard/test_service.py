@@ -450,7 +450,7 @@ class Link:
     arms: ClassVar[list[float]] = []
     caps: ClassVar[list[int]] = []
 
-    def __init__(self, port, car):
+    def __init__(self, port, car=None):
         self.state, self.sequence, self.left = State.MANUAL, 0, 10
 
     def unacknowledged_s(self, now_s):
