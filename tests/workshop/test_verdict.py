@@ -24,7 +24,13 @@ def demo():
     files = {stage: folder / f"{stage}.json" for stage in ("load", "quantize", "compare")}
     stages = {stage: read_stage(path, stage)["metrics"] for stage, path in files.items()}
     (path,) = folder.glob("benchmark-*.json")
-    return copy.deepcopy(stages | {"benchmark": read_stage(path, "benchmark")["metrics"]})
+    stages = copy.deepcopy(stages | {"benchmark": read_stage(path, "benchmark")["metrics"]})
+    timed = stages["benchmark"]["artifacts"]
+    # What the rule makes of these is tested, not how busy the machine was that published them.
+    timed["mixed"]["latency_p50_ms"] = timed["static"]["latency_p50_ms"]
+    for times in timed.values():
+        times["latency_p95_ms"] = 1.1 * times["latency_p50_ms"]
+    return stages
 
 
 def judge(stages):
