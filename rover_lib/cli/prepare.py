@@ -267,10 +267,7 @@ def distill(
     from rover_lib.workshop.distill import distill as teach
     from rover_lib.workshop.student import StudentShape
 
-    recipe = Recipe(**params()["distill"])
-    recipe = recipe.of_steps(steps) if steps else recipe
-    given = {"samples": samples, "seed": seed}
-    recipe = replace(recipe, **{name: value for name, value in given.items() if value is not None})
+    recipe = Recipe.of(params(), steps, samples, seed)
     height, width = size or (None, None)
     shape = StudentShape(height, width, decoder_layers, feedforward)
     folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal(), **options)

@@ -83,6 +83,14 @@ class Recipe:
     judged_frames: int
     seed: int
 
+    @classmethod
+    def of(cls, params: dict[str, Any], steps: int | None, samples: int | None, seed: int | None) -> "Recipe":
+        """That of params.yml, with what is not None in its place. steps: in all."""
+        recipe = cls(**params["distill"])
+        recipe = recipe.of_steps(steps) if steps else recipe
+        given = {"samples": samples, "seed": seed}
+        return replace(recipe, **{name: value for name, value in given.items() if value is not None})
+
     def of_steps(self, steps: int) -> "Recipe":
         """The same with that many steps in all, at least one in each phase."""
         names = ("backbone_steps", "transformer_steps", "together_steps", "qat_steps")

@@ -173,17 +173,12 @@ class Notebooks:
 
     def _taught(self, job: Job, folder: Path) -> Path:
         """The student's checkpoint, in the run's own folder; what was begun goes on."""
-        from dataclasses import replace
-
         from rover_lib.onboard.params import params
         from rover_lib.workshop.distill import Recipe, distill
         from rover_lib.workshop.student import StudentShape
 
         options = dict(job.student)
-        recipe = Recipe(**params()["distill"])
-        if steps := options.pop("steps", None):
-            recipe = recipe.of_steps(steps)
-        recipe = replace(recipe, **{key: options.pop(key) for key in ("samples", "seed") if key in options})
+        recipe = Recipe.of(params(), **{key: options.pop(key, None) for key in ("steps", "samples", "seed")})
         width, _, height = str(options.pop("size", "x")).partition("x")
         qat = bool(options.pop("qat", False))
         try:
@@ -411,7 +406,7 @@ def write_report(jobs: Sequence[Job], folder: Path | str, failed: Mapping[str, s
     from rover_lib.workshop.plots.sweep import pareto
 
     folder, found = Path(folder), rows(jobs, folder)
-    inputs = {name: fingerprint(job) for name, job in ((job.name, job) for job in jobs)}
+    inputs = {job.name: fingerprint(job) for job in jobs}
     metrics = {"runs": found, "failed": dict(failed), "missing": len(jobs) - len(found) - len(failed)}
     content = write_stage(folder / REPORT, "sweep", params={"mode": MODE}, metrics=metrics, inputs=inputs)
     if found:
