@@ -7,7 +7,7 @@ episode_YYYYMMDD_HHMMSS/
 throttle_measured: true or false in JSON, True or False in CSV. Where it is false, that channel has no value: its
 normalized, raw_us and period_us are null in JSON and empty in CSV, which pandas reads as NaN and no program takes for
 "stopped". Files without the two columns are the user's recorder's (and the playground's, where nothing is ever lost):
-in them a pulse or period of 0 says "not measured". More columns may follow.
+in them a pulse or period of 0 says "not measured". More columns may follow: driver says who drove, one of DRIVERS.
 """
 
 import contextlib
@@ -46,6 +46,8 @@ CONTROL_FIELDS = (
 )
 FLAG_FIELDS = ("steering_measured", "throttle_measured")
 FRAME_FIELDS = ("frame_id", "timestamp", "image_path")
+# Who drove at a control: a policy; a human, whose pulses went to the servos; or nobody, as the car was held in neutral.
+POLICY, HUMAN, NOBODY = DRIVERS = ("policy", "human", "nobody")
 
 LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
 ARDUINO_WRAP_MS = 1 << 32  # its clock starts again after 49.7 days
@@ -361,6 +363,17 @@ def no_pulse(row: Mapping[str, Any], channel: str) -> bool:
     flag = row.get(f"{channel}_measured")
     values = (row.get(f"{channel}_{part}") for part in ("normalized", "raw_us", "period_us"))
     return str(flag).strip().lower() in ("false", "0") or all(v is None or v == "" for v in values)
+
+
+def driver_of(row: Mapping[str, Any]) -> str | None:
+    """Who drove at a control of a file, one of DRIVERS; None for a word that is none of them.
+
+    Where nothing is said of it, a policy's recording names its artifact's mode, and all others are a human's.
+    """
+    said = row.get("driver")
+    if said is None or said == "":
+        return POLICY if row.get("mode") else HUMAN
+    return said if said in DRIVERS else None
 
 
 def arduino_step_s(before_s: float, after_s: float) -> float:

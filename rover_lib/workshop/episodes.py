@@ -27,7 +27,7 @@ import json
 import math
 import os
 import stat
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -40,8 +40,10 @@ from rover_lib.onboard.recording import (
     BURST_MIN,
     CONTROL_FIELDS,
     FRAME_FIELDS,
+    HUMAN,
     arduino_step_s,
     arrived_late,
+    driver_of,
     no_pulse,
     number_of,
     recorded_car,
@@ -98,6 +100,7 @@ class _Control:
     system_s: float
     arduino_s: float
     actions: tuple[float | None, float | None]
+    driver: str = HUMAN
 
 
 @dataclass(frozen=True)
@@ -317,7 +320,11 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
         steering, throttle = (
             None if name in lost else _read_action(name, values, i, path, pwm, faults) for name in ACTION_NAMES
         )
-        controls.append(_Control(values["system_timestamp"], values["arduino_timestamp"] / 1000, (steering, throttle)))
+        if (driver := driver_of(row)) is None:
+            faults.add(path, "unknown_driver", f"control {i}: {shown(row.get('driver'))} drove; left out")
+            continue
+        times_s = values["system_timestamp"], values["arduino_timestamp"] / 1000
+        controls.append(_Control(*times_s, (steering, throttle), driver))
     return _sorted_by_time(controls, [c.system_s for c in controls], path, "control", faults)
 
 
@@ -376,7 +383,7 @@ def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list
                 break
             time_s = placed[-1].system_s - step_s
             farthest_s = max(farthest_s, control.system_s - time_s)
-            placed.append(_Control(time_s, control.arduino_s, control.actions))
+            placed.append(replace(control, system_s=time_s))
             moved += 1
     faults.add(
         path,
@@ -461,8 +468,8 @@ def _jpeg_problem(head: bytes, tail: bytes) -> str | None:
 
 def _actions_of(
     frames: list[_Frame], controls: list[_Control], sync_s: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Each frame's action, (n, 2) float32; whether it has one, (n,); whether any control is near, (n,)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+    """Each frame's action, (n, 2) float32; whether it has one, (n,); whether any control is near, (n,); who drove."""
     times_s = np.array([f.time_s for f in frames])
     actions = np.zeros((len(frames), len(ACTION_NAMES)), np.float32)
     known = np.ones(len(frames), bool)
@@ -472,8 +479,8 @@ def _actions_of(
         known &= near
         if len(values):
             actions[:, i] = np.where(near, values[index], 0)
-    near, _ = _nearest(times_s, np.array([c.system_s for c in controls]), sync_s)
-    return actions, known, near
+    near, index = _nearest(times_s, np.array([c.system_s for c in controls]), sync_s)
+    return actions, known, near, [controls[i].driver for i in index]
 
 
 def _nearest(times_s: np.ndarray, sorted_s: np.ndarray, within_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -489,7 +496,7 @@ def _nearest(times_s: np.ndarray, sorted_s: np.ndarray, within_s: float) -> tupl
 def _make_samples(
     folder: Path, frames: list[_Frame], controls: list[_Control], chunk: int, sync_s: float, faults: _Faults
 ) -> tuple[Sample, ...]:
-    actions, known, near = _actions_of(frames, controls, sync_s)
+    actions, known, near, drivers = _actions_of(frames, controls, sync_s)
     if not near.any():
         gap_s = min(abs(frames[0].time_s - controls[-1].system_s), abs(controls[0].system_s - frames[-1].time_s))
         faults.add(folder, "no_overlap", f"frames and controls are {gap_s:.1f} s apart")
@@ -527,6 +534,7 @@ def _make_samples(
                     chunk=chunks[k].copy(),
                     is_pad=pads[k].copy(),
                     row=i,
+                    driver=drivers[i],
                 )
             )
     faults.add(folder, "frame_without_state", "the previous frame's action is not known", unknown_state)

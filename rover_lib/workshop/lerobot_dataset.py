@@ -10,7 +10,7 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,7 +89,7 @@ class _Pictures:
 class LerobotSample(Sample):
     """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file (of several cameras the first's)."""
 
-    pictures: _Pictures
+    pictures: _Pictures = field(kw_only=True)
 
     @property
     def frame_name(self) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.picture import PictureError, read_jpeg
-from rover_lib.onboard.recording import CHANNELS
+from rover_lib.onboard.recording import CHANNELS, HUMAN
 from rover_lib.onboard.stage import sha256_of
 
 ACTION_NAMES = CHANNELS
@@ -91,7 +91,7 @@ class Sample:
 
     time_s: seconds since the episode's first frame. state: (S,) float32, in our recordings the previous frame's
     [steering, throttle]. chunk: (chunk, A) float32, this frame's action and the following ones. is_pad: (chunk,)
-    bool, True past the end.
+    bool, True past the end. driver: who drove at this frame, one of onboard.recording.DRIVERS.
     """
 
     episode: str
@@ -101,6 +101,7 @@ class Sample:
     chunk: np.ndarray
     is_pad: np.ndarray
     row: int  # of the frame: in its episode, or in the whole of a LeRobotDataset
+    driver: str = HUMAN
 
     @property
     def frame_name(self) -> str:

@@ -98,6 +98,24 @@ def test_pairs_of_a_faultless_recording(tmp_path):
     assert len({tuple(c) for c in samples[5].chunk.tolist()}) > CHUNK // 2  # a chunk changes over time
 
 
+@pytest.mark.parametrize(
+    ("columns", "driver"), [({}, "human"), ({"mode": "static"}, "policy"), ({"driver": "nobody"}, "nobody")]
+)
+def test_every_sample_says_who_drove(tmp_path, columns, driver):
+    edit(record(tmp_path), lambda content: [row.update(columns) for row in content["control_samples"]] and None)
+    assert {sample.driver for sample in load(tmp_path).samples} == {driver}
+
+
+def test_a_driver_of_whom_nobody_knows_is_left_out(tmp_path):
+    def change(content):
+        for row in content["control_samples"][10:20]:
+            row["driver"] = "the cat"
+
+    recordings = load(edit(record(tmp_path), change).parent)
+    assert kinds(recordings)["unknown_driver"] == 10
+    assert {sample.driver for sample in recordings.samples} == {"human"}
+
+
 def test_actions_are_the_nearest_controls(tmp_path):
     folder = record(tmp_path)
     content = json.loads((folder / "episode_data.json").read_text())
