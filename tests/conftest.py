@@ -1,6 +1,7 @@
 """What many tests share: one tiny policy, its calibration and its artifacts, and the demo's run."""
 
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import pytest
 from filelock import FileLock
 from hypothesis import settings
 
+# jsonschema, which reads notebooks, compiles a grammar of URLs where it finds one: 2 s in each process, for nothing.
+sys.modules["rfc3987_syntax"] = None  # type: ignore[assignment]
 # In a container there may be nobody but root.
 os.environ.setdefault("ROVER_AS_ROOT", "1")
 # How long an example takes is the machine's affair: another program's turn is no failure.

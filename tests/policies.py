@@ -77,6 +77,15 @@ def lerobot_policy(
     return policy
 
 
+def moving_policy() -> "ACTPolicy":
+    """A tiny one whose plans are of a car's size, and differ from frame to frame."""
+    policy = lerobot_policy(**TINY)
+    with torch.no_grad():
+        policy.model.action_head.weight.mul_(torch.tensor([[0.05], [0.005]]))
+        policy.model.action_head.bias.copy_(torch.tensor([0.0, 0.05]))
+    return policy
+
+
 def trainer_config(policy: "ACTPolicy") -> dict:
     c = policy.config
     _, height, width = next(iter(c.image_features.values())).shape

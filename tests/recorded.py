@@ -1,8 +1,14 @@
-"""Where a real recording lies, for the tests that want to see one."""
+"""Recordings for tests: a real one where it is there, and small ones that are made."""
 
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
+from policies import smooth_frame
+
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.recording import EpisodeWriter
 
 REPO = Path(__file__).resolve().parents[1]
 
@@ -14,3 +20,17 @@ def real_episode() -> Path:
         if found:
             return found[0].parent
     pytest.skip("no real recording here: put one at shared/sample_episode/episode_*/ to run this test on it")
+
+
+def record_drives(root: Path, drives: int = 4, frames: int = 24) -> Path:
+    """Drives whose steering and throttle change, and whose pictures do."""
+    rng, pwm = np.random.default_rng(0), PwmCalibration()
+    for drive in range(drives):
+        with EpisodeWriter(root / f"episode_{drive}", label="", resolution=(96, 54)) as writer:
+            for i in range(frames + 6):
+                t_s = i / 30
+                pulses = pwm.pulses(0.5 * math.sin(4 * t_s + drive), 0.05 + 0.04 * math.cos(3 * t_s + drive))
+                writer.control(t_s, 500 + 33 * i, pulses.steering_us, pulses.throttle_us, 21316, 1016)
+            for i in range(frames):
+                writer.frame(0.1 + i / 30, smooth_frame(rng, 54, 96))
+    return root

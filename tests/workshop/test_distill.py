@@ -1,20 +1,18 @@
 """A student is taught on recordings alone, whatever interrupts it."""
 
 import json
-import math
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from policies import TINY, lerobot_policy, smooth_frame, trainer_content
+from policies import TINY, lerobot_policy, moving_policy, trainer_content
+from recorded import record_drives
 
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import load_policy
-from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.onboard.recording import EpisodeWriter
 from rover_lib.workshop import distill as distill_module
 from rover_lib.workshop import training
 from rover_lib.workshop.checkpoint import load_checkpoint
@@ -24,34 +22,16 @@ from rover_lib.workshop.student import StudentShape
 SHAPE = StudentShape(54, 96, decoder_layers=1, feedforward=64)
 
 
-def record(root, drives=4, frames=24):
-    """Drives whose steering and throttle change, and whose pictures do."""
-    rng, pwm = np.random.default_rng(0), PwmCalibration()
-    for drive in range(drives):
-        with EpisodeWriter(root / f"episode_{drive}", label="", resolution=(96, 54)) as writer:
-            for i in range(frames + 6):
-                t_s = i / 30
-                pulses = pwm.pulses(0.5 * math.sin(4 * t_s + drive), 0.05 + 0.04 * math.cos(3 * t_s + drive))
-                writer.control(t_s, 500 + 33 * i, pulses.steering_us, pulses.throttle_us, 21316, 1016)
-            for i in range(frames):
-                writer.frame(0.1 + i / 30, smooth_frame(rng, 54, 96))
-    return root
-
-
 @pytest.fixture(scope="module")
 def episodes(tmp_path_factory):
-    return record(tmp_path_factory.mktemp("episodes"))
+    return record_drives(tmp_path_factory.mktemp("episodes"))
 
 
 @pytest.fixture(scope="module")
 def teacher(tmp_path_factory):
     """A policy whose plans are of a car's size, and differ from frame to frame."""
-    policy = lerobot_policy(**TINY)
-    with torch.no_grad():
-        policy.model.action_head.weight.mul_(torch.tensor([[0.05], [0.005]]))
-        policy.model.action_head.bias.copy_(torch.tensor([0.0, 0.05]))
     path = tmp_path_factory.mktemp("teacher") / "best_model.pth"
-    torch.save(trainer_content(policy), path)
+    torch.save(trainer_content(moving_policy()), path)
     return path
 
 

@@ -4,14 +4,18 @@ import json
 from dataclasses import replace
 
 import pytest
+import torch
 import yaml
 from click.testing import CliRunner
+from policies import moving_policy, trainer_content
+from recorded import record_drives
 from sweep_work import Stub
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.workshop import sweep as sweeping
+from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.sweep import Job, Sheet, SweepError
 
 
@@ -140,6 +144,25 @@ def test_twelve_runs_on_two_workers_of_which_one_dies(tmp_path, sheet):
     assert (out / "sweep.png").stat().st_size > 10_000
     assert len(sweeping.table(content["runs"])) == 13
     assert json.loads((out / "sweep.json").read_text())["stage"] == "sweep"
+
+
+@pytest.mark.slow
+def test_a_student_is_taught_into_its_runs_folder(tmp_path, monkeypatch):
+    """The notebooks themselves are left out: what they are given is what this is about."""
+    asked = []
+    monkeypatch.setattr("rover_lib.workshop.run.run", lambda *words, **options: asked.append((words, options)))
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
+    torch.save(trainer_content(moving_policy()), tmp_path / "teacher.pth")
+    episodes = record_drives(tmp_path / "episodes")
+    student = {"size": "96x54", "decoder_layers": 1, "feedforward": 64, "steps": 4, "samples": 12}
+    job = Job(str(tmp_path / "teacher.pth"), str(episodes), student, {"worlds": 0}, {"distill.judged_frames": 4})
+    sweeping.Notebooks().prepare(job, tmp_path)
+    student_file = tmp_path / job.name / "best_model.pth"
+    config = load_checkpoint(student_file).config
+    assert (config.image_sizes, config.decoder_layers) == (((54, 96),), 1)
+    assert asked == [((student_file, job.episodes, job.name), {"runs_dir": tmp_path, "timed": False, "worlds": 0})]
+    with pytest.raises(SweepError, match="WIDTHxHEIGHT"):
+        sweeping.Notebooks().prepare(replace(job, student={"size": "96 by 54"}), tmp_path)
 
 
 @pytest.mark.slow
