@@ -10,6 +10,8 @@ PYTEST := $(VENV)/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfil
 NAME ?= mine
 # In a container there may be nobody but root, and what is loaded here was made here; see onboard/confine.py.
 export ROVER_AS_ROOT := 1
+# Some containers' images forbid Python to keep what it compiles: then every process compiles torch anew, for 2 s.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help demo watch run test test-fast check-release coverage lint lab arm faults faults-cars random pi-fast pi firmware flash notebooks tables docs clean
 
