@@ -58,18 +58,24 @@ def doctor(ctx: click.Context, artifact: Path | None) -> None:
 )
 @click.option("--jobs", type=click.IntRange(min=1), help="Artifacts at a time [default: all cores].")
 @click.option("--peers", is_flag=True, help="Count ONNX Runtime, ExecuTorch and others beside them.")
+@click.option("--pi4", is_flag=True, help="Count FP32 and static alone, on a Pi 4's core beside a Pi 5's.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, as_json: bool) -> None:
+def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as_json: bool) -> None:
     """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
 
     A count, never a time. Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of
-    lab/params.yml hold. Needs Debian 12 with qemu-user and gcc, which are installed when you are root.
+    lab/params.yml hold. With --pi4 it leaves arm-cortex-a72.json alone. Needs Debian 12 with qemu-user and gcc, which
+    are installed when you are root.
     """
-    from lab.a76.count_run import count_run
-    from lab.a76.report import table
+    from lab.a76.core import A72
+    from lab.a76.count_run import count_other_core, count_run
+    from lab.a76.report import other_core_table, table
     from rover_lib.onboard.stage import read_stage
     from rover_lib.workshop.run import execute
 
+    if pi4:
+        content = count_other_core(run_dir, A72, progress=terminal())
+        return click.echo(json.dumps(content, indent=2) if as_json else other_core_table(content))
     count_run(run_dir, frames=frames, jobs=jobs, progress=terminal())
     if peers:
         from lab.a76.peers import count_peers

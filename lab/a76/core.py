@@ -1,4 +1,4 @@
-"""An emulated Cortex-A76, the core of a Raspberry Pi 5, that counts what a program executes on it.
+"""An emulated Cortex-A76, the core of a Raspberry Pi 5, that counts what a program executes on it. Or a Pi 4's, an A72.
 
     core = prepare()
     emulation = emulate_script(core, Path("predict.py"), [], folder)
@@ -26,6 +26,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import IO, Any
@@ -57,14 +58,25 @@ FOR_GUEST = ("--python-platform", PLATFORM, "--python-version", PYTHON)  # of `f
 CORES = 4  # of the Pi; with fewer or others in /proc/cpuinfo, XNNPACK would choose other kernels
 CPUINFO = """processor\t: {core}
 BogoMIPS\t: 108.00
-Features\t: fp asimd evtstrm aes pmull sha1 sha2 crc32 atomics fphp asimdhp cpuid asimdrdm lrcpc dcpop asimddp
+Features\t: {features}
 CPU implementer\t: 0x41
 CPU architecture: 8
-CPU variant\t: 0x4
-CPU part\t: 0xd0b
-CPU revision\t: 1
+CPU variant\t: {variant}
+CPU part\t: {part}
+CPU revision\t: {revision}
 
 """
+A76, A72 = "cortex-a76", "cortex-a72"  # QEMU's names for the cores of a Raspberry Pi 5 and 4
+PROCESSORS = {  # what Linux says of each there
+    A76: {
+        "features": "fp asimd evtstrm aes pmull sha1 sha2 crc32 atomics fphp asimdhp cpuid asimdrdm lrcpc dcpop "
+        "asimddp",
+        "variant": "0x4",
+        "part": "0xd0b",
+        "revision": 1,
+    },
+    A72: {"features": "fp asimd evtstrm crc32 cpuid", "variant": "0x0", "part": "0xd08", "revision": 3},
+}
 GUEST_BASE, GUEST_SIZE = 0x100000000000, 0x4000000000  # the guest's addresses, as the host sees them
 SAMPLE_S = 0.2  # the emulator's own memory grows slowly
 SILENCE_S = 1200  # of its processor's time: loading the full policy in FP32 takes five minutes without a word
@@ -82,21 +94,22 @@ class CountError(RoverError):
 
 @dataclass(frozen=True)
 class Core:
-    """An emulated core: its file system, the Pi's wheels included, and the plugin that counts."""
+    """An emulated core: its file system, the Pi's wheels included, the plugin that counts, and QEMU's name for it."""
 
     root: Path
     plugin: Path
+    cpu: str = A76
 
 
-def prepare(progress: Progress = silent) -> Core:
+def prepare(progress: Progress = silent, cpu: str = A76) -> Core:
     """Everything that counting needs, from the cache or made now (about half a minute).
 
     Debian packages that are missing are installed when this runs as root. Raises CountError or DebianError if anything
     is not to be had.
     """
-    steps = (_install_missing, build_plugin, _userland)
-    _, plugin, root = [step() for step in progress(steps, desc="emulated Cortex-A76", total=len(steps))]
-    return Core(root, plugin)
+    steps = (_install_missing, build_plugin, partial(_userland, cpu))
+    _, plugin, root = [step() for step in progress(steps, desc=f"emulated {cpu}", total=len(steps))]
+    return Core(root, plugin, cpu)
 
 
 def _install_missing() -> None:
@@ -113,9 +126,18 @@ def build_plugin() -> Path:
     return cached_folder("arm-plugin", key_of({}, PLUGIN), make) / "count.so"
 
 
-def _userland() -> Path:
-    recipe = {"made": [GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, CORES, RECIPE]}
-    return cached_folder("arm-userland", key_of(recipe, REQUIREMENTS), _make_userland)
+def _userland(cpu: str) -> Path:
+    recipe = {"made": [GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, PROCESSORS[cpu], CORES, RECIPE]}
+
+    def of_another_core(root: Path) -> None:
+        """The same files, but for what Linux says of its processor."""
+        shutil.copytree(_userland(A76), root, copy_function=os.link, symlinks=True, dirs_exist_ok=True)
+        (root / "proc" / "cpuinfo").unlink()
+        _write_cpuinfo(root, cpu)
+
+    return cached_folder(
+        "arm-userland", key_of(recipe, REQUIREMENTS), _make_userland if cpu == A76 else of_another_core
+    )
 
 
 def _make_userland(root: Path) -> None:
@@ -124,14 +146,19 @@ def _make_userland(root: Path) -> None:
     fetch_wheels(_site(root), "--require-hashes", *FOR_GUEST, "--requirement", REQUIREMENTS)
     # QEMU looks for every absolute path below this root first, so these stand before the host's own files.
     (root / "proc").mkdir()
-    (root / "proc" / "cpuinfo").write_text("".join(CPUINFO.format(core=i) for i in range(CORES)))
+    _write_cpuinfo(root, A76)
     cpus = root / "sys" / "devices" / "system" / "cpu"
     cpus.mkdir(parents=True)
     for name in ("possible", "present", "online"):
         (cpus / name).write_text(f"0-{CORES - 1}\n")
     # Leaves the bytecode of all that they import, which costs a third of a minute in the emulator, and proves them.
     imports = [_python(root), "-c", "import torch, cv2, serial"]
-    run(*_qemu(root), *imports, error=CountError, env=_environment(root, root))
+    run(*_qemu(root, A76), *imports, error=CountError, env=_environment(root, root))
+
+
+def _write_cpuinfo(root: Path, cpu: str) -> None:
+    text = "".join(CPUINFO.format(core=i, **PROCESSORS[cpu]) for i in range(CORES))
+    (root / "proc" / "cpuinfo").write_text(text)
 
 
 def fetch_wheels(folder: Path, *what: object) -> None:
@@ -148,10 +175,10 @@ def fetch_wheels(folder: Path, *what: object) -> None:
     run(uv, "pip", "install", *options, *what, error=CountError, remedy=remedy)
 
 
-def _qemu(root: Path) -> list[str]:
+def _qemu(root: Path, cpu: str) -> list[str]:
     place = ["-B", hex(GUEST_BASE), "-R", hex(GUEST_SIZE)]
     # setpriv: whoever started it may be killed before it can end its emulator
-    return ["setpriv", "--pdeathsig", "KILL", "qemu-aarch64", "-L", str(root), "-cpu", "cortex-a76", *place]
+    return ["setpriv", "--pdeathsig", "KILL", "qemu-aarch64", "-L", str(root), "-cpu", cpu, *place]
 
 
 def _python(root: Path) -> Path:
@@ -230,7 +257,7 @@ def emulate(
     Raises CountError with the end of its stderr if it fails, or prints nothing for SILENCE_S of its processor's time;
     whatever ends this, the emulator ends with it.
     """
-    qemu = [*_qemu(core.root), "-plugin", f"{core.plugin},folder={folder}", *command]
+    qemu = [*_qemu(core.root, core.cpu), "-plugin", f"{core.plugin},folder={folder}", *command]
     with (folder / "stderr").open("wb") as stderr:
         try:
             process = subprocess.Popen(

@@ -2,12 +2,12 @@
 
 import json
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Lock
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -33,6 +33,7 @@ class Guest:
 
 
 OURS = Guest()
+Name = TypeVar("Name", bound=Hashable)
 
 
 def onnxruntime_there() -> Path:
@@ -131,8 +132,8 @@ def count_artifact(
 
 
 def side_by_side(
-    counts: dict[str, Callable[..., Counted]], inferences: int, what: str, jobs: int, progress: Progress
-) -> dict[str, Counted]:
+    counts: Mapping[Name, Callable[..., Counted]], inferences: int, what: str, jobs: int, progress: Progress
+) -> dict[Name, Counted]:
     """Count in several emulated machines, `jobs` at a time: a count does not depend on who else is running.
 
     counts: by name, each called with on_step and stop (see `count_artifact`); the others end when one fails.

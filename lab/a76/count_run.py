@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lab.a76.core import Core, CountError, emulate_script, prepare
+from lab.a76.core import A76, Core, CountError, emulate_script, prepare
 from lab.a76.count import COUNTED, OURS, STEADY, Counted, count_artifact, guest_of, side_by_side
 from lab.a76.report import LABEL, STATIC, artifact_metrics, gates
 from lab.params import lab_params
@@ -90,10 +90,37 @@ def count_run(
     if STATIC in artifacts:
         metrics["backbone_bits"] = backbone_bits(run_dir, core, again.checkpoint, thinned(samples, BIT_FRAMES))
     metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
-    given = {"frames": len(samples), "steady": STEADY, "cpu": "cortex-a76", "threads": 1}
+    given = {"frames": len(samples), "steady": STEADY, "cpu": A76, "threads": 1}
     given["qemu"] = run("qemu-aarch64", "--version", error=CountError).splitlines()[0]
     inputs = {p.name: sha256_of(p) for p in artifacts.values()}
     return write_stage(run_dir / "arm.json", "arm", params=given, metrics=metrics, inputs=inputs)
+
+
+def count_other_core(run_dir: Path | str, cpu: str, progress: Progress = silent) -> dict[str, Any]:
+    """Count policy_fp32 and policy_static of a run on another core and on a Pi 5's; write and return arm-<cpu>.json.
+
+    metrics: for each the instructions of an inference on both, 10**9, and their ratio. Counted only: what an artifact
+    predicts on another core is judged where it is deployed, by its parity vectors. Raises as `count_run`.
+    """
+    run_dir = Path(run_dir)
+    artifacts = {stem: run_dir / f"{stem}.pt" for stem in (REFERENCE, STATIC)}
+    if missing := [path.name for path in artifacts.values() if not path.exists()]:
+        raise CountError(f"{run_dir}: no {missing[0]} in it", remedy="'rover run' makes a run")
+    samples = thinned(opened(run_dir).parts.held_out, STEADY)
+    cores = {core: prepare(progress, core) for core in (A76, cpu)}
+    counts = {
+        (stem, name): partial(count_artifact, core, path, samples, counted=STEADY)
+        for stem, path in artifacts.items()
+        for name, core in cores.items()
+    }
+    counted = side_by_side(counts, STEADY * len(counts), "emulated inferences", os.cpu_count() or 1, progress)
+    rows = {}
+    for stem in artifacts:
+        here, there = (counted[stem, name].steady / 1e9 for name in (A76, cpu))
+        rows[stem] = {f"{A76}_g": here, f"{cpu}_g": there, "ratio": there / here}
+    inputs = {p.name: sha256_of(p) for p in artifacts.values()}
+    given = {"cpu": cpu, "steady": STEADY, "threads": 1}
+    return write_stage(run_dir / f"arm-{cpu}.json", "arm", params=given, metrics={"artifacts": rows}, inputs=inputs)
 
 
 def reference_of(stem: str, artifacts: Iterable[str]) -> str | None:

@@ -3,7 +3,9 @@
 import re
 from typing import Any
 
+from lab.a76.core import A76
 from lab.a76.count import Counted
+from rover_lib.onboard.columns import aligned
 from rover_lib.onboard.floor import PI5_SEEN_GMAC_PER_S
 from rover_lib.workshop.compare import gate
 from rover_lib.workshop.judge import worst
@@ -181,6 +183,15 @@ def table(content: dict[str, Any]) -> str:
             shown = "-" if row["found"] is None else f"{row['found']:.4g}"
             lines.append(f"{row['gate']:56} {shown:>8} {row['relation']} {row['limit']:<6g} {verdict}")
     return "\n".join(lines)
+
+
+def other_core_table(content: dict[str, Any]) -> str:
+    """The JSON of `count_other_core` for people."""
+    names = [f"{A76}_g", f"{content['params']['cpu']}_g"]
+    rows = [["", *(f"{name.removesuffix('_g')}, G instructions" for name in names), "ratio"]]
+    for stem, m in content["metrics"]["artifacts"].items():
+        rows.append([stem, *(f"{m[name]:.4g}" for name in names), f"{m['ratio']:.2f}"])
+    return "\n".join(aligned(rows))
 
 
 def _cell(value: float | None, key: str, width: int) -> str:

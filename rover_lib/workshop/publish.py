@@ -80,7 +80,8 @@ def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEB
         written += publish(runs_dir / "full", notebooks_dir, of_full)
     results = notebooks_dir.resolve().parent / "results"
     reports = {runs_dir / name: results / "lab" / name for name in OF_LABORATORY}
-    reports[runs_dir / "demo" / "arm.json"] = results / "demo" / "arm.json"  # notebook 06 shows the full size's count
+    for name in ("arm.json", "arm-cortex-a72.json"):  # notebook 06 shows the full size's count
+        reports[runs_dir / "demo" / name] = results / "demo" / name
     reports |= {path: results / "students" / f"{path.parent.name}.json" for path in students(runs_dir)}
     return written + _write({target: _result(path) for path, target in reports.items() if path.is_file()})
 

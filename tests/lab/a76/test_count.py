@@ -208,6 +208,25 @@ def test_what_onnx_runtime_runs_is_counted_like_the_rest(report):
     assert "policy_static.onnx" in reports.table(report)
 
 
+def test_a_pi_4_has_no_dot_product(report, counts, tiny_run, again, monkeypatch):
+    """Of four counts one is made here: the others are those of `report`."""
+    count = counting.count_artifact
+
+    def count_new(core, artifact, *args, **options):
+        new = core.cpu == a76.A72 and artifact.stem == "policy_static"
+        return count(core, artifact, *args, **options) if new else counts[artifact.stem]
+
+    monkeypatch.setattr(counting, "opened", lambda run_dir: again)
+    monkeypatch.setattr(counting, "count_artifact", count_new)
+    content = counting.count_other_core(tiny_run, a76.A72)
+    assert read_stage(tiny_run / "arm-cortex-a72.json", "arm") == content
+    rows = content["metrics"]["artifacts"]
+    assert rows["policy_fp32"]["ratio"] == 1 and 1.5 < rows["policy_static"]["ratio"] < 5
+    assert "policy_static" in reports.other_core_table(content)
+    with pytest.raises(CountError, match=r"no policy_fp32\.pt in it"):
+        counting.count_other_core(tiny_run.parent, a76.A72)
+
+
 def test_an_image_size_without_fp32_is_only_counted(report):
     static, small = (report["metrics"]["artifacts"][f"policy_static{size}"] for size in ("", "_54x96"))
     assert (small["image_height"], small["image_width"]) == (54, 96)
