@@ -1,0 +1,197 @@
+"""Who drove, as a recording says it, against the firmware's own pins: in virtual time exactly, and in simavr whole."""
+
+import json
+import threading
+import time
+from bisect import bisect_right
+from pathlib import Path
+
+import needs
+import numpy as np
+import pytest
+
+from lab.driving.bench import Drive, DrivingBench
+from lab.driving.faults import ATTEMPTS
+from lab.driving.pins import HUMAN as BY_HUMAN
+from lab.driving.pins import STEP_US, Gates, Observation, judge
+from lab.driving.virtual import FRAME_MS, LOST, STICKS_US, World
+from lab.driving.virtual_host import RATE_HZ, Process, VirtualLink
+from rover_lib.onboard.errors import TakenOver
+from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY
+from rover_lib.onboard.takeover import LET_GO_S, TakeoverRecorder
+from rover_lib.workshop.episodes import load_recordings
+from rover_lib.world.standin import REST_US, PinEvent
+
+# ---- in virtual time: the real firmware's state machine, link, loop and plans
+
+
+class Steps:
+    """What each wait of the takeover's recorder is: the world goes on."""
+
+    def __init__(self, world):
+        self._world = world
+
+    def is_set(self):
+        return False
+
+    def wait(self, seconds):
+        self._world.sleep(seconds)
+
+
+class Rows:
+    """In the place of a Recorder."""
+
+    failure = None
+
+    def __init__(self):
+        self.rows = []
+
+    def control(self, *row, **columns):
+        self.rows.append((row[0], row[1], columns["driver"], row[2:4]))
+
+
+class Recorded(Process):
+    """A drive that is recorded, through the human's takeover too."""
+
+    def __init__(self, world):
+        super().__init__(world, service=False)
+        self.written, self.takeover = Rows(), None
+
+    def _drive(self, link, report):
+        recorder, world = TakeoverRecorder(self.written, "static"), self.world
+        self.record = recorder.command
+        try:
+            super()._drive(link, report)
+        except TakenOver:
+            written = list(world.written)
+            options = {"rate_hz": RATE_HZ, "stop": Steps(world), "clock": world.clock}
+            self.takeover = recorder.human(link, self.armed, **options)
+            assert world.written == written, "something was sent to a car that is the human's"
+            raise
+
+
+def mixed(*happenings, make=Recorded):
+    """A drive in which a human does things: (milliseconds, what is done to the hand). The world, and the process."""
+    world = World()
+    process = make(world)
+
+    def wiggle(throw_us):
+        world.hand.sticks[0] = STICKS_US[0] + throw_us
+        world.handle()
+
+    for at_ms, throw_us in ((400, 300), (500, -300), (600, 0)):
+        world.at(at_ms, lambda us=throw_us: wiggle(us))
+    for at_ms, change in happenings:
+        world.at(at_ms, lambda change=change: (change(world.hand), world.handle()))
+    world.sleep(1.0)
+    process.run()
+    world.close()
+    return world, process
+
+
+def sticks(steering_us, throttle_us):
+    def change(hand):
+        hand.sticks[:] = STICKS_US[0] + steering_us, STICKS_US[1] + throttle_us
+
+    return change
+
+
+def lost(hand):
+    hand.receiver = LOST
+
+
+def there(hand):
+    hand.receiver = "live"
+
+
+KNOWN_MS = 101  # a receiver that falls silent is known, by the firmware's design; until then its last pulses count
+
+
+def hands_at(world, ms):
+    """The pulses of each channel, without none, that the receiver has sent lately; a set for each."""
+    lately = [hand for at, hand in world.seen.hands if ms - KNOWN_MS < at <= ms]
+    lately.append([hand for at, hand in world.seen.hands if at <= max(0, ms - KNOWN_MS)][-1])
+    return [{hand.pulses()[channel] for hand in lately} - {0} for channel in (0, 1)]
+
+
+def drivers_by_pins(world):
+    """A function of a millisecond: who drove, by what the pins did and what the receiver had sent."""
+    found = {}
+
+    def truly(ms):
+        if ms not in found:
+            pins = world.seen.pins[bisect_right(world.seen.pins, ms, key=lambda pin: pin[0]) - 1][1]
+            steering, throttle = hands_at(world, ms)
+            follows = pins.state == b"M" and pins.steering_us in steering and pins.throttle_us in throttle
+            found[ms] = POLICY if pins.state == b"A" else HUMAN if follows else NOBODY
+        return found[ms]
+
+    return truly
+
+
+MIXED = (
+    (2600, sticks(200, 0)),  # takes over
+    (3300, sticks(-200, 80)),
+    (4000, lost),
+    (4700, there),  # the throttle is held: it waits until it was at rest
+    (5400, sticks(-200, 0)),
+    (5800, sticks(100, 60)),
+    (6600, sticks(0, 0)),
+)
+
+
+@needs.gcc
+@pytest.mark.slow
+def test_every_frame_of_a_mixed_drive_says_who_drove():
+    """To a tick, whenever within one the stick moves; and then until the human lets go."""
+    farthest_ms, judged = 0.0, 0
+    for later_ms in range(0, 34, 3):
+        world, process = mixed(*((ms + later_ms, change) for ms, change in MIXED))
+        assert process.takeover.ended == f"the sticks have been at rest for {LET_GO_S:g} s"
+        rows = process.written.rows
+        times_ms = np.array([s for s, *_ in rows]) * 1e3
+        assert np.all(np.diff(times_ms) > 0)
+        assert {driver for _, _, driver, _ in rows} == {POLICY, HUMAN, NOBODY}
+        truly = drivers_by_pins(world)
+        changes = [ms for ms in range(round(times_ms[0]), world.seen.end_ms) if truly(ms - 1) != truly(ms)]
+        for frame_ms in np.arange(times_ms[0] + 1, times_ms[-1], FRAME_MS / 10):  # wherever a frame may lie
+            said = rows[int(np.abs(times_ms - frame_ms).argmin())][2]
+            judged += 1
+            if said != truly(int(frame_ms)):
+                farthest_ms = max(farthest_ms, min(abs(frame_ms - ms) for ms in changes))
+    print(f"{judged} moments judged; who drove is wrong for at most {farthest_ms:.1f} ms beside a change")
+    assert judged > 10_000 and farthest_ms <= FRAME_MS
+
+
+@needs.gcc
+def test_what_is_written_of_the_human_is_what_the_receiver_measured():
+    world, process = mixed(*MIXED)
+    truly = drivers_by_pins(world)
+    start_ms = world.seen.starts[-1]
+    humans = [row for row in process.written.rows if row[2] != POLICY]
+    assert len(humans) > 150
+    for _, uptime_ms, driver, pulses_us in humans:
+        ms = start_ms + uptime_ms
+        assert driver == truly(ms)
+        assert all(us is None or us in sent for us, sent in zip(pulses_us, hands_at(world, ms), strict=True))
+
+
+@needs.gcc
+def test_the_pins_are_the_humans_as_soon_whether_it_is_recorded_or_not():
+    def pins_of(world):
+        return [(ms, event.steering_us, event.throttle_us) for ms, event in world.seen.pins]
+
+    happenings = (*MIXED[:1], (3300, sticks(0, 0)))
+    recorded, process = mixed(*happenings)
+    alone, _ = mixed(*happenings, make=lambda world: Process(world, service=False))
+    assert process.takeover is not None
+    assert recorded.seen.commands == alone.seen.commands and len(alone.seen.commands) > 30
+    assert recorded.written == alone.written  # every line, to the byte
+    assert pins_of(recorded)[: len(pins_of(alone))] == pins_of(alone)
+    assert (1656, 120) in {pins[1:] for pins in pins_of(alone)}
+
+
+@needs.gcc
+def test_a_transmitter_that_is_switched_off_ends_the_recording():
+    _, process = mixed((2600, sticks(200, 0)), (3200, lost))
+    assert "no signal" in process.takeover.ended and process.written.rows[-1][2] == NOBODY
