@@ -45,7 +45,7 @@ class Time(threading.Event):
 
 
 class Link:
-    """Says what `said` gives for a time since 100 s, anew every STEP_S. It can be told nothing: it has no such method."""
+    """Says what `said` gives for a time since 100 s, anew every STEP_S. It can be told nothing: no method is there."""
 
     calibration = Car().pwm
 

@@ -1,26 +1,16 @@
 """Who drove, as a recording says it, against the firmware's own pins: in virtual time exactly, and in simavr whole."""
 
-import json
-import threading
-import time
 from bisect import bisect_right
-from pathlib import Path
 
 import needs
 import numpy as np
 import pytest
 
-from lab.driving.bench import Drive, DrivingBench
-from lab.driving.faults import ATTEMPTS
-from lab.driving.pins import HUMAN as BY_HUMAN
-from lab.driving.pins import STEP_US, Gates, Observation, judge
 from lab.driving.virtual import FRAME_MS, LOST, STICKS_US, World
-from lab.driving.virtual_host import RATE_HZ, Process, VirtualLink
+from lab.driving.virtual_host import RATE_HZ, Process
 from rover_lib.onboard.errors import TakenOver
 from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY
 from rover_lib.onboard.takeover import LET_GO_S, TakeoverRecorder
-from rover_lib.workshop.episodes import load_recordings
-from rover_lib.world.standin import REST_US, PinEvent
 
 # ---- in virtual time: the real firmware's state machine, link, loop and plans
 
