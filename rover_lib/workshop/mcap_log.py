@@ -119,9 +119,9 @@ def _of_episode(episode: Path) -> Iterator[_Message]:
         if 0 <= at_s < MOST_S:
             yield _Message(_ns(at_s), PICTURE, picture)
     for row in json_controls(episode / "episode_data.json"):
-        at_s = number_of(row.get("system_timestamp"))
-        if at_s is not None and 0 <= at_s < MOST_S:  # not NaN either
-            yield _Message(_ns(at_s), CONTROL, plain(row))
+        control_s = number_of(row.get("system_timestamp"))
+        if control_s is not None and 0 <= control_s < MOST_S:  # not NaN either
+            yield _Message(_ns(control_s), CONTROL, plain(row))
 
 
 def _picture(at_ns: int, file: Path) -> dict[str, Any] | None:

@@ -1,16 +1,25 @@
 """Who drove, as a recording says it, against the firmware's own pins: in virtual time exactly, and in simavr whole."""
 
+import json
+import time
 from bisect import bisect_right
 
 import needs
 import numpy as np
 import pytest
 
+from lab.driving.bench import AT_SPEED_S, END_S, START_S, Drive, DrivingBench
+from lab.driving.faults import ATTEMPTS
+from lab.driving.pins import HUMAN as BY_HUMAN
+from lab.driving.pins import STEP_US, Gates, Observation, judge
 from lab.driving.virtual import FRAME_MS, LOST, STICKS_US, World
 from lab.driving.virtual_host import RATE_HZ, Process
 from rover_lib.onboard.errors import TakenOver
 from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY
 from rover_lib.onboard.takeover import LET_GO_S, TakeoverRecorder
+from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.export_dataset import export_dataset
+from rover_lib.world.standin import REST_US
 
 # ---- in virtual time: the real firmware's state machine, link, loop and plans
 
@@ -185,3 +194,140 @@ def test_the_pins_are_the_humans_as_soon_whether_it_is_recorded_or_not():
 def test_a_transmitter_that_is_switched_off_ends_the_recording():
     _, process = mixed((2600, sticks(200, 0)), (3200, lost))
     assert "no signal" in process.takeover.ended and process.written.rows[-1][2] == NOBODY
+
+
+# ---- whole: `rover drive --record`, the real firmware in simavr, real time
+
+PHASES = (  # seconds, and the transmitter's pulses from rest; None: off. Of the default car: 20 us of throttle are rest
+    (0.6, (144, 20)),
+    (0.6, (-180, 60)),
+    (0.6, None),
+    (0.5, (-180, 60)),  # there again: the throttle is held until it was at rest
+    (0.4, (-180, 0)),
+    (0.6, (100, 70)),
+)
+BESIDE_S = 0.09  # of a change, within which a frame is not judged: a tick, a status, and a machine that is busy
+LATELY_S = 0.15  # what the pins may still follow: a receiver that fell silent, a pulse of 21 ms
+
+
+class MixedDrive:
+    """One `rover drive --record` that a human takes over; what was seen."""
+
+    def __init__(self, bench, folder):
+        self.bench, self.sent = bench, []
+        make = type("RecordedDrive", (Drive,), {"arguments": ("--record", folder)})
+        drive = bench.start(make=make)
+        end = time.monotonic() + START_S
+        while not bench.driving:
+            bench.wait(0.05)
+            assert drive.running and time.monotonic() < end, drive.last_words()
+        bench.arduino.ready(False)
+        bench.wait(AT_SPEED_S)
+        bench.events = bench.events[-3000:]
+        self.events = []
+        self.at_s = time.monotonic()
+        for seconds, moved in PHASES:
+            self.transmit(moved)
+            bench.wait(seconds)
+        self.transmit((0, 0))
+        bench.wait(LET_GO_S + 0.5)
+        self.code = drive.wait(END_S)
+        bench.wait(0.1)
+        self.words = drive.last_words()
+        self.offset_s = time.time() - time.monotonic()
+        commands = [c for c in bench.cable.commands if c.at_s > self.at_s - 1]
+        self.seen = Observation(bench.events, commands, self.at_s, self.at_s + PHASES[0][0] - 0.05)
+        self.late_commands = [c for c in bench.cable.commands if c.at_s > self.at_s + 0.3]
+
+    def transmit(self, moved):
+        pulses = (0, 0) if moved is None else tuple(rest + us for rest, us in zip(REST_US, moved, strict=True))
+        self.sent.append((time.monotonic(), pulses))
+        self.bench.arduino.transmitter(*pulses)
+
+    @property
+    def spoilt(self):
+        """This machine had no time for it."""
+        return bool(self.seen.stalled_ms()) or not self.seen.was_driving(GATES.throttle_max_us)
+
+    def driver(self, at_s, pins):
+        """Who drove, by the pulses that both pins have just had, and by what the transmitter had sent."""
+        lately = [pulses for since_s, pulses in self.sent if at_s - LATELY_S < since_s <= at_s]
+        lately += [pulses for since_s, pulses in self.sent if since_s <= at_s - LATELY_S][-1:] or [REST_US]
+        human = all(any(abs(us - pulses[i]) <= STEP_US for pulses in lately) for i, us in enumerate(pins))
+        if human:
+            return HUMAN
+        commanded = [c for c in self.seen.commands if at_s - 0.25 < c.at_s <= at_s]
+        return POLICY if commanded and at_s < self.at_s + BESIDE_S else NOBODY
+
+
+GATES = Gates.of_params()
+
+
+@pytest.fixture(scope="module")
+def taken_over(tmp_path_factory):
+    """A mixed drive that this machine had time for, and its episodes."""
+    with DrivingBench() as bench:
+        for attempt in range(ATTEMPTS):
+            folder = tmp_path_factory.mktemp(f"attempt{attempt}") / "episodes"
+            found = MixedDrive(bench, folder)
+            if not found.spoilt:
+                break
+        return found, folder
+
+
+@pytest.mark.emulated
+@needs.simavr
+def test_a_recorded_takeover_is_as_fast_and_ends_as_before(taken_over):
+    found, _ = taken_over
+    human_us = tuple(rest + us for rest, us in zip(REST_US, PHASES[0][1], strict=True))
+    verdict = judge(BY_HUMAN, found.seen, GATES, human_us=human_us)
+    print(f"the human's pulses after {verdict.figures['takeover_ms']} ms, recorded")
+    assert verdict.wrong == [] and found.code == 4, found.words
+    assert found.late_commands == []  # nothing is sent to a car that is the human's
+
+
+@pytest.mark.emulated
+@needs.simavr
+def test_every_frame_says_who_drove_as_the_pins_of_the_emulated_arduino_do(taken_over):
+    found, folder = taken_over
+    (episode,) = folder.iterdir()
+    content = json.loads((episode / "episode_data.json").read_text())
+    recordings = load_recordings(folder, chunk=4)
+    assert content["metadata"]["takeover"]["ended"] == f"the sticks have been at rest for {LET_GO_S:g} s"
+    assert not {f.kind for f in recordings.faults} & {"unsorted_control_times", "serial_burst", "unknown_driver"}
+    pulses = {pin: [e for e in found.seen.events if e.pin == pin] for pin in ("steering", "throttle")}
+    ends = {pin: [e.end_s for e in events] for pin, events in pulses.items()}
+
+    def truly(at_s):
+        pins = [pulses[pin][bisect_right(ends[pin], at_s) - 1].pulse_us for pin in pulses]
+        return found.driver(at_s, pins)
+
+    judged = dict.fromkeys((POLICY, HUMAN, NOBODY), 0)
+    frames = content["frame_samples"]
+    for sample in recordings.samples:
+        at_s = frames[sample.row]["timestamp"] - found.offset_s
+        around = {truly(at_s + beside_s) for beside_s in np.linspace(-BESIDE_S, BESIDE_S, 9)}
+        if at_s > found.at_s - 1 and len(around) == 1:
+            assert sample.driver == around.pop(), f"{(at_s - found.at_s) * 1e3:.0f} ms after the takeover"
+            judged[sample.driver] += 1
+    print(f"frames that say who drove as the pins do: {judged}, of {len(recordings.samples)} samples")
+    assert judged[HUMAN] > 40 and judged[POLICY] > 10 and judged[NOBODY] > 5
+
+
+@pytest.mark.emulated
+@needs.simavr
+def test_lerobots_loader_reads_a_mixed_drive(taken_over, tmp_path, monkeypatch):
+    import datasets
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
+    export_dataset(taken_over[1], tmp_path / "out")
+    theirs = LeRobotDataset("local/out", tmp_path / "out", video_backend="pyav")
+    ours = [s for s in load_recordings(taken_over[1], chunk=2).samples if s.driver != NOBODY]
+    marks = [bool(mark) for mark in theirs.hf_dataset["intervention"]]
+    assert len(marks) > 60 and {True, False} == set(marks)
+    drivers = [s.driver for s in load_recordings(tmp_path / "out", chunk=2).samples]
+    assert [driver == HUMAN for driver in drivers] == marks
+    assert 0 <= len(ours) - len(marks) <= 3  # an episode of one frame is left out
+    actions = {tuple(np.round(s.chunk[0], 5)) for s in ours}
+    assert all(tuple(np.round(np.asarray(action), 5)) in actions for action in theirs.hf_dataset["action"])
