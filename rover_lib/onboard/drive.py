@@ -48,7 +48,7 @@ from rover_lib.onboard.watch import (
 )
 
 REST_S = 1.0  # between plans that nobody drives by
-RECORDED = "the human drives, and is recorded until the sticks are let go"
+TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"
 
 
 class Car(Protocol):
@@ -190,8 +190,8 @@ def drive_car(
         def human_over() -> str | None:
             if service:
                 service.alive()
-            report.status = RECORDED
-            feed.waiting(report, camera, link, RECORDED)
+            report.status = TAKEN_OVER
+            feed.taken_over(report, camera, link, TAKEN_OVER)
             return feed.over()
 
         checks = [camera.latest, planner.newest, *([link.latest] if link else []), show_waiting]
@@ -390,7 +390,7 @@ class _Arming:
             return
         self._driving.close()  # nothing is driven any more: no real time, and a plan a second
         recorder = self._recorder.recorder
-        self._log.event(RECORDED)
+        self._log.event(TAKEN_OVER)
         try:
             takeover = self._recorder.human(link, self._armed, rate_hz=self._options.hz, stop=stop, over=over)
             recorder.note(takeover=vars(takeover))

@@ -403,7 +403,7 @@ def arrived_late(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[
 class Controls:
     """What a transmitter sent. times_s: (n,) float64 seconds from the first, which never go back. steering_us,
     throttle_us: (n,) int64 microseconds, as measured. A hole in the recording is a long step in time. left_out: count
-    of controls that were not usable, mostly because no pulse was measured.
+    of controls that were not usable: no pulse was measured, or nobody drove: the car stood then.
     """
 
     times_s: np.ndarray
@@ -457,7 +457,9 @@ def _found(row: Mapping[str, Any], name: str) -> float | None:
 
 
 def _pulses(row: Mapping[str, Any], pwm: PwmCalibration) -> tuple[int, int] | None:
-    """Both pulses of a control in whole microseconds, None if one was not measured."""
+    """Both pulses of a control in whole microseconds, None if one was not measured, or the car did something else."""
+    if driver_of(row) not in (POLICY, HUMAN):
+        return None
     pulses = []
     for name in CHANNELS:
         pulse_us, period_us = _found(row, f"{name}_raw_us"), _found(row, f"{name}_period_us")
