@@ -8,7 +8,7 @@ import needs
 import numpy as np
 import pytest
 
-from lab.driving.bench import AT_SPEED_S, END_S, START_S, Drive, DrivingBench
+from lab.driving.bench import AT_SPEED_S, END_S, START_S, Drive, DrivingBench, FaultError
 from lab.driving.faults import ATTEMPTS
 from lab.driving.pins import HUMAN as BY_HUMAN
 from lab.driving.pins import STEP_US, Gates, Observation, judge
@@ -214,17 +214,17 @@ class MixedDrive:
     """One `rover drive --record` that a human takes over; what was seen."""
 
     def __init__(self, bench, folder):
-        self.bench, self.sent = bench, []
+        self.bench, self.folder, self.sent = bench, folder, []
         make = type("RecordedDrive", (Drive,), {"arguments": ("--record", folder)})
         drive = bench.start(make=make)
         end = time.monotonic() + START_S
         while not bench.driving:
             bench.wait(0.05)
-            assert drive.running and time.monotonic() < end, drive.last_words()
+            if not drive.running or time.monotonic() > end:
+                raise FaultError(f"rover drive did not drive: {drive.last_words()}")
         bench.arduino.ready(False)
         bench.wait(AT_SPEED_S)
         bench.events = bench.events[-3000:]
-        self.events = []
         self.at_s = time.monotonic()
         for seconds, moved in PHASES:
             self.transmit(moved)
@@ -246,8 +246,14 @@ class MixedDrive:
 
     @property
     def spoilt(self):
-        """This machine had no time for it."""
-        return bool(self.seen.stalled_ms()) or not self.seen.was_driving(GATES.throttle_max_us)
+        """This machine had no time for it: not for the Arduino, the loop, or who records."""
+        if self.seen.stalled_ms() or not self.seen.was_driving(GATES.throttle_max_us) or self.code != 4:
+            return True
+        return max(np.diff([row["system_timestamp"] for row in self.content()["control_samples"]])) > 0.1
+
+    def content(self):
+        (episode,) = self.folder.iterdir()
+        return json.loads((episode / "episode_data.json").read_text())
 
     def driver(self, at_s, pins):
         """Who drove, by the pulses that both pins have just had, and by what the transmitter had sent."""
@@ -269,7 +275,12 @@ def taken_over(tmp_path_factory):
     with DrivingBench() as bench:
         for attempt in range(ATTEMPTS):
             folder = tmp_path_factory.mktemp(f"attempt{attempt}") / "episodes"
-            found = MixedDrive(bench, folder)
+            try:
+                found = MixedDrive(bench, folder)
+            except FaultError:
+                if attempt + 1 < ATTEMPTS:
+                    continue
+                raise
             if not found.spoilt:
                 break
         return found, folder
@@ -290,8 +301,7 @@ def test_a_recorded_takeover_is_as_fast_and_ends_as_before(taken_over):
 @needs.simavr
 def test_every_frame_says_who_drove_as_the_pins_of_the_emulated_arduino_do(taken_over):
     found, folder = taken_over
-    (episode,) = folder.iterdir()
-    content = json.loads((episode / "episode_data.json").read_text())
+    content = found.content()
     recordings = load_recordings(folder, chunk=4)
     assert content["metadata"]["takeover"]["ended"] == f"the sticks have been at rest for {LET_GO_S:g} s"
     assert not {f.kind for f in recordings.faults} & {"unsorted_control_times", "serial_burst", "unknown_driver"}
