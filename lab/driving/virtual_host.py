@@ -21,7 +21,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Order, PolicyPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
 from rover_lib.onboard.service import NotArmed, check_age
-from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink
+from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink, Telemetry
 
 RATE_HZ = 30.0
 PLAN = (0.2, 0.15)  # steering, throttle
@@ -258,8 +258,12 @@ def _settings() -> Settings:
 class Process:
     """`rover drive` from its start to its end, in this one; its parts, for what breaks them.
 
-    service: it drives again and again, each time that an operator asks for it with ask().
+    service: it drives again and again, each time that an operator asks for it with ask(). record: takes each command,
+    as the loop's hook does; armed: the status with which the car was armed.
     """
+
+    record: Callable[..., None] | None = None
+    armed: Telemetry | None = None
 
     def __init__(self, world: World, service: bool):
         self.world = world
@@ -315,11 +319,11 @@ class Process:
         world.phase("ready")
         pilot = _Pilot(self.eyes.camera, self.planner, self.commanded, _settings(), RATE_HZ)
         pilot.world, pilot.planner = world, self.planner
-        hooks = Hooks(arm=functools.partial(self._arm, pilot, link))
+        hooks = Hooks(arm=functools.partial(self._arm, pilot, link), record=self.record)
         drive(pilot, link, self._log, rate_hz=RATE_HZ, until=self.until, hooks=hooks, report=report,
               clock=world.clock, sleep=world.sleep)  # fmt: skip
 
-    def _arm(self, pilot: PolicyPilot, link: ServoLink) -> Any:
+    def _arm(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry:
         """As drive.py and service.py do: one request, one attempt."""
         world = self.world
         if not self._service:
@@ -347,4 +351,5 @@ class Process:
                 self._log.event(f"not armed: {error}")
                 continue
             world.phase("driving")
+            self.armed = telemetry
             return telemetry

@@ -22,7 +22,15 @@ SECTIONS = {
         prepare.export,
         prepare.export_dataset,
     ),
-    "Drive": (ROVERS["doctor"], ROVERS["calibrate"], ROVERS["record"], drive.drive, drive.view, drive.log),
+    "Drive": (
+        ROVERS["doctor"],
+        ROVERS["calibrate"],
+        ROVERS["record"],
+        drive.drive,
+        drive.view,
+        drive.log,
+        ROVERS["label"],
+    ),
     "Set up a rover, and arm it": (prepare.wheelhouse, ROVERS["release"], ROVERS["arm-car"], ROVERS["heartbeat"]),
     "Try it without a car": (world.world,),
 }

@@ -54,7 +54,10 @@ def view(file: Path | None, drive: int, **options: Any) -> None:
 @click.option("-o", "--output", type=FILE, help="The figure to write [default: FILE.png].")
 @LOG_DRIVE
 @click.option("--video", type=FILE, help="A film of the drive: .mp4, or .webp for a page.")
-@click.option("--pictures", type=PathTo("recordings"), help="With --video: the drive's episode [default: by the log].")
+@click.option("--mcap", type=FILE, help="The drive for Foxglove or Rerun, with its pictures where there are some.")
+@click.option(
+    "--pictures", type=PathTo("recordings"), help="The drive's episode [default: the one that the log names]."
+)
 @click.option("--video-hz", type=click.FloatRange(1, 60), default=30, show_default=True, help="Of it, a second.")
 @click.option("--video-width", type=click.IntRange(160, 1920), default=640, show_default=True, help="Of it, in pixels.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")
@@ -63,6 +66,7 @@ def log(
     output: Path | None,
     drive: int,
     video: Path | None,
+    mcap: Path | None,
     pictures: Path | None,
     video_hz: float,
     video_width: int,
@@ -71,7 +75,8 @@ def log(
     """Sum up the flight log FILE of `rover drive`, and draw it.
 
     With --video it makes a film of the drive instead, which needs the pictures that `rover drive --record` has kept:
-    where the car was led, what was commanded, and what its pins did.
+    where the car was led, what was commanded, and what its pins did. With --mcap it writes the log, and the pictures if
+    there are some, for viewers of such files.
 
     Missed ticks, jitter, ages and latencies of plans, who drove, temperature, and what happened. Older parts of the
     same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation, the summary does not.
@@ -86,7 +91,13 @@ def log(
         width = video_width // 2 * 2
         count = write_film(video, shown, rate_hz=video_hz, width=width, progress=terminal())
         click.echo(f"drawn: {video}, {count} pictures, {video.stat().st_size / 1e6:.2f} MB", err=as_json)
-    if output or not (as_json or video):
+    if mcap:
+        from rover_lib.workshop.mcap_log import write_mcap
+
+        counts = write_mcap(mcap, flight, pictures)
+        said = ", ".join(f"{count} of {topic}" for topic, count in counts.items())
+        click.echo(f"written: {mcap}, {said}, {mcap.stat().st_size / 1e6:.2f} MB", err=as_json)
+    if output or not (as_json or video or mcap):
         from rover_lib.onboard.stage import atomic_path
         from rover_lib.workshop.flight import flight_figure
 

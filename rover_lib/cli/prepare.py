@@ -318,13 +318,15 @@ def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> 
     """Write our recordings in EPISODES as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.
 
     lerobot-train trains at the size of the pictures: as recorded, it takes 25 times as long as at a fifth of the sides.
-    What is repaired in them or left out is printed, and kept in OUT/rover_export.json.
+    What is repaired in them or left out is printed, and kept in OUT/rover_export.json. Where a policy drove, each frame
+    says whether a human had taken over: LeRobot's `intervention`.
     """
-    from rover_lib.workshop.export_dataset import REPORT
+    from rover_lib.workshop.export_dataset import DRIVEN_BY, OUTCOMES, REPORT
     from rover_lib.workshop.export_dataset import export_dataset as write
 
     report = write(episodes, out, progress=terminal(), **options)
-    del report["episodes_are"]  # long, and in the file
+    for name in ("episodes_are", DRIVEN_BY, OUTCOMES):  # long, and in the file
+        del report[name]
     show({"exported": report | {"report": str(out / REPORT)}}, as_json)
 
 

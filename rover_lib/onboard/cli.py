@@ -285,6 +285,21 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -
     ctx.exit(1 if fault else 0)
 
 
+@main.command("label", short_help="Note whether recorded drives hit or missed.")
+@click.argument("episodes", type=PathTo("recordings"), nargs=-1, required=True, metavar="EPISODE [EPISODE]...")
+@click.argument("outcome", type=click.Choice(["hit", "missed", "none"]))
+def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
+    """Note in each EPISODE, a folder of one recorded drive, what it came to; `none` takes that back.
+
+    It is in its episode_data.json as metadata.outcome, and nothing else in it changes. A drive that failed is kept:
+    `rover inspect` counts outcomes, and `rover export-dataset` writes them.
+    """
+    from rover_lib.onboard.outcome import label
+
+    label(episodes, outcome)
+    click.echo(f"{len(episodes)} labelled: {outcome}")
+
+
 @main.command(short_help="Look at all that driving needs; say what to do.")
 @click.argument("artifact", type=ARTIFACT, required=False)
 @CAMERA

@@ -22,7 +22,7 @@ from rover_lib.onboard.artifact import car_of, content_hash
 from rover_lib.onboard.camera import Camera, CameraError, path_of
 from rover_lib.onboard.car import Car as CarFile
 from rover_lib.onboard.car import this_car
-from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver
+from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver, sentence_of
 from rover_lib.onboard.feed import Feed
 from rover_lib.onboard.host import default_log, default_view
 from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
@@ -35,6 +35,7 @@ from rover_lib.onboard.recording import read_controls, recorded_car
 from rover_lib.onboard.service import CHECK_S, NotArmed, Service
 from rover_lib.onboard.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.signal_event import SignalEvent
+from rover_lib.onboard.takeover import TakeoverRecorder
 from rover_lib.onboard.telemetry import FlightLog, StatusLine
 from rover_lib.onboard.watch import (
     HealthWatch,
@@ -47,6 +48,7 @@ from rover_lib.onboard.watch import (
 )
 
 REST_S = 1.0  # between plans that nobody drives by
+TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"
 
 
 class Car(Protocol):
@@ -185,6 +187,13 @@ def drive_car(
             if asked and not service:
                 raise NotArmed(asked)
 
+        def human_over() -> str | None:
+            if service:
+                service.alive()
+            report.status = TAKEN_OVER
+            feed.taken_over(report, camera, link, TAKEN_OVER)
+            return feed.over()
+
         checks = [camera.latest, planner.newest, *([link.latest] if link else []), show_waiting]
         while True:
             pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz, calibration=this.pwm)
@@ -210,7 +219,9 @@ def drive_car(
                 hooks = Hooks(_then(arm, camera.begin), warnings, record, show)
                 try:
                     run_loop(pilot, hooks=hooks)
-                except (DriveFault, TakenOver):
+                except (DriveFault, TakenOver) as error:
+                    if link and isinstance(error, TakenOver):
+                        attempt.record_human(link, stop, human_over)
                     if not service:
                         raise
                 finally:
@@ -328,25 +339,32 @@ class _Arming:
         self._room: int | None = None
         if options.record and options.record_mb:
             self._room = room_for(options.record, options.record_mb)  # now: it may take a while
-        self._recorder: Recorder | None = None
-        self._driving = ExitStack()
+        self._recorder: TakeoverRecorder | None = None
+        self._armed: Telemetry | None = None
+        self._driving, self._recording = ExitStack(), ExitStack()
 
     def __enter__(self) -> "_Arming":
         return self
 
     def __exit__(self, *exc: Any) -> None:
+        if self._recorder:
+            self._recorder.flush()
         try:
             self._driving.__exit__(*exc)
         finally:
-            if self._recorder and (outcome := self._recorder.path or self._recorder.failure):
-                self._log.event(f"recorded: {outcome}")
+            try:
+                self._recording.__exit__(*exc)
+            finally:
+                if self._recorder and (outcome := self._recorder.recorder.path or self._recorder.recorder.failure):
+                    self._log.event(f"recorded: {outcome}")
 
     def arm(self) -> Telemetry | None:
         """For the loop's hooks; raises RoverError where it is refused, and may be called again then."""
-        with ExitStack() as driving:
+        with ExitStack() as recording, ExitStack() as driving:
             driving.enter_context(self._planner.without_rest())
             if self._options.record:
-                self._recorder = driving.enter_context(self._new_recorder(self._options.record))
+                recorder = recording.enter_context(self._new_recorder(self._options.record))
+                self._recorder = TakeoverRecorder(recorder, self._mode)
             driving.enter_context(boosted_priority(self._log))
             self._planner.renew(self._settings.fade_s)
             self._pilot.check_sight()
@@ -354,13 +372,32 @@ class _Arming:
             telemetry = None
             if self._link:
                 telemetry = arm_capped(self._link, limit, limit, self._log.event, self.still_wanted)
-            self._driving = driving.pop_all()
+            self._armed = telemetry
+            self._driving, self._recording = driving.pop_all(), recording.pop_all()
         return telemetry
 
     def record(self, *row: Any, **columns: Any) -> None:
         """For the loop's hooks: a command goes into the episode."""
         if self._recorder:
-            self._recorder.control(*row, mode=self._mode, **columns)
+            self._recorder.command(*row, **columns)
+
+    def record_human(self, link: ServoLink, stop: threading.Event, over: Callable[[], str | None]) -> None:
+        """After a takeover, where the drive is recorded: until the human lets go, or as TakeoverRecorder.human() ends.
+
+        Raises nothing: the human has the car, and opening the port again might take it from him.
+        """
+        if not self._recorder:
+            return
+        self._driving.close()  # nothing is driven any more: no real time, and a plan a second
+        recorder = self._recorder.recorder
+        self._log.event(TAKEN_OVER)
+        try:
+            takeover = self._recorder.human(link, self._armed, rate_hz=self._options.hz, stop=stop, over=over)
+            recorder.note(takeover=vars(takeover))
+            self._log.event(str(takeover))
+            recorder.close(takeover.ended if takeover.fault else None)
+        except Exception as error:
+            self._log.event(f"the human is not recorded: {sentence_of(error)}", level=logging.ERROR)
 
     def _new_recorder(self, folder: Path) -> Recorder:
         return Recorder(

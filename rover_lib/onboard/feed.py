@@ -43,7 +43,7 @@ ASKED_MOST = 8  # messages of the view that are read at a tick
 STOP = re.compile(rb"stop ([0-9a-f.:]{1,45})", re.ASCII)  # and the address of who asked
 RAW_BYTES = 120_000  # of a picture that is no JPEG
 MOST_BYTES = 400_000  # of a message; one that would be larger goes without its picture
-DRIVING, WAITING, ENDED = "driving", "waiting", "ended"
+DRIVING, WAITING, TAKEN, ENDED = "driving", "waiting", "taken over", "ended"
 
 
 class Feed:
@@ -83,6 +83,11 @@ class Feed:
         """While nobody has armed the car. said: how the drive before this one ended."""
         if self._due():
             self._show(WAITING, said, report, camera, link=link)
+
+    def taken_over(self, report: Report, camera: Camera | None, link: ServoLink | None, said: str) -> None:
+        """While a human is recorded who took over. said: in words."""
+        if self._due():
+            self._show(TAKEN, said, report, camera, link=link)
 
     def ended(self, report: Report, camera: Camera | None, link: ServoLink | None) -> None:
         """Once, after a drive, with what the pins do now; where the view is busy, for LAST_S."""
@@ -154,6 +159,8 @@ class Feed:
             message |= {"tick": tick and tick._asdict(), "missed": report.missed, "machine": self._log.machine}
             message["events"] = [[round(event.t_s, 2), str(event)[:200]] for event in tuple(self._log.recent)]
             message |= self._pace() | self._pins(tick, link)
+            if phase == TAKEN:
+                message["missing"] = ""  # nobody is about to arm it
             if pilot and pilot.plan:
                 plan, rate_hz = pilot.plan
                 actions = plan.actions.round(3).tolist()

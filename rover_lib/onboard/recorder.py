@@ -121,6 +121,11 @@ class Recorder:
             (host_s, arduino_ms, steering_us, throttle_us, steering_period_us, throttle_period_us, extra)
         )
 
+    def note(self, **metadata: Any) -> None:
+        """What else is to be in the episode's metadata, JSON's types; nothing where it has ended."""
+        if self.failure is None and not self._closing.is_set():
+            self._writer.metadata |= metadata
+
     def close(self, fault: str | None = None) -> Path | None:
         """Ends the episode and returns its folder; None if it is none, and then `failure` says why.
 

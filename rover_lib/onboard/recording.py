@@ -7,7 +7,8 @@ episode_YYYYMMDD_HHMMSS/
 throttle_measured: true or false in JSON, True or False in CSV. Where it is false, that channel has no value: its
 normalized, raw_us and period_us are null in JSON and empty in CSV, which pandas reads as NaN and no program takes for
 "stopped". Files without the two columns are the user's recorder's (and the playground's, where nothing is ever lost):
-in them a pulse or period of 0 says "not measured". More columns may follow: driver says who drove, one of DRIVERS.
+in them a pulse or period of 0 says "not measured". More columns may follow: driver says who drove, one of DRIVERS. What
+a drive came to, one of OUTCOMES, is metadata.outcome, noted afterwards (outcome.py).
 """
 
 import contextlib
@@ -48,6 +49,7 @@ FLAG_FIELDS = ("steering_measured", "throttle_measured")
 FRAME_FIELDS = ("frame_id", "timestamp", "image_path")
 # Who drove at a control: a policy; a human, whose pulses went to the servos; or nobody, as the car was held in neutral.
 POLICY, HUMAN, NOBODY = DRIVERS = ("policy", "human", "nobody")
+HIT, MISSED = OUTCOMES = ("hit", "missed")  # what a drive came to, as metadata.outcome
 
 LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
 ARDUINO_WRAP_MS = 1 << 32  # its clock starts again after 49.7 days
@@ -401,7 +403,7 @@ def arrived_late(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[
 class Controls:
     """What a transmitter sent. times_s: (n,) float64 seconds from the first, which never go back. steering_us,
     throttle_us: (n,) int64 microseconds, as measured. A hole in the recording is a long step in time. left_out: count
-    of controls that were not usable, mostly because no pulse was measured.
+    of controls that were not usable: no pulse was measured, or nobody drove: the car stood then.
     """
 
     times_s: np.ndarray
@@ -432,7 +434,7 @@ def read_controls(folder: Path | str, pwm: PwmCalibration | None = None) -> Cont
     """
     folder = Path(folder)
     pwm = pwm or recorded_car(folder).pwm
-    for name, read in (("control_data.csv", _csv_rows), ("episode_data.json", _json_rows)):
+    for name, read in (("control_data.csv", _csv_rows), ("episode_data.json", json_controls)):
         rows = read(folder / name)
         timed = [(row, t_s, arduino) for row in rows if (t_s := _found(row, "system_timestamp")) is not None
                  and (arduino := _found(row, "arduino_timestamp")) is not None]  # fmt: skip
@@ -455,7 +457,9 @@ def _found(row: Mapping[str, Any], name: str) -> float | None:
 
 
 def _pulses(row: Mapping[str, Any], pwm: PwmCalibration) -> tuple[int, int] | None:
-    """Both pulses of a control in whole microseconds, None if one was not measured."""
+    """Both pulses of a control in whole microseconds, None if one was not measured, or the car did something else."""
+    if driver_of(row) not in (POLICY, HUMAN):
+        return None
     pulses = []
     for name in CHANNELS:
         pulse_us, period_us = _found(row, f"{name}_raw_us"), _found(row, f"{name}_period_us")
@@ -495,7 +499,8 @@ def _csv_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _json_rows(path: Path) -> list[dict[str, Any]]:
+def json_controls(path: Path) -> list[dict[str, Any]]:
+    """The controls in an episode_data.json, as they are; none where it cannot be read."""
     try:
         content = json.loads(_data_of(path))
         return [row for row in content["control_samples"] if isinstance(row, dict)]

@@ -9,8 +9,9 @@ says what it still wants (switch the transmitter on, let go of the throttle, wig
 requests meanwhile. Moving a stick takes the car back.
 
 However a drive ends, by a takeover too, the same process waits disarmed again, with the port open: opening it anew
-might reset the Arduino, and take the car from the human who has just taken it. What is broken for good (a camera that
-is gone, a port) ends the service, and systemd starts it again, disarmed.
+might reset the Arduino, and take the car from the human who has just taken it. While a takeover is recorded, nobody can
+ask for the car. What is broken for good (a camera that is gone, a port) ends the service, and systemd starts it again,
+disarmed.
 
 A drive is over after --max-seconds of the service, or what the request says if that is less. Who arms from afar also
 promises to be heard of: without `rover heartbeat` within the time that the request says, the drive ends.
@@ -22,9 +23,9 @@ What the service says of itself (systemctl show --property=StatusText) begins wi
 only while that is "disarmed".
 
 systemd's watchdog hears of ticks that happened: while the car drives, those of the control loop; while it is disarmed,
-the checks of camera, policy and Arduino; and for a while after a drive has ended, when an episode is finished. A loop
-that hangs, or a process that does, is killed after WatchdogSec; the Arduino has stopped the car 150 ms after the last
-command.
+the checks of camera, policy and Arduino; while a human is recorded who took over, those of that; and for a while after
+a drive has ended, when an episode is finished. A loop that hangs, or a process that does, is killed after WatchdogSec;
+the Arduino has stopped the car 150 ms after the last command.
 """
 
 import contextlib
@@ -209,6 +210,10 @@ class Service:
         """For who arms, just before the Arduino is told: raises NotArmed where the operator asked too long ago."""
         check_age(self._clock() - self._asked_s)
 
+    def alive(self) -> None:
+        """For what goes on after a drive has ended, at each of its turns: the watchdog hears of it."""
+        self._rounds += 1
+
     def over(self) -> str | None:
         """For the loop: why this drive is over by what was requested, None if it is not."""
         request, now = self._request or Request(), self._clock()
@@ -274,8 +279,8 @@ class Service:
         while not self._done.wait(FEED_S):
             if self._report.ended and self._stop.is_set():
                 return self._stopping(self._report.ended)
-            ended = ended + 1 if self._report.ended else 0
             happened = self._rounds + self._report.ticks
+            ended = ended + 1 if self._report.ended and happened == seen else 0
             if not self._rounds or (happened == seen and not 0 < ended * FEED_S < FINISH_S):
                 continue
             seen = happened

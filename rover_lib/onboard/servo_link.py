@@ -233,10 +233,11 @@ class ServoLink:
         self._serial: serial.Serial | None = None
         self._reader: threading.Thread | None = None
         self._closing = threading.Event()
-        self._heard = threading.Condition()  # guards the five below
+        self._heard = threading.Condition()  # guards the six below
         self._hello: Hello | None = None
         self._hellos = 0
         self._telemetry: Telemetry | None = None
+        self._turned: Telemetry | None = None
         self._failure: LinkError | None = None
         self._unanswered: deque[tuple[int, float]] = deque(maxlen=256)  # commands: number, and when it was sent
         self._sending = threading.RLock()  # guards the two below, and keeps lines whole; never taken inside _heard
@@ -276,7 +277,7 @@ class ServoLink:
             ) from error
         self._closing.clear()
         with self._heard:
-            self._hello = self._telemetry = self._failure = None
+            self._hello = self._telemetry = self._turned = self._failure = None
             self._unanswered.clear()
         self._reader = threading.Thread(
             target=self._read, args=(self._serial,), name=f"servo link {self.port}", daemon=True
@@ -479,6 +480,12 @@ class ServoLink:
             raise LinkError(f"{self.port}: the Arduino said nothing for {age:.1f} s", remedy="is it still plugged in?")
         return telemetry
 
+    @property
+    def turned(self) -> Telemetry | None:
+        """The first status that said of who drives what the newest one says; None before the first."""
+        with self._heard:
+            return self._turned
+
     def unacknowledged_s(self, now_s: float) -> float:
         """Age of the oldest command that the Arduino has not acknowledged, nor any after it; 0 if there is none.
 
@@ -596,7 +603,9 @@ class ServoLink:
                     self._unanswered.clear()
                 self._hello, self._hellos = message, self._hellos + 1
             else:
-                self._telemetry = message
+                before, self._telemetry = self._telemetry, message
+                if not before or (before.boot, before.state) != (message.boot, message.state):
+                    self._turned = message
                 while self._unanswered and _reached(message, self._unanswered[0][0]):
                     self._unanswered.popleft()
             self._heard.notify_all()

@@ -20,6 +20,9 @@ How a recording becomes samples:
   its neighbours keep their state and chunk. A frame without an action, or a hole in time, ends the chunks
   before it, and the frame after it is no sample: its state would be invented. Only the episode's first frame
   starts neutral.
+- Where nobody drove, the pulses are those of a human whose car did something else: it was held. They are samples, with
+  that driver, but no chunk goes from there to where somebody drove, or back, and no state.
+- A drive that failed is as good a recording as another: its outcome is noted, and nothing is left out for it.
 """
 
 import csv
@@ -41,6 +44,8 @@ from rover_lib.onboard.recording import (
     CONTROL_FIELDS,
     FRAME_FIELDS,
     HUMAN,
+    NOBODY,
+    OUTCOMES,
     arduino_step_s,
     arrived_late,
     driver_of,
@@ -189,7 +194,7 @@ def _load_episode(
     except CarError as e:
         faults.add(folder, "no_car", str(e))
         return None
-    label, tables = _read_tables(folder, faults)
+    (label, outcome), tables = _read_tables(folder, faults)
     controls = _read_controls(*tables["control_samples"], pwm, faults)
     frames = _read_frames(folder, *tables["frame_samples"], faults)
     if not controls or not frames:
@@ -214,15 +219,21 @@ def _load_episode(
         controls=len(tables["control_samples"][1]),
         samples=samples,
         files=tuple(p for name in DATA_FILES if (p := folder / name).is_file()),
+        outcome=outcome,
     )
 
 
-def _read_tables(folder: Path, faults: _Faults) -> tuple[str, dict[str, tuple[Path, list]]]:
-    """The label, and for controls and frames the file that they came from and its rows: JSON if it has
+def _read_tables(folder: Path, faults: _Faults) -> tuple[tuple[str, str | None], dict[str, tuple[Path, list]]]:
+    """Label and outcome, and for controls and frames the file that they came from and its rows: JSON if it has
     them, else CSV.
     """
     content = _read_json(folder / "episode_data.json", faults)
     label = content.get("action_label", "")
+    metadata = content.get("metadata")
+    outcome = metadata.get("outcome") if isinstance(metadata, dict) else None
+    if outcome is not None and outcome not in OUTCOMES:
+        faults.add(folder / "episode_data.json", "unknown_outcome", f"{shown(outcome)}: rover label says it anew")
+        outcome = None
     tables = {}
     for key, name, fields in (
         ("control_samples", "control_data.csv", CONTROL_FIELDS),
@@ -236,7 +247,7 @@ def _read_tables(folder: Path, faults: _Faults) -> tuple[str, dict[str, tuple[Pa
             tables[key] = folder / "episode_data.json", rows
         else:
             tables[key] = folder / name, _read_csv(folder / name, fields, faults)
-    return label if isinstance(label, str) else "", tables
+    return (label if isinstance(label, str) else "", outcome), tables
 
 
 def _read_bytes(path: Path, faults: _Faults) -> bytes | None:
@@ -514,7 +525,9 @@ def _make_samples(
 
     samples: list[Sample] = []
     unknown_state = 0
-    for segment in _segments(known, set(holes.tolist())):
+    held = np.array([driver == NOBODY for driver in drivers])
+    breaks = {*holes.tolist(), *(np.flatnonzero(held[1:] != held[:-1]) + 1).tolist()}
+    for segment in _segments(known, breaks):
         n = len(segment)
         index = np.arange(n)[:, None] + np.arange(chunk)
         chunks, pads = actions[segment][np.minimum(index, n - 1)], index >= n
@@ -542,7 +555,7 @@ def _make_samples(
 
 
 def _segments(known: np.ndarray, holes: set[int]) -> list[list[int]]:
-    """Runs of frames with actions and without a hole in time, as lists of indices."""
+    """Runs of frames with actions, none of which but the first is in `holes`, as lists of indices."""
     runs: list[list[int]] = []
     for i in np.flatnonzero(known).tolist():
         if runs and runs[-1][-1] == i - 1 and i not in holes:

@@ -6,13 +6,20 @@ A row of that format is a picture, the state before it and the action at it, at 
 So what our reader repairs (readings that came in a burst, single lost pulses) is repaired in it, and where a frame must
 be left out (a picture that is not whole, a hole in time, no measured pulse), the episode ends and another begins. Each
 is counted in the report, which stays in the dataset's folder. Read again, it gives the samples of the recordings.
+
+Where a policy drove in one of the recordings, each frame says whether a human had taken over from it: `intervention`,
+as `lerobot-rollout` writes it when it collects corrections. A demonstration is no intervention. Frames at which nobody
+drove are left out, as a hole is: the car did something else than the pulses beside its picture say, and who trains on
+a LeRobotDataset trains on all of it. Where every recording was labelled, the last frame of each episode says how its
+drive came out, by LeRobot's `next.success`, `next.reward` and `next.done`.
 """
 
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,13 +29,23 @@ import numpy as np
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.recording import HIT, HUMAN, NOBODY, POLICY
 from rover_lib.workshop.episodes import load_recordings
-from rover_lib.workshop.lerobot_dataset import ACTION, BACKEND, STATE
+from rover_lib.workshop.lerobot_dataset import (
+    ACTION,
+    BACKEND,
+    DRIVEN_BY,
+    INTERVENTION,
+    OUTCOMES,
+    REPORT,
+    STATE,
+    SUCCESS,
+)
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import ACTION_NAMES, CAMERA, Episode, Recordings, Sample
 
 NAME = "cam_front"  # of the camera, as in the trainer's policies
-REPORT = "rover_export.json"
+REWARD, DONE = "next.reward", "next.done"
 SIDES_PX = 16, 8192  # of a picture, as an artifact takes them
 SHORTEST = 2  # rows of an episode: of one there is no spread to normalise by
 OTHER_RATE = 0.2  # of the usual time between two frames
@@ -92,9 +109,15 @@ def _step_s(episode: Episode) -> float:
 
 
 def _runs(samples: tuple[Sample, ...]) -> Iterator[list[Sample]]:
-    """Samples whose frames follow each other without one left out, and whose chunks know of each other."""
-    run = [samples[0]]
-    for before, after in pairwise(samples):
+    """Samples whose frames follow each other without one left out, and whose chunks know of each other.
+
+    Of frames at which somebody drove.
+    """
+    driven = [sample for sample in samples if sample.driver != NOBODY]
+    if not driven:
+        return
+    run = driven[:1]
+    for before, after in pairwise(driven):
         if after.row == before.row + 1 and not before.is_pad[1]:
             run.append(after)
         else:
@@ -119,11 +142,12 @@ def _write(
     recorded = recordings.samples[0].frame_bgr().shape
     shape = (*size, 3) if size else recorded
     numbers = {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)}
+    said = _Said.of(recordings)
     picture = {"dtype": "video" if video else "image", "shape": shape, "names": ["height", "width", "channels"]}
     dataset = LeRobotDataset.create(
         repo_id=f"local/{root.name.strip('.').removesuffix('.new')}",
         fps=rate_hz,
-        features={f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers},
+        features={f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers, **said.features},
         root=root,
         robot_type="rover",
         use_videos=video,
@@ -131,7 +155,12 @@ def _write(
     )
     written, short, broken = 0, 0, 0
     origins: list[str] = []
-    with SuppressProgressBars():
+    driven_by: list[str] = []
+    outcomes: list[str | None] = []
+    with SuppressProgressBars(), warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", "Converting input from bool"
+        )  # numpy's, of LeRobot's statistics of yes and no
         for episode in progress(recordings.episodes, desc="exporting", total=len(recordings.episodes)):
             for run in _runs(episode.samples):
                 for rows, unread in _readable(run, size, recorded):
@@ -146,10 +175,13 @@ def _write(
                                 STATE: sample.state,
                                 ACTION: sample.chunk[0],
                                 "task": episode.label or "drive",
+                                **said.of_frame(episode, sample, last=sample is rows[-1][0]),
                             }
                         )
                     dataset.save_episode()
                     written += len(rows)
+                    driven_by.append(POLICY if _by_policy(episode) else HUMAN)
+                    outcomes.append(episode.outcome)
                     origins.append(f"{episode.id} from frame {rows[0][0].row}")
         dataset.finalize()
     if not written:
@@ -163,9 +195,48 @@ def _write(
         "recorded_episodes": len(recordings.episodes),
         "left_out_pictures_not_whole": broken,
         "left_out_too_short": short,
+        "left_out_nobody_drove": sum(s.driver == NOBODY for s in recordings.samples),
         "repaired_or_left_out_while_reading": [asdict(fault) for fault in recordings.faults],
         "episodes_are": origins,
+        DRIVEN_BY: driven_by,
+        OUTCOMES: outcomes,
     }
+
+
+def _by_policy(episode: Episode) -> bool:
+    return any(sample.driver == POLICY for sample in episode.samples)
+
+
+@dataclass(frozen=True)
+class _Said:
+    """Which columns more there are. intervention: a policy drove; outcome: each recording was labelled."""
+
+    intervention: bool
+    outcome: bool
+
+    @classmethod
+    def of(cls, recordings: Recordings) -> "_Said":
+        return cls(any(map(_by_policy, recordings.episodes)), all(e.outcome for e in recordings.episodes))
+
+    @property
+    def features(self) -> dict[str, Any]:
+        """LeRobot's, as its own commands make them."""
+
+        def one(dtype: str) -> dict[str, Any]:
+            return {"dtype": dtype, "shape": (1,), "names": None}
+
+        features = {INTERVENTION: one("bool")} if self.intervention else {}
+        return features | ({REWARD: one("float32"), DONE: one("bool"), SUCCESS: one("bool")} if self.outcome else {})
+
+    def of_frame(self, episode: Episode, sample: Sample, last: bool) -> dict[str, Any]:
+        """last: of its episode in the dataset."""
+        row: dict[str, Any] = {}
+        if self.intervention:
+            row[INTERVENTION] = np.array([sample.driver == HUMAN and _by_policy(episode)])
+        if self.outcome:
+            hit = last and episode.outcome == HIT
+            row |= {REWARD: np.array([hit], np.float32), DONE: np.array([last]), SUCCESS: np.array([hit])}
+        return row
 
 
 def _readable(

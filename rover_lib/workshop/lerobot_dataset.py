@@ -19,11 +19,13 @@ import numpy as np
 from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.policy import action_limits
+from rover_lib.onboard.recording import HIT, HUMAN, MISSED, POLICY
 from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import (
     ACTION_NAMES,
     Episode,
+    Fault,
     Layout,
     Recordings,
     Sample,
@@ -40,6 +42,10 @@ INFO_BYTES = 5_000_000  # LeRobot's: some kB
 CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 STATE, ACTION = "observation.state", "action"
+INTERVENTION = "intervention"  # as lerobot-rollout writes it: in this frame a human had taken over from a policy
+SUCCESS = "next.success"
+REPORT = "rover_export.json"  # beside a dataset of our own, where it says for each episode:
+DRIVEN_BY, OUTCOMES = "driven_by", "outcomes"  # who drove where nobody intervened; what the drive came to, or null
 COPY_AGAIN = "copy the whole dataset again"
 UNEVEN = 0.1  # of the time between two frames
 
@@ -108,8 +114,10 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     """Read a LeRobotDataset v3 folder.
 
     chunk: actions per sample, padded at an episode's end with its last one. Each frame is a sample, with the state
-    that was recorded with it. Raises EpisodeError, in one sentence, for another version, for what is damaged or
-    missing, for numbers that no rover can mean, and where it is not said which camera and which numbers are the car's.
+    that was recorded with it. In a dataset that marks interventions a human drove in those frames, and a policy in all
+    others, unless our own export says otherwise; where nothing is marked, a human did. Raises EpisodeError, in one
+    sentence, for another version, for what is damaged or missing, for numbers that no rover can mean, and where it is
+    not said which camera and which numbers are the car's.
     """
     root = source.path
     info = _read_info(root)
@@ -120,13 +128,48 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     _check_rate(root, columns, float(info["fps"]))
     number = columns["episode_index"]
     starts = np.flatnonzero(np.diff(number, prepend=-1))
+    exported, faults = _exported(root, len(starts), INTERVENTION in columns)
     episodes = []
-    for rows in progress(np.split(np.arange(len(number)), starts[1:]), desc="reading episodes", total=len(starts)):
-        episodes.append(_episode(root, pictures, columns, rows, chunk))
+    parts = np.split(np.arange(len(number)), starts[1:])
+    for rows, said in progress(list(zip(parts, exported, strict=True)), desc="reading episodes", total=len(starts)):
+        episodes.append(_episode(root, pictures, columns, rows, chunk, said))
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
     for sample in last.values():  # a file that was cut lacks its end
         sample.frame_bgr()
-    return Recordings(root, tuple(episodes), (), source, layout)
+    return Recordings(root, tuple(episodes), faults, source, layout)
+
+
+@dataclass(frozen=True)
+class _Exported:
+    """What our own export says of an episode. driver: where nobody intervened; outcome: None: it says nothing."""
+
+    driver: str
+    outcome: str | None = None
+
+
+def _exported(root: Path, episodes: int, marked: bool) -> tuple[list[_Exported], tuple[Fault, ...]]:
+    """Of each episode; what is known without it where REPORT is not there, or of other episodes, which is a fault.
+
+    marked: the dataset marks interventions.
+    """
+    default = [_Exported(POLICY if marked else HUMAN)] * episodes
+    path = root / REPORT
+    if not path.is_file():
+        return default, ()
+    try:
+        if path.stat().st_size > INFO_BYTES:
+            raise ValueError("it is larger than any that rover export-dataset writes")
+        report = json.loads(path.read_bytes())
+        if DRIVEN_BY not in report:  # of before there were takeovers
+            return default, ()
+        driven_by, outcomes = report[DRIVEN_BY], report[OUTCOMES]
+        if not len(driven_by) == len(outcomes) == episodes:
+            raise ValueError(f"it is of {len(driven_by)} episodes, here are {episodes}")
+        if not set(driven_by) <= {POLICY, HUMAN} or not set(outcomes) <= {None, HIT, MISSED}:
+            raise ValueError("it names who drove, or what it came to, by unknown words")
+    except (OSError, ValueError, RecursionError, TypeError, KeyError) as e:
+        return default, (Fault(REPORT, "another_export", 1, f"not used: {shown(str(e))}"),)
+    return [_Exported(*both) for both in zip(driven_by, outcomes, strict=True)], ()
 
 
 def fetched(source: Source) -> Source:
@@ -280,8 +323,11 @@ def _said_of(path: Path, what: str) -> Iterator[None]:
 def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
     """All frames' numbers, in their order: state (n, S) and action (n, A) float32 by the layout's names, and times."""
     names = [STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index"]
+    marks = [key for key in (INTERVENTION, SUCCESS) if _is_mark(dataset.meta.features.get(key))]
     with _said_of(root, "its numbers cannot be read"):
-        columns = dataset.hf_dataset.select_columns(names).with_format("numpy")[:]
+        columns = dataset.hf_dataset.select_columns(names + marks).with_format("numpy")[:]
+        for key in marks:
+            columns[key] = np.asarray(columns[key]).reshape(len(columns["timestamp"])).astype(bool)
         for key, order in ((STATE, layout.state_order), (ACTION, layout.action_order)):
             rows = np.stack(list(columns[key])).astype(np.float32).reshape(len(columns[key]), -1)
             columns[key] = np.ascontiguousarray(rows[:, list(order)])
@@ -299,6 +345,11 @@ def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str,
     return columns
 
 
+def _is_mark(feature: Any) -> bool:
+    """Whether it is a yes or a no for each frame."""
+    return bool(feature) and feature["dtype"] == "bool" and list(feature["shape"]) == [1]
+
+
 def _check_rate(root: Path, columns: Mapping[str, np.ndarray], fps: float) -> None:
     """Raise EpisodeError for frames that do not come `fps` a second: the steps of a plan would not be what they say."""
     times_s, number = columns["timestamp"].astype(np.float64), columns["episode_index"]
@@ -312,9 +363,14 @@ def _check_rate(root: Path, columns: Mapping[str, np.ndarray], fps: float) -> No
 
 
 def _episode(
-    root: Path, pictures: _Pictures, columns: Mapping[str, np.ndarray], rows: np.ndarray, chunk: int
+    root: Path,
+    pictures: _Pictures,
+    columns: Mapping[str, np.ndarray],
+    rows: np.ndarray,
+    chunk: int,
+    said: _Exported,
 ) -> Episode:
-    """rows: of the whole dataset, those of one episode."""
+    """rows: of the whole dataset, those of one episode. said: by our own export."""
     meta, first, n = pictures.dataset.meta, int(rows[0]), len(rows)
     number = int(columns["episode_index"][first])
     name, data = f"episode_{number:06d}", root / meta.get_data_file_path(number)
@@ -323,6 +379,10 @@ def _episode(
     index = np.arange(n)[:, None] + np.arange(chunk)
     actions, pads = columns[ACTION][rows], index >= n
     chunks = actions[np.minimum(index, n - 1)]
+    taken_over = columns[INTERVENTION][rows] if INTERVENTION in columns else np.zeros(n, bool)
+    outcome = said.outcome
+    if outcome is None and SUCCESS in columns:
+        outcome = HIT if columns[SUCCESS][rows].any() else MISSED
     samples = tuple(
         LerobotSample(
             episode=name,
@@ -333,6 +393,7 @@ def _episode(
             is_pad=pads[k].copy(),
             pictures=pictures,
             row=int(row),
+            driver=HUMAN if taken_over[k] else said.driver,
         )
         for k, row in enumerate(rows)
     )
@@ -346,4 +407,5 @@ def _episode(
         controls=n,
         samples=samples,
         files=(root / INFO, data, *files[1:]),
+        outcome=outcome,
     )

@@ -65,10 +65,11 @@ def moments(file: Path | str, drive: int = -1, pictures: Path | None = None) -> 
     if "flight log" not in kinds_of(file):
         return _of_recording(file)
     flight = read_log(file, drive)
-    return _of_flight(flight, pictures or _recorded_with(flight))
+    return _of_flight(flight, pictures or recorded_with(flight))
 
 
-def _recorded_with(flight: Flight) -> Path:
+def recorded_with(flight: Flight) -> Path:
+    """The episode that was recorded with a drive. Raises EpisodeError where none was, or it is gone."""
     for event in reversed(flight.events):
         if event.text.startswith(RECORDED):
             named = Path(event.text.removeprefix(RECORDED))
@@ -82,22 +83,27 @@ def _recorded_with(flight: Flight) -> Path:
     )
 
 
+def began_s(flight: Flight) -> float:
+    """When t_s was 0, by the system's clock. Raises LogError where the log's header is damaged."""
+    try:
+        return datetime.fromisoformat(str(flight.header["start"])).timestamp()
+    except (KeyError, ValueError):
+        raise LogError(f"{flight.path}: when it began is not known, its header is damaged") from None
+
+
 def _of_flight(flight: Flight, episode: Path) -> list[Moment]:
     ticks = flight.ticks
     t_s = ticks["t_s"]
     if not len(t_s):
         raise LogError(f"{flight.path}: nothing was driven in this drive", remedy="choose another by --drive")
-    try:
-        begin_s = datetime.fromisoformat(str(flight.header["start"])).timestamp()  # by the system's clock
-    except (KeyError, ValueError):
-        raise LogError(f"{flight.path}: when it began is not known, its header is damaged") from None
+    begin_s = began_s(flight)
     period_ms, late_ms = flight.period_ms or 1000 / 30, ticks["late_ms"]
     gaps = np.rint(np.diff(t_s * 1000 - late_ms) / period_ms) - 1
     missed = np.concatenate([[0], np.cumsum(gaps.clip(0))])
     commanded = np.stack([ticks["steering"], ticks["throttle"]], axis=1)
     title = Path(str(flight.header.get("drive", {}).get("artifact", ""))).name or flight.path.name
     found = []
-    for at_s, frame in _frames(episode):
+    for at_s, frame in pictures_of(episode):
         i = int(np.searchsorted(t_s, at_s - begin_s, side="right")) - 1
         now_s = at_s - begin_s
         if i < 0 or now_s > t_s[-1] + 0.1:
@@ -151,8 +157,11 @@ def _head(title: str, now_s: float, ahead: Sequence[Sequence[float]], rate_hz: f
             "machine": {}, "events": [], "hz": None, "late_most_ms": None, "missed": 0, "plan": plan}  # fmt: skip
 
 
-def _frames(episode: Path) -> list[tuple[float, Path]]:
-    """When each picture of an episode was taken, by the system's clock, and its file."""
+def pictures_of(episode: Path) -> list[tuple[float, Path]]:
+    """When each picture of an episode was taken, by the system's clock, and its file.
+
+    Raises EpisodeError where there is no list of them.
+    """
     try:
         with (episode / "frame_data.csv").open(newline="") as file:
             rows = [(float(row["timestamp"]), episode / row["image_path"]) for row in csv.DictReader(file)]

@@ -3,7 +3,8 @@
 `episodes` reads our own recordings and `lerobot_dataset` LeRobot's; behind them nobody asks which of the two it was.
 """
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -124,7 +125,10 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One drive. frames and controls: how many were listed; duration_s: first to last frame."""
+    """One drive. frames and controls: how many were listed; duration_s: first to last frame.
+
+    outcome: one of onboard.recording.OUTCOMES, None where none was noted.
+    """
 
     id: str
     path: Path
@@ -134,6 +138,7 @@ class Episode:
     controls: int
     samples: tuple[Sample, ...]
     files: tuple[Path, ...]  # that the numbers came from
+    outcome: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +163,15 @@ class Recordings:
             n: (float(actions[:, i].min()), float(actions[:, i].max())) for i, n in enumerate(self.layout.action_names)
         }
 
+    def driven_by_pct(self) -> dict[str, float]:
+        """Who drove, one of onboard.recording.DRIVERS, at how many percent of the samples."""
+        count = len(self.samples)
+        return {who: round(100 * n / count, 1) for who, n in self._counted(s.driver for s in self.samples).items()}
+
+    @staticmethod
+    def _counted(words: Iterable[str]) -> dict[str, int]:
+        return dict(sorted(Counter(words).items()))
+
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file that the samples came from, by its path relative to `root`."""
         files = {path: None for e in self.episodes for path in (*e.files, *(s.frame_path for s in e.samples))}
@@ -179,6 +193,8 @@ class Recordings:
             "duration_s": sum(e.duration_s for e in self.episodes),
             "layout": self.layout.words(),
             "labels": sorted({e.label for e in self.episodes}),
+            "outcomes": self._counted(e.outcome or "not labelled" for e in self.episodes),
+            "driven_by_pct": self.driven_by_pct(),
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
             "faults": [{"file": f.file, "kind": f.kind, "count": f.count, "note": f.note} for f in self.faults],
         }

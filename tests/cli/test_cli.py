@@ -44,6 +44,7 @@ def rover(*args):
         ["drive"],
         ["view"],
         ["record"],
+        ["label"],
         ["release"],
     ],
     ids=" ".join,

@@ -72,6 +72,8 @@ def test_a_recorded_drive_is_an_episode(world_drive):
     assert len(controls.times_s) == 60
     data = json.loads(next((world_drive[0] / "episodes").glob("*/episode_data.json")).read_text())
     assert {"mode", "plan_age_ms"} <= set(data["control_samples"][0])
+    assert {row["driver"] for row in data["control_samples"]} == {s.driver for s in episode.samples} == {"policy"}
+    assert "takeover" not in data["metadata"]
 
 
 def test_its_replay_sends_the_same_pulses(world_drive, tmp_path):

@@ -316,6 +316,18 @@ def test_while_it_waits_it_says_what_is_missing(tmp_path, listener):
     assert (message["missing"], message["who"]) == ("let go of the throttle stick", "M")
 
 
+def test_while_a_human_is_recorded_it_asks_for_nothing(tmp_path, listener):
+    bench = Bench(tmp_path)
+    bench.link.status = replace(STATUS, state=State.MANUAL, reason="h", missing="w")
+    bench.feed.taken_over(bench.report, bench.eyes, bench.link, "recorded")
+    bench.feed.taken_over(bench.report, bench.eyes, bench.link, "too soon")
+    (message, picture), *more = listener.messages()
+    assert (message["phase"], message["text"], picture, more) == (f.TAKEN, "recorded", JPEG, [])
+    assert (message["missing"], message["who"], message["why"]) == ("", "M", "the human moved a stick")
+    listener.drive.send(b"stop 127.0.0.1")
+    assert bench.feed.over().startswith("stopped from the view")
+
+
 def test_the_last_message_waits_for_a_busy_view_only_shortly(tmp_path, listener):
     bench = Bench(tmp_path, listener.hello, Eyes(replace(Eyes().frame, jpeg=bytes(60_000))))
     bench.drive()

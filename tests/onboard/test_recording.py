@@ -346,7 +346,7 @@ def test_a_long_drive_stays_out_of_memory(tmp_path):
 def csv_of(folder, rows):
     folder.mkdir(exist_ok=True)
     with (folder / "control_data.csv").open("w", newline="") as f:
-        table = csv.DictWriter(f, CONTROL_FIELDS)
+        table = csv.DictWriter(f, rows[0].keys() if rows else CONTROL_FIELDS)
         table.writeheader()
         table.writerows(rows)
     return folder
@@ -437,6 +437,19 @@ def test_what_no_recorder_measured_is_left_out(tmp_path):
     controls = read_controls(tmp_path)
     assert controls.left_out == 2
     assert controls.times_s == pytest.approx([0, 0.099], abs=1e-6)
+
+
+@pytest.mark.parametrize("word", ["nobody", "the cat"])
+def test_pulses_that_the_car_did_not_follow_are_never_replayed(tmp_path, word):
+    """The throttle was held, and the stick said go: a replay would move a car that had stood."""
+    drivers = ["policy"] * 4 + [word] * 4 + ["human"] * 4
+    rows = [row_of(1.76e9 + 0.033 * i, 33 * i) | {"driver": driver} for i, driver in enumerate(drivers)]
+    left = [0.033 * i for i in (*range(4), *range(8, 12))]
+    (tmp_path / "json").mkdir()
+    (tmp_path / "json" / "episode_data.json").write_text(json.dumps({"control_samples": rows}))
+    for folder in (csv_of(tmp_path / "csv", rows), tmp_path / "json"):
+        controls = read_controls(folder)
+        assert controls.left_out == 4 and controls.times_s == pytest.approx(left, abs=1e-6)
 
 
 def test_controls_of_a_real_recording():

@@ -1,5 +1,7 @@
 """The drive as a service: what systemd hears, and who arms."""
 
+import contextlib
+import json
 import math
 import os
 import signal
@@ -17,10 +19,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from needs import until
 
 from lab.driving.policy import pictures
 from rover_lib.cli import main
 from rover_lib.onboard import service as s
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.drive import DriveOptions, arm_capped, arm_when_ready, drive_car
 from rover_lib.onboard.loop import Report
 from rover_lib.onboard.plan import Settings
@@ -555,6 +559,84 @@ def test_after_a_takeover_the_same_process_waits_for_another_request(systemd, tm
     # 0.2 s are six periods; a busy machine misses some of them, and the wait for the human is none.
     assert 5 <= len(second.ticks["t_s"]) + second.summary()["missed"] <= 8
     assert any(e.text == "the human took over with the transmitter" for e in first.events)
+
+
+class DrivenLink(Link):
+    """And who then drives for three seconds."""
+
+    car, missing, opened = Car(), "-", 0
+    arms: ClassVar[list[float]] = []
+    sent_later: ClassVar[list[int]] = []
+    taken_s = 0.0
+
+    def send(self, steering_us, throttle_us):
+        if self.taken_s:
+            self.sent_later.append(self.sequence)
+        super().send(steering_us, throttle_us)
+        if self.state is State.MANUAL:
+            type(self).taken_s = time.monotonic()
+        return self.sequence
+
+    @property
+    def turned(self):
+        return self.latest()
+
+    def latest(self):
+        moved = self.state is State.MANUAL and time.monotonic() - self.taken_s < 3
+        steering_us, throttle_us = (1600, 180) if moved else (1456, 120)
+        sticks = {"receiver_steering_us": steering_us, "receiver_throttle_us": throttle_us}
+        periods = {"receiver_steering_period_us": 21316, "receiver_throttle_period_us": 1016}
+        pins = {"steering_us": steering_us, "throttle_us": throttle_us}
+        now_s = time.monotonic()
+        return replace(super().latest(), host_s=now_s, uptime_ms=int(now_s * 1000), **sticks, **periods, **pins)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ends", ["let go", "SIGTERM"])
+def test_a_takeover_is_recorded_and_then_the_service_waits_disarmed(systemd, tmp_path, monkeypatch, ends):
+    for name, fake in {"ServoLink": DrivenLink, "PolicyProcess": Policy, "content_hash": lambda path: "ab12"}.items():
+        monkeypatch.setattr(f"rover_lib.onboard.drive.{name}", fake)
+    monkeypatch.setattr("rover_lib.onboard.takeover.LET_GO_S", 0.5)
+    monkeypatch.setattr(s, "FINISH_S", 0.0)  # the watchdog hears of what happens, and of nothing else
+    for name in ("taken_s", "opened"):
+        monkeypatch.setattr(DrivenLink, name, 0)
+    for name in ("arms", "sent_later"):
+        monkeypatch.setattr(DrivenLink, name, [])
+    (tmp_path / "film.mjpeg").write_bytes(b"".join(pictures(0) * 20))
+    answers = []
+
+    def operator() -> None:
+        answers.append(human())
+        until(lambda: DrivenLink.taken_s)
+        systemd.hear_until("STATUS=driving: the human took over")
+        answers.append(human())  # nobody can ask for a car that the human has
+        systemd.lines.clear()
+        if ends == "let go":
+            systemd.hear(0.8)
+            assert feeds(systemd.lines) >= 2
+            systemd.hear_until("STATUS=disarmed: the human took over with the transmitter; waiting for a human")
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    options = {"artifact": tmp_path / "policy.pt", "camera": str(tmp_path / "film.mjpeg"), "film": True}
+    thread = beside(systemd, operator)
+    log = tmp_path / "flight.log"
+    drive_options = DriveOptions(**options, service=True, log_file=log, record=tmp_path / "episodes")
+    with contextlib.suppress(s.NotArmed):  # of a service that waits again; one that was told to stop before just ends
+        drive_car(drive_options, Report())
+    thread.join()
+    assert answers[0] == "driving: armed by a human" and answers[1].startswith("rover-drive.service did not arm")
+    assert (len(DrivenLink.arms), DrivenLink.opened, DrivenLink.sent_later) == (1, 1, [])
+    (episode,) = (tmp_path / "episodes").iterdir()
+    content = json.loads((episode / "episode_data.json").read_text())
+    drivers = [row["driver"] for row in content["control_samples"]]
+    commands = drivers.index("human")
+    assert 4 < commands <= 10 and set(drivers[:commands]) == {"policy"} and set(drivers[commands:]) == {"human"}
+    takeover = content["metadata"]["takeover"]
+    assert takeover["ended"] == ("the sticks have been at rest for 0.5 s" if ends == "let go" else "told to stop")
+    assert takeover["controls"] == {"human": len(drivers) - commands, "nobody": 0}
+    assert "fault" not in content["metadata"]
+    events = [e.text for e in read_log(log, 0).events]
+    assert events.index("the human took over with the transmitter") < events.index(f"recorded: {episode}")
 
 
 def test_a_human_in_a_terminal_is_told_what_is_missing():

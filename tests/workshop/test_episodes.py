@@ -116,6 +116,31 @@ def test_a_driver_of_whom_nobody_knows_is_left_out(tmp_path):
     assert {sample.driver for sample in recordings.samples} == {"human"}
 
 
+def test_no_chunk_and_no_state_goes_over_to_where_nobody_drove(tmp_path):
+    """There the car was held: what the sticks said is not what it did."""
+
+    def change(content):
+        for row in content["control_samples"]:
+            row["driver"] = "nobody" if 15 <= round((row["system_timestamp"] - 1000.1) * 30) < 25 else "human"
+
+    recordings = load(edit(record(tmp_path), change).parent)
+    by_row = {sample.row: sample for sample in recordings.samples}
+    drivers = {row: sample.driver for row, sample in by_row.items()}
+    begin, end = (f([row for row, driver in drivers.items() if driver == "nobody"]) for f in (min, max))
+    assert 8 <= end - begin <= 10 and kinds(recordings) == {"frame_without_state": 2}
+    assert set(range(40)) - set(by_row) == {begin - 1, end + 1}
+    for row, sample in by_row.items():
+        left = (begin - 1 if row < begin - 1 else end + 1 if row <= end else 40) - row
+        assert sample.is_pad.tolist() == [step >= left for step in range(CHUNK)]
+    assert recordings.summary()["driven_by_pct"].keys() == {"human", "nobody"}
+
+
+@pytest.mark.parametrize("outcome", ["perhaps", 3, ["hit"], {}])
+def test_an_outcome_that_is_none_is_counted(tmp_path, outcome):
+    recordings = load(edit(record(tmp_path), lambda c: c["metadata"].update(outcome=outcome)).parent)
+    assert kinds(recordings) == {"unknown_outcome": 1} and recordings.episodes[0].outcome is None
+
+
 def test_actions_are_the_nearest_controls(tmp_path):
     folder = record(tmp_path)
     content = json.loads((folder / "episode_data.json").read_text())

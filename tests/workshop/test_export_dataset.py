@@ -141,3 +141,139 @@ def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
 def wide(folder):
     cv2.imwrite(str(folder / "wide.jpg"), np.full((18, 64, 3), 99, np.uint8))
     return folder / "wide.jpg"
+
+
+# ---- who drove, and what it came to
+
+
+def driven(folder, *spans, outcome=None):
+    """Says who drove: (driver, from which frame on); controls are 0.1 s ahead of the frames, every 33 ms."""
+
+    def change(content):
+        first_s = content["frame_samples"][0]["timestamp"]
+        for row in content["control_samples"]:
+            frame = round((row["system_timestamp"] - first_s) * 30)
+            row["driver"] = next(driver for driver, since in reversed(spans) if frame >= since or not since)
+        if outcome:
+            content["metadata"]["outcome"] = outcome
+
+    return edit(folder, change)
+
+
+@pytest.fixture
+def mixed(tmp_path):
+    """A demonstration, a policy's drive, and one that a human ended."""
+    root = tmp_path / "mixed"
+    for second in range(3):
+        record(root, f"episode_20260101_12000{second}", frames=40)
+    driven(root / "episode_20260101_120001", ("policy", 0))
+    driven(root / "episode_20260101_120002", ("policy", 0), ("human", 15), ("nobody", 25), ("human", 32))
+    return root
+
+
+def test_interventions_are_lerobots(mixed, tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    report = export_dataset(mixed, tmp_path / "out")
+    theirs = LeRobotDataset("local/out", tmp_path / "out", video_backend="pyav")
+    # lerobot-rollout's, rollout/context.py
+    assert theirs.meta.features["intervention"] == {"dtype": "bool", "shape": (1,), "names": None}
+    ours = [s for s in load(mixed).samples if s.driver != "nobody"]
+    assert report["left_out_nobody_drove"] == 6 and len(theirs) == len(ours) == 40 + 40 + 25 + 7
+    marked = [bool(item["intervention"]) for item in theirs]
+    assert marked == [s.driver == "human" and s.episode.endswith("2") for s in ours] and sum(marked) == 17
+    assert report["episodes_are"][2:] == [f"episode_20260101_120002 from frame {n}" for n in (0, 33)]
+    for item, sample in zip(theirs, ours, strict=True):
+        assert np.array_equal(item["action"].numpy(), sample.chunk[0])
+        assert np.array_equal(item["observation.state"].numpy(), sample.state)
+    again = load(tmp_path / "out")
+    assert [s.driver for s in again.samples] == [s.driver for s in ours] and again.faults == ()
+    check_equal(again.samples, ours)
+    assert again.summary()["driven_by_pct"] == {"human": 50.9, "policy": 49.1}
+
+
+def test_without_our_report_all_else_is_a_policys(mixed, tmp_path):
+    export_dataset(mixed, tmp_path / "out")
+    (tmp_path / "out" / "rover_export.json").unlink()
+    again = load(tmp_path / "out")
+    assert [s.driver for s in again.episodes[0].samples] == ["policy"] * 40
+    assert [s.driver for s in again.episodes[2].samples] == ["policy"] * 15 + ["human"] * 10
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda report: report["driven_by"].pop(),
+        lambda report: report["driven_by"].__setitem__(0, "the cat"),
+        lambda report: report["outcomes"].__setitem__(0, ["hit"]),
+        lambda report: report.update(outcomes=3),
+        lambda report: report.pop("outcomes"),
+    ],
+)
+def test_a_report_of_another_dataset_is_not_used_and_said(mixed, tmp_path, change):
+    export_dataset(mixed, tmp_path / "out")
+    path = tmp_path / "out" / "rover_export.json"
+    report = json.loads(path.read_text())
+    change(report)
+    path.write_text(json.dumps(report))
+    again = load(tmp_path / "out")
+    assert [f.kind for f in again.faults] == ["another_export"]
+    assert {s.driver for s in again.episodes[0].samples} == {"policy"}
+
+
+def test_demonstrations_alone_have_no_more_columns_than_before(recorded, tmp_path):
+    export_dataset(recorded, tmp_path / "out")
+    features = json.loads((tmp_path / "out" / "meta" / "info.json").read_text())["features"]
+    assert not [name for name in features if name.startswith("next.") or name == "intervention"]
+    again = load(tmp_path / "out")
+    assert {s.driver for s in again.samples} == {"human"} and {e.outcome for e in again.episodes} == {None}
+
+
+def test_outcomes_are_lerobots_where_all_are_known(mixed, tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from rover_lib.onboard.outcome import label
+
+    folders = sorted(mixed.iterdir())
+    label(folders[:2], "hit")
+    report = export_dataset(mixed, tmp_path / "some")
+    assert report["outcomes"] == ["hit", "hit", None, None]
+    assert [e.outcome for e in load(tmp_path / "some").episodes] == ["hit", "hit", None, None]
+    label(folders[2:], "missed")
+    export_dataset(mixed, tmp_path / "all")
+    theirs = LeRobotDataset("local/all", tmp_path / "all", video_backend="pyav")
+    ends = np.cumsum([e["length"] for e in theirs.meta.episodes]) - 1
+    for i, item in enumerate(theirs):
+        last = i in ends
+        hit = bool(last and i in ends[:2])
+        found = [item[f"next.{name}"].item() for name in ("done", "success", "reward")]
+        assert found == [last, hit, float(hit)]
+    for kept in (True, False):
+        if not kept:
+            (tmp_path / "all" / "rover_export.json").unlink()
+        assert [e.outcome for e in load(tmp_path / "all").episodes] == ["hit", "hit", "missed", "missed"]
+
+
+def test_a_drive_that_nobody_drove_is_no_dataset(tmp_path):
+    driven(record(tmp_path / "held", frames=20), ("nobody", 0))
+    assert "no two whole frames in a row" in refused(tmp_path / "held", tmp_path / "out")
+
+
+def test_lerobots_training_takes_it(mixed, tmp_path):
+    """What it does with a dataset before the first step: features of a policy, statistics, a batch."""
+    import torch
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.datasets.utils import dataset_to_policy_features
+
+    from rover_lib.onboard.outcome import label
+
+    label(sorted(mixed.iterdir()), "hit")
+    export_dataset(mixed, tmp_path / "out")
+    dataset = LeRobotDataset("local/out", tmp_path / "out", video_backend="pyav")
+    assert set(dataset_to_policy_features(dataset.meta.features)) == {
+        "observation.images.cam_front",
+        "observation.state",
+        "action",
+    }
+    batch = next(iter(torch.utils.data.DataLoader(dataset, batch_size=8)))
+    assert batch["intervention"].dtype == torch.bool and batch["intervention"].numel() == 8
