@@ -28,10 +28,10 @@ from rover_lib.onboard.host import default_log, default_view
 from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
 from rover_lib.onboard.loop import Arm, Hooks, Report, Until, Warnings, drive
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pilot import PolicyPilot, ReplayPilot
+from rover_lib.onboard.pilot import Pilot, PolicyPilot, ReplayPilot
 from rover_lib.onboard.plan import Commanded, Settings
 from rover_lib.onboard.recorder import Recorder, room_for
-from rover_lib.onboard.recording import read_controls, recorded_car
+from rover_lib.onboard.recording import Controls, read_controls, recorded_car
 from rover_lib.onboard.service import CHECK_S, NotArmed, Service
 from rover_lib.onboard.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.signal_event import SignalEvent
@@ -129,10 +129,9 @@ def drive_car(
     artifact = options.artifact.resolve() if options.artifact else None  # another may take its place meanwhile
     if not (controls or car or options.dry_run or options.film):
         _check_no_film(options.camera)
-    stop = SignalEvent()
-    until = Until(options.ticks, options.max_seconds, stop)
     with ExitStack() as stack:
         log = stack.enter_context(_flight_log(options, settings, report))
+        stop = SignalEvent()
         stack.enter_context(stopped_by_signals(stop, log))
         stack.enter_context(exit_if_hung(report, log))
         if car:
@@ -141,32 +140,62 @@ def drive_car(
             stack.callback(lambda: report.world.update(other.summary()))
         service = None
         if options.service and artifact:
-            service = Service(report, stop, log.event, model=content_hash(artifact))
-            stack.enter_context(service)
-            until = replace(until, over=service.over)
+            service = stack.enter_context(Service(report, stop, log.event, model=content_hash(artifact)))
         title = (options.artifact or options.replay or Path()).name
         feed = stack.enter_context(contextlib.closing(Feed(options.view or default_view(), log, title)))
-        until = replace(until, over=_first_of(until.over, feed.over))
+        over = _first_of(*([service.over] if service else []), feed.over)
+        until = Until(options.ticks, options.max_seconds, stop, over)
         link = None if options.dry_run else stack.enter_context(ServoLink(options.port, car=this))
-        run_loop = partial(drive, link=link, log=log, rate_hz=options.hz, until=until, report=report)
+        opened = _Opened(options, settings, report, log, feed, link, until)
         if controls:
-            limit = 1.0 if options.throttle_limit is None else options.throttle_limit
-            replay = ReplayPilot(controls, throttle_limit=limit, calibration=this.pwm)
-            warnings = _all_of(HealthWatch(report, link), MemoryWatch(report, [os.getpid()]))
-            arm: Arm | None = None
-            if link:
-                arm = partial(arm_capped, link, limit, replay.most_throttle, log.event)
-                if sys.stdin.isatty():
-                    arm = partial(arm_when_ready, arm, link, stop, log.event)
-            hooks = Hooks(arm, warnings, show=partial(feed.tick, report, None, None))
-            try:
-                with boosted_priority(log):
-                    run_loop(replay, hooks=hooks)
-            finally:
-                feed.ended(report, None, link)
-            return
-        if not artifact:
+            _replay(opened, controls)
+        elif artifact:
+            _drive_by(artifact, opened, service)
+        else:
             raise ParamsError("a drive needs an artifact or a replay")
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """What every drive has open. link: None drives no motor."""
+
+    options: DriveOptions
+    settings: Settings
+    report: Report
+    log: FlightLog
+    feed: Feed
+    link: ServoLink | None
+    until: Until
+
+    def run(self, pilot: Pilot, hooks: Hooks) -> None:
+        """One drive; raises as loop.drive."""
+        rate_hz, report = self.options.hz, self.report
+        drive(pilot, self.link, self.log, rate_hz=rate_hz, until=self.until, hooks=hooks, report=report)
+
+
+def _replay(opened: _Opened, controls: Controls) -> None:
+    """Sends the pulses of a recording."""
+    options, report, log, link = opened.options, opened.report, opened.log, opened.link
+    limit = 1.0 if options.throttle_limit is None else options.throttle_limit
+    pilot = ReplayPilot(controls, throttle_limit=limit, calibration=this_car().pwm)
+    arm: Arm | None = None
+    if link:
+        arm = partial(arm_capped, link, limit, pilot.most_throttle, log.event)
+        if sys.stdin.isatty():
+            arm = partial(arm_when_ready, arm, link, opened.until.stop, log.event)
+    warnings = _all_of(HealthWatch(report, link), MemoryWatch(report, [os.getpid()]))
+    try:
+        with boosted_priority(log):
+            opened.run(pilot, Hooks(arm, warnings, show=partial(opened.feed.tick, report, None, None)))
+    finally:
+        opened.feed.ended(report, None, link)
+
+
+def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
+    """Drives by an artifact's plans: once, or with a service each time that a human arms the car."""
+    options, report, log, link, feed = opened.options, opened.report, opened.log, opened.link, opened.feed
+    this, stop = this_car(), opened.until.stop
+    with ExitStack() as stack:
         camera = stack.enter_context(Camera(options.camera, held=options.film))
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:
@@ -178,7 +207,6 @@ def drive_car(
         )
         if sentence := another_car(policy.manifest, this):
             log.event(sentence, level=logging.WARNING)
-        arming = partial(_Arming, options, settings, planner, camera, link, log, policy.manifest["mode"])
         said = ""
 
         def show_waiting() -> None:
@@ -196,15 +224,16 @@ def drive_car(
 
         checks = [camera.latest, planner.newest, *([link.latest] if link else []), show_waiting]
         while True:
-            pilot = PolicyPilot(camera, planner, commanded, settings, policy.rate_hz, calibration=this.pwm)
+            pilot = PolicyPilot(camera, planner, commanded, opened.settings, policy.rate_hz, calibration=this.pwm)
             warnings = _all_of(
                 artifact_changes(artifact),
                 pilot.warnings,
                 HealthWatch(report, link),
                 MemoryWatch(report, [os.getpid(), *policy.pids]),
             )
-            with arming(pilot) as attempt:
+            with _Arming(opened, planner, camera, policy.manifest["mode"], pilot) as attempt:
                 report.clear()
+                arm: Arm = attempt.arm
                 if service and link:
                     attempt.still_wanted = service.check_request
                     arm = partial(
@@ -212,13 +241,10 @@ def drive_car(
                     )
                 elif link and sys.stdin.isatty():
                     arm = partial(arm_when_ready, attempt.arm, link, stop, log.event, checks)
-                else:
-                    arm = attempt.arm
                 show = partial(feed.tick, report, camera, pilot)
                 record = attempt.record if options.record else None
-                hooks = Hooks(_then(arm, camera.begin), warnings, record, show)
                 try:
-                    run_loop(pilot, hooks=hooks)
+                    opened.run(pilot, Hooks(_then(arm, camera.begin), warnings, record, show))
                 except (DriveFault, TakenOver) as error:
                     if link and isinstance(error, TakenOver):
                         attempt.record_human(link, stop, human_over)
@@ -323,19 +349,10 @@ class _Arming:
 
     still_wanted: Callable[[], object] = staticmethod(lambda: None)
 
-    def __init__(
-        self,
-        options: DriveOptions,
-        settings: Settings,
-        planner: Planner,
-        camera: Camera,
-        link: ServoLink | None,
-        log: FlightLog,
-        mode: str,
-        pilot: PolicyPilot,
-    ):
-        self._options, self._settings, self._planner, self._camera = options, settings, planner, camera
-        self._link, self._log, self._mode, self._pilot = link, log, mode, pilot
+    def __init__(self, opened: _Opened, planner: Planner, camera: Camera, mode: str, pilot: PolicyPilot):
+        options = opened.options
+        self._options, self._settings, self._link, self._log = options, opened.settings, opened.link, opened.log
+        self._planner, self._camera, self._mode, self._pilot = planner, camera, mode, pilot
         self._room: int | None = None
         if options.record and options.record_mb:
             self._room = room_for(options.record, options.record_mb)  # now: it may take a while
