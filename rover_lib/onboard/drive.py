@@ -92,7 +92,7 @@ class DriveOptions:
     view: Path | None = None
 
 
-def _check_no_film(camera: str) -> None:
+def check_no_film(camera: str) -> None:
     """Raises CameraError for pictures that do not come from a camera's device."""
     path = path_of(camera)
     if path.exists() and not path.is_char_device():
@@ -126,7 +126,7 @@ def drive_car(
         )
     artifact = options.artifact.resolve() if options.artifact else None  # another may take its place meanwhile
     if not (controls or car or options.dry_run or options.film):
-        _check_no_film(options.camera)
+        check_no_film(options.camera)
     stop = SignalEvent()
     until = Until(options.ticks, options.max_seconds, stop)
     with ExitStack() as stack:
