@@ -8,13 +8,14 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import click
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_robot_rover.configuration_rover_artifact import N_ACTION_STEPS, RoverArtifactConfig
 from lerobot_robot_rover.processor_rover_artifact import make_rover_artifact_pre_post_processors
 from rover_lib.onboard.artifact import check_artifact, read_manifest
-from rover_lib.onboard.errors import ParamsError
+from rover_lib.onboard.errors import ParamsError, RoverError
 
 
 def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_ACTION_STEPS) -> Path:
@@ -49,3 +50,21 @@ def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_AC
             pipeline.save_pretrained(new)
         new.rename(folder)
     return folder
+
+
+@click.command()
+@click.argument("artifact", type=click.Path(path_type=Path))
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--n-action-steps",
+    type=click.IntRange(min=1),
+    default=N_ACTION_STEPS,
+    show_default=True,
+    help="Actions of a chunk that are driven by before the next is computed.",
+)
+def main(artifact: Path, folder: Path, n_action_steps: int) -> None:
+    """Put ARTIFACT into the new FOLDER, as LeRobot's --policy.path wants it."""
+    try:
+        click.echo(f"packed: {pack(artifact, folder, n_action_steps=n_action_steps)}")
+    except RoverError as error:
+        raise click.ClickException(str(error)) from None
