@@ -57,12 +57,14 @@ class Ride:
         return self._thread.ident is not None and not self._thread.is_alive()
 
     def begin(self, steering: float, throttle: float) -> None:
-        """Arms the car, and drives by that action. Raises LinkError and CameraError where arming is refused."""
+        """Arms the car, and drives by that action. Raises LinkError and CameraError where arming is refused, DriveFault
+        where it takes too long."""
         self._sight.check()
         self._action = (steering, throttle)
         self._thread.start()
         if not self._settled.wait(ARMED_S):
             self.end()
+            raise DriveFault(f"the car was not armed within {ARMED_S:g} s", remedy="is this machine too busy?")
         self.check()
 
     def put(self, steering: float, throttle: float) -> None:

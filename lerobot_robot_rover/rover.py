@@ -235,12 +235,16 @@ class Rover(Robot):
         if self._ride:
             self._ride.put(steering, throttle)
             return steering, throttle
+        self._camera.latest()  # raises if it failed
         if (age_s := time.monotonic() - self._captured_s) > self.settings.stop_s:
             self._log.event(f"an action came {age_s:.1f} s after its picture, and was not driven by")
             return NEUTRAL
-        ride = Ride(self._camera, self._link, self.settings, self._log)
-        ride.begin(steering, throttle)
-        self._ride = ride
+        self._ride = Ride(self._camera, self._link, self.settings, self._log)
+        try:
+            self._ride.begin(steering, throttle)
+        except BaseException:  # Ctrl-C too
+            self._end_ride()
+            raise
         return steering, throttle
 
     def _end_ride(self) -> None:

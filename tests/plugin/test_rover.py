@@ -1,23 +1,26 @@
 """The robot by itself: what LeRobot may ask of it, and what it refuses. On a stand-in for the Arduino."""
 
 import math
+import threading
 import time
 
 import numpy as np
 import pytest
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
-from needs import real_time, until
+from needs import real_time, simavr, until
 
+from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.policy import PLAIN, pictures
-from lerobot_robot_rover import Rover, RoverConfig
+from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig
 from lerobot_robot_rover.ride import HOLD_S, Ride
 from rover_lib.onboard.camera import CameraError
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
 from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.onboard.servo_link import LinkError
+from rover_lib.onboard.servo_link import LinkError, State
 from rover_lib.onboard.telemetry import read_log
+from rover_lib.world.standin import REST_US
 
 GO = {"steering": 0.2, "throttle": 0.15}
 SENT = PwmCalibration().pulses(0.2, 0.15)
@@ -256,7 +259,8 @@ def test_what_a_drive_detects_is_detected(make_rover, standin, happens, error, s
         happens(standin, feed)
         with pytest.raises((error, CameraError), match=sentence):
             turn(rover, seconds=3)
-        until(lambda: standin._state != "A")
+        until(lambda: rover._ride is None or rover._ride.over)
+        assert standin._state != "A"
         for ask in (rover.get_observation, lambda: rover.send_action(GO)):
             with pytest.raises((error, CameraError)):
                 ask()
@@ -306,6 +310,60 @@ def test_no_picture_no_observation(rover):
     with pytest.raises(CameraError, match=r"no new frame for 0.2 s"):
         for _ in range(3):
             rover.get_observation()
+
+
+# ---- and a human
+
+
+@pytest.mark.slow
+@real_time
+def test_what_the_human_does_is_not_sent_and_ends_a_drive(make_rover, standin, tmp_path):
+    transmitter = RoverTransmitter(RoverTransmitterConfig(port=standin.port, calibration_dir=tmp_path))
+    rover, _ = make_rover(standin.port)
+    rover.connect()
+    transmitter.connect()
+    try:
+        for _ in range(5):
+            rover.get_observation()
+            sticks = transmitter.get_action()
+            assert rover.send_action(sticks) == sticks == pytest.approx({"steering": 0.0, "throttle": 0.0}, abs=1e-3)
+        assert standin._state == "M"
+        turn(rover, seconds=0.2)  # the same loop, by a policy
+        assert standin._state == "A"
+        rover.get_observation()
+        rover.send_action(transmitter.get_action())  # and again the human: a reset between episodes
+        assert standin._state == "S"
+        rover.disconnect()
+        assert transmitter.get_action() == sticks  # the port is open as long as one of the two needs it
+    finally:
+        transmitter.disconnect()
+
+
+@pytest.mark.emulated
+@pytest.mark.slow
+@simavr
+def test_connecting_waits_for_the_gesture_and_says_what_is_missing(make_rover):
+    with EmulatedArduino(every_pulse=False, nice=NICE) as board:
+        rover, _ = make_rover(board.port)
+
+        def said(words):
+            log = getattr(rover, "_log", None)
+            return bool(log) and any(words in event.text for event in log.recent)
+
+        def human():
+            until(lambda: said("switch the transmitter on"))
+            board.transmitter(*REST_US)
+            until(lambda: said("move the steering stick"))
+            assert not rover.is_connected
+            board.wiggle()
+
+        hand = threading.Thread(target=human)
+        hand.start()
+        rover.connect()
+        hand.join()
+        assert said("move the steering stick")
+        assert rover.is_connected and rover._link.latest().state is State.MANUAL
+        rover.disconnect()
 
 
 # ---- how long an action holds, by a clock of our own
