@@ -197,8 +197,10 @@ class TestHuman:
             states = np.stack(episode["observation.state"])
             np.testing.assert_array_equal(states[1:], actions[:-1])
 
-    def test_lerobots_loader_reads_it(self, drives, monkeypatch):
+    def test_lerobots_loader_reads_it_and_ours(self, drives, monkeypatch):
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        from rover_lib.workshop.episodes import load_recordings
 
         monkeypatch.setenv("HF_HUB_OFFLINE", "1")
         data = LeRobotDataset("local/drives", root=drives, video_backend="pyav")
@@ -207,6 +209,8 @@ class TestHuman:
             data.features["action"]["names"] == data.features["observation.state"]["names"] == ["steering", "throttle"]
         )
         picture = data[5]["observation.images.cam_front"]
+        ours = load_recordings(drives, 8)
+        assert len(ours.episodes) == 3 and not ours.faults
         assert tuple(picture.shape) == (3, 48, 96) and 0.3 < float(picture.mean()) < 0.6
 
     @needs.real_time
