@@ -39,11 +39,11 @@ help:
 	@echo "make tables                                 the pages' tables alone"
 
 # uv installs the CUDA build of torch, gigabytes that its wheel insists on, in a minute where pip takes several.
-$(READY): pyproject.toml
+$(READY): pyproject.toml lerobot_robot_rover/pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and f"Python 3.11 to 3.13 is needed, found {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet 'uv>=0.5'
-	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,view,dev,docs]'
+	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,view,dev,docs]' -e ./lerobot_robot_rover
 	@touch $@
 
 demo: $(READY)
@@ -67,7 +67,7 @@ lint: $(READY)
 	$(VENV)/bin/ruff check --quiet
 	$(VENV)/bin/ruff format --quiet --check
 	$(VENV)/bin/mypy
-	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware lab notebooks rover_lib tests
+	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware lab lerobot_robot_rover notebooks rover_lib tests
 
 # The demo is the tests' whole run; it is made once, and tests/test_demo.py holds it to the gates of params.yml.
 test: lint demo
@@ -84,7 +84,7 @@ check-release: lint demo
 	$(MAKE) faults faults-cars random pi-fast pi
 
 coverage: demo
-	$(VENV)/bin/pytest --cov=rover_lib --cov=lab --cov-report=term
+	$(VENV)/bin/pytest --cov=rover_lib --cov=lab --cov=lerobot_robot_rover --cov-report=term
 
 # NAME=full needs no checkpoint: it makes one. policy_static.onnx.zip is the last that is made of it.
 arm: $(READY)

@@ -9,6 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = ("rover_lib.onboard", "rover_lib.workshop", "rover_lib.world", "rover_lib.cli", "lab")  # the lowest first
+PLUGIN = "lerobot_robot_rover"  # for LeRobot's commands
 ROOMS = ("lab.debian", "lab.arduino", "lab.driving", "lab.a76", "lab.pi", "lab.__main__")  # of the laboratory, the same
 ONBOARD_NEEDS = {
     "torch",
@@ -28,7 +29,7 @@ ONBOARD_NEEDS = {
 
 @functools.cache
 def modules() -> dict[str, Path]:
-    files = [p for top in ("rover_lib", "lab") for p in (ROOT / top).rglob("*.py") if "guest" not in p.parts]
+    files = [p for top in ("rover_lib", PLUGIN, "lab") for p in (ROOT / top).rglob("*.py") if "guest" not in p.parts]
     return {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in files}
 
 
@@ -51,7 +52,7 @@ def ours(path: Path) -> set[str]:
     """The modules of this repository that a file imports."""
     known = modules()
     names = imported(path)
-    return {n if n in known else n.rpartition(".")[0] for n in names if n.split(".")[0] in ("rover_lib", "lab")}
+    return {n if n in known else n.rpartition(".")[0] for n in names if n.split(".")[0] in ("rover_lib", PLUGIN, "lab")}
 
 
 def place(name: str, places: tuple[str, ...]) -> int | None:
@@ -86,3 +87,13 @@ def test_onboard_needs_only_what_a_rover_has():
             top = name.split(".")[0]
             assert top != "aiohttp" or path.name == "view.py", f"{path}: imports {name}"
             assert top in ONBOARD_NEEDS or top in sys.stdlib_module_names, f"{path}: imports {name}"
+
+
+def test_the_plugin_for_lerobot_stands_on_onboard_alone():
+    """It goes where a rover's wheel and LeRobot are; nothing of ours needs it."""
+    for name, path in modules().items():
+        for other in ours(path):
+            if name.split(".")[0] == PLUGIN:
+                assert other.startswith((PLUGIN, "rover_lib.onboard")), f"{name} imports {other}"
+            else:
+                assert not other.startswith(PLUGIN), f"{name} imports {other}"

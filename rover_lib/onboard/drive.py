@@ -94,7 +94,7 @@ class DriveOptions:
     view: Path | None = None
 
 
-def _check_no_film(camera: str) -> None:
+def check_no_film(camera: str) -> None:
     """Raises CameraError for pictures that do not come from a camera's device."""
     path = path_of(camera)
     if path.exists() and not path.is_char_device():
@@ -128,7 +128,7 @@ def drive_car(
         )
     artifact = options.artifact.resolve() if options.artifact else None  # another may take its place meanwhile
     if not (controls or car or options.dry_run or options.film):
-        _check_no_film(options.camera)
+        check_no_film(options.camera)
     with ExitStack() as stack:
         log = stack.enter_context(_flight_log(options, settings, report))
         stop = SignalEvent()

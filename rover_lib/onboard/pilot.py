@@ -54,6 +54,43 @@ class Pilot(Protocol):
         """It went out at that time."""
 
 
+class Sight:
+    """Whether what the camera shows is a reason to drive on. Not for several threads at a time."""
+
+    def __init__(self, camera: Camera, settings: Settings):
+        self._camera, self._settings = camera, settings
+        self._moving_s: float | None = None  # since when the car has been driving
+        self._throttle_s = 0.0  # when it was last told to
+        self._blank_s: float | None = None  # since when nothing has been on the picture
+
+    def check(self) -> None:
+        """Raises CameraError if the newest frame is no reason to drive: frozen, black or without contrast."""
+        frame = self._camera.latest()
+        if frame and (fault := frozen(frame, self._settings) or blank(frame, self._settings)):
+            raise fault
+
+    def sent(self, at_s: float, throttle: float) -> None:
+        """The car was told to drive with that throttle: from then on its pictures must change."""
+        if abs(throttle) > MOVING:
+            self._throttle_s = at_s
+            self._moving_s = at_s if self._moving_s is None else self._moving_s
+        elif at_s - self._throttle_s > COASTS_S:
+            self._moving_s = None
+
+    def watch(self, frame: Frame, now_s: float) -> None:
+        """Raises CameraError for the newest frame: frozen while the car moves, or blank for too long."""
+        moves = self._moving_s is not None and now_s - self._moving_s > BEGINS_S
+        if moves and (fault := frozen(frame, self._settings)):
+            raise fault
+        fault = blank(frame, self._settings)
+        if not fault:
+            self._blank_s = None
+            return
+        self._blank_s = frame.captured_s if self._blank_s is None else self._blank_s
+        if frame.captured_s - self._blank_s >= (self._settings.black_frames - 1.5) / self._camera.wanted_hz:
+            raise fault
+
+
 class PolicyPilot:
     """Drives by plans, and watches the camera behind them. rate_hz: of the plans' steps."""
 
@@ -70,9 +107,7 @@ class PolicyPilot:
         self._camera, self._planner, self._commanded, self._settings = camera, planner, commanded, settings
         self._calibration = calibration or PwmCalibration()
         self._follower = Follower(settings, rate_hz)
-        self._moving_s: float | None = None  # since when the car has been driving
-        self._throttle_s = 0.0  # when it was last told to
-        self._blank_s: float | None = None  # since when nothing has been on the picture
+        self._sight = Sight(camera, settings)
         self._frame_age_s = self._asking_s = 0.0  # the most, since warnings()
 
     @property
@@ -92,7 +127,7 @@ class PolicyPilot:
     def order(self, now_s: float) -> Order | None:
         frame = self._camera.latest()
         if frame:
-            self._watch(frame, now_s)
+            self._sight.watch(frame, now_s)
             self._frame_age_s = max(self._frame_age_s, now_s - frame.captured_s)
         self._asking_s = max(self._asking_s, self._planner.asking_s)
         plan = self._planner.newest()
@@ -118,17 +153,11 @@ class PolicyPilot:
 
     def sent(self, at_s: float, order: Order) -> None:
         self._commanded.add(at_s, order.steering, order.throttle)
-        if abs(order.throttle) > MOVING:
-            self._throttle_s = at_s
-            self._moving_s = at_s if self._moving_s is None else self._moving_s
-        elif at_s - self._throttle_s > COASTS_S:
-            self._moving_s = None
+        self._sight.sent(at_s, order.throttle)
 
     def check_sight(self) -> None:
-        """Raises CameraError if the newest frame is no reason to drive: frozen, black or without contrast."""
-        frame = self._camera.latest()
-        if frame and (fault := frozen(frame, self._settings) or blank(frame, self._settings)):
-            raise fault
+        """As Sight.check()."""
+        self._sight.check()
 
     def warnings(self) -> Iterator[str]:
         """A source of warnings: of camera and policy, since it was asked last."""
@@ -138,18 +167,6 @@ class PolicyPilot:
             yield f"no new frame for {age_s:.2f} s"
         if plan and asking_s > LATE_FRAME_S + 1.5 * plan.latency_s:
             yield f"the policy took {asking_s:.2f} s or more, for the plan before {plan.latency_s:.2f} s"
-
-    def _watch(self, frame: Frame, now_s: float) -> None:
-        moves = self._moving_s is not None and now_s - self._moving_s > BEGINS_S
-        if moves and (fault := frozen(frame, self._settings)):
-            raise fault
-        fault = blank(frame, self._settings)
-        if not fault:
-            self._blank_s = None
-            return
-        self._blank_s = frame.captured_s if self._blank_s is None else self._blank_s
-        if frame.captured_s - self._blank_s >= (self._settings.black_frames - 1.5) / self._camera.wanted_hz:
-            raise fault
 
 
 def frozen(frame: Frame, settings: Settings) -> CameraError | None:

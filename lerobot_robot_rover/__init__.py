@@ -1,0 +1,12 @@
+"""The rover in LeRobot's own commands: robot `rover`, teleoperator `rover_transmitter`, policy `rover_artifact`.
+
+    lerobot-record --robot.type=rover --teleop.type=rover_transmitter ...
+
+LeRobot imports this because of the distribution's name, and finds the classes by the names of their configs.
+"""
+
+from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig
+from lerobot_robot_rover.rover import Rover, RoverConfig
+from lerobot_robot_rover.rover_transmitter import RoverTransmitter, RoverTransmitterConfig
+
+__all__ = ["Rover", "RoverArtifactConfig", "RoverConfig", "RoverTransmitter", "RoverTransmitterConfig"]

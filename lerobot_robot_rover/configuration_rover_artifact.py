@@ -1,0 +1,74 @@
+"""What LeRobot has to know of an artifact. The name of this file, of modeling_ and of processor_ are LeRobot's rule."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.optim.optimizers import OptimizerConfig
+
+from rover_lib.onboard.errors import ParamsError, PolicyError
+
+N_ACTION_STEPS = 8  # of 30 a second: no action's plan is older than half a second, as `rover drive` has it
+
+
+@PreTrainedConfig.register_subclass("rover_artifact")
+@dataclass
+class RoverArtifactConfig(PreTrainedConfig):
+    """artifact: a policy_<mode>.pt or .onnx.zip; a relative path is looked for in the pretrained folder first.
+
+    n_action_steps: actions of a chunk that are driven by before the next is computed. threads: the policy's, None: all
+    cores but one.
+    """
+
+    artifact: str = ""
+    n_action_steps: int = N_ACTION_STEPS
+    threads: int | None = None
+    device: str | None = field(default="cpu")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.n_action_steps < 1 or (self.threads is not None and self.threads < 1):
+            raise ParamsError(
+                "a policy needs n_action_steps and threads from 1", found=f"{self.n_action_steps} and {self.threads}"
+            )
+
+    @property
+    def file(self) -> Path:
+        """The artifact's. Raises ParamsError if none was named, or there is no such file."""
+        if not self.artifact:
+            raise ParamsError(
+                "no artifact is named", remedy="--policy.artifact=runs/mine/policy_static.pt, or a packed --policy.path"
+            )
+        named = Path(self.artifact)
+        places = [Path(self.pretrained_path) / named, named] if self.pretrained_path else [named]
+        for place in places:
+            if place.is_file():
+                return place
+        raise ParamsError(f"{self.artifact}: not found", remedy="name a policy_<mode>.pt of a run")
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> None:
+        return None
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+    def get_optimizer_preset(self) -> OptimizerConfig:
+        """Raises PolicyError: nothing in an artifact can be trained."""
+        raise not_trained()
+
+    def get_scheduler_preset(self) -> None:
+        return None
+
+    def validate_features(self) -> None:
+        """The artifact's manifest is what counts; modeling_rover_artifact looks at it."""
+
+
+def not_trained() -> PolicyError:
+    """For all that LeRobot's training asks."""
+    return PolicyError("an artifact is not trained", remedy="train its checkpoint, and `rover run` that")

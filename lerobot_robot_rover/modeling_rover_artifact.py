@@ -1,0 +1,148 @@
+"""An artifact as a policy of LeRobot: the same confined process as in `rover drive`, asked by LeRobot's loop."""
+
+import logging
+import shutil
+import weakref
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from torch import Tensor
+
+from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig, not_trained
+from lerobot_robot_rover.line import wait_for_humans
+from rover_lib.onboard.car import this_car
+from rover_lib.onboard.drive import another_car
+from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.inference import PolicyProcess
+from rover_lib.onboard.params import params
+from rover_lib.onboard.plan import Plan, Settings
+
+ACTIONS = ["steering", "throttle"]
+
+_log = logging.getLogger("rover")
+
+
+class RoverArtifactPolicy(PreTrainedPolicy):
+    """Runs an artifact. It has no weights that LeRobot could see, save or train.
+
+    Raises ParamsError and PolicyError for an artifact that is not there, is damaged or has other actions, and for a
+    dataset of another rate or camera than its own.
+    """
+
+    config_class = RoverArtifactConfig
+    name = "rover_artifact"
+
+    def __init__(self, config: RoverArtifactConfig, dataset_meta: Any = None, **kwargs: Any):
+        super().__init__(config)
+        self.config: RoverArtifactConfig = config
+        self._limits = this_car().limits
+        self._queue: deque[Tensor] = deque()
+        self._plans = 0
+        self._process = PolicyProcess(config.file, threads=config.threads)
+        self._close = weakref.finalize(self, self._process.close)  # at the program's end too
+        self._process.__enter__()  # its first inferences, which are slow, are over then
+        try:
+            self._check(self._process.manifest, dataset_meta)
+        except BaseException:
+            self._close()
+            raise
+        if self._process.unconfined:
+            _log.warning("the policy's process is not confined: %s", self._process.unconfined)
+
+    def get_optim_params(self) -> dict:
+        """Raises PolicyError."""
+        raise not_trained()
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
+        """Raises PolicyError: an artifact has no loss."""
+        raise not_trained()
+
+    def reset(self) -> None:
+        """Before an episode. Where a rover is connected it waits for the human's gesture, which is no part of the
+        episode then."""
+        self._queue.clear()
+        wait_for_humans()
+
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """(B, 2) [steering, throttle], the next of the chunk; a new one is computed after n_action_steps."""
+        if not self._queue:
+            chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
+            self._queue.extend(chunk.transpose(0, 1))
+        return self._queue.popleft()
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """(B, chunk, 2) float32 [steering, throttle], clipped as by `rover drive`.
+
+        batch: `observation.images.<camera>`, (B, 3, h, w) float in [0, 1] RGB, and `observation.state`, (B, 2). Raises
+        PolicyError for what is not there, and for a prediction that is not finite or far out of range.
+        """
+        camera = f"{OBS_IMAGES}.{self._camera}"
+        if missing := {camera, OBS_STATE} - set(batch):
+            raise PolicyError(f"the policy needs {', '.join(sorted(missing))}", found=sorted(map(str, batch)))
+        pictures = (batch[camera].detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8)
+        states = batch[OBS_STATE].detach().cpu().numpy()
+        chunks = []
+        for picture, state in zip(pictures.permute(0, 2, 3, 1).numpy(), states, strict=True):
+            actions = self._process.predict(np.ascontiguousarray(picture[..., ::-1]), state)
+            self._plans += 1
+            chunks.append(Plan(self._plans, 0.0, 0.0, actions, self._limits).actions)
+        return torch.from_numpy(np.stack(chunks).astype(np.float32))
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, *, config: Any = None, **kwargs: Any):
+        """Of a folder that pack() wrote. Raises ParamsError for a repository of the Hub: artifacts are files here."""
+        folder = Path(pretrained_name_or_path)
+        if not folder.is_dir():
+            raise ParamsError(f"{folder}: not a folder", remedy="`python -m lerobot_robot_rover` packs an artifact")
+        config = config or RoverArtifactConfig.from_pretrained(folder)
+        config.pretrained_path = folder
+        return cls(config, **kwargs).eval()
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        shutil.copyfile(self.config.file, save_directory / self.config.file.name)
+        self.config._save_pretrained(save_directory)
+
+    def _check(self, manifest: dict[str, Any], dataset_meta: Any) -> None:
+        """That LeRobot's loop can run this artifact as `rover drive` would."""
+        cameras = [camera["name"] for camera in manifest["cameras"]]
+        names = manifest["state_names"], manifest["action_names"]
+        if names != (ACTIONS, ACTIONS) or len(cameras) != 1:
+            raise PolicyError(
+                "the rover has one camera, and steering and throttle as state and actions",
+                found=f"an artifact of {cameras}, {names[0]} and {names[1]}",
+            )
+        self._camera = cameras[0]
+        rate_hz, chunk, stop_s = float(manifest["rate_hz"]), int(manifest["chunk"]), _stop_s()
+        if self.config.n_action_steps > (most := min(chunk, int(stop_s * rate_hz))):
+            raise ParamsError(
+                f"n_action_steps may be {most} at most: `rover drive` stops by a plan of {stop_s:g} s",
+                found=self.config.n_action_steps,
+            )
+        if sentence := another_car(manifest, this_car()):
+            _log.warning(sentence)
+        if dataset_meta is None:
+            return
+        if dataset_meta.fps != rate_hz:
+            raise PolicyError(
+                f"this artifact's actions are {rate_hz:g} a second",
+                found=f"a dataset of {dataset_meta.fps} frames a second",
+                remedy=f"--dataset.fps={rate_hz:g}",
+            )
+        pictures = sorted(name for name in dataset_meta.features if name.startswith(OBS_IMAGES))
+        if f"{OBS_IMAGES}.{self._camera}" not in pictures:
+            without = "--dataset.video=true: LeRobot records no pictures otherwise"
+            raise PolicyError(
+                f"this artifact looks through {self._camera}",
+                found=f"a dataset of {pictures or 'no pictures'}",
+                remedy=f"--robot.camera_name={self._camera}" if pictures else without,
+            )
+
+
+def _stop_s() -> float:
+    """Age of a plan at which `rover drive` stops the car."""
+    return Settings.of(params()["drive"]).stop_s

@@ -1,0 +1,253 @@
+"""The rover as a robot of LeRobot: its camera, and its Arduino with all limits of `rover drive`."""
+
+import logging
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.robots import Robot, RobotConfig
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+
+from lerobot_robot_rover.line import line_to
+from lerobot_robot_rover.ride import HOLD_S, RATE_HZ, Ride
+from rover_lib.onboard.camera import Camera, CameraError
+from rover_lib.onboard.car import this_car
+from rover_lib.onboard.drive import arm_when_ready, check_no_film
+from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.host import default_log
+from rover_lib.onboard.params import params
+from rover_lib.onboard.pilot import HOLE_S, LATE_FRAME_S, Sight
+from rover_lib.onboard.plan import Plan, Settings
+from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.pwm import NEUTRAL
+from rover_lib.onboard.servo_link import ServoLink
+from rover_lib.onboard.telemetry import FlightLog
+from rover_lib.onboard.watch import unfinished_drive
+
+ACTIONS = ("steering", "throttle")
+NO_PROMISE = (
+    "LeRobot's loop has no deadlines, knows no age of a plan and does not make up for its latency: an action holds for "
+    f"{HOLD_S * 1e3:g} ms, then the car stops; `rover drive` does more"
+)
+
+
+@RobotConfig.register_subclass("rover")
+@dataclass(kw_only=True)
+class RoverConfig(RobotConfig):
+    """port: the Arduino's. camera: a number, /dev/videoN, or with film a folder, FIFO or .mjpeg of JPEGs.
+
+    camera_name: the picture is `observation.images.<camera_name>` in the dataset. width, height: of the pictures that
+    LeRobot gets, pixels; the camera's are made that by what policies see through. throttle_limit: in [0, 1], None:
+    params.yml's. log: of the flight log, None: where `rover drive` writes it.
+    """
+
+    port: str = "/dev/ttyUSB0"
+    camera: str = "0"
+    camera_name: str = "cam_front"
+    width: int = 640
+    height: int = 360
+    throttle_limit: float | None = None
+    film: bool = False
+    log: Path | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.width < 1 or self.height < 1:
+            raise ParamsError("a picture has a width and a height from 1", found=f"{self.width} and {self.height}")
+        if not self.camera_name.isidentifier():
+            raise ParamsError("camera_name must be a name, such as cam_front", found=repr(self.camera_name))
+
+
+class Rover(Robot):
+    """A car with a camera and an Arduino, as LeRobot's commands drive and record it.
+
+    With a `rover_transmitter` on the same port the human drives, and nothing is sent. Otherwise send_action() drives:
+    it arms the car, which takes the human's gesture each time, and the car is stopped and disarmed when no action
+    comes for 0.1 s. Not for several threads.
+    """
+
+    config_class = RoverConfig
+    name = "rover"
+
+    def __init__(self, config: RoverConfig):
+        super().__init__(config)
+        self.config = config
+        self.settings = Settings.of(params()["drive"], throttle_limit=config.throttle_limit)
+        self.cameras: dict[str, Camera | None] = {config.camera_name: None}  # LeRobot counts them
+        self._line = line_to(config.port)
+        self._open: ExitStack | None = None
+        self._ride: Ride | None = None
+
+    @cached_property
+    def observation_features(self) -> dict[str, Any]:
+        """The state, which is the action before, and (height, width, 3) of the camera's picture."""
+        return {**self.action_features, self.config.camera_name: (self.config.height, self.config.width, 3)}
+
+    @cached_property
+    def action_features(self) -> dict[str, type]:
+        """steering in [-1, 1], positive to the left, and throttle in [0, 1], or from -1 of a car with reverse."""
+        return dict.fromkeys(ACTIONS, float)
+
+    @property
+    def is_connected(self) -> bool:
+        return self._open is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    def calibrate(self) -> None:
+        """Nothing: a car is measured once, by `rover calibrate`, which writes its car.yml."""
+
+    def configure(self) -> None:
+        """Nothing: the Arduino is told of the car when its port is opened."""
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Opens camera and Arduino; without a `rover_transmitter` it then waits until a human has made the gesture
+        for arming, and says what is missing. Nothing is armed yet: the first action does that.
+
+        Raises CameraError, LinkError and CarError for what is not there or does not fit, ParamsError, and
+        DeviceAlreadyConnectedError.
+        """
+        if self._open:
+            raise DeviceAlreadyConnectedError(f"the rover at {self.config.port} is connected already")
+        if not self.config.film:
+            check_no_film(self.config.camera)
+        with ExitStack() as stack:
+            self._log = stack.enter_context(self._flight_log())
+            self._camera = stack.enter_context(Camera(self.config.camera))
+            self._link: ServoLink = self._line.open()
+            stack.callback(self._line.close)
+            stack.callback(self._end_ride)
+            self.cameras[self.config.camera_name] = self._camera
+            stack.callback(self.cameras.update, {self.config.camera_name: None})
+            self._sight = Sight(self._camera, self.settings)
+            self._seen = 0  # number of the newest frame that LeRobot was given
+            self._captured_s = 0.0
+            self._action, self._acted_s = NEUTRAL, 0.0
+            self._log.event(NO_PROMISE)
+            if not self._line.transmitters:
+                self._wait_for_human()
+            self._line.before_drive = self._wait_for_human
+            stack.callback(setattr, self._line, "before_drive", None)
+            self._open = stack.pop_all()
+
+    def get_observation(self) -> dict[str, Any]:
+        """The newest picture, (height, width, 3) uint8 RGB, and steering and throttle of the action before this, which
+        are neutral before the first.
+
+        Waits for a picture that LeRobot has not seen; where the car is not armed, first for the human's gesture as
+        connect(). Raises CameraError for a camera that stopped, froze or shows nothing, LinkError for a link that is
+        gone, and what ended the drive: DriveFault, TakenOver.
+        """
+        self._check_connected()
+        if self._ride:
+            self._ride.check()
+            if self._ride.over:
+                self._ride, self._action = None, NEUTRAL
+        if not self._ride:
+            self._link.latest()
+            if not self._line.transmitters:
+                self._wait_for_human()
+        frame = self._next_frame()
+        now_s = time.monotonic()
+        if not self._ride:
+            self._sight.watch(frame, now_s)
+        if now_s - self._acted_s > HOLE_S:  # another episode
+            self._action = NEUTRAL
+        self._seen, self._captured_s = frame.number, frame.captured_s
+        picture = prepare_frame(frame.image, self.config.height, self.config.width)
+        return {**dict(zip(ACTIONS, self._action, strict=True)), self.config.camera_name: picture}
+
+    def send_action(self, action: dict[str, Any]) -> dict[str, float]:
+        """Drives by an action, or leaves it to the human whose own it is; gives what the car was told.
+
+        action: steering and throttle, finite, at most 0.25 beyond an end, to which they are clipped; the throttle also
+        to the limit. Raises PolicyError for others, LinkError where arming is refused, and what ended the drive.
+        """
+        self._check_connected()
+        steering, throttle = self._valid(action)
+        if self._line.take_humans_action():
+            self._end_ride()
+            self._sight.sent(time.monotonic(), throttle)
+        else:
+            limit = self.settings.throttle_limit
+            steering, throttle = self._driven(steering, max(min(throttle, limit), -limit))
+        self._action, self._acted_s = (steering, throttle), time.monotonic()
+        return dict(zip(ACTIONS, self._action, strict=True))
+
+    def disconnect(self) -> None:
+        """Neutral first, then all is closed. Raises DeviceNotConnectedError."""
+        self._check_connected()
+        opened, self._open = self._open, None
+        if opened:
+            opened.close()
+
+    # ---- the parts
+
+    def _check_connected(self) -> None:
+        if not self._open:
+            raise DeviceNotConnectedError(f"the rover at {self.config.port} is not connected: connect() first")
+
+    def _flight_log(self) -> FlightLog:
+        limits, path, car = params()["flight_log"], self.config.log or default_log(), this_car()
+        if unfinished := unfinished_drive(path):
+            logging.getLogger("rover").warning(unfinished)
+        header = {"artifact": "LeRobot", "hz": RATE_HZ, **vars(self.settings), "car": car.description()}
+        return FlightLog(path, header=header, max_bytes=int(limits["max_mb"] * 1e6), keep=limits["keep"])
+
+    def _wait_for_human(self) -> None:
+        """Until the car can be armed, unless it is driven."""
+        if self._ride and not self._ride.over:
+            return
+        arm_when_ready(lambda: None, self._link, threading.Event(), self._log.event, [self._camera.latest])
+
+    def _next_frame(self):
+        newest = self._camera.latest()
+        after = self._seen
+        if newest and time.monotonic() - newest.captured_s > LATE_FRAME_S:  # nobody looked for a while
+            after = max(after, newest.number)
+        frame = self._camera.wait(after, LATE_FRAME_S)
+        if frame is None:
+            raise CameraError(
+                f"{self.config.camera}: no new frame for {LATE_FRAME_S:g} s", remedy="is the camera plugged in?"
+            )
+        return frame
+
+    def _valid(self, action: dict[str, Any]) -> tuple[float, float]:
+        """As the last boundary of `rover drive` takes them."""
+        if set(action) != set(ACTIONS):
+            raise PolicyError("an action of the rover is steering and throttle", found=sorted(map(str, action)))
+        try:
+            values = np.array([[float(action[name]) for name in ACTIONS]])
+        except (TypeError, ValueError):
+            raise PolicyError("an action must be of numbers", found=repr(action)[:80]) from None
+        steering, throttle = Plan(0, 0.0, 0.0, values, self._link.car.limits).actions[0].tolist()
+        return steering, throttle
+
+    def _driven(self, steering: float, throttle: float) -> tuple[float, float]:
+        """What is sent of an action that is to be driven by."""
+        if self._ride:
+            self._ride.put(steering, throttle)
+            return steering, throttle
+        self._camera.latest()  # raises if it failed
+        if (age_s := time.monotonic() - self._captured_s) > self.settings.stop_s:
+            self._log.event(f"an action came {age_s:.1f} s after its picture, and was not driven by")
+            return NEUTRAL
+        self._ride = Ride(self._camera, self._link, self.settings, self._log)
+        try:
+            self._ride.begin(steering, throttle)
+        except BaseException:  # Ctrl-C too
+            self._end_ride()
+            raise
+        return steering, throttle
+
+    def _end_ride(self) -> None:
+        ride, self._ride = self._ride, None
+        if ride:
+            ride.end()

@@ -1,0 +1,355 @@
+"""LeRobot's own commands, as processes, with the rover: on the emulated Arduino, and in the balloon world."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import zipfile
+from pathlib import Path
+
+import needs
+import numpy as np
+import pandas as pd
+import pytest
+
+from lab.arduino.emulator import NICE, EmulatedArduino
+from lab.driving.pins import CONTINUES, HUMAN, STOPPED, Command, Gates, Observation, judge
+from lab.driving.policy import PLAIN, make_artifact, pictures
+from rover_lib.onboard.pwm import ARDUINO_STEP_US, PwmCalibration
+from rover_lib.onboard.telemetry import read_log
+from rover_lib.world.car import CameraFeed, VirtualCar
+from rover_lib.world.standin import REST_US
+
+ROOT = Path(__file__).parents[2]
+BIN = Path(sys.executable).parent
+GATES = Gates.of_params()
+START_S = 150.0  # LeRobot imports for 5 s, or 20 on a busy machine
+HELD_S = 0.4
+STICKS = ((1600.0, 150.0), (1300.0, 173.0), (1480.0, 140.0), (1750.0, 160.0))  # within what the host may ask for, too
+with_firmware = [pytest.mark.emulated, pytest.mark.slow, needs.simavr]
+
+
+@pytest.fixture(scope="session")
+def plugin(made_once):
+    """A folder with the package as pip would install it: LeRobot looks for the distribution."""
+
+    def make(folder):
+        build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", folder / "wheel"]
+        subprocess.run(build, cwd=ROOT / "lerobot_robot_rover", check=True, capture_output=True)
+        (wheel,) = (folder / "wheel").glob("*.whl")
+        with zipfile.ZipFile(wheel) as z:
+            z.extractall(folder)
+
+    return made_once("plugin", make)
+
+
+class LeRobot:
+    """One of LeRobot's commands, in a process of its own, and what it says."""
+
+    def __init__(self, name, plugin, folder, **options):
+        words = [f"--{key.replace('__', '.')}={value}" for key, value in options.items()]
+        offline = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(folder / "cache"), "HF_LEROBOT_HOME": str(folder)}
+        env = {**os.environ, **offline, "OMP_NUM_THREADS": "1", "PYTHONPATH": f"{plugin}{os.pathsep}{ROOT}"}
+        env.pop("DISPLAY", None)
+        self.process = subprocess.Popen(
+            [BIN / name, *words],
+            env=env,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            # A shell's & would have it ignored.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+        self.text = ""
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.kill()
+        self.process.wait()
+        self._reader.join(10)
+
+    def _read(self):
+        for line in self.process.stdout:
+            self.text += line
+
+    def wait_for(self, words, seconds=START_S):
+        end = time.monotonic() + seconds
+        while words not in self.text:
+            assert self.process.poll() is None and time.monotonic() < end, f"{words!r} not said:\n{self.text[-3000:]}"
+            time.sleep(0.005)
+
+    def over(self, end_s):
+        """Whether it has ended, which it has to in time. Raises Late where its loop was too slow for the car."""
+        if waits_for_a_human(self):
+            raise needs.Late(f"LeRobot's loop was late:\n{self.text[-1500:]}")
+        assert time.monotonic() < end_s, self.text[-3000:]
+        return self.process.poll() is not None
+
+    def ended(self, seconds=60.0):
+        """Its exit status."""
+        self.process.wait(seconds)
+        self._reader.join(10)
+        return self.process.returncode
+
+    def children(self):
+        stats = [p.read_text().rpartition(")") for p in Path("/proc").glob("[0-9]*/stat") if _readable(p)]
+        return [int(head.split()[0]) for head, _, rest in stats if int(rest.split()[1]) == self.process.pid]
+
+
+def waits_for_a_human(command):
+    """To drive again, after it drove."""
+    return "before the car can drive" in command.text.partition(" armed\n")[2]
+
+
+def _readable(path):
+    with contextlib.suppress(OSError):
+        return bool(path.read_text())
+    return False
+
+
+def robot(port, folder, **more):
+    given = {"port": port, "camera": folder / "camera", "film": True, "width": 96, "height": 48} | more
+    given |= {"log": folder / "flight.log", "calibration_dir": folder}
+    return {"robot__type": "rover"} | {f"robot__{key}": value for key, value in given.items()}
+
+
+def dataset(folder, name, **more):
+    given = {"repo_id": f"local/{name}", "root": folder / name, **more}
+    return {f"dataset__{key}": value for key, value in given.items()}
+
+
+def recording(folder, name, **more):
+    given = {"single_task": "drive", "push_to_hub": False, "vcodec": "h264", "fps": 30} | more
+    return dataset(folder, name, **given) | {"play_sounds": False, "display_data": False}
+
+
+def rows(root):
+    """A dataset's, in order."""
+    files = sorted((root / "data").rglob("*.parquet"))
+    return pd.concat([pd.read_parquet(file) for file in files]).sort_values("index")
+
+
+def without_repeats(pairs):
+    pairs = [tuple(pair) for pair in pairs]
+    return [pair for i, pair in enumerate(pairs) if i == 0 or pair != pairs[i - 1]]
+
+
+def pulses_of(actions):
+    calibration = PwmCalibration()
+    return np.array([[(p := calibration.pulses(*map(float, a))).steering_us, p.throttle_us] for a in actions])
+
+
+@pytest.fixture(scope="module")
+def eyes(tmp_path_factory):
+    """A folder with a camera in it."""
+    folder = tmp_path_factory.mktemp("lerobot")
+    with CameraFeed(folder / "camera", *pictures(PLAIN)):
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def drives(eyes, plugin):
+    """lerobot-record of three episodes: a human drives by the transmitter. Gives the dataset's folder."""
+    with EmulatedArduino(every_pulse=False, transmitter=REST_US, nice=NICE) as board:
+        given = robot(board.port, eyes) | {"teleop__type": "rover_transmitter", "teleop__port": board.port}
+        given |= recording(eyes, "drives", num_episodes=3, episode_time_s=2, reset_time_s=0.5)
+        with LeRobot("lerobot-record", plugin, eyes, **given) as record:
+            record.wait_for("Recording episode 0")
+            turn = 0
+            end_s = time.monotonic() + START_S
+            while not record.over(end_s):
+                board.transmitter(*STICKS[turn % len(STICKS)])
+                turn += 1
+                time.sleep(HELD_S)
+            assert record.ended() == 0, record.text[-3000:]
+            assert "headless" in record.text.lower() and "armed" not in record.text
+    return eyes / "drives"
+
+
+class TestHuman:
+    pytestmark = with_firmware
+
+    def test_three_episodes_of_a_human(self, drives):
+        table = rows(drives)
+        assert sorted(set(table["episode_index"])) == [0, 1, 2]
+        for _, episode in table.groupby("episode_index"):
+            actions = np.stack(episode["action"])
+            assert 20 <= len(actions) <= 61
+            pulses = pulses_of(actions)
+            for channel in (0, 1):
+                sticks = np.array([us[channel] for us in STICKS])
+                distance = np.abs(pulses[:, channel, None] - sticks)
+                settled = distance.min(1) <= ARDUINO_STEP_US
+                assert settled.mean() > 0.9  # a status in between two sticks' pulses is between them
+                assert (distance.min(0) <= ARDUINO_STEP_US).all()  # each was there
+            states = np.stack(episode["observation.state"])
+            np.testing.assert_array_equal(states[1:], actions[:-1])
+
+    def test_lerobots_loader_reads_it_and_ours(self, drives, monkeypatch):
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        from rover_lib.workshop.episodes import load_recordings
+
+        monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+        data = LeRobotDataset("local/drives", root=drives, video_backend="pyav")
+        assert (data.num_episodes, data.fps, data.meta.robot_type) == (3, 30, "rover")
+        assert (
+            data.features["action"]["names"] == data.features["observation.state"]["names"] == ["steering", "throttle"]
+        )
+        picture = data[5]["observation.images.cam_front"]
+        ours = load_recordings(drives, 8)
+        assert len(ours.episodes) == 3 and not ours.faults
+        assert tuple(picture.shape) == (3, 48, 96) and 0.3 < float(picture.mean()) < 0.6
+
+    @needs.real_time
+    def test_an_episode_is_replayed(self, drives, eyes, plugin):
+        (eyes / "flight.log").unlink(missing_ok=True)
+        with EmulatedArduino(transmitter=REST_US, ready=True, nice=NICE) as board:
+            given = robot(board.port, eyes) | dataset(eyes, "drives", episode=1) | {"play_sounds": False}
+            with LeRobot("lerobot-replay", plugin, eyes, **given) as replay:
+                end_s = time.monotonic() + START_S
+                events = watched(board, lambda: replay.over(end_s))
+                assert replay.ended() == 0, replay.text[-3000:]
+        table = rows(drives)
+        actions = np.stack(table[table["episode_index"] == 1]["action"])
+        flight = read_log(eyes / "flight.log")
+        sent = np.stack([flight.ticks["steering_us"], flight.ticks["throttle_us"]], 1).astype(int)
+        assert without_repeats(sent) == without_repeats(pulses_of(actions))
+        times = flight.header["start_monotonic_s"] + flight.ticks["t_s"]
+        commands = [Command(at_s, *us) for at_s, us in zip(times.tolist(), sent.tolist(), strict=True)]
+        seen = Observation(events, commands, times[0] + 0.5, times[-1])
+        wrong = judge(CONTINUES, seen, GATES).wrong
+        if wrong and seen.stalled_ms():
+            raise needs.Late(f"the emulated Arduino had no time for {seen.stalled_ms():.0f} ms: {wrong}")
+        assert wrong == []
+        for channel, pin in enumerate(("steering", "throttle")):
+            errors = list(errors_us(seen, channel, pin))
+            assert len(errors) >= 3 and max(errors) <= ARDUINO_STEP_US
+
+
+def errors_us(seen, channel, pin):
+    """How far a pin's pulses were from what was commanded, where that had been one stick for a quarter of a second."""
+    for event in seen.pulses(pin):
+        recent = [c[1 + channel] for c in seen.commands if event.monotonic_s - 0.25 < c.at_s <= event.monotonic_s]
+        if recent and max(recent) - min(recent) <= 2:
+            yield min(abs(event.pulse_us - us) for us in recent)
+
+
+def watched(board, over, every_s=0.2):
+    events = []
+    while not over():
+        events += board.pulses()
+        time.sleep(every_s)
+    return events + board.pulses()
+
+
+# ---- a policy drives, and somebody ends it
+
+
+@pytest.fixture(scope="module")
+def artifact(tmp_path_factory):
+    path = tmp_path_factory.mktemp("constant") / "policy_fp32.pt"
+    make_artifact(path, camera="cam_front")
+    return path
+
+
+def interrupt(process, board):
+    process.send_signal(signal.SIGINT)
+
+
+def kill(process, board):
+    process.kill()
+
+
+def stop(process, board):
+    process.send_signal(signal.SIGSTOP)
+
+
+def take_over(process, board):
+    board.ready(False)  # he does not wiggle the stick again
+    board.transmitter(1700, REST_US[1])
+
+
+@pytest.mark.emulated
+@pytest.mark.slow
+@needs.simavr
+@pytest.mark.parametrize(
+    "happens", [interrupt, kill, *(pytest.param(what, marks=pytest.mark.release) for what in (stop, take_over))]
+)
+@needs.real_time
+def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifact, plugin, tmp_path):
+    folder = Path(tempfile.mkdtemp(dir=tmp_path))  # of this attempt
+    with EmulatedArduino(transmitter=REST_US, ready=True, nice=NICE) as board:
+        given = robot(board.port, eyes) | {"policy__type": "rover_artifact", "policy__artifact": artifact}
+        given |= recording(folder, "eval_a", num_episodes=1, episode_time_s=60, reset_time_s=0)
+        with LeRobot("lerobot-record", plugin, eyes, **given) as record:
+            record.wait_for("Recording episode 0")
+            moving_s, events = None, []
+            end = time.monotonic() + 20
+            while moving_s is None or time.monotonic() < moving_s + 0.8:
+                assert not record.over(end), record.text[-3000:]
+                events += board.pulses()
+                if moving_s is None and any(e.pin == "throttle" and e.pulse_us > 190 for e in events):
+                    moving_s = time.monotonic()
+                time.sleep(0.02)
+            children = record.children()
+            at_s = time.monotonic()
+            happens(record.process, board)
+            end_s = at_s + 1.0
+            events += watched(board, lambda: time.monotonic() > end_s)
+            seen = Observation(events, [], at_s, end_s)
+            expected, human_us = (HUMAN, (1700, REST_US[1])) if happens is take_over else (STOPPED, REST_US)
+            verdict = judge(expected, seen, GATES, human_us=human_us)
+            wrong = verdict.wrong
+            if wrong and seen.stalled_ms():
+                raise needs.Late(f"the emulated Arduino had no time for {seen.stalled_ms():.0f} ms: {wrong}")
+            assert wrong == []
+            if happens is stop:  # in the middle of a turn, or between two of them
+                record.process.send_signal(signal.SIGCONT)
+                needs.until(lambda: record.process.poll() is not None or waits_for_a_human(record), 30)
+                record.process.send_signal(signal.SIGINT)
+            status = record.ended()
+            after = [e.pulse_us for e in board.pulses() if e.pin == "throttle"]
+            assert after and max(after) <= GATES.throttle_max_us  # nothing drives it again
+    assert status == -signal.SIGKILL if happens is kill else status != 0
+    wanted = {interrupt: "KeyboardInterrupt", take_over: "TakenOver: the human took over"}
+    assert wanted.get(happens, "") in record.text
+    print(f"{happens.__name__}: {verdict.figures}")
+    for pid in children:
+        needs.until(lambda pid=pid: needs.ended(pid), 10)
+
+
+# ---- in the balloon world
+
+
+@pytest.mark.release  # ten seconds in which a busy machine must never be late by a tenth of one
+@needs.real_time
+def test_the_demos_policy_hits_balloons(demo_run, plugin, tmp_path):
+    """By a packed folder, two episodes, each after a gesture, which the stand-in's human has always just made."""
+    folder = Path(tempfile.mkdtemp(dir=tmp_path))  # of this attempt
+    packing = [sys.executable, "-m", "lerobot_robot_rover", demo_run / "policy_static.pt", folder / "packed"]
+    subprocess.run(packing, check=True, env={**os.environ, "PYTHONPATH": f"{plugin}{os.pathsep}{ROOT}"})
+    with VirtualCar() as car:
+        given = robot(car.port, folder, camera=car.camera, width=128, height=72)
+        given |= recording(folder, "eval_world", num_episodes=2, episode_time_s=5, reset_time_s=0)
+        with LeRobot("lerobot-record", plugin, folder, policy__path=folder / "packed", **given) as record:
+            end_s = time.monotonic() + START_S
+            needs.until(lambda: record.over(end_s), START_S + 1)
+            assert record.ended() == 0, record.text[-3000:]
+        report = car.report()
+    assert report.hits >= 1, report.outcomes
+    table = rows(folder / "eval_world")
+    assert sorted(set(table["episode_index"])) == [0, 1]
+    assert read_log(folder / "flight.log").drives == 2
