@@ -54,7 +54,7 @@ class Ride:
     @property
     def over(self) -> bool:
         """Whether the car is no longer driven by this."""
-        return self._thread.ident is not None and not self._thread.is_alive()
+        return self._thread.ident is not None and (bool(self.report.ended) or not self._thread.is_alive())
 
     def begin(self, steering: float, throttle: float) -> None:
         """Arms the car, and drives by that action. Raises LinkError and CameraError where arming is refused, DriveFault
@@ -80,6 +80,8 @@ class Ride:
 
     def check(self) -> None:
         """Raises what ended the drive if that was a fault, or the human's takeover."""
+        if self.over:
+            self._thread.join()  # it may still hear what the Arduino answers to neutral
         if self._settled.is_set() and self._error:
             raise self._error
 
