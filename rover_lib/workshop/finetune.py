@@ -58,14 +58,16 @@ from rover_lib.workshop.student import gmac
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 
 OLD, NEW = "old", "new"
+FADED = (0.3, 1.0)  # shares of new recordings' steering that stay in their states
+DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonstrations", "corrections")
 
 
 @dataclass(frozen=True)
 class Recipe:
     """How a policy learns on: params.yml's section `finetune`.
 
-    samples: frames of old demonstrations, new ones and corrections, of each at most so many. rate: of the first phase;
-    the second has a tenth. correction_weight: a correction's frame is drawn as often as that many of a demonstration.
+    samples: frames at most of each folder's demonstrations, and of its corrections. rate: of the first phase; the
+    second has a tenth. correction_weight: a correction's frame is drawn as often as that many of a demonstration.
     to_parent: of an old demonstration's loss, the share that is distance to what the policy planned there before it
     learned on; the rest is distance to what was recorded, as all of it is elsewhere.
     held_out_share: of the new episodes, to judge by; the old ones are parted as for everything else. judged_frames: of
@@ -179,16 +181,18 @@ class _HeldOut:
 class _Material:
     """What is learned from, and what judges.
 
-    demonstrations and corrections: a human's frames, the demonstrations' not yet thinned. held_out: episodes.
-    left_out: frames that nobody shall imitate. seconds: of demonstrations among the new, and of corrections.
+    taught: (kind, a human's frames) of each of the recordings, thinned; the kinds are DEMONSTRATIONS, ADDITIONS, new
+    ones of those, and CORRECTIONS. held_out: episodes. left_out: frames that nobody shall imitate.
     """
 
     recordings: tuple[Recordings, ...]
-    demonstrations: tuple[Sample, ...]
-    additions: tuple[Sample, ...]
-    corrections: tuple[Sample, ...]
+    taught: tuple[tuple[str, tuple[Sample, ...]], ...]
     held_out: tuple[_HeldOut, ...]
     left_out: int
+
+    def count(self, kind: str) -> int:
+        """Frames of that kind."""
+        return sum(len(samples) for each, samples in self.taught if each == kind)
 
     def action_range(self) -> dict[str, tuple[float, float]]:
         """Smallest and largest value of each action in all recordings."""
@@ -240,36 +244,38 @@ def _parted(read: Sequence[Recordings], recipe: Recipe) -> _Material:
             f"{read[0].root}: no new episode: in none of them a policy drove",
             remedy="give the new recordings too, after the old ones",
         )
-    demonstrations: tuple[Sample, ...] = ()
+    taught: list[tuple[str, tuple[Sample, ...]]] = []
     held_out = []
     if old:
         parts = split(replace(read[0], episodes=tuple(old)), p["held_out_share"], p["seed"])
-        demonstrations = _driven_by_humans(parts.calibration, old)
+        taught.append((DEMONSTRATIONS, _driven_by_humans(parts.calibration, old)))
         for name in dict.fromkeys(s.episode for s in (*parts.choosing, *parts.held_out)):
             samples = tuple(s for s in (*parts.choosing, *parts.held_out) if s.episode == name)
             held_out.append(_HeldOut(name, OLD, _driven_by_humans(samples, old)))
-    taught = [(r, e, samples) for r, e in new if (samples := human_samples(e))]
-    if not taught:
+    driven = [(r, e) for r, e in new if any(s.driver == HUMAN for s in e.samples)]
+    if not driven:
         raise FinetuneError(
             f"a human drove in none of the {len(new)} new episodes",
             found=f"{sum(len(e.samples) for _, e in new)} frames of a policy or of nobody",
             remedy="a policy cannot learn from its own drives: take over where it drives wrong",
         )
-    count = max(round(len(taught) * recipe.held_out_share), 1) if recipe.held_out_share and len(taught) > 1 else 0
-    judges = set(np.random.default_rng(recipe.seed).permutation(len(taught))[:count].tolist())
-    additions: tuple[Sample, ...] = ()
-    corrections: tuple[Sample, ...] = ()
-    for i, (r, e, samples) in enumerate(taught):
-        if i in judges:
-            held_out.append(_HeldOut(f"{r.root.name}/{e.id}", NEW, samples))
-        elif is_corrected(e):
-            corrections += samples
-        else:
-            additions += samples
-    frames = sum(len(e.samples) for e in (*old, *(e for _, e in new)))
-    humans = sum(len(human_samples(e)) for e in (*old, *(e for _, e in new)))
-    held = tuple(each for each in held_out if each.samples)
-    return _Material(tuple(read), demonstrations, additions, corrections, held, frames - humans)
+    count = max(round(len(driven) * recipe.held_out_share), 1) if recipe.held_out_share and len(driven) > 1 else 0
+    judges = set(np.random.default_rng(recipe.seed).permutation(len(driven))[:count].tolist())
+    held_out += [_HeldOut(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (driven[i] for i in judges)]
+    for recordings in read:
+        own = [e for i, (r, e) in enumerate(driven) if r is recordings and i not in judges]
+        for kind in (ADDITIONS, CORRECTIONS):
+            taught.append(
+                (kind, tuple(s for e in own if is_corrected(e) == (kind == CORRECTIONS) for s in human_samples(e)))
+            )
+    every = [*old, *(e for _, e in new)]
+    left_out = sum(s.driver != HUMAN for e in every for s in e.samples)
+    return _Material(
+        tuple(read),
+        tuple((kind, thinned(samples, recipe.samples)) for kind, samples in taught if samples),
+        tuple(each for each in held_out if each.samples),
+        left_out,
+    )
 
 
 def _driven_by_humans(samples: Sequence[Sample], episodes: Sequence[Episode]) -> tuple[Sample, ...]:
@@ -325,50 +331,45 @@ class _Work:
 @dataclass(frozen=True, eq=False)
 class _Taught:
     """A policy that has learned. weights: by LeRobot's names without the leading `model.`, the VAE's as they were.
-    folders: where its phases are saved.
+    folder: where its phases are saved.
     """
 
     weights: dict[str, Tensor]
     losses: dict[str, list[float]]
-    folders: tuple[Path, ...]
+    folder: Path
 
 
 def _taught(work: _Work) -> _Taught:
-    """Both phases. What the policy sees of the old recordings stays in the cache, for the next time it learns."""
+    """Both phases. What the policy sees of each of the recordings stays in the cache, for the next time it learns."""
     sources = [lessons_module, training, preprocess, act]
     recipe, material = work.recipe, work.material
-    every = {
-        "demonstrations": thinned(material.demonstrations, recipe.samples),
-        "additions": thinned(material.additions, recipe.samples),
-        "corrections": thinned(material.corrections, recipe.samples),
-    }
-    learned, folders = {}, {}
-    for kind, samples in every.items():
-        if samples:
-            folders[kind] = cache_root() / f"lessons-{key_of(_sees(work, kind, samples), *sources)}"
-            learned[kind] = _asked(work, kind, samples, folders[kind])
-    if "demonstrations" in learned and (
-        found := learned["demonstrations"].stranger(
-            judged_ranges(material.action_range()), work.parent.config.action_names
-        )
-    ):
-        raise FinetuneError(
-            f"{work.parent.path}: on the old recordings its plans are worse than one action for all frames",
-            found=found,
-            remedy="give first the recordings that it was trained on",
-        )
-    whole = {"lessons": {kind: folder.name for kind, folder in folders.items()}, "recipe": asdict(recipe)}
+    every = []
+    for kind, samples in material.taught:
+        folder = cache_root() / f"lessons-{key_of(_sees(work, kind, samples), *sources)}"
+        every.append((kind, _asked(work, kind, samples, folder)))
+        if kind == DEMONSTRATIONS:
+            _refuse_strangers(work, every[-1][1])
+    whole = {"lessons": [[kind, each.frames.path.parent.name] for kind, each in every], "recipe": asdict(recipe)}
     own = cache_root() / f"finetune-{key_of(whole, sys.modules[__name__], *sources)}"
-    room = _Room(work, learned)
+    room = _Room(work, every)
     with Resumable(own, work.progress) as saved:
         policy = BatchedPolicy(work.parent.config, work.parent.weights).to(work.device)
         policy.thaw()
         _train(room, policy, saved, "transformer")
         _train(room, policy, saved, "together")
         losses = dict(saved.losses)
-    own_folders = (own, *(folder for kind, folder in folders.items() if kind != "demonstrations"))
     weights = {name: weight.float() for name, weight in work.parent.weights.items()} | policy.weights()
-    return _Taught(weights, losses, own_folders)
+    return _Taught(weights, losses, own)
+
+
+def _refuse_strangers(work: _Work, lessons: Lessons) -> None:
+    """Raise FinetuneError if the policy knows nothing of the old recordings: then it is another car's, or camera's."""
+    if found := lessons.stranger(judged_ranges(work.material.action_range()), work.parent.config.action_names):
+        raise FinetuneError(
+            f"{work.parent.path}: on the old recordings its plans are worse than one action for all frames",
+            found=found,
+            remedy="give first the recordings that it was trained on",
+        )
 
 
 def _sees(work: _Work, kind: str, samples: Sequence[Sample]) -> dict[str, Any]:
@@ -397,24 +398,23 @@ def _asked(work: _Work, kind: str, samples: tuple[Sample, ...], folder: Path) ->
 class _Room:
     """Where a policy learns: batches of all lessons, and the loss."""
 
-    def __init__(self, work: _Work, lessons: dict[str, Lessons]):
+    def __init__(self, work: _Work, lessons: Sequence[tuple[str, Lessons]]):
         self.work, self.lessons = work, lessons
         self.units = torch.from_numpy(1 / judged_ranges(work.material.action_range())).to(work.device)
-        weights = {kind: work.recipe.correction_weight if kind == "corrections" else 1.0 for kind in lessons}
-        shares = np.concatenate([np.full(len(each), weights[kind]) for kind, each in lessons.items()])
-        self.shares = shares / shares.sum()
-        self.kinds = np.repeat(np.arange(len(lessons)), [len(each) for each in lessons.values()])
-        self.rows = np.concatenate([np.arange(len(each)) for each in lessons.values()])
+        counts = [len(each) for _, each in lessons]
+        weights = [work.recipe.correction_weight if kind == CORRECTIONS else 1.0 for kind, _ in lessons]
+        self.shares = np.repeat(weights, counts) / np.dot(weights, counts)
+        self.places = np.repeat(np.arange(len(lessons)), counts)
+        self.rows = np.concatenate([np.arange(count) for count in counts])
 
-    def batches(self, rng: np.random.Generator) -> "_Batch":
+    def batch(self, rng: np.random.Generator) -> "_Batch":
         """The next samples, each from its lessons, and their views."""
         count = len(self.rows)
         chosen = rng.choice(count, min(self.work.recipe.batch, count), replace=False, p=self.shares)
-        chosen = chosen[np.argsort(self.kinds[chosen], kind="stable")]
         views = rng.integers(2, size=len(chosen))
         parts = []
-        for i, (kind, lessons) in enumerate(self.lessons.items()):
-            own = self.kinds[chosen] == i
+        for place, (kind, lessons) in enumerate(self.lessons):
+            own = self.places[chosen] == place
             if own.any():
                 parts.append((kind, lessons, self.rows[chosen][own], views[own]))
         return _Batch(parts, rng, self.work.device)
@@ -449,24 +449,25 @@ class _Batch:
         return torch.from_numpy(in_another_light(frames, self.rng)).to(self.device)
 
     def states(self) -> Tensor:
-        """(B, 2). Of demonstrations half are another frame's, as in training, so that they do not give the action away.
+        """(B, 2). Of old demonstrations half are another frame's, as in training, so that they do not give the action
+        away.
 
-        A correction's tell where the balloon was seen last, so they keep their side, and any share of their size: a
-        human steers more than the policy that was about to go wrong.
+        What is new keeps its side, and a share of its size: where nothing is in sight to steer to, only the state says
+        to which side it was, and a human steers more than the policy does that comes there later.
         """
         each = []
         for kind, lessons, rows, views in self.parts:
-            if kind != "corrections":
+            if kind == DEMONSTRATIONS:
                 each.append(lessons.asked[2 * rows + views])
                 continue
             states = lessons.data.states[rows] * np.where((views == MIRRORED)[:, None], MIRROR, 1)
-            states[:, 0] *= self.rng.uniform(0, 1, len(rows))
+            states[:, 0] *= self.rng.uniform(*FADED, len(rows))
             each.append(states.astype(np.float32))
         return self._together(each)
 
     def to_parent(self, share: float) -> Tensor:
         """(B, 1, 1): that share for an old demonstration, 0 for what is new."""
-        each = [np.full(len(rows), share if kind == "demonstrations" else 0.0) for kind, _, rows, _ in self.parts]
+        each = [np.full(len(rows), share if kind == DEMONSTRATIONS else 0.0) for kind, _, rows, _ in self.parts]
         return self._together(each).float()[:, None, None]
 
     def planned(self) -> Tensor:
@@ -491,7 +492,7 @@ def _train(room: _Room, policy: BatchedPolicy, saved: Resumable, phase: str) -> 
     optimizer, scheduler = optimiser(module.parameters(), recipe.rate / 10 if whole else recipe.rate, max(steps, 1))
     rng = room.work.rng(phase)
     for _ in saved.steps(phase, steps, rng, module=module, optimizer=optimizer, scheduler=scheduler):
-        batch = room.batches(rng)
+        batch = room.batch(rng)
         states = batch.states()
         features = policy.features(batch.pictures()) if whole else batch.features()
         loss = room.loss(policy.plan(features, states), batch)
@@ -550,12 +551,7 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
             "finetune",
             params=described,
             metrics={
-                "learned_from": {
-                    "demonstrations": min(len(material.demonstrations), recipe.samples),
-                    "new_demonstrations": min(len(material.additions), recipe.samples),
-                    "corrections": min(len(material.corrections), recipe.samples),
-                    "not_imitated": material.left_out,
-                },
+                "learned_from": {kind: material.count(kind) for kind in KINDS} | {"not_imitated": material.left_out},
                 "held_out": [each.row() for each in judged],
                 "verdict": verdict(judged),
                 "losses": taught.losses,
@@ -568,6 +564,5 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
         take_place(new, folder, "finetune.json")
     finally:
         shutil.rmtree(new, ignore_errors=True)
-    for each in taught.folders:
-        shutil.rmtree(each, ignore_errors=True)
+    shutil.rmtree(taught.folder)
     return folder

@@ -54,7 +54,8 @@ FIRST_DEMONSTRATED = 3_000_000
 FIRST_DRIVE = datetime(2025, 6, 1, 12, tzinfo=UTC)  # made up, so that a seed's recording has the same bytes every time
 BETWEEN_DRIVES = timedelta(seconds=30)
 GATED_WORLDS = 40
-JUDGED_FRAMES = 10  # of an old episode that is held out: here worlds judge
+HALF_A_TICK_S = 0.5 / RATE_HZ
+JUDGED_FRAMES = 2  # of an old episode that is held out: here worlds judge
 CHECKPOINT, EPISODES, ARTIFACT = "best_model.pth", "episodes", "policy_static.pt"
 JUDGING = ("worlds", "other_worlds")
 BEGUN, DRIVES_FILE = "experiment.json", "drives.jsonl"
@@ -69,7 +70,7 @@ class Human:
     """
 
     off: float = 0.25
-    for_s: float = 0.5
+    for_s: float = 0.4
 
     def watching(self, world: World) -> Callable[[Order], bool]:
         """Asked at every tick of a drive through that world; true when they take over."""
@@ -118,7 +119,7 @@ def demonstrate(folder: Path, index: int, seed: int, condition: Condition, most_
     """Record a whole drive of the expert, or its first most_s seconds. Returns how many there are."""
     world = World(seed, condition.pushes, condition.decoys)
     with WorldEpisode(folder, _start(index), world) as episode:
-        while not world.done and world.state.time_s < most_s:
+        while not world.done and world.state.time_s < most_s - HALF_A_TICK_S:
             world.step(*episode.tick(*expert(world), driver=HUMAN))
     return world.state.time_s
 
@@ -127,7 +128,7 @@ def demonstrate(folder: Path, index: int, seed: int, condition: Condition, most_
 class Experiment:
     """What is tried: rounds of that many drives; worlds that judge when pushed, and other_worlds when left alone and
     with decoys, the first of them notebook 07's. pushes and decoys: of a world; every second one to learn in has both.
-    steps: of learning, the recipe's if None.
+    samples: frames at most of each round, and of what the policy began with, steps: of learning, the recipe's if None.
     """
 
     rounds: int = ROUNDS
@@ -138,6 +139,7 @@ class Experiment:
     pushes: int = 4
     decoys: int = 1
     human: Human = Human()
+    samples: int = 700
     steps: int | None = None
 
     def __post_init__(self):
@@ -157,8 +159,9 @@ class Experiment:
         return {PUSHED: replace(alone, pushes=self.pushes), ALONE: alone, DECOY: replace(alone, decoys=self.decoys)}
 
     def recipe(self) -> Recipe:
-        """All recordings of the rounds are learned from: worlds judge here."""
-        recipe = Recipe.of(params(), held_out_share=0.0, judged_frames=JUDGED_FRAMES)
+        """For both arms, and all recordings of the rounds are learned from: worlds judge here."""
+        alike = {"correction_weight": 1.0, "held_out_share": 0.0, "judged_frames": JUDGED_FRAMES}
+        recipe = Recipe.of(params(), samples=self.samples, **alike)
         return recipe.of_steps(self.steps) if self.steps else recipe
 
 
@@ -296,7 +299,7 @@ class _Lab:
         folder = self.folder / _name(DEMONSTRATED, number)
         _swept(folder)
         i, left_s = 0, most_s
-        while left_s > 1 / RATE_HZ:
+        while left_s > HALF_A_TICK_S:
             rows = _drives_of(folder)
             if i not in rows:
                 seed = FIRST_DEMONSTRATED + 1000 * number + i

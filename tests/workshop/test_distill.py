@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from policies import TINY, lerobot_policy, smooth_frame, trainer_content
+from policies import TINY, lerobot_policy, of_a_cars_size, smooth_frame, trainer_content
 
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.params import params
@@ -45,14 +45,7 @@ def episodes(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def teacher(tmp_path_factory):
-    """A policy whose plans are of a car's size, and differ from frame to frame."""
-    policy = lerobot_policy(**TINY)
-    with torch.no_grad():
-        policy.model.action_head.weight.mul_(torch.tensor([[0.05], [0.005]]))
-        policy.model.action_head.bias.copy_(torch.tensor([0.0, 0.05]))
-    path = tmp_path_factory.mktemp("teacher") / "best_model.pth"
-    torch.save(trainer_content(policy), path)
-    return path
+    return of_a_cars_size(tmp_path_factory.mktemp("teacher") / "best_model.pth")
 
 
 @pytest.fixture(scope="module")
