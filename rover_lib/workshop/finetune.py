@@ -10,7 +10,7 @@ published practice is the same: HG-DAgger learns from the human's states alone, 
 intervention no weight.
 
 It learns in phases, as a student does (see `distill`): the transformer on what its backbone sees, then all together at
-a tenth of the rate. The run's folder gets best_model.pth, pretrained_model/ and finetune.json.
+a fiftieth of the rate. The run's folder gets best_model.pth, pretrained_model/ and finetune.json.
 
 Letters: n samples, B batch, C chunk, A actions.
 """
@@ -58,7 +58,8 @@ from rover_lib.workshop.student import gmac
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 
 OLD, NEW = "old", "new"
-FADED = (0.3, 1.0)  # shares of new recordings' steering that stay in their states
+TOGETHER_SLOWER = 50  # times the first phase's rate: a backbone that sees is not to be unlearned
+FADED = (0.1, 1.0)  # shares of new recordings' steering that stay in their states
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonstrations", "corrections")
 
 
@@ -67,7 +68,9 @@ class Recipe:
     """How a policy learns on: params.yml's section `finetune`.
 
     samples: frames at most of each folder's demonstrations, and of its corrections. rate: of the first phase; the
-    second has a tenth. correction_weight: a correction's frame is drawn as often as that many of a demonstration.
+    second has a fiftieth. correction_weight: a correction's frame is drawn as often as that many of a demonstration.
+    focus: of new frames those are drawn more often on which the policy planned something else than the human did, by
+    this power of how far off it was; 0: all alike.
     to_parent: of an old demonstration's loss, the share that is distance to what the policy planned there before it
     learned on; the rest is distance to what was recorded, as all of it is elsewhere.
     held_out_share: of the new episodes, to judge by; the old ones are parted as for everything else. judged_frames: of
@@ -80,6 +83,7 @@ class Recipe:
     together_steps: int
     rate: float
     correction_weight: float
+    focus: float
     to_parent: float
     held_out_share: float
     judged_frames: int
@@ -89,8 +93,8 @@ class Recipe:
         counts = self.samples, self.batch, self.judged_frames
         if min(counts) < 1 or min(self.transformer_steps, self.together_steps, self.seed) < 0:
             raise FinetuneError("samples, batch and frames must be at least 1, steps and seed at least 0", found=self)
-        if not (self.rate > 0 and self.correction_weight > 0):
-            raise FinetuneError("rate and correction_weight must be above 0", found=self)
+        if not (self.rate > 0 and self.correction_weight > 0 and self.focus >= 0):
+            raise FinetuneError("rate and correction_weight must be above 0, focus at least 0", found=self)
         if not (0 <= self.held_out_share < 1 and 0 <= self.to_parent <= 1):
             raise FinetuneError("to_parent must be from 0 to 1, held_out_share from 0 to below 1", found=self)
 
@@ -402,10 +406,20 @@ class _Room:
         self.work, self.lessons = work, lessons
         self.units = torch.from_numpy(1 / judged_ranges(work.material.action_range())).to(work.device)
         counts = [len(each) for _, each in lessons]
-        weights = [work.recipe.correction_weight if kind == CORRECTIONS else 1.0 for kind, _ in lessons]
-        self.shares = np.repeat(weights, counts) / np.dot(weights, counts)
+        weights = np.concatenate([self._weights(kind, each) for kind, each in lessons])
+        self.shares = weights / weights.sum()
         self.places = np.repeat(np.arange(len(lessons)), counts)
         self.rows = np.concatenate([np.arange(count) for count in counts])
+
+    def _weights(self, kind: str, lessons: Lessons) -> np.ndarray:
+        """(n,): how often each sample is drawn."""
+        recipe = self.work.recipe
+        if kind == DEMONSTRATIONS:
+            return np.ones(len(lessons))
+        planned, driven = lessons.plans[2 * np.arange(len(lessons))], ~lessons.data.is_pad
+        off = (np.abs(planned - lessons.data.chunks) * self.units.cpu().numpy()).mean(2)
+        off = ((off * driven).sum(1) / driven.sum(1)) ** recipe.focus
+        return (recipe.correction_weight if kind == CORRECTIONS else 1.0) * off / max(off.mean(), 1e-9) + 1e-6
 
     def batch(self, rng: np.random.Generator) -> "_Batch":
         """The next samples, each from its lessons, and their views."""
@@ -484,12 +498,14 @@ class _Batch:
 
 
 def _train(room: _Room, policy: BatchedPolicy, saved: Resumable, phase: str) -> None:
-    """'transformer': all but the backbone, on what that sees. 'together': all, at a tenth of the rate, in any light."""
+    """'transformer': all but the backbone, on what that sees. 'together': all, slowly, in any light."""
     recipe = room.work.recipe
     whole = phase == "together"
     module = policy if whole else policy.model
     steps = recipe.together_steps if whole else recipe.transformer_steps
-    optimizer, scheduler = optimiser(module.parameters(), recipe.rate / 10 if whole else recipe.rate, max(steps, 1))
+    optimizer, scheduler = optimiser(
+        module.parameters(), recipe.rate / TOGETHER_SLOWER if whole else recipe.rate, max(steps, 1)
+    )
     rng = room.work.rng(phase)
     for _ in saved.steps(phase, steps, rng, module=module, optimizer=optimizer, scheduler=scheduler):
         batch = room.batch(rng)

@@ -242,7 +242,7 @@ def test_it_learns_what_the_human_did_and_keeps_what_it_could(checkpoint, old, n
     folder = finetune(checkpoint, [old, new], "better", runs_dir=tmp_path, recipe=longer, device="cpu")
     metrics = read_stage(folder / "finetune.json", "finetune")["metrics"]
     losses = metrics["losses"]["transformer"]
-    assert np.mean(losses[-30:]) < 0.7 * np.mean(losses[:10])
+    assert np.mean(losses[-30:]) < 0.85 * np.mean(losses[:10])
 
 
 @pytest.mark.slow
@@ -297,6 +297,7 @@ def test_arguments_that_cannot_be_are_refused(checkpoint, old, new, tmp_path, op
         ({"seed": -1}, "steps and seed"),
         ({"batch": 0}, "at least 1"),
         ({"correction_weight": 0.0}, "above 0"),
+        ({"focus": -1.0}, "focus at least 0"),
         ({"to_parent": 1.5}, "from 0 to 1"),
         ({"held_out_share": 1.0}, "below 1"),
     ],
