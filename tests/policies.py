@@ -3,6 +3,7 @@
 # LeRobot takes ten seconds to import in each process that collects tests: whoever needs it imports it in its functions.
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -77,15 +78,6 @@ def lerobot_policy(
     return policy
 
 
-def moving_policy() -> "ACTPolicy":
-    """A tiny one whose plans are of a car's size, and differ from frame to frame."""
-    policy = lerobot_policy(**TINY)
-    with torch.no_grad():
-        policy.model.action_head.weight.mul_(torch.tensor([[0.05], [0.005]]))
-        policy.model.action_head.bias.copy_(torch.tensor([0.0, 0.05]))
-    return policy
-
-
 def trainer_config(policy: "ACTPolicy") -> dict:
     c = policy.config
     _, height, width = next(iter(c.image_features.values())).shape
@@ -124,6 +116,16 @@ def trainer_content(policy: "ACTPolicy") -> dict:
         "best_val_loss": np.mean([0.1, 0.2]),
         "config": trainer_config(policy),
     }
+
+
+def of_a_cars_size(path: Path) -> Path:
+    """A trainer's file of a tiny policy whose plans are of a car's size, and differ from frame to frame."""
+    policy = lerobot_policy(**TINY)
+    with torch.no_grad():
+        policy.model.action_head.weight.mul_(torch.tensor([[0.05], [0.005]]))
+        policy.model.action_head.bias.copy_(torch.tensor([0.0, 0.05]))
+    torch.save(trainer_content(policy), path)
+    return path
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ SECTIONS = {
         prepare.compare,
         ROVERS["benchmark"],
         prepare.distill,
+        prepare.finetune,
         prepare.export,
         prepare.export_dataset,
     ),

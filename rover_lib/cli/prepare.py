@@ -275,6 +275,47 @@ def distill(
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
 
 
+@click.command(short_help="Let a policy learn on, from takeovers.")
+@click.argument("checkpoint", type=CHECKPOINT)
+@click.argument("episodes", type=EPISODES, nargs=-1, required=True)
+@click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
+@click.option("--runs-dir", type=FILE, default="runs", show_default=True)
+@click.option("--weight", type=float, help="How many times a correction's frame counts [default: params.yml].")
+@click.option("--samples", type=click.IntRange(min=1), help="Frames of each kind, at most [default: params.yml].")
+@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of both phases [default: params.yml].")
+@click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]")
+@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
+@AS_JSON
+def finetune(
+    checkpoint: Path,
+    episodes: tuple[Path, ...],
+    weight: float | None,
+    samples: int | None,
+    steps: int | None,
+    seed: int | None,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Let CHECKPOINT learn on, from what humans drove in EPISODES: first the old recordings, then the new ones.
+
+    A human's frames of a drive in which the policy drove too are corrections, and count more; what a policy drove is
+    not imitated. Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and finetune.json in the run's
+    folder, and says on which held-out episodes it is nearer to the human than before. Ended at any moment and started
+    again, it goes on where it was.
+    """
+    from rover_lib.onboard.params import params
+    from rover_lib.onboard.stage import read_stage
+    from rover_lib.workshop.finetune import Recipe
+    from rover_lib.workshop.finetune import finetune as learn_on
+    from rover_lib.workshop.improved import summary
+
+    recipe = Recipe.of(params(), correction_weight=weight, samples=samples, seed=seed)
+    recipe = recipe.of_steps(steps) if steps else recipe
+    folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal(), **options)
+    content = read_stage(folder / "finetune.json", "finetune")
+    click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
+
+
 @click.command(short_help="Write a run's policies for other engines: ONNX Runtime, Hailo.")
 @click.argument("run_dir", type=PathTo("run"))
 @click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")

@@ -113,3 +113,32 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
     if as_json:
         return click.echo(json.dumps(content, indent=2))
     click.echo("\n".join([str(table(content["metrics"])), "", *sentences(content["metrics"])]))
+
+
+@world.command(short_help="Drive, correct, learn: does it drive better?")
+@click.argument("run_dir", type=PathTo("run"))
+@click.option("--out", type=FILE, help="For what it records and learns [default: <RUN_DIR>-learn].")
+@click.option("--rounds", type=click.IntRange(min=1), default=3, show_default=True)
+@click.option("--drives", type=click.IntRange(min=1), default=20, show_default=True, help="Of each round.")
+@click.option(
+    "--worlds", type=click.IntRange(min=1), default=200, show_default=True, help="That judge, pushed; half as many not."
+)
+@click.option("--steps", type=click.IntRange(min=1), help="Of learning, each time [default: params.yml].")
+@AS_JSON
+def learn(run_dir: Path, out: Path | None, worlds: int, as_json: bool, **options: Any) -> None:
+    """Let the policy in RUN_DIR drive while an expert takes over where a human would, and learn on from that.
+
+    Beside it, it learns from as many seconds of plain demonstrations. Both are judged in worlds that taught nobody,
+    after each round. Leaves learn.json and the executed notebook 09 in RUN_DIR. Ended at any moment, the same command
+    goes on where it was; with more worlds only those that are missing are driven.
+    """
+    from rover_lib.workshop.run import execute
+    from rover_lib.world.learn import Experiment, measured, table
+
+    run_dir = run_dir.resolve()
+    experiment = Experiment(worlds=worlds, other_worlds=max(1, worlds // 2), **options)
+    content = measured(run_dir, out or run_dir.with_name(f"{run_dir.name}-learn"), experiment, terminal())
+    execute("09_learn", run_dir)
+    if as_json:
+        return click.echo(json.dumps(content, indent=2))
+    click.echo("\n".join([str(table(content)), "", *content["metrics"]["said"]]))

@@ -45,6 +45,7 @@ WORKSTATION_COMMANDS = frozenset(
         "quantize",
         "compare",
         "distill",
+        "finetune",
         "export",
         "export-dataset",
         "wheelhouse",

@@ -52,6 +52,10 @@ class DistillError(RoverError):
     """A student that its teacher or the recordings cannot make."""
 
 
+class FinetuneError(RoverError):
+    """A policy, or recordings, of which nothing can be learned on."""
+
+
 class ArtifactError(RoverError):
     """A policy file that is damaged, of another format, or that this machine cannot run."""
 

@@ -85,3 +85,13 @@ def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
     """Mean and standard deviation whose normalisation, LeRobot's eps included, is x * scale + shift."""
     scale, shift = torch.tensor(norm.scale, dtype=torch.float64), torch.tensor(norm.shift, dtype=torch.float64)
     return {"mean": (-shift / scale).float().reshape(shape), "std": (1 / scale - EPS).float().reshape(shape)}
+
+
+def take_place(new: Path, folder: Path, last: str) -> None:
+    """Move what is whole into a run's folder, the file `last` last; what was there goes when its successor is there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in sorted(new.iterdir(), key=lambda p: p.name == last):
+        place, old = folder / path.name, new / f"{path.name}.old"
+        if place.is_dir():
+            place.rename(old)
+        path.rename(place)

@@ -12,7 +12,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import Source
 
 BULK = 200  # characters of a report's value; of a longer one only the count is shown
-STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "distill")
+STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "distill", "finetune", "learn")
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:

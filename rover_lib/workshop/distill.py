@@ -24,39 +24,33 @@ import torch
 from torch import Tensor
 
 from rover_lib.onboard import preprocess
-from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy import action_limits
-from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path, sha256_of, write_stage
 from rover_lib.workshop import act, training
 from rover_lib.workshop import lessons as lessons_module
 from rover_lib.workshop import pipeline as quantization
 from rover_lib.workshop import student as student_module
-from rover_lib.workshop.act import ACT, ActConfig, inputs_of, multiply_accumulates, predictions
+from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.cache import cache_root, key_of
-from rover_lib.workshop.checkpoint import Checkpoint, expected_shapes, load_checkpoint
-from rover_lib.workshop.checkpoint_files import trainer_can_hold, write_lerobot, write_trainer
+from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint_files import take_place, trainer_can_hold, write_lerobot, write_trainer
 from rover_lib.workshop.choose import Chooser
 from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.episodes import Sample
 from rover_lib.workshop.export import export
 from rover_lib.workshop.fake_quant import RoundedPolicy
 from rover_lib.workshop.judge import Range, not_judged, pct_of_range, shown_pct, worst
-from rover_lib.workshop.lessons import BLOCK, BatchedPolicy, Lessons
+from rover_lib.workshop.lessons import BatchedPolicy, Lessons, in_another_light, judged_ranges, plans_of
 from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.quantize import QuantizedPolicy, quantize
 from rover_lib.workshop.samples import Source
 from rover_lib.workshop.scheme import Scheme
 from rover_lib.workshop.session import SMALL_GMAC, Opened, load
-from rover_lib.workshop.student import StudentShape, initial_weights, student_config
+from rover_lib.workshop.student import StudentShape, gmac, initial_weights, student_config
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 
-SMALLEST_RANGE = 0.02  # of an action that hardly changes: errors are a share of its range, which must not be nothing
-LIGHT, COLOUR = (0.8, 1.25), (0.9, 1.1)  # what pictures are multiplied by: all of one, and each of its colours
-STRANGER = 2.0  # times the error of one action for all frames: a teacher that is worse was not trained for this car
 NOBODY_DROVE = "Judged on recordings alone: nobody drove."
 
 
@@ -134,7 +128,7 @@ def distill(
     if work.is_teacher and not qat:
         remedy = "give it a smaller picture or fewer layers, or train it for INT8 with --qat"
         raise DistillError("this student would be its teacher", remedy=remedy)
-    with threads(1 if _gmac(config) < SMALL_GMAC else torch.get_num_threads()):
+    with threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()):
         taught = _taught(work)
         return _leave(Path(runs_dir).resolve() / name, work, taught)
 
@@ -165,14 +159,7 @@ class _Work:
 
     def ranges(self) -> np.ndarray:
         """(A,) float32: each action's recorded range, in which errors are counted."""
-        ends = np.array(list(self.opened.recordings.action_range().values()), np.float32)
-        return np.maximum(ends[:, 1] - ends[:, 0], SMALLEST_RANGE)
-
-
-def _gmac(config: ActConfig) -> float:
-    """Multiply-accumulates of one inference, in 10^9."""
-    weights = {name: torch.zeros(shape) for name, shape in expected_shapes(config).items()}
-    return sum(multiply_accumulates(ACT(config, weights)).values()) / 1e9
+        return judged_ranges(self.opened.recordings.action_range())
 
 
 # --- teaching ---------------------------------------------------------------------------------------------------------
@@ -246,10 +233,7 @@ class _Room:
 
     def pictures(self, rows: np.ndarray, views: np.ndarray, rng: np.random.Generator) -> Tensor:
         """(B, height, width, 3) uint8 RGB, in another light."""
-        frames = self.lessons.pictures(rows, views)
-        gain = rng.uniform(*LIGHT, (len(rows), 1, 1, 1)) * rng.uniform(*COLOUR, (len(rows), 1, 1, 3))
-        lit = np.minimum(frames * gain.astype(np.float32) + 0.5, 255).astype(np.uint8)
-        return torch.from_numpy(lit).to(self.work.device)
+        return torch.from_numpy(in_another_light(self.lessons.pictures(rows, views), rng)).to(self.work.device)
 
     def states(self, rows: np.ndarray, views: np.ndarray) -> Tensor:
         return torch.from_numpy(self.lessons.asked[2 * rows + views]).to(self.work.device)
@@ -267,17 +251,11 @@ class _Room:
 
 def _refuse_strangers(room: _Room) -> None:
     """Raise DistillError if the teacher knows nothing of what was driven: then it is another car's, or camera's."""
-    lessons, ranges = room.lessons, room.work.ranges()
-    actions, driven = lessons.data.chunks, ~lessons.data.is_pad
-    constant = (np.abs(actions - np.median(actions[driven], axis=0)) / ranges)[driven].mean(0)
-    as_recorded = (lessons.asked[::2] == lessons.data.states).all(1)  # not with another sample's state
-    plans = lessons.plans[2 * np.arange(len(lessons))]
-    planned = (np.abs(plans - actions) / ranges)[driven & as_recorded[:, None]].mean(0)
-    if (planned > STRANGER * constant).all():
-        pairs = zip(room.work.config.action_names, planned, constant, strict=True)
+    config, ranges = room.work.config, room.work.ranges()
+    if found := room.lessons.stranger(ranges, config.action_names):
         raise DistillError(
             f"{room.work.teacher.path}: on these recordings its plans are worse than one action for all frames",
-            found=" and ".join(f"{a} {100 * p:.0f} % off instead of {100 * c:.0f} %" for a, p, c in pairs),
+            found=found,
             remedy="give recordings of the car and the camera that it was trained for",
         )
 
@@ -395,19 +373,9 @@ def _rounded(work: _Work, weights: dict[str, Tensor]) -> tuple[QuantizedPolicy, 
 # --- judging ----------------------------------------------------------------------------------------------------------
 
 
-@torch.inference_mode()
 def _plans(work: _Work, config: ActConfig, weights: dict[str, Tensor], samples: Sequence[Sample]) -> np.ndarray:
-    """(n, C, A) float32 of what a policy would drive: clipped to what a pulse can express."""
-    policy = BatchedPolicy(config, weights).to(work.device)
-    plans = []
-    firsts = range(0, len(samples), BLOCK)
-    for first in work.progress(firsts, desc="judging", total=len(firsts)):
-        block = samples[first : first + BLOCK]
-        frames = torch.from_numpy(np.stack([prepare_frame(s.frame_bgr(), *config.image_sizes[0]) for s in block]))
-        states = torch.from_numpy(np.stack([s.state for s in block]).astype(np.float32))
-        plans.append(policy(frames.to(work.device), states.to(work.device)).cpu().numpy())
-    low, high = action_limits(config.action_names, this_car())
-    return np.concatenate(plans).clip(low, high)
+    """(n, C, A) float32 of what a policy would drive."""
+    return plans_of(BatchedPolicy(config, weights).to(work.device), samples, work.progress)
 
 
 def errors_of(
@@ -451,7 +419,7 @@ def _row(name: str, config: ActConfig, qat: bool) -> dict[str, Any]:
         "decoder_layers": config.decoder_layers,
         "feedforward": config.feedforward,
         "qat": qat,
-        "gmac": _gmac(config),
+        "gmac": gmac(config),
     }
 
 
@@ -551,7 +519,7 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
             },
             inputs={teacher.path.name: teacher.sha256} | work.opened.recordings.hashes(),
         )
-        _take_place(new, folder)
+        take_place(new, folder, "distill.json")
     finally:
         shutil.rmtree(new, ignore_errors=True)
     shutil.rmtree(taught.folder)
@@ -563,13 +531,3 @@ def _quantization_gate(student: dict[str, Any]) -> dict[str, Any]:
     loss = worst(v for k, v in student.items() if k.startswith("int8_") and not k.startswith("int8_teacher_"))
     limit = params()["gates"]["original"]["accuracy_loss_pct"]
     return gate("INT8 accuracy_loss_pct, or else --qat", loss, "<=", limit)
-
-
-def _take_place(new: Path, folder: Path) -> None:
-    """Move what is whole into the run's folder, distill.json last; what was there goes when its successor is there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in sorted(new.iterdir(), key=lambda p: p.name == "distill.json"):
-        place, old = folder / path.name, new / f"{path.name}.old"
-        if place.is_dir():
-            place.rename(old)
-        path.rename(place)

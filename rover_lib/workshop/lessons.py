@@ -10,6 +10,7 @@ the states are another sample's, and the teacher is asked with those: a plan is 
 Letters: B batch, C chunk, A actions, D channels of the feature map, h and w of it.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,15 +19,21 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from rover_lib.onboard.car import this_car
+from rover_lib.onboard.policy import action_limits
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine, lerobot_act
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.episodes import Sample
+from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.training import Frames, Given, Resumable, RowFile, frames_of, swapped_states
 
 BLOCK = 8  # samples that a policy is asked about at once
 VIEWS = PLAIN, MIRRORED = 0, 1
 MIRROR = np.array([-1, 1], np.float32)  # of steering and throttle
+LIGHT, COLOUR = (0.8, 1.25), (0.9, 1.1)  # what pictures are multiplied by: all of one, and each of its colours
+SMALLEST_RANGE = 0.02  # of an action that hardly changes: errors are a share of its range, which must not be nothing
+STRANGER = 2.0  # times the error of one action for all frames: a policy that is worse was not trained for this car
 
 
 class BatchedPolicy(nn.Module):
@@ -85,6 +92,33 @@ class BatchedPolicy(nn.Module):
 
     def forward(self, frames: Tensor, states: Tensor) -> Tensor:
         return self.plan(self.features(frames), states)
+
+
+@torch.inference_mode()
+def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progress = silent) -> np.ndarray:
+    """(n, C, A) float32 of what a policy would drive on the samples: clipped to what a pulse can express."""
+    device, (size,) = policy.image_scale.device, policy.config.image_sizes
+    plans = []
+    firsts = range(0, len(samples), BLOCK)
+    for first in progress(firsts, desc="judging", total=len(firsts)):
+        block = samples[first : first + BLOCK]
+        frames = torch.from_numpy(np.stack([prepare_frame(s.frame_bgr(), *size) for s in block]))
+        states = torch.from_numpy(np.stack([s.state for s in block]).astype(np.float32))
+        plans.append(policy(frames.to(device), states.to(device)).cpu().numpy())
+    low, high = action_limits(policy.config.action_names, this_car())
+    return np.concatenate(plans).clip(low, high)
+
+
+def judged_ranges(action_range: Mapping[str, tuple[float, float]]) -> np.ndarray:
+    """(A,) float32: each action's recorded range, in which errors are counted."""
+    ends = np.array(list(action_range.values()), np.float32)
+    return np.maximum(ends[:, 1] - ends[:, 0], SMALLEST_RANGE)
+
+
+def in_another_light(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """frames: (B, height, width, 3) uint8. The same, each lighter or darker, and tinted."""
+    gain = rng.uniform(*LIGHT, (len(frames), 1, 1, 1)) * rng.uniform(*COLOUR, (len(frames), 1, 1, 3))
+    return np.minimum(frames * gain.astype(np.float32) + 0.5, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +189,21 @@ class Lessons:
             states = torch.from_numpy(self.asked[2 * rows[0] : 2 * rows[-1] + 2]).to(device)
             self.maps.append(F.adaptive_avg_pool2d(seen, grid).half().cpu())
             self.plans.append(policy.plan(seen, states).cpu())
+
+    def stranger(self, ranges: np.ndarray, action_names: Sequence[str]) -> str | None:
+        """How far off a teacher's plans are that knows nothing of what was driven, None if it does know.
+
+        ranges: (A,), as of `judged_ranges`. Such a teacher is another car's, or another camera's.
+        """
+        actions, driven = self.data.chunks, ~self.data.is_pad
+        constant = (np.abs(actions - np.median(actions[driven], axis=0)) / ranges)[driven].mean(0)
+        as_recorded = (self.asked[::2] == self.data.states).all(1)  # not with another sample's state
+        plans = self.plans[2 * np.arange(len(self))]
+        planned = (np.abs(plans - actions) / ranges)[driven & as_recorded[:, None]].mean(0)
+        if not (planned > STRANGER * constant).all():
+            return None
+        pairs = zip(action_names, planned, constant, strict=True)
+        return " and ".join(f"{a} {100 * p:.0f} % off instead of {100 * c:.0f} %" for a, p, c in pairs)
 
     @torch.inference_mode()
     def see(self, saved: Resumable, student: BatchedPolicy, rng: np.random.Generator) -> None:

@@ -31,6 +31,7 @@ RESULTS_OF = {  # stages that a notebook leaves
     "06_arm": "arm",
     "07_drive": "drive",
     "08_distill": "distill",
+    "09_learn": "learn",
 }
 OF_LABORATORY = ("faults.json", "random.json", "pi-fast.json", "pi.json")  # in runs/, where make leaves them
 IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
@@ -70,11 +71,12 @@ def publish(
 
 
 def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEBOOKS) -> list[Path]:
-    """Publish the demo, its count and its student; of runs/full its count and its students; what `rover distill` left
-    of each student; of the laboratory its reports: where they are there.
+    """Publish the demo, its count, its student and what it learned; of runs/full its count and its students; what
+    `rover distill` left of each student; of the laboratory its reports: where they are there.
     """
     runs_dir, notebooks_dir = Path(runs_dir), Path(notebooks_dir)
-    written = publish(runs_dir / "demo", notebooks_dir, (*NAMES, "07_drive", "08_distill"))
+    learned = ("09_learn",) if (runs_dir / "demo" / "09_learn.ipynb").is_file() else ()
+    written = publish(runs_dir / "demo", notebooks_dir, (*NAMES, "07_drive", "08_distill", *learned))
     of_full = tuple(name for name in ("06_arm", "08_distill") if (runs_dir / "full" / f"{name}.ipynb").is_file())
     if of_full:
         written += publish(runs_dir / "full", notebooks_dir, of_full)

@@ -29,8 +29,8 @@ from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
-# Of a run that is there: what `make arm`, `rover world latency` and `rover world students` execute.
-AFTERWARDS = ("06_arm", "07_drive", "08_distill")
+# Of a run that is there: what `make arm` and `rover world latency`, `students` and `learn` execute.
+AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")
 KERNEL_ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",  # rover_lib/__init__.py says why; a cell may import torch before it
     # Both are known, and noise in a stored output: QNNPACK ignores reduce_range, tqdm misses widgets.
@@ -130,7 +130,7 @@ def run(
 
 def _own(folder: Path) -> list[Path]:
     """What a run leaves in its folder, and what was made of its artifacts later: none of it is of another run's."""
-    stages = ("load", "calibrate", "quantize", "compare", "run", "arm", "parts", "drive")
+    stages = ("load", "calibrate", "quantize", "compare", "run", "arm", "parts", "drive", "learn")
     names = [f"{stage}.json" for stage in (*stages, f"benchmark-{socket.gethostname()}")]
     names += [*(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures", "report.html"]
     if (folder / "08_distill.ipynb").exists():  # a teacher's; a student's distill.json is of what its run begins with

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import DistillError
-from rover_lib.workshop.act import ACT, ActConfig, FeedForward
-from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.act import ACT, ActConfig, FeedForward, multiply_accumulates
+from rover_lib.workshop.checkpoint import Checkpoint, expected_shapes
 
 RIDGE = 1e-4  # of the mean square of a unit: keeps `down` near the teacher's where the frames say nothing
 ROWS = 4096  # tokens that are multiplied at once: the sums are double, and memory is small
@@ -66,6 +66,12 @@ def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
         feedforward=shape.feedforward or c.feedforward,
         vae_layers=0,
     )
+
+
+def gmac(config: ActConfig) -> float:
+    """Multiply-accumulates of one inference, in 10^9."""
+    weights = {name: torch.zeros(shape) for name, shape in expected_shapes(config).items()}
+    return sum(multiply_accumulates(ACT(config, weights)).values()) / 1e9
 
 
 def initial_weights(

@@ -10,7 +10,7 @@ import copy
 import os
 import queue
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -53,12 +53,13 @@ class Plans(Protocol):
 class Condition:
     """What a drive is driven with.
 
-    latency_s: from a look at the newest frame to the plan, 0: within the same tick. pushes: as World's shoves.
+    latency_s: from a look at the newest frame to the plan, 0: within the same tick. pushes, decoys: as World's.
     """
 
     latency_s: float
     settings: Settings
     pushes: int = 0
+    decoys: int = 0
 
     def __post_init__(self):
         if not 0 <= self.latency_s <= LATENCY_MOST_S:
@@ -114,6 +115,9 @@ class LatencyReport:
             "plan_age_max_ms": at[100],
             "time_to_hit_p50_s": float(np.median(times_s)) if times_s else None,
         }
+
+
+Watch = Callable[[Order], bool]
 
 
 class _Car:
@@ -182,18 +186,20 @@ class _Car:
 
 
 class _Pilot(PolicyPilot):
-    """Whose orders move the car, and are kept."""
+    """Whose orders move the car, and are kept. watch: see `drive_in`."""
 
-    def __init__(self, car: _Car, commanded: Commanded, settings: Settings, rate_hz: float):
+    def __init__(self, car: _Car, commanded: Commanded, settings: Settings, rate_hz: float, watch: Watch | None):
         camera_and_planner: Any = car
         super().__init__(camera_and_planner, camera_and_planner, commanded, settings, rate_hz)
         self.orders: list[Order] = []
-        self._car = car
+        self._car, self._asked = car, watch
 
     def sent(self, at_s: float, order: Order) -> None:
         super().sent(at_s, order)
         self._car.command = order
         self.orders.append(order)
+        if self._asked and self._asked(order):
+            self._car.stop.set()  # after this tick
 
 
 class _NoLog:
@@ -206,22 +212,42 @@ class _NoLog:
     def event(self, text: str, **fields: Any) -> None: ...
 
 
-def drive_late(policy: Plans, seed: int, condition: Condition) -> LateDrive:
-    """One drive through the world of that seed. Raises PolicyError for a plan that no car may be driven by."""
+@dataclass(frozen=True)
+class Driven:
+    """How a policy drove in a world. outcome: as LateDrive's, or 'taken over'. orders, plans: as LateDrive's."""
+
+    outcome: str
+    orders: list[Order]
+    plans: list[tuple[Plan, CarState]]
+
+
+def drive_in(policy: Plans, world: World, condition: Condition, watch: Watch | None = None) -> Driven:
+    """Drive through a world, whose pushes and decoys are its own, at the condition's latency, until it has ended.
+
+    watch: sees every order when it is sent, before the car moves by it; true ends the drive after that tick, because
+    somebody takes over. Raises PolicyError for a plan that no car may be driven by.
+    """
     commanded = Commanded()
-    car = _Car(World(seed, condition.pushes), policy, condition.latency_s, commanded)
-    pilot = _Pilot(car, commanded, condition.settings, policy.rate_hz)
+    car = _Car(world, policy, condition.latency_s, commanded)
+    pilot = _Pilot(car, commanded, condition.settings, policy.rate_hz, watch)
     try:
         drive(pilot, None, _NoLog(), rate_hz=RATE_HZ, until=Until(stop=car.stop), clock=car.clock, sleep=car.sleep)
-        outcome = str(car.world.outcome)
+        outcome = str(world.outcome) if world.done else "taken over"
     except DriveFault as fault:
         if fault.__cause__:  # the policy failed: it is not that a plan is too old
             raise fault.__cause__ from None
         outcome = "stopped"
-    path = Trajectory.of(car.world)
+    return Driven(outcome, pilot.orders, car.plans)
+
+
+def drive_late(policy: Plans, seed: int, condition: Condition) -> LateDrive:
+    """One drive through the world of that seed. Raises PolicyError for a plan that no car may be driven by."""
+    world = World(seed, condition.pushes, condition.decoys)
+    driven = drive_in(policy, world, condition)
+    path = Trajectory.of(world)
     balloon_x_m, balloon_y_m = path.balloon_xy_m
     nearest_m = float(np.hypot(path.x_m - balloon_x_m, path.y_m - balloon_y_m).min())
-    return LateDrive(seed, outcome, car.world.state.time_s, nearest_m, path, pilot.orders, car.plans)
+    return LateDrive(seed, driven.outcome, world.state.time_s, nearest_m, path, driven.orders, driven.plans)
 
 
 def run_latencies(

@@ -8,6 +8,7 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -99,32 +100,60 @@ def _record_all(folder: Path, count: int, seed: int, key: str, progress: Progres
 def record_drive(folder: Path, index: int, seed: int) -> bool:
     """Record drive number `index` of a seed into folder/episode_YYYYMMDD_HHMMSS. Returns whether it hit."""
     world = World(FIRST_WORLD * (seed + 1) + index, shoves=SHOVES)
-    start = FIRST_DRIVE + timedelta(days=seed) + index * BETWEEN_DRIVES
-    start_s = start.timestamp()
-    car = this_car()
-    pwm = car.pwm
-    periods = [_measured_us(c.period_us) for c in (pwm.steering, pwm.throttle)]
-    with EpisodeWriter(
-        folder / f"episode_{start:%Y%m%d_%H%M%S}",
-        label=LABEL,
-        fps=RATE_HZ,
-        resolution=(FRAME_WIDTH, FRAME_HEIGHT),
-        start_time_s=start_s,
-        arduino_port="playground",
-        jpeg_quality=JPEG_QUALITY,
-        car=car,
-    ) as episode:
+    with WorldEpisode(folder, FIRST_DRIVE + timedelta(days=seed) + index * BETWEEN_DRIVES, world) as episode:
         while not world.done:
-            t_s = world.state.time_s
-            episode.frame(start_s + t_s, world.render())
-            pulses = pwm.pulses(*expert(world))
-            measured = _measured_us(pulses.steering_us), _measured_us(pulses.throttle_us)
-            episode.control(start_s + t_s + CONTROL_LATENCY_S, round(1000 * t_s), measured[0], measured[1], *periods)
             # The car obeys what was sent, and what was measured of it is what is recorded.
-            sent = pwm.actions_from_pulses(*measured, *periods)
-            assert sent.steering is not None and sent.throttle is not None, "the expert's pulses are measurable"
-            world.step(sent.steering, sent.throttle)
+            world.step(*episode.tick(*expert(world)))
     return world.hit
+
+
+def episode_name(start: datetime) -> str:
+    """The folder of a drive that began then."""
+    return f"episode_{start:%Y%m%d_%H%M%S}"
+
+
+class WorldEpisode:
+    """The recording of a drive in a world, folder/episode_YYYYMMDD_HHMMSS of its start; there when it ends well.
+
+    Raises EpisodeError as EpisodeWriter does.
+    """
+
+    def __init__(self, folder: Path, start: datetime, world: World):
+        car = this_car()
+        self._world, self._pwm, self._start_s = world, car.pwm, start.timestamp()
+        self._periods = [_measured_us(c.period_us) for c in (self._pwm.steering, self._pwm.throttle)]
+        self.writer = EpisodeWriter(
+            folder / episode_name(start),
+            label=LABEL,
+            fps=RATE_HZ,
+            resolution=(FRAME_WIDTH, FRAME_HEIGHT),
+            start_time_s=self._start_s,
+            arduino_port="playground",
+            jpeg_quality=JPEG_QUALITY,
+            car=car,
+        )
+
+    def __enter__(self) -> "WorldEpisode":
+        self.writer.open()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.writer.__exit__(*error)
+
+    def tick(self, steering: float, throttle: float, **extra: Any) -> tuple[float, float]:
+        """What the camera sees now, and what is commanded. Returns that as it is measured, (steering, throttle).
+
+        extra: further columns of the control.
+        """
+        t_s = self._world.state.time_s
+        self.writer.frame(self._start_s + t_s, self._world.render())
+        pulses = self._pwm.pulses(steering, throttle)
+        measured = _measured_us(pulses.steering_us), _measured_us(pulses.throttle_us)
+        at_s = self._start_s + t_s + CONTROL_LATENCY_S
+        self.writer.control(at_s, round(1000 * t_s), *measured, *self._periods, **extra)
+        sent = self._pwm.actions_from_pulses(*measured, *self._periods)
+        assert sent.steering is not None and sent.throttle is not None, "what is commanded is measurable"
+        return sent.steering, sent.throttle
 
 
 def _measured_us(pulse_us: float) -> int:

@@ -213,7 +213,7 @@ def _row(run: _Run) -> dict[str, Any]:
     }
 
 
-def _everywhere(artifact: Path, asked: Sequence[K], do: Callable[[Policy, K], V]) -> Iterator[tuple[K, V]]:
+def everywhere(artifact: Path, asked: Sequence[K], do: Callable[[Policy, K], V]) -> Iterator[tuple[K, V]]:
     """(question, answer) of each, as they come: a policy in one thread on each core.
 
     Not one policy on all cores: torch's second thread, once it was there, spins between inferences, which costs several
@@ -262,7 +262,7 @@ def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progr
     key = key_of({"artifact": content_hash(artifact), "frames": frames, "torch": torch.__version__}, preprocess)
     path = cache_root() / f"plans-{key}.npy"
     if not path.exists():
-        every = _everywhere(artifact, range(len(samples)), lambda policy, i: _plan(policy, samples[i]))
+        every = everywhere(artifact, range(len(samples)), lambda policy, i: _plan(policy, samples[i]))
         planned = dict(progress(every, desc=f"judging {name}", total=len(samples)))
         with atomic_path(path) as temporary:
             np.save(temporary, np.stack([planned[i] for i in range(len(samples))]))
@@ -323,7 +323,7 @@ def _driven(
     """Outcomes by seed of each kind of drive. What a file has is not driven again, and a drive that ends is in it."""
     kept = {name: _read(path) for name, path in files.items()}
     missing = [(name, seed) for name in asked for seed in seeds if seed not in kept[name]]
-    driven = _everywhere(run.artifact, missing, lambda policy, drive: asked[drive[0]](policy, drive[1]))
+    driven = everywhere(run.artifact, missing, lambda policy, drive: asked[drive[0]](policy, drive[1]))
     for (name, seed), outcome in progress(driven, desc=f"driving {run.name}", total=len(missing)) if missing else ():
         kept[name][seed] = outcome
         _append(files[name], {"seed": seed, "outcome": outcome})

@@ -47,6 +47,8 @@ BALLOON_HEIGHT_M = 0.24  # its centre
 HIT_DISTANCE_M = 0.30  # camera to the balloon's centre: the bumper touches it
 ARENA_RADIUS_M = 7.0
 
+DECOY_ASIDE_RAD = 0.25  # between decoy and balloon, at least, as seen from the start
+
 FLOOR_PX_PER_M = 160
 FLOOR_TILE_PX = 640
 FAR_ROWS = 24  # below the horizon, drawn from a blurred floor: a sharp one would flicker
@@ -102,13 +104,15 @@ class Shove:
 class World:
     """One drive to one balloon.
 
-    seed: everything that is random follows from it. shoves: how many pushes the car gets on its way.
-    Frames and motion depend on nothing but the seed, the shoves and the actions given.
+    seed: everything that is random follows from it. shoves: how many pushes the car gets on its way. decoys: how many
+    red things stand about that are no balloons; without them nothing but the balloon is red.
+    Frames and motion depend on nothing but these and the actions given.
     """
 
-    def __init__(self, seed: int, shoves: int = 0):
-        if seed < 0 or shoves < 0:
-            raise WorldError("a world's seed and shoves must not be negative", found=f"{seed} and {shoves}")
+    def __init__(self, seed: int, shoves: int = 0, decoys: int = 0):
+        if min(seed, shoves, decoys) < 0:
+            found = f"{seed}, {shoves} and {decoys}"
+            raise WorldError("a world's seed, shoves and decoys must not be negative", found=found)
         self.seed = seed
         rng = np.random.default_rng([seed, 20_251])
         self.state = CarState()
@@ -123,6 +127,7 @@ class World:
             red,
         )
         self.distractors = tuple(_distractors(rng, self.balloon))
+        self.distractors += tuple(_decoys(np.random.default_rng([seed, 20_253]), self.balloon, decoys))
         self.trajectory = [self.state]
         self.outcome: str | None = None  # 'hit', 'left' (past it or out of the arena), 'timeout'
         self._shoves = tuple(_shoves(np.random.default_rng([seed, 20_252]), shoves))
@@ -269,6 +274,18 @@ def _distractors(rng: np.random.Generator, balloon: Thing) -> Iterator[Thing]:
         if aside < 0.45 and along < to_balloon + 0.3:
             continue  # it would hide the balloon from a car that drives straight to it
         yield Thing(kind, x, y, radius, height, (blue, green, red))
+
+
+def _decoys(rng: np.random.Generator, balloon: Thing, count: int) -> Iterator[Thing]:
+    """Boxes and cones in a balloon's red, about as far away as the balloon and well beside the way to it."""
+    to_balloon, bearing = math.hypot(balloon.x_m, balloon.y_m), math.atan2(balloon.y_m, balloon.x_m)
+    for _ in range(count):
+        kind = str(rng.choice(["box", "cone"]))
+        aside = rng.choice([-1.0, 1.0]) * rng.uniform(DECOY_ASIDE_RAD, 2 * DECOY_ASIDE_RAD)
+        distance = to_balloon * rng.uniform(0.8, 1.2)
+        red = (int(rng.integers(20, 50)), int(rng.integers(15, 45)), int(rng.integers(190, 240)))
+        x, y = distance * math.cos(bearing + aside), distance * math.sin(bearing + aside)
+        yield Thing(kind, x, y, rng.uniform(0.10, 0.18), rng.uniform(0.2, 0.45), red)
 
 
 def _shoves(rng: np.random.Generator, count: int) -> Iterator[Shove]:

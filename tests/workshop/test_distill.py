@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from policies import TINY, lerobot_policy, moving_policy, trainer_content
+from policies import TINY, lerobot_policy, of_a_cars_size, trainer_content
 from recorded import record_drives
 
 from rover_lib.onboard.errors import DistillError
@@ -29,10 +29,7 @@ def episodes(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def teacher(tmp_path_factory):
-    """A policy whose plans are of a car's size, and differ from frame to frame."""
-    path = tmp_path_factory.mktemp("teacher") / "best_model.pth"
-    torch.save(trainer_content(moving_policy()), path)
-    return path
+    return of_a_cars_size(tmp_path_factory.mktemp("teacher") / "best_model.pth")
 
 
 @pytest.fixture(scope="module")

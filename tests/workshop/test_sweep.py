@@ -4,10 +4,9 @@ import json
 from dataclasses import replace
 
 import pytest
-import torch
 import yaml
 from click.testing import CliRunner
-from policies import moving_policy, trainer_content
+from policies import of_a_cars_size
 from recorded import record_drives
 from sweep_work import Stub
 
@@ -152,7 +151,7 @@ def test_a_student_is_taught_into_its_runs_folder(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr("rover_lib.workshop.run.run", lambda *words, **options: asked.append((words, options)))
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
-    torch.save(trainer_content(moving_policy()), tmp_path / "teacher.pth")
+    of_a_cars_size(tmp_path / "teacher.pth")
     episodes = record_drives(tmp_path / "episodes")
     student = {"size": "96x54", "decoder_layers": 1, "feedforward": 64, "steps": 4, "samples": 12}
     job = Job(str(tmp_path / "teacher.pth"), str(episodes), student, {"worlds": 0}, {"distill.judged_frames": 4})

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rover_lib.onboard.errors import WorldError
-from rover_lib.world.world import STEERING_MOST, THROTTLE_MOST, TIMEOUT_S, World, expert
+from rover_lib.world.world import DECOY_ASIDE_RAD, STEERING_MOST, THROTTLE_MOST, TIMEOUT_S, World, expert
 
 
 def drive(world):
@@ -36,6 +36,24 @@ def test_the_same_seed_gives_the_same_drive_and_frames(shoves):
         drive(world)
     assert worlds[0].trajectory == worlds[1].trajectory
     assert frame_hash(worlds[0]) == frame_hash(worlds[1])
+
+
+def test_decoys_are_red_things_beside_the_way_and_change_nothing_else():
+    for seed in range(30):
+        plain, with_decoys = World(seed, 2), World(seed, 2, decoys=2)
+        assert frame_hash(plain) == frame_hash(World(seed, 2, decoys=0)) if seed < 3 else True
+        assert (plain.balloon, plain._shoves) == (with_decoys.balloon, with_decoys._shoves)
+        *others, first, second = with_decoys.distractors
+        assert tuple(others) == plain.distractors and first != second
+        bearing = np.arctan2(plain.balloon.y_m, plain.balloon.x_m)
+        for decoy in (first, second):
+            assert decoy.kind in ("box", "cone") and decoy.colour[2] > 1.5 * max(decoy.colour[:2])
+            assert abs(np.arctan2(decoy.y_m, decoy.x_m) - bearing) >= DECOY_ASIDE_RAD - 1e-9
+    assert World(5, decoys=1).distractors == World(5, decoys=1).distractors
+
+
+def test_decoys_are_seen():
+    assert any(frame_hash(World(seed)) != frame_hash(World(seed, decoys=1)) for seed in range(3))
 
 
 def test_rendering_changes_nothing():

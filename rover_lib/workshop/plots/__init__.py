@@ -18,6 +18,7 @@ from rover_lib.workshop.plots.counting import (
     whole_size,
 )
 from rover_lib.workshop.plots.late_plans import beside_the_path, hits_by_latency, plans_from_above, throttle_over_age
+from rover_lib.workshop.plots.learning import hits_by_round
 from rover_lib.workshop.plots.quantization import errors_by_choice, layers, outlier_channels, sensitivity
 from rover_lib.workshop.plots.recordings import (
     calibration_coverage,

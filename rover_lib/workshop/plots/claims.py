@@ -202,3 +202,17 @@ def student(students: Sequence[Mapping[str, Any]], chosen: str) -> str:
         return f"{chosen}: {less}; nobody drove"
     lost = teacher["hits"] - row["hits"]
     return f"{chosen}: {less}, and {f'{lost} balloons lost' if lost > 0 else 'no balloon lost'} when left alone"
+
+
+# --- corrected and demonstrated ---------------------------------------------------------------------------------------
+
+
+def learned(policies: Sequence[Mapping[str, Any]]) -> str:
+    """policies: of learn.json, the one that all began with first."""
+    first, last = policies[0], max(row["round"] for row in policies)
+    of = {row["arm"]: row["pushed"] for row in policies if row["round"] == last}
+    if not {"corrected", "demonstrated"} <= of.keys():
+        return ""
+    own, other, before = of["corrected"]["hits"], of["demonstrated"]["hits"], first["pushed"]["hits"]
+    among = f"of {first['pushed']['trials']} worlds"
+    return f"Pushed, it hit {before} {among}; corrected {own}, after as many seconds of demonstrations {other}"

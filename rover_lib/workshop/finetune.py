@@ -1,0 +1,584 @@
+"""A policy that goes on learning: from what it was trained on, and from what a human did where it drove wrong.
+
+    folder = finetune("best_model.pth", ["episodes", "corrected"], "better")
+
+It learns what humans did, and nothing else. A human's frames of an episode in which a policy drove too are corrections:
+they show what to do in places to which only that policy goes, and are drawn more often. What a policy or nobody drove
+is not imitated, and a plan ends where its human let go. Nor is the second before a takeover: the human's answer there
+is to what the policy had done by then, so a plan that began earlier would have to make the same mistake first. The
+published practice is the same: HG-DAgger learns from the human's states alone, Sirius gives the moments before an
+intervention no weight.
+
+It learns in phases, as a student does (see `distill`): the transformer on what its backbone sees, then all together at
+a fiftieth of the rate. The run's folder gets best_model.pth, pretrained_model/ and finetune.json.
+
+Letters: n samples, B batch, C chunk, A actions.
+"""
+
+import shutil
+import sys
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rover_lib.onboard import preprocess
+from rover_lib.onboard.errors import FinetuneError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.recording import HUMAN, POLICY, recorded_car
+from rover_lib.onboard.stage import sha256_of, write_stage
+from rover_lib.workshop import act, training
+from rover_lib.workshop import lessons as lessons_module
+from rover_lib.workshop.cache import cache_root, key_of
+from rover_lib.workshop.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint_files import take_place, trainer_can_hold, write_lerobot, write_trainer
+from rover_lib.workshop.compare import thinned
+from rover_lib.workshop.episodes import load_recordings, split
+from rover_lib.workshop.improved import Judged, verdict
+from rover_lib.workshop.judge import not_judged, pct_of_range
+from rover_lib.workshop.lessons import (
+    MIRROR,
+    MIRRORED,
+    BatchedPolicy,
+    Lessons,
+    in_another_light,
+    judged_ranges,
+    plans_of,
+)
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.samples import Episode, Recordings, Sample, Source
+from rover_lib.workshop.session import SMALL_GMAC
+from rover_lib.workshop.student import gmac
+from rover_lib.workshop.training import Resumable, descend, optimiser, threads
+
+OLD, NEW = "old", "new"
+TOGETHER_SLOWER = 50  # times the first phase's rate: a backbone that sees is not to be unlearned
+FADED = (0.1, 1.0)  # shares of new recordings' steering that stay in their states
+DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonstrations", "corrections")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a policy learns on: params.yml's section `finetune`.
+
+    samples: frames at most of each folder's demonstrations, and of its corrections. rate: of the first phase; the
+    second has a fiftieth. correction_weight: a correction's frame is drawn as often as that many of a demonstration.
+    focus: of new frames those are drawn more often on which the policy planned something else than the human did, by
+    this power of how far off it was; 0: all alike.
+    to_parent: of an old demonstration's loss, the share that is distance to what the policy planned there before it
+    learned on; the rest is distance to what was recorded, as all of it is elsewhere.
+    held_out_share: of the new episodes, to judge by; the old ones are parted as for everything else. judged_frames: of
+    one held-out episode at most. seed: of all that is drawn.
+    """
+
+    samples: int
+    batch: int
+    transformer_steps: int
+    together_steps: int
+    rate: float
+    correction_weight: float
+    focus: float
+    to_parent: float
+    held_out_share: float
+    judged_frames: int
+    seed: int
+
+    def __post_init__(self):
+        counts = self.samples, self.batch, self.judged_frames
+        if min(counts) < 1 or min(self.transformer_steps, self.together_steps, self.seed) < 0:
+            raise FinetuneError("samples, batch and frames must be at least 1, steps and seed at least 0", found=self)
+        if not (self.rate > 0 and self.correction_weight > 0 and self.focus >= 0):
+            raise FinetuneError("rate and correction_weight must be above 0, focus at least 0", found=self)
+        if not (0 <= self.held_out_share < 1 and 0 <= self.to_parent <= 1):
+            raise FinetuneError("to_parent must be from 0 to 1, held_out_share from 0 to below 1", found=self)
+
+    @classmethod
+    def of(cls, params: dict[str, Any], **given: Any) -> "Recipe":
+        """That of params.yml, with what is not None in its place."""
+        return cls(**params["finetune"] | {name: value for name, value in given.items() if value is not None})
+
+    def of_steps(self, steps: int) -> "Recipe":
+        """The same with that many steps in all, at least one in each phase."""
+        planned = self.transformer_steps + self.together_steps
+        transformer = max(1, round(steps * self.transformer_steps / max(planned, 1)))
+        return replace(self, transformer_steps=transformer, together_steps=max(1, steps - transformer))
+
+
+def finetune(
+    checkpoint: Path | str,
+    episodes: Sequence[Path | str | Source],
+    name: str,
+    *,
+    runs_dir: Path | str = "runs",
+    recipe: Recipe | None = None,
+    device: str | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Let a checkpoint learn on, from old and new recordings. Returns the run's folder.
+
+    episodes: folders of recordings. The first has the old ones, which the checkpoint was trained on, the others the
+    new ones; an episode in which a policy drove is new wherever it is. recipe: params.yml's if None. device: 'cpu',
+    'cuda' or None for the best there is.
+    Ended at any moment and started again with the same arguments, it goes on and gives the same policy; the folder
+    appears when all is there.
+    Raises FinetuneError for a name, a device or recordings that cannot be; CheckpointError, EpisodeError,
+    TrainingError.
+    """
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
+        raise FinetuneError("device must be cpu, or cuda where torch finds one", found=device, remedy="leave it out")
+    if Path(name).name != name or name.startswith("."):
+        raise FinetuneError("a run's name must be a plain folder name", found=repr(name))
+    folder = Path(runs_dir).resolve() / name
+    if folder.exists():
+        raise FinetuneError(f"{folder}: is there already", remedy="give another --name, or move that run away")
+    recipe = recipe or Recipe.of(params())
+    parent, material = _opened(checkpoint, episodes, recipe, progress)
+    work = _Work(parent, material, recipe, torch.device(device), progress)
+    with threads(1 if gmac(parent.config) < SMALL_GMAC else torch.get_num_threads()):
+        return _leave(folder, work, _taught(work))
+
+
+# --- what is learned from ---------------------------------------------------------------------------------------------
+
+
+def human_samples(episode: Episode) -> tuple[Sample, ...]:
+    """An episode's samples that a human drove; their chunks are padded from where that human no longer drove.
+
+    A frame of which nobody knows who drove it, because its picture is damaged, ends a chunk too, where others drove.
+    """
+    drivers = {s.row: s.driver for s in episode.samples}
+    if set(drivers.values()) == {HUMAN}:
+        return episode.samples
+    first, last = min(drivers), max(drivers)
+    lasts = np.zeros(last - first + 2, int)  # of how many frames on, from each one, a human drives
+    for i in range(last - first, -1, -1):
+        lasts[i] = lasts[i + 1] + 1 if drivers.get(first + i) == HUMAN else 0
+    return tuple(
+        replace(s, is_pad=s.is_pad | (np.arange(len(s.is_pad)) >= lasts[s.row - first]))
+        for s in episode.samples
+        if s.driver == HUMAN
+    )
+
+
+def is_corrected(episode: Episode) -> bool:
+    """Whether a policy drove in it, so that what a human did there are corrections."""
+    return any(s.driver == POLICY for s in episode.samples)
+
+
+@dataclass(frozen=True, eq=False)
+class _HeldOut:
+    """An episode that judges. kind: OLD or NEW. samples: a human's."""
+
+    name: str
+    kind: str
+    samples: tuple[Sample, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Material:
+    """What is learned from, and what judges.
+
+    taught: (kind, a human's frames) of each of the recordings, thinned; the kinds are DEMONSTRATIONS, ADDITIONS, new
+    ones of those, and CORRECTIONS. held_out: episodes. left_out: frames that nobody shall imitate.
+    """
+
+    recordings: tuple[Recordings, ...]
+    taught: tuple[tuple[str, tuple[Sample, ...]], ...]
+    held_out: tuple[_HeldOut, ...]
+    left_out: int
+
+    def count(self, kind: str) -> int:
+        """Frames of that kind."""
+        return sum(len(samples) for each, samples in self.taught if each == kind)
+
+    def action_range(self) -> dict[str, tuple[float, float]]:
+        """Smallest and largest value of each action in all recordings."""
+        ranges = [r.action_range() for r in self.recordings]
+        return {name: (min(r[name][0] for r in ranges), max(r[name][1] for r in ranges)) for name in ranges[0]}
+
+
+def _opened(
+    checkpoint: Path | str, episodes: Sequence[Path | str | Source], recipe: Recipe, progress: Progress
+) -> tuple[Checkpoint, _Material]:
+    """The checkpoint and what it learns from, in proof that they belong together."""
+    if str(checkpoint).endswith((".pt", ".onnx.zip")):
+        raise FinetuneError(
+            f"{checkpoint}: is an artifact, whose weights are for driving and not for training",
+            remedy="give the checkpoint that it was made of: best_model.pth, or LeRobot's pretrained_model folder",
+        )
+    parent = load_checkpoint(checkpoint)
+    c = parent.config
+    if len(c.cameras) != 1 or c.state_names != c.action_names or len(c.action_names) != 2:
+        raise FinetuneError(
+            f"{parent.path}: only a policy of one camera, steering and throttle can learn from recordings of a car",
+            found=f"{len(c.cameras)} cameras, {len(c.state_names)} states and {len(c.action_names)} actions",
+        )
+    sources = [Source.of(each) for each in episodes]
+    if not sources:
+        raise FinetuneError("there are no recordings to learn from", remedy="give the old ones, then the new ones")
+    places = [str(s.path.resolve()) if isinstance(s.path, Path) else str(s.path) for s in sources]
+    if len(set(places)) < len(places):
+        raise FinetuneError("the same recordings are given twice", found=", ".join(places), remedy="leave one out")
+    p = params()["calibration"]
+    read = [load_recordings(source, c.chunk, p["sync_s"], progress) for source in sources]
+    policies = [parent.recorded_as(recordings.layout) for recordings in read]
+    if any(policy.config != policies[0].config for policy in policies):
+        raise FinetuneError(
+            "the recordings name or order their states and actions differently", found=", ".join(places)
+        )
+    _refuse_another_car(read)
+    _refuse_another_camera(read)
+    return policies[0], _parted(read, recipe)
+
+
+def _parted(read: Sequence[Recordings], recipe: Recipe) -> _Material:
+    """Old and new episodes, and of each what is learned from and what judges."""
+    p = params()["calibration"]
+    old = [e for e in read[0].episodes if not is_corrected(e)]
+    new = [(r, e) for r in read for e in r.episodes if r is not read[0] or is_corrected(e)]
+    if not new:
+        raise FinetuneError(
+            f"{read[0].root}: no new episode: in none of them a policy drove",
+            remedy="give the new recordings too, after the old ones",
+        )
+    taught: list[tuple[str, tuple[Sample, ...]]] = []
+    held_out = []
+    if old:
+        parts = split(replace(read[0], episodes=tuple(old)), p["held_out_share"], p["seed"])
+        taught.append((DEMONSTRATIONS, _driven_by_humans(parts.calibration, old)))
+        for name in dict.fromkeys(s.episode for s in (*parts.choosing, *parts.held_out)):
+            samples = tuple(s for s in (*parts.choosing, *parts.held_out) if s.episode == name)
+            held_out.append(_HeldOut(name, OLD, _driven_by_humans(samples, old)))
+    driven = [(r, e) for r, e in new if any(s.driver == HUMAN for s in e.samples)]
+    if not driven:
+        raise FinetuneError(
+            f"a human drove in none of the {len(new)} new episodes",
+            found=f"{sum(len(e.samples) for _, e in new)} frames of a policy or of nobody",
+            remedy="a policy cannot learn from its own drives: take over where it drives wrong",
+        )
+    count = max(round(len(driven) * recipe.held_out_share), 1) if recipe.held_out_share and len(driven) > 1 else 0
+    judges = set(np.random.default_rng(recipe.seed).permutation(len(driven))[:count].tolist())
+    held_out += [_HeldOut(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (driven[i] for i in judges)]
+    for recordings in read:
+        own = [e for i, (r, e) in enumerate(driven) if r is recordings and i not in judges]
+        for kind in (ADDITIONS, CORRECTIONS):
+            taught.append(
+                (kind, tuple(s for e in own if is_corrected(e) == (kind == CORRECTIONS) for s in human_samples(e)))
+            )
+    every = [*old, *(e for _, e in new)]
+    left_out = sum(s.driver != HUMAN for e in every for s in e.samples)
+    return _Material(
+        tuple(read),
+        tuple((kind, thinned(samples, recipe.samples)) for kind, samples in taught if samples),
+        tuple(each for each in held_out if each.samples),
+        left_out,
+    )
+
+
+def _driven_by_humans(samples: Sequence[Sample], episodes: Sequence[Episode]) -> tuple[Sample, ...]:
+    """Those of the samples that a human drove, as `human_samples` has them."""
+    wanted = {(s.episode, s.row) for s in samples}
+    names = {s.episode for s in samples}
+    return tuple(s for e in episodes if e.id in names for s in human_samples(e) if (s.episode, s.row) in wanted)
+
+
+def _refuse_another_car(read: Sequence[Recordings]) -> None:
+    first = read[0].episodes[0]
+    car = recorded_car(first.path)
+    for recordings in read:
+        for episode in recordings.episodes:
+            if not recorded_car(episode.path).drives_like(car):
+                raise FinetuneError(
+                    f"{episode.path}: was recorded with another car than {first.path}",
+                    remedy="a policy drives one car: give recordings of that one alone",
+                )
+
+
+def _refuse_another_camera(read: Sequence[Recordings]) -> None:
+    """Of each set of recordings the first picture: a camera's shape is its recordings' whole."""
+    shapes = [r.episodes[0].samples[0].frame_bgr().shape[:2] for r in read]
+    height, width = shapes[0]
+    for recordings, (own_height, own_width) in zip(read, shapes, strict=True):
+        if abs(own_width * height / (own_height * width) - 1) > SQUEEZED:
+            raise FinetuneError(
+                f"{recordings.root}: its camera has another shape than that of {read[0].root}",
+                found=f"{own_width}x{own_height} beside {width}x{height}",
+                remedy="a policy looks through one camera: give recordings of that one alone",
+            )
+
+
+# --- learning ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """What is to be done."""
+
+    parent: Checkpoint
+    material: _Material
+    recipe: Recipe
+    device: torch.device
+    progress: Progress
+
+    def rng(self, phase: str) -> np.random.Generator:
+        """Random numbers of a phase, the same in every process."""
+        return np.random.default_rng([self.recipe.seed, zlib.crc32(phase.encode())])
+
+
+@dataclass(frozen=True, eq=False)
+class _Taught:
+    """A policy that has learned. weights: by LeRobot's names without the leading `model.`, the VAE's as they were.
+    folder: where its phases are saved.
+    """
+
+    weights: dict[str, Tensor]
+    losses: dict[str, list[float]]
+    folder: Path
+
+
+def _taught(work: _Work) -> _Taught:
+    """Both phases. What the policy sees of each of the recordings stays in the cache, for the next time it learns."""
+    sources = [lessons_module, training, preprocess, act]
+    recipe, material = work.recipe, work.material
+    every = []
+    for kind, samples in material.taught:
+        folder = cache_root() / f"lessons-{key_of(_sees(work, kind, samples), *sources)}"
+        every.append((kind, _asked(work, kind, samples, folder)))
+        if kind == DEMONSTRATIONS:
+            _refuse_strangers(work, every[-1][1])
+    whole = {"lessons": [[kind, each.frames.path.parent.name] for kind, each in every], "recipe": asdict(recipe)}
+    own = cache_root() / f"finetune-{key_of(whole, sys.modules[__name__], *sources)}"
+    room = _Room(work, every)
+    with Resumable(own, work.progress) as saved:
+        policy = BatchedPolicy(work.parent.config, work.parent.weights).to(work.device)
+        policy.thaw()
+        _train(room, policy, saved, "transformer")
+        _train(room, policy, saved, "together")
+        losses = dict(saved.losses)
+    weights = {name: weight.float() for name, weight in work.parent.weights.items()} | policy.weights()
+    return _Taught(weights, losses, own)
+
+
+def _refuse_strangers(work: _Work, lessons: Lessons) -> None:
+    """Raise FinetuneError if the policy knows nothing of the old recordings: then it is another car's, or camera's."""
+    if found := lessons.stranger(judged_ranges(work.material.action_range()), work.parent.config.action_names):
+        raise FinetuneError(
+            f"{work.parent.path}: on the old recordings its plans are worse than one action for all frames",
+            found=found,
+            remedy="give first the recordings that it was trained on",
+        )
+
+
+def _sees(work: _Work, kind: str, samples: Sequence[Sample]) -> dict[str, Any]:
+    """What lessons depend on."""
+    return {
+        "parent": work.parent.sha256,
+        "pictures": [(s.episode, s.frame_name, s.row, s.frame_path.stat().st_size) for s in samples],
+        "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
+        "pads": zlib.crc32(np.stack([s.is_pad for s in samples]).tobytes()),
+        "kind": kind,
+        "at": [work.device.type, work.recipe.seed],
+        "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
+    }
+
+
+def _asked(work: _Work, kind: str, samples: tuple[Sample, ...], folder: Path) -> Lessons:
+    """What the policy sees of these samples before it learns."""
+    config = work.parent.config
+    channels = work.parent.weights["encoder_img_feat_input_proj.weight"].shape[1]
+    with Resumable(folder, work.progress) as saved:
+        lessons = Lessons.open(folder, samples, config, channels, work.rng(f"states, {kind}"))
+        lessons.ask(saved, work.parent, work.rng(kind), work.device)
+    return lessons
+
+
+class _Room:
+    """Where a policy learns: batches of all lessons, and the loss."""
+
+    def __init__(self, work: _Work, lessons: Sequence[tuple[str, Lessons]]):
+        self.work, self.lessons = work, lessons
+        self.units = torch.from_numpy(1 / judged_ranges(work.material.action_range())).to(work.device)
+        counts = [len(each) for _, each in lessons]
+        weights = np.concatenate([self._weights(kind, each) for kind, each in lessons])
+        self.shares = weights / weights.sum()
+        self.places = np.repeat(np.arange(len(lessons)), counts)
+        self.rows = np.concatenate([np.arange(count) for count in counts])
+
+    def _weights(self, kind: str, lessons: Lessons) -> np.ndarray:
+        """(n,): how often each sample is drawn."""
+        recipe = self.work.recipe
+        if kind == DEMONSTRATIONS:
+            return np.ones(len(lessons))
+        planned, driven = lessons.plans[2 * np.arange(len(lessons))], ~lessons.data.is_pad
+        off = (np.abs(planned - lessons.data.chunks) * self.units.cpu().numpy()).mean(2)
+        off = ((off * driven).sum(1) / driven.sum(1)) ** recipe.focus
+        return (recipe.correction_weight if kind == CORRECTIONS else 1.0) * off / max(off.mean(), 1e-9) + 1e-6
+
+    def batch(self, rng: np.random.Generator) -> "_Batch":
+        """The next samples, each from its lessons, and their views."""
+        count = len(self.rows)
+        chosen = rng.choice(count, min(self.work.recipe.batch, count), replace=False, p=self.shares)
+        views = rng.integers(2, size=len(chosen))
+        parts = []
+        for place, (kind, lessons) in enumerate(self.lessons):
+            own = self.places[chosen] == place
+            if own.any():
+                parts.append((kind, lessons, self.rows[chosen][own], views[own]))
+        return _Batch(parts, rng, self.work.device)
+
+    def loss(self, plans: Tensor, batch: "_Batch") -> Tensor:
+        """plans: (B, C, A). Mean absolute error, in units of the recorded range."""
+        share, driven = batch.to_parent(self.work.recipe.to_parent), batch.driven()
+        to_parent = ((plans - batch.planned()).abs() * self.units * share).sum()
+        to_recorded = ((plans - batch.recorded()).abs() * self.units * driven * (1 - share)).sum()
+        counted = (share + driven * (1 - share)).expand(*plans.shape[:2], 1).sum()
+        return (to_parent + to_recorded) / (counted * len(self.units))
+
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """parts: of each kind its lessons, rows (b,) and views (b,)."""
+
+    parts: list[tuple[str, Lessons, np.ndarray, np.ndarray]]
+    rng: np.random.Generator
+    device: torch.device
+
+    def _together(self, each: list[np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.concatenate(each)).to(self.device)
+
+    def features(self) -> Tensor:
+        """(B, D, h, w): the frozen backbone's."""
+        return self._together([lessons.maps[2 * rows + views] for _, lessons, rows, views in self.parts]).float()
+
+    def pictures(self) -> Tensor:
+        """(B, height, width, 3) uint8 RGB, in another light."""
+        frames = np.concatenate([lessons.pictures(rows, views) for _, lessons, rows, views in self.parts])
+        return torch.from_numpy(in_another_light(frames, self.rng)).to(self.device)
+
+    def states(self) -> Tensor:
+        """(B, 2). Of old demonstrations half are another frame's, as in training, so that they do not give the action
+        away.
+
+        What is new keeps its side, and a share of its size: where nothing is in sight to steer to, only the state says
+        to which side it was, and a human steers more than the policy does that comes there later.
+        """
+        each = []
+        for kind, lessons, rows, views in self.parts:
+            if kind == DEMONSTRATIONS:
+                each.append(lessons.asked[2 * rows + views])
+                continue
+            states = lessons.data.states[rows] * np.where((views == MIRRORED)[:, None], MIRROR, 1)
+            states[:, 0] *= self.rng.uniform(*FADED, len(rows))
+            each.append(states.astype(np.float32))
+        return self._together(each)
+
+    def to_parent(self, share: float) -> Tensor:
+        """(B, 1, 1): that share for an old demonstration, 0 for what is new."""
+        each = [np.full(len(rows), share if kind == DEMONSTRATIONS else 0.0) for kind, _, rows, _ in self.parts]
+        return self._together(each).float()[:, None, None]
+
+    def planned(self) -> Tensor:
+        """(B, C, A), by the policy before it learned."""
+        return self._together([lessons.plans[2 * rows + views] for _, lessons, rows, views in self.parts])
+
+    def recorded(self) -> Tensor:
+        """(B, C, A), by the human."""
+        return self._together([lessons.recorded(rows, views) for _, lessons, rows, views in self.parts])
+
+    def driven(self) -> Tensor:
+        """(B, C, 1), true where the human drove."""
+        return self._together([~lessons.data.is_pad[rows] for _, lessons, rows, _ in self.parts])[..., None]
+
+
+def _train(room: _Room, policy: BatchedPolicy, saved: Resumable, phase: str) -> None:
+    """'transformer': all but the backbone, on what that sees. 'together': all, slowly, in any light."""
+    recipe = room.work.recipe
+    whole = phase == "together"
+    module = policy if whole else policy.model
+    steps = recipe.together_steps if whole else recipe.transformer_steps
+    optimizer, scheduler = optimiser(
+        module.parameters(), recipe.rate / TOGETHER_SLOWER if whole else recipe.rate, max(steps, 1)
+    )
+    rng = room.work.rng(phase)
+    for _ in saved.steps(phase, steps, rng, module=module, optimizer=optimizer, scheduler=scheduler):
+        batch = room.batch(rng)
+        states = batch.states()
+        features = policy.features(batch.pictures()) if whole else batch.features()
+        loss = room.loss(policy.plan(features, states), batch)
+        saved.losses[phase].append(descend(loss, module, optimizer, scheduler))
+
+
+# --- judging and leaving ----------------------------------------------------------------------------------------------
+
+
+def _judged(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
+    """Each held-out episode, before and after."""
+    action_range = work.material.action_range()
+    policies = [BatchedPolicy(work.parent.config, each).to(work.device) for each in (work.parent.weights, weights)]
+    judged = []
+    for episode in work.progress(work.material.held_out, desc="judging", total=len(work.material.held_out)):
+        samples = thinned(episode.samples, work.recipe.judged_frames)
+        driven, recorded = ~np.stack([s.is_pad for s in samples]), np.stack([s.chunk for s in samples])
+        errors = [
+            np.abs(plans_of(policy, samples).astype(np.float64) - recorded)[driven].mean(0) for policy in policies
+        ]
+        before, after = (
+            {name: pct_of_range(e, ends) for e, (name, ends) in zip(each, action_range.items(), strict=True)}
+            for each in errors
+        )
+        judged.append(Judged(episode.name, episode.kind, len(samples), before, after))
+    return judged
+
+
+def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
+    """Judge the policy and leave its files and finetune.json in the run's folder, which appears whole or not at all."""
+    parent, material, recipe = work.parent, work.material, work.recipe
+    judged = _judged(work, taught.weights)
+    errors = [e for each in judged if each.kind == OLD for e in each.after.values() if e is not None]
+    described = asdict(recipe) | {"device": work.device.type}
+    origin = {"parent_sha256": parent.sha256, "parent_format": parent.format, "finetuned_by": described}
+    new = folder.with_name(f".{folder.name}.finetuned")
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir(parents=True)
+    try:
+        files = {"model.safetensors": "pretrained_model/model.safetensors"}
+        write_lerobot(new / "pretrained_model", parent.config, taught.weights, origin)
+        if trainer_can_hold(parent.config):
+            settings = {
+                "learning_rate": recipe.rate,
+                "batch_size": recipe.batch,
+                "data_dir": material.recordings[-1].root.name,
+                "output_dir": folder.name,
+                "device": work.device.type,
+                "seed": recipe.seed,
+            }
+            loss = float(np.mean(errors)) / 100 if errors else float("nan")
+            write_trainer(new / "best_model.pth", parent.config, taught.weights, loss, origin, **settings)
+            files["best_model.pth"] = "best_model.pth"
+        write_stage(
+            new / "finetune.json",
+            "finetune",
+            params=described,
+            metrics={
+                "learned_from": {kind: material.count(kind) for kind in KINDS} | {"not_imitated": material.left_out},
+                "held_out": [each.row() for each in judged],
+                "verdict": verdict(judged),
+                "losses": taught.losses,
+                "warnings": not_judged(material.action_range()),
+                "files_sha256": {name: sha256_of(new / path) for name, path in files.items()},
+            },
+            inputs={parent.path.name: parent.sha256}
+            | {f"{r.root.name}/{name}": digest for r in material.recordings for name, digest in r.hashes().items()},
+        )
+        take_place(new, folder, "finetune.json")
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    shutil.rmtree(taught.folder)
+    return folder

@@ -1,0 +1,383 @@
+"""A policy learns on from what humans drove, and from nothing else, whatever interrupts it."""
+
+import json
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+from policies import TINY, lerobot_policy, of_a_cars_size, smooth_frame, trainer_content
+
+from rover_lib.cli import main
+from rover_lib.onboard.car import Car
+from rover_lib.onboard.errors import FinetuneError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY, EpisodeWriter
+from rover_lib.onboard.stage import read_stage
+from rover_lib.workshop import finetune as finetune_module
+from rover_lib.workshop import training
+from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.finetune import Recipe, finetune, human_samples, is_corrected
+from rover_lib.workshop.samples import Episode, Sample
+
+FRAMES = 24
+TAKEN_OVER = [POLICY] * 8 + [HUMAN] * 12 + [NOBODY] * 4
+
+
+def record(root, drives=4, drivers=(HUMAN,) * FRAMES, size=(96, 54), offset=0, car=None):
+    """Drives whose steering and throttle change, and whose pictures do; with who drove at each frame."""
+    rng, pwm = np.random.default_rng(offset), PwmCalibration()
+    for drive in range(drives):
+        with EpisodeWriter(root / f"episode_{offset + drive}", label="", resolution=size, car=car) as writer:
+            for i, driver in enumerate(drivers):
+                t_s = i / 30
+                pulses = pwm.pulses(0.5 * math.sin(4 * t_s + drive), 0.05 + 0.04 * math.cos(3 * t_s + drive))
+                writer.frame(t_s, smooth_frame(rng, size[1], size[0]))
+                measured = pulses.steering_us, pulses.throttle_us, 21316, 1016
+                writer.control(t_s + 0.004, 500 + 33 * i, *measured, driver=driver)
+    return root
+
+
+@pytest.fixture(scope="module")
+def old(tmp_path_factory):
+    return record(tmp_path_factory.mktemp("recordings") / "old")
+
+
+@pytest.fixture(scope="module")
+def new(tmp_path_factory):
+    return record(tmp_path_factory.mktemp("recordings") / "new", drives=3, drivers=TAKEN_OVER, offset=50)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    return of_a_cars_size(tmp_path_factory.mktemp("parent") / "best_model.pth")
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    few = {"samples": 20, "batch": 4, "judged_frames": 4, "rate": 1e-3}
+    return Recipe.of(params(), transformer_steps=6, together_steps=3, **few)
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture(scope="module")
+def taught(checkpoint, old, new, recipe, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("taught")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROVER_CACHE", str(folder / "cache"))
+        return finetune(checkpoint, [old, new], "better", runs_dir=folder, recipe=recipe, device="cpu")
+
+
+# --- what is learned from ---
+
+
+def episode_of(drivers, chunk=8, missing=()):
+    samples = []
+    for row, driver in enumerate(drivers):
+        if row not in missing:
+            pad = np.arange(chunk) + row >= len(drivers)
+            samples.append(Sample("e", None, row / 30, np.zeros(2), np.full((chunk, 2), row), pad, 100 + row, driver))
+    return Episode("e", None, "", 1.0, len(drivers), len(drivers), tuple(samples), ())
+
+
+@given(
+    st.lists(st.sampled_from([POLICY, HUMAN, NOBODY]), min_size=1, max_size=40),
+    st.sets(st.integers(0, 39), max_size=3),
+    st.integers(1, 12),
+)
+def test_only_what_a_human_drove_is_learned_from(drivers, missing, chunk):
+    """Against the definition, frame by frame and step by step."""
+    if set(range(len(drivers))) <= missing:
+        return
+    episode = episode_of(drivers, chunk, missing)
+    others = {s.driver for s in episode.samples} != {HUMAN}
+    learned = {s.row - 100: s for s in human_samples(episode)}
+    assert set(learned) == {s.row - 100 for s in episode.samples if s.driver == HUMAN}
+    for row, sample in learned.items():
+        driven = True
+        for step in range(chunk):
+            at = row + step
+            driven &= at < len(drivers) and (not others or (at not in missing and drivers[at] == HUMAN))
+            assert sample.is_pad[step] == (not driven)
+
+
+def test_a_plan_that_began_before_the_takeover_is_not_taught():
+    """And one that ends where the human let go has no step of what came then."""
+    learned = human_samples(episode_of([POLICY] * 5 + [HUMAN] * 4 + [NOBODY] * 3 + [HUMAN] * 2))
+    assert [s.row - 100 for s in learned] == [5, 6, 7, 8, 12, 13]
+    assert [int((~s.is_pad).sum()) for s in learned] == [4, 3, 2, 1, 2, 1]
+
+
+def test_a_whole_drive_of_a_human_is_left_as_it_is():
+    episode = episode_of([HUMAN] * 9, missing={4})
+    assert human_samples(episode) == episode.samples
+    assert not is_corrected(episode) and is_corrected(episode_of([HUMAN, POLICY]))
+    assert not is_corrected(episode_of([HUMAN, NOBODY]))
+
+
+def test_the_state_of_the_first_correction_is_what_the_policy_did(new):
+    (episode, *_) = load_recordings(new, 32).episodes
+    first = human_samples(episode)[0]
+    assert first.row == 8 and np.allclose(first.state, episode.samples[7].chunk[0])
+
+
+# --- what it leaves ---
+
+
+@pytest.mark.slow
+def test_what_is_left_is_one_policy_in_two_formats_with_its_parent_and_recipe(taught, checkpoint):
+    ours, lerobots = load_checkpoint(taught / "best_model.pth"), load_checkpoint(taught / "pretrained_model")
+    parent = load_checkpoint(checkpoint)
+    assert ours.config == parent.config  # the VAE's encoder too, so that the trainer can go on with it
+    assert set(ours.weights) == set(parent.weights)
+    assert all(torch.equal(weight, lerobots.weights[name]) for name, weight in ours.weights.items())
+    moved = {name for name, weight in ours.weights.items() if not torch.equal(weight, parent.weights[name])}
+    assert any(name.startswith("backbone.") for name in moved) and any(name.startswith("decoder.") for name in moved)
+    assert not any(name.startswith("vae_") for name in moved)
+    origin = json.loads((taught / "pretrained_model" / "origin.json").read_text())
+    assert origin == ours.report["trainer_config"]["origin"]
+    assert origin["parent_sha256"] == parent.sha256 and origin["finetuned_by"]["transformer_steps"] == 6
+    assert sorted(p.name for p in taught.iterdir()) == ["best_model.pth", "finetune.json", "pretrained_model"]
+
+
+@pytest.mark.slow
+def test_finetune_json_says_what_was_learned_from_and_judges_each_episode(taught):
+    metrics = read_stage(taught / "finetune.json", "finetune")["metrics"]
+    assert metrics["learned_from"] == {
+        "demonstrations": 20,
+        "new_demonstrations": 0,
+        "corrections": 24,
+        "not_imitated": 3 * 12,
+    } | {"corrections": 20}
+    assert [(row["kind"], row["frames"]) for row in metrics["held_out"]] == [("old", 4)] * 2 + [("new", 4)]
+    assert all(row[f"{when}_steering_pct"] > 0 for row in metrics["held_out"] for when in ("before", "after"))
+    assert metrics["verdict"]["better"] is None and "only 2 old and 1 new" in metrics["verdict"]["why"]
+    assert {phase: len(losses) for phase, losses in metrics["losses"].items()} == {"transformer": 6, "together": 3}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [1, 4, 7, 9])
+def test_killed_in_either_phase_it_goes_on_and_gives_the_same(
+    checkpoint, old, new, recipe, taught, tmp_path, monkeypatch, step
+):
+    steps = []
+
+    def dies(*args):
+        steps.append(1)
+        if len(steps) == step:
+            raise KeyboardInterrupt
+        return training.descend(*args)
+
+    monkeypatch.setattr(finetune_module, "Resumable", partial(training.Resumable, every_s=0.0))
+    monkeypatch.setattr(training, "SAVING_SHARE", 1e9)  # after every step, however long that takes
+    monkeypatch.setattr(finetune_module, "descend", dies)
+    arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
+    with pytest.raises(KeyboardInterrupt):
+        finetune(checkpoint, [old, new], "better", **arguments)
+    assert not (tmp_path / "better").exists()
+    folder = finetune(checkpoint, [old, new], "better", **arguments)
+    assert len(steps) == 6 + 3 + 1  # only the step that was interrupted is made again
+    assert_same(folder, taught)
+
+
+def assert_same(folder, other):
+    expected = load_checkpoint(other / "best_model.pth").weights
+    weights = load_checkpoint(folder / "best_model.pth").weights
+    assert all(torch.equal(weight, expected[name]) for name, weight in weights.items())
+    losses = [json.loads((f / "finetune.json").read_text())["metrics"]["losses"] for f in (folder, other)]
+    assert losses[0] == losses[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("asked", [2, 4])
+def test_killed_while_it_looks_at_the_recordings_it_goes_on(
+    checkpoint, old, new, recipe, taught, tmp_path, monkeypatch, asked
+):
+    """In the old ones, and in the new ones."""
+    blocks, features = [], finetune_module.BatchedPolicy.features
+
+    def dies(self, frames):
+        blocks.append(1)
+        if len(blocks) == asked:
+            raise KeyboardInterrupt
+        return features(self, frames)
+
+    monkeypatch.setattr(finetune_module, "Resumable", partial(training.Resumable, every_s=0.0))
+    monkeypatch.setattr(training, "SAVING_SHARE", 1e9)
+    arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
+    with monkeypatch.context() as patch:
+        patch.setattr(finetune_module.BatchedPolicy, "features", dies)
+        with pytest.raises(KeyboardInterrupt):
+            finetune(checkpoint, [old, new], "better", **arguments)
+    assert_same(finetune(checkpoint, [old, new], "better", **arguments), taught)
+
+
+@pytest.mark.slow
+def test_killed_while_it_writes_it_leaves_nothing_half(checkpoint, old, new, recipe, taught, tmp_path, monkeypatch):
+    arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
+    with monkeypatch.context() as patch:
+        patch.setattr(finetune_module, "write_stage", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            finetune(checkpoint, [old, new], "better", **arguments)
+    assert not (tmp_path / "better").exists()
+    assert_same(finetune(checkpoint, [old, new], "better", **arguments), taught)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["better", "cache"]
+    assert [p.name.split("-")[0] for p in (tmp_path / "cache").iterdir()] == ["lessons"] * 2
+
+
+@pytest.mark.slow
+def test_it_learns_what_the_human_did_and_keeps_what_it_could(checkpoint, old, new, recipe, tmp_path):
+    longer = replace(recipe, transformer_steps=150, together_steps=0, correction_weight=1000.0, to_parent=1.0)
+    folder = finetune(checkpoint, [old, new], "better", runs_dir=tmp_path, recipe=longer, device="cpu")
+    metrics = read_stage(folder / "finetune.json", "finetune")["metrics"]
+    losses = metrics["losses"]["transformer"]
+    assert np.mean(losses[-30:]) < 0.85 * np.mean(losses[:10])
+
+
+@pytest.mark.slow
+def test_a_lerobot_folder_learns_on_and_recordings_of_one_folder_do(taught, old, new, recipe, tmp_path):
+    """Episodes in which a policy drove are new, wherever they are; a LeRobot folder is what `rover finetune` leaves."""
+    both = tmp_path / "both"
+    both.mkdir()
+    for path in (*old.iterdir(), *new.iterdir()):
+        (both / path.name).symlink_to(path)
+    short = replace(recipe, transformer_steps=1, together_steps=0)
+    folder = finetune(taught / "pretrained_model", [both], "again", runs_dir=tmp_path, recipe=short, device="cpu")
+    metrics = read_stage(folder / "finetune.json", "finetune")["metrics"]
+    assert [row["kind"] for row in metrics["held_out"]] == ["old", "old", "new"]
+    weights = load_checkpoint(folder / "pretrained_model").weights
+    assert set(weights) == set(load_checkpoint(taught / "pretrained_model").weights)
+
+
+@pytest.mark.slow
+def test_new_demonstrations_alone_are_learned_from_too(checkpoint, old, recipe, tmp_path):
+    more = record(tmp_path / "more", drives=2, offset=90)
+    short = replace(recipe, transformer_steps=1, together_steps=1, held_out_share=0.0)
+    folder = finetune(checkpoint, [old, more], "taught", runs_dir=tmp_path, recipe=short, device="cpu")
+    metrics = read_stage(folder / "finetune.json", "finetune")["metrics"]
+    assert metrics["learned_from"]["corrections"] == 0 and metrics["learned_from"]["new_demonstrations"] == 20
+    assert {row["kind"] for row in metrics["held_out"]} == {"old"}
+
+
+# --- what cannot be ---
+
+
+def refused(says, checkpoint, episodes, tmp_path, **options):
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(FinetuneError, match=says) as error:
+        finetune(checkpoint, episodes, **{"name": "better", "runs_dir": tmp_path / "runs", "device": "cpu", **options})
+    assert "\n" not in str(error.value) and sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"device": "tpu"}, "device must be"),
+        ({"name": "../better"}, "plain folder name"),
+    ],
+)
+def test_arguments_that_cannot_be_are_refused(checkpoint, old, new, tmp_path, options, says):
+    refused(says, checkpoint, [old, new], tmp_path, **options)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"seed": -1}, "steps and seed"),
+        ({"batch": 0}, "at least 1"),
+        ({"correction_weight": 0.0}, "above 0"),
+        ({"focus": -1.0}, "focus at least 0"),
+        ({"to_parent": 1.5}, "from 0 to 1"),
+        ({"held_out_share": 1.0}, "below 1"),
+    ],
+)
+def test_a_recipe_that_cannot_be_is_refused(recipe, values, says):
+    with pytest.raises(FinetuneError, match=says):
+        replace(recipe, **values)
+
+
+def test_a_run_that_is_there_is_not_overwritten(checkpoint, old, new, tmp_path):
+    (tmp_path / "runs" / "better").mkdir(parents=True)
+    refused("is there already", checkpoint, [old, new], tmp_path)
+
+
+def test_without_a_new_episode_there_is_nothing_to_learn(checkpoint, old, tmp_path):
+    refused("no new episode", checkpoint, [old], tmp_path)
+
+
+def test_drives_in_which_no_human_drove_teach_nothing(checkpoint, old, tmp_path):
+    alone = record(tmp_path / "alone", drives=2, drivers=[POLICY] * 20 + [NOBODY] * 4)
+    refused("a human drove in none of the 2 new episodes", checkpoint, [old, alone], tmp_path)
+
+
+def test_another_camera_is_refused(checkpoint, old, tmp_path):
+    square = record(tmp_path / "square", drives=1, drivers=TAKEN_OVER, size=(64, 64))
+    refused("its camera has another shape", checkpoint, [old, square], tmp_path)
+
+
+def test_another_car_is_refused(checkpoint, old, tmp_path):
+    other = Car()
+    channel = replace(other.pwm.steering, neutral_pct=7.0)
+    other = replace(other, pwm=replace(other.pwm, steering=channel))
+    others = record(tmp_path / "other", drives=1, drivers=TAKEN_OVER, car=other)
+    refused("was recorded with another car", checkpoint, [old, others], tmp_path)
+
+
+def test_the_same_recordings_twice_are_refused(checkpoint, old, tmp_path):
+    refused("given twice", checkpoint, [old, old.parent / "." / old.name], tmp_path)
+
+
+def test_an_artifact_does_not_learn(old, new, tmp_path):
+    refused("is an artifact", tmp_path / "policy_static.pt", [old, new], tmp_path)
+
+
+@pytest.mark.slow
+def test_a_policy_of_another_car_is_refused(old, new, recipe, tmp_path):
+    policy = lerobot_policy(**TINY)
+    with torch.no_grad():
+        policy.model.action_head.weight.zero_()
+        policy.model.action_head.bias.copy_(torch.tensor([-0.9, 0.6]))
+    torch.save(trainer_content(policy), tmp_path / "best_model.pth")
+    with pytest.raises(FinetuneError, match="worse than one action for all frames, found steering"):
+        finetune(tmp_path / "best_model.pth", [old, new], "x", runs_dir=tmp_path, recipe=recipe, device="cpu")
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("steps", [1, 10, 1000])
+def test_a_recipe_of_few_steps_keeps_both_phases(recipe, steps):
+    short = recipe.of_steps(steps)
+    assert min(short.transformer_steps, short.together_steps) >= 1
+    assert abs(short.transformer_steps + short.together_steps - steps) <= 1
+
+
+@pytest.mark.slow
+def test_the_command_prints_what_it_learned_from_and_where_it_left_it(checkpoint, old, new, tmp_path):
+    given_ = [
+        "--name",
+        "better",
+        "--runs-dir",
+        tmp_path,
+        "--samples",
+        8,
+        "--steps",
+        2,
+        "--weight",
+        3,
+        "--device",
+        "cpu",
+    ]
+    result = CliRunner().invoke(main, [str(a) for a in ("finetune", checkpoint, old, new, *given_)])
+    assert result.exit_code == 0, result.output
+    assert "8 of corrections" in result.output and f"done: {tmp_path / 'better'}" in result.output
+    assert read_stage(tmp_path / "better" / "finetune.json", "finetune")["params"]["correction_weight"] == 3

@@ -1,0 +1,255 @@
+"""Drives with a human beside them, what is learned from that, and what is said of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from policies import of_a_cars_size
+
+from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.pilot import Order
+from rover_lib.onboard.plan import Settings
+from rover_lib.onboard.recording import HUMAN, POLICY
+from rover_lib.onboard.stage import read_stage
+from rover_lib.workshop import pipeline, plots
+from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.finetune import human_samples
+from rover_lib.workshop.pipeline import make_artifact
+from rover_lib.workshop.session import load
+from rover_lib.world import learn
+from rover_lib.world.latency import Condition, drive_in
+from rover_lib.world.learn import Experiment, Human, demonstrate, drive_corrected, gates, measured, sentences, table
+from rover_lib.world.world import World, expert
+
+CURVE = 10_003  # the balloon is 23 degrees aside
+LATE = Condition(0.3, Settings.of(params()["drive"]))
+
+
+class Straight:
+    """Plans to drive on as it is, at the recordings' speed."""
+
+    rate_hz = 30.0
+
+    def predict_unclipped(self, frame_bgr, state):
+        return np.tile(np.float32([0.0, 0.08]), (32, 1))
+
+
+class NotDrawn(World):
+    def render(self):
+        return np.zeros((360, 640, 3), np.uint8)
+
+
+@pytest.fixture
+def not_drawn(monkeypatch):
+    monkeypatch.setattr(learn, "World", NotDrawn)
+
+
+def order(steering):
+    return Order(steering, 0.05, 0, 0)
+
+
+def test_a_human_takes_over_after_their_time_and_forgives_what_is_shorter():
+    world = World(CURVE)
+    right, wrong = order(expert(world)[0]), order(expert(world)[0] - 0.3)
+    takes_over = Human(off=0.25, for_s=0.4).watching(world)
+    assert [takes_over(wrong) for _ in range(11)] == [False] * 11
+    assert not takes_over(right)
+    assert [takes_over(wrong) for _ in range(12)] == [False] * 11 + [True]
+    takes_over = Human(off=0.35, for_s=0.4).watching(world)
+    assert not any(takes_over(wrong) for _ in range(60))
+
+
+def test_a_drive_that_is_taken_over_ends_after_that_tick():
+    world, seen = NotDrawn(CURVE), []
+
+    def watch(sent):
+        seen.append((world.state.time_s, sent))
+        return len(seen) == 5
+
+    driven = drive_in(Straight(), world, LATE, watch)
+    assert driven.outcome == "taken over" and not world.done
+    assert [sent for _, sent in seen] == driven.orders and len(world.trajectory) == 6
+    assert world.state.time_s == pytest.approx(5 / 30)
+
+
+def test_who_drove_is_in_the_recording_and_what_they_did_in_the_world(not_drawn, tmp_path):
+    found = drive_corrected(Straight(), tmp_path, 7, CURVE, LATE, Human())
+    assert found.outcome == "hit" and found.taken_over_s is not None
+    (episode,) = load_recordings(tmp_path, 32).episodes
+    drivers = [s.driver for s in episode.samples]
+    first = drivers.index(HUMAN)
+    assert drivers == [POLICY] * first + [HUMAN] * (len(drivers) - first)
+    assert found.taken_over_s == pytest.approx(first / 30, abs=1e-6)
+    assert found.human_s == pytest.approx((len(drivers) - first) / 30, abs=1e-6)
+    corrections = human_samples(episode)
+    assert corrections[0].row == first and not corrections[0].is_pad.all()
+    # the expert's own drive from there: what is recorded is what was done, in an Arduino's steps
+    world = NotDrawn(CURVE)
+    for sample in episode.samples:
+        if sample.driver == HUMAN:
+            assert np.allclose(sample.chunk[0], expert(world), atol=0.01), sample.row
+        world.step(*sample.chunk[0].astype(float))
+    assert world.hit
+
+
+def test_nobody_takes_over_where_all_is_well(not_drawn, tmp_path):
+    found = drive_corrected(Straight(), tmp_path, 0, CURVE, LATE, Human(off=2.0))
+    assert (found.taken_over_s, found.human_s, found.outcome) == (None, 0.0, "left")
+    (episode,) = load_recordings(tmp_path, 32).episodes
+    assert {s.driver for s in episode.samples} == {POLICY}
+
+
+def test_demonstrations_are_whole_drives_or_cut(not_drawn, tmp_path):
+    assert demonstrate(tmp_path, 0, CURVE, LATE, 1.0) == pytest.approx(1.0, abs=1 / 30)
+    whole_s = demonstrate(tmp_path, 1, CURVE, LATE, 60.0)
+    cut, whole = load_recordings(tmp_path, 32).episodes
+    assert len(cut.samples) == 30 and len(whole.samples) == pytest.approx(30 * whole_s, abs=1)
+    assert {s.driver for s in (*cut.samples, *whole.samples)} == {HUMAN}
+
+
+# --- what is said ---
+
+
+def policies(pushed, alone=(), trials=40):
+    """Rows of learn.json; of each policy the seeds that it missed."""
+    rows = []
+    for name, missed in pushed.items():
+        arm, _, number = name.partition("-")
+        row = {"name": name, "arm": arm, "round": int(number or 0), "human_s": 10.0 * int(number or 0)}
+        for how, of in (("pushed", missed), ("alone", alone if name == "corrected-1" else ()), ("decoy", ())):
+            hits = trials - len(of)
+            row[how] = {"hits": hits, "trials": trials, "hits_of_40": hits, "missed": list(of)}
+            row[how] |= {"wilson_low": hits / trials - 0.1, "wilson_high": min(1.0, hits / trials + 0.05)}
+        rows.append(row)
+    return rows
+
+
+def content_of(rows):
+    by_name = {row["name"]: row for row in rows}
+    pairs = [
+        learn._pair(by_name["corrected-1"], by_name[other], how)
+        for other in ("before", "demonstrated-1")
+        for how in learn.HOW
+    ]
+    rounds = [{"round": 1, "human_s": 10.0, "takeovers": 5, "drives": 20, "missed": 1}]
+    return {"metrics": {"policies": rows, "pairs": pairs, "rounds": rounds}}
+
+
+@pytest.mark.parametrize(
+    ("corrected", "demonstrated", "alone", "passed"),
+    [
+        (range(4), range(6), (), [True, True, True]),
+        (range(5), range(5), (), [False, True, False]),
+        (range(4), range(9), (3,), [True, False, True]),
+    ],
+)
+def test_gates_are_of_the_last_round(corrected, demonstrated, alone, passed):
+    rows = policies({"before": range(9), "corrected-1": corrected, "demonstrated-1": demonstrated}, alone)
+    assert [row["passed"] for row in gates(rows)] == passed
+
+
+def test_of_few_worlds_nothing_is_promised():
+    rows = policies({"before": [1], "corrected-1": [], "demonstrated-1": []}, trials=4)
+    assert [row["passed"] for row in gates(rows)][:2] == [None, None]
+
+
+def test_sentences_say_what_is_and_what_is_not_better():
+    rows = policies({"before": range(9), "corrected-1": [0], "demonstrated-1": []})
+    text = "\n".join(sentences(content_of(rows)["metrics"]))
+    assert "Pushed, the corrected policy is better than before: 39 of 40 worlds, not 31; 8 only it hit, 0 only" in text
+    assert "is worse than by demonstrations: 39 of 40 worlds, not 40; 0 only it hit, 1 only the other: chance" in text
+    assert "Left alone, the corrected policy is no better than before" in text and "10 human seconds" in text
+
+
+def test_what_is_shown_and_what_where_nothing_is(tmp_path):
+    rows = policies({"before": range(9), "corrected-1": [0], "demonstrated-1": range(3)})
+    content = content_of(rows)
+    assert "corrected, round 1" in str(table(content)) and "5 of 20" in str(learn.rounds_table(content))
+    figure = plots.hits_by_round(rows)
+    assert figure._suptitle.get_text() == (
+        "Pushed, it hit 31 of 40 worlds; corrected 39, after as many seconds of demonstrations 37"
+    )
+    assert learn.left(tmp_path) is None
+    assert "rover world learn" in str(table(None)) and "rover world learn" in str(learn.rounds_table(None))
+    assert "nothing has been learned" in repr(plots.hits_by_round([]))
+
+
+# --- the whole ---
+
+
+@pytest.fixture(scope="module")
+def few_params(tmp_path_factory):
+    path = tmp_path_factory.mktemp("params") / "params.yml"
+    path.write_text("calibration: {samples: 8}\nfinetune: {batch: 4}\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROVER_PARAMS", str(path))
+        yield
+
+
+@pytest.fixture(scope="module")
+def run_dir(few_params, recorded, tmp_path_factory):
+    """As `make demo` leaves one, of a policy that knows nothing."""
+    folder = tmp_path_factory.mktemp("runs") / "demo"
+    folder.mkdir()
+    (folder / "episodes").symlink_to(recorded)
+    checkpoint = of_a_cars_size(folder / "best_model.pth")
+    make_artifact(load(checkpoint, recorded), folder / "policy_static.pt", pipeline.Recipe.of(params()))
+    return folder
+
+
+FEW = Experiment(rounds=2, drives=2, worlds=2, other_worlds=1, steps=2, samples=8)
+
+
+@pytest.mark.slow
+def test_both_arms_learn_from_as_many_seconds_and_a_kill_costs_nothing(run_dir, tmp_path, monkeypatch):
+    out = tmp_path / "learned"
+    calls = []
+
+    def dies_at(count):
+        def counted(*args, **options):
+            calls.append(1)
+            if len(calls) == count:
+                raise KeyboardInterrupt
+            return drive_corrected(*args, **options)
+
+        return counted
+
+    with monkeypatch.context() as patch:
+        patch.setattr(learn, "drive_corrected", dies_at(2))
+        with pytest.raises(KeyboardInterrupt):
+            measured(run_dir, out, FEW)
+    assert not (run_dir / "learn.json").exists()
+    (out / "corrected-1" / ".episode_half.part").mkdir(parents=True, exist_ok=True)
+    content = measured(run_dir, out, FEW)
+    assert content == read_stage(run_dir / "learn.json", "learn") == measured(run_dir, tmp_path / "unused", FEW)
+    assert not (tmp_path / "unused").exists() and not (out / "corrected-1" / ".episode_half.part").exists()
+    metrics = content["metrics"]
+    names = ["before", "corrected-1", "corrected-2", "demonstrated-1", "demonstrated-2"]
+    assert sorted(row["name"] for row in metrics["policies"]) == names
+    assert metrics["policies"][-1]["human_s"] == pytest.approx(sum(r["human_s"] for r in metrics["rounds"]))
+    for number, row in enumerate(metrics["rounds"], 1):
+        seconds = {}
+        for arm in learn.ARMS:
+            episodes = load_recordings(out / f"{arm}-{number}", 32).episodes
+            seconds[arm] = sum(s.driver == HUMAN for e in episodes for s in e.samples) / 30
+        assert seconds["corrected"] == pytest.approx(row["human_s"], abs=0.1)
+        assert seconds["demonstrated"] == pytest.approx(row["human_s"], abs=0.1)
+    more = measured(run_dir, out, replace(FEW, worlds=3))  # only what is missing is driven
+    assert [row["pushed"]["trials"] for row in more["metrics"]["policies"]] == [3] * 5
+    with pytest.raises(WorldError, match="holds another experiment"):
+        measured(run_dir, out, replace(FEW, drives=3))
+
+
+def test_what_is_missing_is_said(tmp_path):
+    with pytest.raises(WorldError, match=r"best_model.pth: not there; `make demo` makes it"):
+        measured(tmp_path, tmp_path / "out")
+    with pytest.raises(WorldError, match="at least one round"):
+        Experiment(rounds=0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "mine").write_text("")
+    with pytest.raises(WorldError, match="exists and is not of this"):
+        learn._begin(tmp_path, {})
