@@ -85,8 +85,8 @@ def test_from_recordings_to_a_drive(artifact, tmp_path):
 def start_of(checkpoint, dataset, folder):
     """A LeRobot policy of the demo's shape, without a VAE, with its backbone and nothing else of what it has learned.
 
-    A backbone that knows nothing learns little while its batch norm is frozen, which is why LeRobot downloads one. Saved
-    with processors: lerobot-train takes no other as --policy.path.
+    A backbone that knows nothing learns little while its batch norm is frozen, which is why LeRobot downloads one.
+    lerobot-train takes no --policy.path without processors.
     """
     import torch
     from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata

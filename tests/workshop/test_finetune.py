@@ -158,7 +158,7 @@ def test_finetune_json_says_what_was_learned_from_and_judges_each_episode(taught
         "demonstrations": 20,
         "new_demonstrations": 0,
         "corrections": 24,
-        "not_imitated": 3 * 12,
+        "not_imitated": 3 * (8 + 3),  # nobody's first frame is no sample: the action before it was the human's
     } | {"corrections": 20}
     assert [(row["kind"], row["frames"]) for row in metrics["held_out"]] == [("old", 4)] * 2 + [("new", 4)]
     assert all(row[f"{when}_steering_pct"] > 0 for row in metrics["held_out"] for when in ("before", "after"))
