@@ -187,6 +187,20 @@ def _students(root: Path) -> list[Row]:
     return [("", "MB", *counted, *driven, f"{' / '.join(actions)} error to the recordings, %"), *map(row, rows)]
 
 
+def _learning(root: Path) -> list[Row]:
+    """The demo's policy before and after learning on, from corrections and from demonstrations."""
+    policies = _metrics(root / "results" / "demo", "learn")["policies"]
+    conditions = [key for key, value in policies[0].items() if isinstance(value, dict)]
+    words = {"alone": "left alone", "decoy": "beside a red thing that is no balloon"}
+
+    def row(policy: Mapping[str, Any]) -> Row:
+        name = policy["arm"] + (f", round {policy['round']}" if policy["round"] else "")
+        hits = (f"{policy[how]['hits']} of {policy[how]['trials']}" for how in conditions)
+        return (name, f"{policy['human_s']:.0f}", *hits)
+
+    return [("", "human seconds", *(words.get(how, how) for how in conditions)), *map(row, policies)]
+
+
 def _parameters(root: Path) -> list[Row]:
     """What papermill's -p sets, as the cells of parameters say it."""
     rows: list[Row] = []
@@ -201,6 +215,7 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "faults": _faults,
     "drives": _drives,
     "students": _students,
+    "learning": _learning,
     "parameters": _parameters,
 }
 
