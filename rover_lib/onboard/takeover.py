@@ -26,7 +26,7 @@ from rover_lib.onboard.recorder import SILENT_S, Recorder
 from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY
 from rover_lib.onboard.servo_link import ServoLink, State, Telemetry
 
-LET_GO_S = 2.0  # both sticks at rest for so long: the human has let go
+LET_GO_S = 2.0  # with both sticks at rest for this time, the human has let go
 MOST_S = 300.0  # a transmitter that was put down with a stick held would fill the disk
 # As the firmware has them (vehicle.h): so far from rest a stick has not moved, or is the throttle at rest.
 STEERING_REST_US, THROTTLE_REST_US = 48, 32

@@ -180,7 +180,7 @@ def _write(
                         )
                     dataset.save_episode()
                     written += len(rows)
-                    driven_by.append(POLICY if _by_policy(episode) else HUMAN)
+                    driven_by.append(POLICY if episode.by_policy else HUMAN)
                     outcomes.append(episode.outcome)
                     origins.append(f"{episode.id} from frame {rows[0][0].row}")
         dataset.finalize()
@@ -203,10 +203,6 @@ def _write(
     }
 
 
-def _by_policy(episode: Episode) -> bool:
-    return any(sample.driver == POLICY for sample in episode.samples)
-
-
 @dataclass(frozen=True)
 class _Said:
     """Which columns more there are. intervention: a policy drove; outcome: each recording was labelled."""
@@ -216,7 +212,7 @@ class _Said:
 
     @classmethod
     def of(cls, recordings: Recordings) -> "_Said":
-        return cls(any(map(_by_policy, recordings.episodes)), all(e.outcome for e in recordings.episodes))
+        return cls(any(e.by_policy for e in recordings.episodes), all(e.outcome for e in recordings.episodes))
 
     @property
     def features(self) -> dict[str, Any]:
@@ -232,7 +228,7 @@ class _Said:
         """last: of its episode in the dataset."""
         row: dict[str, Any] = {}
         if self.intervention:
-            row[INTERVENTION] = np.array([sample.driver == HUMAN and _by_policy(episode)])
+            row[INTERVENTION] = np.array([sample.driver == HUMAN and episode.by_policy])
         if self.outcome:
             hit = last and episode.outcome == HIT
             row |= {REWARD: np.array([hit], np.float32), DONE: np.array([last]), SUCCESS: np.array([hit])}

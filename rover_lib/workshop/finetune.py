@@ -31,7 +31,7 @@ from torch import Tensor
 from rover_lib.onboard import preprocess
 from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.recording import HUMAN, POLICY, recorded_car
+from rover_lib.onboard.recording import HUMAN, recorded_car
 from rover_lib.onboard.stage import sha256_of, write_stage
 from rover_lib.workshop import act, training
 from rover_lib.workshop import lessons as lessons_module
@@ -167,11 +167,6 @@ def human_samples(episode: Episode) -> tuple[Sample, ...]:
     )
 
 
-def is_corrected(episode: Episode) -> bool:
-    """Whether a policy drove in it, so that what a human did there are corrections."""
-    return any(s.driver == POLICY for s in episode.samples)
-
-
 @dataclass(frozen=True, eq=False)
 class _HeldOut:
     """An episode that judges. kind: OLD or NEW. samples: a human's."""
@@ -241,8 +236,8 @@ def _opened(
 def _parted(read: Sequence[Recordings], recipe: Recipe) -> _Material:
     """Old and new episodes, and of each what is learned from and what judges."""
     p = params()["calibration"]
-    old = [e for e in read[0].episodes if not is_corrected(e)]
-    new = [(r, e) for r in read for e in r.episodes if r is not read[0] or is_corrected(e)]
+    old = [e for e in read[0].episodes if not e.by_policy]
+    new = [(r, e) for r in read for e in r.episodes if r is not read[0] or e.by_policy]
     if not new:
         raise FinetuneError(
             f"{read[0].root}: no new episode: in none of them a policy drove",
@@ -270,7 +265,7 @@ def _parted(read: Sequence[Recordings], recipe: Recipe) -> _Material:
         own = [e for i, (r, e) in enumerate(driven) if r is recordings and i not in judges]
         for kind in (ADDITIONS, CORRECTIONS):
             taught.append(
-                (kind, tuple(s for e in own if is_corrected(e) == (kind == CORRECTIONS) for s in human_samples(e)))
+                (kind, tuple(s for e in own if e.by_policy == (kind == CORRECTIONS) for s in human_samples(e)))
             )
     every = [*old, *(e for _, e in new)]
     left_out = sum(s.driver != HUMAN for e in every for s in e.samples)

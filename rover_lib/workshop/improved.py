@@ -19,7 +19,7 @@ from rover_lib.workshop.judge import shown_pct
 
 CHANCE = 0.05
 LEAST_EPISODES = 6  # of 5, all alike, chance makes 2 in 32
-EXACT = 12  # so many episodes have 4096 ways to differ; of more, as many are drawn
+EXACT = 12  # episodes at most for which all 2 ** 12 ways are counted; for more, DRAWN of them
 DRAWN = 10_000
 KINDS = ("old", "new")
 

@@ -6,6 +6,7 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.picture import PictureError, read_jpeg
-from rover_lib.onboard.recording import CHANNELS, HUMAN
+from rover_lib.onboard.recording import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
 
 ACTION_NAMES = CHANNELS
@@ -139,6 +140,11 @@ class Episode:
     samples: tuple[Sample, ...]
     files: tuple[Path, ...]  # that the numbers came from
     outcome: str | None = None
+
+    @cached_property
+    def by_policy(self) -> bool:
+        """Whether a policy drove in it, so that what a human did there are corrections."""
+        return any(sample.driver == POLICY for sample in self.samples)
 
 
 @dataclass(frozen=True, eq=False)

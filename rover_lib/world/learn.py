@@ -64,7 +64,7 @@ BEGUN, DRIVES_FILE = "experiment.json", "drives.jsonl"
 
 @dataclass(frozen=True)
 class Human:
-    """When somebody beside the track takes over: the car has steered otherwise than they would, for so long.
+    """When somebody beside the track takes over: once the car has steered otherwise than they would for some time.
 
     off: by how much, of full steering. for_s: how long, with the time that they need to react; what ends sooner is no
     reason.
@@ -428,7 +428,7 @@ def _pair(row: Mapping[str, Any], other: Mapping[str, Any], how: str) -> dict[st
 
 
 def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What was promised of the last round, of notebook 07's worlds where so many were driven. rows: of learn.json."""
+    """What was promised of the last round; of notebook 07's 40 worlds, if all were driven. rows: of learn.json."""
     last = [row for row in rows if row["arm"] == CORRECTED][-1]
     hits = {how: last[how]["hits_of_40"] if last[how]["trials"] >= GATED_WORLDS else None for how in (PUSHED, ALONE)}
     lost = None if hits[ALONE] is None else rows[0][ALONE]["hits_of_40"] - hits[ALONE]

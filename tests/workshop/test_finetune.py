@@ -24,7 +24,7 @@ from rover_lib.workshop import finetune as finetune_module
 from rover_lib.workshop import training
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.episodes import load_recordings
-from rover_lib.workshop.finetune import Recipe, finetune, human_samples, is_corrected
+from rover_lib.workshop.finetune import Recipe, finetune, human_samples
 from rover_lib.workshop.samples import Episode, Sample
 
 FRAMES = 24
@@ -122,8 +122,8 @@ def test_a_plan_that_began_before_the_takeover_is_not_taught():
 def test_a_whole_drive_of_a_human_is_left_as_it_is():
     episode = episode_of([HUMAN] * 9, missing={4})
     assert human_samples(episode) == episode.samples
-    assert not is_corrected(episode) and is_corrected(episode_of([HUMAN, POLICY]))
-    assert not is_corrected(episode_of([HUMAN, NOBODY]))
+    assert not episode.by_policy and episode_of([HUMAN, POLICY]).by_policy
+    assert not episode_of([HUMAN, NOBODY]).by_policy
 
 
 def test_the_state_of_the_first_correction_is_what_the_policy_did(new):
