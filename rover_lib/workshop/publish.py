@@ -34,7 +34,12 @@ RESULTS_OF = {  # stages that a notebook leaves
     "09_learn": "learn",
 }
 OF_LABORATORY = (  # in runs/, where make leaves them
-    *("faults.json", "faults-crawler.json", "faults-inverted.json", "random.json", "pi-fast.json", "pi.json"),
+    "faults.json",
+    "faults-crawler.json",
+    "faults-inverted.json",
+    "random.json",
+    "pi-fast.json",
+    "pi.json",
 )
 IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
 NOTEBOOK_LIMIT = 1_000_000  # bytes, of a committed notebook
