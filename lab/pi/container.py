@@ -48,8 +48,11 @@ CAMERA, PORT = f"{BENCH}/camera", "/dev/rover-arduino"
 DIALOUT = 20  # Debian's number for the group
 # The network is the host's, which has its own; and nothing begins to update itself while something is measured.
 MASKED = ("systemd-networkd.service", "systemd-resolved.service", "apt-daily.timer", "apt-daily-upgrade.timer")
-# Their own programs, which may make no memory executable: an emulator must.
-TRANSLATED = ("systemd-journald", "systemd-logind", "systemd-hostnamed", "systemd-timedated", "systemd-localed")
+# Their programs may make no memory executable: an emulator must.
+TRANSLATED = (
+    *("systemd-journald", "systemd-logind", "systemd-hostnamed", "systemd-timedated", "systemd-localed"),
+    "rover-view",
+)
 SYSTEMD = Path("/usr/lib/systemd/systemd")
 CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 

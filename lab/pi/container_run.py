@@ -20,10 +20,11 @@ runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
     driving_after_s  from switching on until a human could arm the car; plays_s: of all playbooks before the proofs
     system_cached  whether the Pi's file system was in the cache
     engine         what computes the policy there
-    environment    {packages: [{name, version, from}], unhashed, lerobot, missing, others, size_mb}
+    environment    {packages: [{name, version, from}], unhashed, lerobot, missing, others, of_view, size_mb}
     sandbox        {exposure, writable, probes: [{probe, inside, outside}]}; inside: "" is "it worked"
     service        {hang: {...}, start_limit: {...}, boot: {...}}, in seconds, see the functions of those names
     drive          {ticks, driven, ended} of the fetched flight log; recorded: {episodes, left, frames, commands}
+    view           [{row, wanted, found, holds}], see view_proofs.py
     faults         [{fault, model_after, healthy, healed_by_rerun, ...}], see deployment_faults.py
     fleet          {cases: [{broken, results, models, healthy, ...}], good}, see fleet.py
     gates          [{gate, wanted, found, holds}], the limits from lab/params.yml
@@ -48,12 +49,13 @@ from lab.pi.container import CAMERA, PORT, Container
 from lab.pi.debian_image import debian_image
 from lab.pi.deployment_bench import DeploymentBench
 from lab.pi.deployment_faults import break_deployments, row_of, wrong_rows
-from lab.pi.emulation import EmulationError, emulation, interruptible, require, require_arduino, wait_for
+from lab.pi.emulation import EmulationError, emulation, free_port, interruptible, require, require_arduino, wait_for
 from lab.pi.fleet import fleet
 from lab.pi.playbooks import Play
 from lab.pi.pulses import Pins, moving
 from lab.pi.report import PiReport
 from lab.pi.service_proofs import READY_S, STATE, VENV, environment, hang, sandbox, show, start_limit
+from lab.pi.view_proofs import Row, view_again, view_beside_a_drive, view_gone
 from rover_lib.onboard.artifact import ONNX_SUFFIX
 from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.errors import RoverError
@@ -88,8 +90,8 @@ def run_container(
     """All of it; the report is written to `output` whatever fails.
 
     demo: a run's folder with ARTIFACTS. engine: what computes the policy on the Pi, as rover_engine. short: provision,
-    deploy, one fault of a deployment and an armed drive, which is what CI has time for. faults: of deployments, and the
-    fleet, too, which are met with torch's artifacts only. say: told a line for each step.
+    deploy, one fault of a deployment, an armed drive and the view, which is what CI has time for. faults: of
+    deployments, and the fleet, too, which are met with torch's artifacts only. say: told a line for each step.
     Raises RoverError where it cannot begin: no root, packages that cannot be installed, no artifacts.
     """
     output, demo = Path(output), Path(demo)
@@ -132,6 +134,7 @@ class _Run:
             "rover_hz": HZ,
             "rover_ready_s": READY_S,
             "rover_record": True,
+            "rover_view_port": free_port(),  # the network is this machine's, which may have a view of its own
         }
 
     def all(self, static: Path, other: Path, *, short: bool, faults: bool) -> None:
@@ -145,6 +148,9 @@ class _Run:
             with _car(pi) as pins:
                 if short:
                     self.one_fault(pi, static)
+                    self.view(pi, pins)
+                    self.no_view(pi)
+                    self.environment(pi)
                     return
                 driving_s = self.playbooks(pi, static, other)
                 self.metrics["driving_after_s"] = round(driving_s - begun, 1)
@@ -194,6 +200,7 @@ class _Run:
 
     def one_fault(self, pi: Container, static: Path) -> None:
         """A deployment that fails, leaves the rover as it was and is healed by another; it then drives what came."""
+        self.variables["rover_view"] = True
         with _bytecode_from_here(pi.root):
             self.play("provision", pi)
         self.play("deploy", pi, rover_artifact=str(static))
@@ -253,13 +260,7 @@ class _Run:
 
     def proofs(self, pi: Container, pins: Pins) -> None:
         gate, gates = self.report.gate, self.report.gates
-        with self.report.step("environment"):
-            installed = self.metrics["environment"] = environment(pi.root, self.engine)
-        size_mb, limit_mb = installed["size_mb"], gates["environment_mb"][self.engine]
-        gate("the Pi's environment", f"under {limit_mb} MB", size_mb, size_mb < limit_mb)
-        gate("all of it hashed, no lerobot", "none else", installed["unhashed"], not installed["unhashed"])
-        lacks_or_has = installed["missing"] + installed["others"]
-        gate(f"{self.engine}, and no other engine", "so installed", lacks_or_has or "so installed", not lacks_or_has)
+        self.environment(pi)
         with self.report.step("sandbox"):
             sandboxed = self.metrics["sandbox"] = sandbox(pi)
         self.report.limit("systemd-analyze security", sandboxed["exposure"], gates["exposure"], "of 10")
@@ -277,7 +278,47 @@ class _Run:
         gate("hung loop, the car", "disarmed", hung, hung["disarmed"])
         left = limited["tries"] == 5 and limited["state"] == "failed"
         gate("start limit", "5 tries, then failed", limited, left)
+        self.variables["rover_view"] = True
+        self.play("provision", pi, "provision, with the view")
+        self.view(pi, pins)
         self.boot(pi, pins)
+        with self.report.step("the view again"):
+            self.rows(view_again(pi, self.variables["rover_view_port"]))
+        self.no_view(pi)
+
+    def environment(self, pi: Container) -> None:
+        """What is installed, without the view."""
+        gate, limit_mb = self.report.gate, self.report.gates["environment_mb"][self.engine]
+        with self.report.step("environment"):
+            installed = self.metrics["environment"] = environment(pi.root, self.engine)
+        size_mb = installed["size_mb"]
+        gate("the Pi's environment", f"under {limit_mb} MB", size_mb, size_mb < limit_mb)
+        gate("all of it hashed, no lerobot", "none else", installed["unhashed"], not installed["unhashed"])
+        lacks_or_has = installed["missing"] + installed["others"] + installed["of_view"]
+        gate(f"{self.engine}, no other engine and no view", "so installed", lacks_or_has or "so installed",
+             not lacks_or_has)  # fmt: skip
+
+    def view(self, pi: Container, pins: Pins) -> None:
+        """The view's service, which was provisioned, beside an armed drive of the small policy."""
+        with self.report.step("the view"):
+            installed = environment(pi.root, self.engine)
+            needs, unhashed = installed["of_view"], installed["unhashed"]
+            self.rows([Row("what the view needs", "all by hash", unhashed or needs, bool(needs) and not unhashed)])
+            port, stop_s = self.variables["rover_view_port"], self.report.gates["view_stop_s"]
+            self.rows(view_beside_a_drive(pi, pins, port, stop_s))
+
+    def no_view(self, pi: Container) -> None:
+        """Provisioned without it again."""
+        self.variables["rover_view"] = False
+        self.play("provision", pi, "provision, without the view")
+        with self.report.step("no view"):
+            self.rows(view_gone(pi, self.variables["rover_view_port"]))
+
+    def rows(self, rows: list[Row]) -> None:
+        """Each is a gate, and they are all in the report's `view`."""
+        for row in rows:
+            self.metrics.setdefault("view", []).append(row._asdict())
+            self.report.gate(row.row, row.wanted, row.found, row.holds)
 
     def boot(self, pi: Container, pins: Pins) -> None:
         """Disabled at boot by default; with rover_start_at_boot it is up, and disarmed, and the car stands."""

@@ -21,7 +21,7 @@ from lab.pi.container import Container
 from lab.pi.emulation import EmulationError, wait_for
 from lab.pi.pulses import Pins, moving, stopped
 from rover_lib.onboard.service import UNIT
-from rover_lib.workshop.wheelhouse import REQUIREMENTS
+from rover_lib.workshop.wheelhouse import REQUIREMENTS, VIEW
 
 VENV, STATE = "/opt/rover/venv", "/var/lib/rover-drive"
 READY_S = 600  # torch under emulation on a busy machine
@@ -30,16 +30,18 @@ READY_S = 600  # torch under emulation on a busy machine
 def environment(root: Path, engine: str = "torch") -> dict[str, Any]:
     """What is installed for the policy: name, version and who vouches for it; unhashed: what nobody does.
 
-    engine: of REQUIREMENTS. others: engines that are there beside it.
+    engine: of REQUIREMENTS. others: engines that are there beside it. of_view: what only the view needs.
     """
     site = next((root / VENV.lstrip("/") / "lib").glob("python3*/site-packages"))
-    pinned = hashed(REQUIREMENTS[engine])
+    pinned, of_view = hashed(REQUIREMENTS[engine]), hashed(VIEW)
     packages = []
     for found in sorted(distributions(path=[str(site)]), key=lambda d: d.metadata["Name"].lower()):
         name, version = re.sub(r"[-_.]+", "-", found.metadata["Name"]).lower(), found.version
         origin = ""
         if version in pinned.get(name, ()):
             origin = f"{REQUIREMENTS[engine].name}, by hash"
+        elif version in of_view.get(name, ()):
+            origin = f"{VIEW.name}, by hash"
         elif name == "rover-policy":
             origin = "the rover's own wheel"
         elif name in ("pip", "setuptools"):
@@ -54,6 +56,7 @@ def environment(root: Path, engine: str = "torch") -> dict[str, Any]:
         "lerobot": "lerobot" in names,
         "missing": sorted({engine, "numpy", "opencv-python-headless", "pyserial"} - names),
         "others": sorted((REQUIREMENTS.keys() - {engine}) & names),
+        "of_view": sorted(p["name"] for p in packages if p["from"].startswith(VIEW.name)),
         "size_mb": round(sum(sizes.values()) / 1e6),
     }
 
@@ -272,9 +275,9 @@ def start_limit(pi: Container) -> dict[str, Any]:
     }
 
 
-def show(pi: Container, *names: str) -> dict[str, str]:
-    """What systemd says of the service."""
-    told = pi.inside("systemctl", "show", f"--property={','.join(names)}", UNIT).stdout
+def show(pi: Container, *names: str, unit: str = UNIT) -> dict[str, str]:
+    """What systemd says of a service, the drive's if no other is named."""
+    told = pi.inside("systemctl", "show", f"--property={','.join(names)}", unit).stdout
     found = dict(line.partition("=")[::2] for line in told.splitlines())
     return {name: found.get(name, "") for name in names}
 

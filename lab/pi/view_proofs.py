@@ -1,0 +1,271 @@
+"""The view as a service on an emulated Pi that was provisioned with rover_view, beside the real drive service.
+
+    rows = view_beside_a_drive(pi, pins, port, stop_s=2.0)     # who may look, what is seen, what a stop and a kill do
+    rows += view_gone(pi, port)                                 # once it was provisioned without rover_view again
+
+Each row says what was wanted and what was found; container_run.py makes a gate of each. One line of the unit is not
+proven here: MemoryDenyWriteExecute=, under which no emulator of programs works (container.TRANSLATED).
+"""
+
+import contextlib
+import http.client
+import os
+import re
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lab.driving.page import Page
+from lab.pi.container import Container
+from lab.pi.emulation import EmulationError, wait_for
+from lab.pi.pulses import Pins, moving, stopped
+from lab.pi.service_proofs import READY_S, STATE, VENV, show
+from rover_lib.onboard.feed import DRIVING, WAITING
+from rover_lib.onboard.service import UNIT
+
+VIEW_UNIT, VIEW_USER = "rover-view.service", "rover-view"
+TOKEN = "/etc/rover/view.token"
+FILES = (f"/etc/systemd/system/{VIEW_UNIT}", TOKEN, "/opt/rover/requirements_pi_view.txt", "/run/rover-view")
+START_S = 180.0  # of its program, emulated on a busy machine
+SEEN_S = 30.0  # until a page shows what has happened
+DRIVES_S = 30.0  # from a request until the car drives
+WITHOUT_S = 3.0  # that a drive goes on beside a view that was killed; longer than the Arduino's 150 ms
+STOPPED_S = 2.0  # after a stop in which nothing may move the car any more
+LOOPBACK = "0100007F"  # 127.0.0.1, as the kernel writes it
+LISTENS = "0A"
+
+
+class Row(NamedTuple):
+    """What was wanted of the view, what was found, and whether that is the same."""
+
+    row: str
+    wanted: str
+    found: Any
+    holds: bool
+
+
+def view_beside_a_drive(pi: Container, pins: Pins, port: int, stop_s: float) -> list[Row]:
+    """All rows of an installed view. port: of its page. stop_s: from a click until the throttle is off, at most.
+
+    It starts the drive service and arms the car, and leaves the service stopped. Raises EmulationError where it cannot
+    even look: no view, a car that does not drive.
+    """
+    token = page_token(pi)
+    if not wait_for(lambda: status(port, f"/?token={token}") == 200, START_S, 0.5):
+        told = show(pi, "ActiveState", "SubState", "StatusText", "Result", unit=VIEW_UNIT)
+        raise EmulationError(f"the view serves no page: {told}; {_journal(pi)[-800:]}")
+    rows = [_started(pi), _token_is_roots(pi, token), *_doors(port, token)]
+    pi.inside("systemctl", "reset-failed", UNIT, check=False)
+    pi.inside("systemctl", "start", UNIT)
+    try:
+        rows += _beside(pi, pins, port, token, stop_s)
+    finally:
+        pi.inside("systemctl", "stop", UNIT)
+    rows.append(_after_the_drive(pi))
+    return rows
+
+
+def view_again(pi: Container, port: int) -> list[Row]:
+    """After a boot: it is served again, by the token that it had."""
+    token = page_token(pi)
+    served = wait_for(lambda: status(port, f"/?token={token}") == 200, START_S, 0.5)
+    return [Row("the view after a power cut", "served again", _state(pi), served)]
+
+
+def view_gone(pi: Container, port: int) -> list[Row]:
+    """After provisioning with rover_view=false: nothing of it is left, and the drive service is as it was."""
+    left = [path for path in FILES if os.path.lexists(pi.root / path.lstrip("/"))]
+    left += [f"user {VIEW_USER}"] if _uid(pi, VIEW_USER) is not None else []
+    left += ["aiohttp"] if list((pi.root / VENV.lstrip("/")).glob("lib/python3*/site-packages/aiohttp")) else []
+    state = _state(pi)
+    answers = status(port, "/")
+    drive = show(pi, "LoadState", "ActiveState")
+    return [
+        Row("rover_view=false, of the view", "nothing is left", left or "nothing", not left),
+        Row("rover_view=false, its service", "inactive, not known", state, state["LoadState"] == "not-found"),
+        Row("rover_view=false, its port", "nobody listens", answers, answers == 0 and not listening(port)),
+        Row("rover_view=false, the drive service", "installed", drive, drive["LoadState"] == "loaded"),
+    ]
+
+
+def page_token(pi: Container) -> str:
+    """Of root's file. Raises EmulationError if there is none."""
+    try:
+        return (pi.root / TOKEN.lstrip("/")).read_text().strip()
+    except OSError as error:
+        raise EmulationError(f"{pi.name}: no {TOKEN} ({error.strerror})") from None
+
+
+def status(port: int, path: str, **headers: str) -> int:
+    """HTTP status that this port of the loopback gives; 0: nobody answers."""
+    wire = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    with contextlib.closing(wire), contextlib.suppress(OSError, http.client.HTTPException):
+        wire.request("GET", path, headers=headers)
+        return wire.getresponse().status
+    return 0
+
+
+def listening(port: int, tables: tuple[str, ...] = ("/proc/net/tcp", "/proc/net/tcp6")) -> list[str]:
+    """Addresses at which a port of TCP is listened to, in the kernel's own hexadecimal."""
+    found = []
+    for table in tables:
+        for line in Path(table).read_text().splitlines()[1:]:
+            _, local, _, state, *_ = line.split()
+            address, _, number = local.partition(":")
+            if int(number, 16) == port and state == LISTENS:
+                found.append(address)
+    return found
+
+
+# ---- who may look
+
+
+def _started(pi: Container) -> Row:
+    """A service of its own user, in no group but its own, at boot too."""
+    told = show(pi, "ActiveState", "UnitFileState", "MainPID", unit=VIEW_UNIT)
+    own = _uid(pi, VIEW_USER)
+    with contextlib.suppress(EmulationError, OSError):
+        lines = Path(f"/proc/{pi.pid_of(int(told['MainPID']))}/status").read_text().splitlines()
+        about = {key: value.split() for key, _, value in (line.partition(":") for line in lines)}
+        told |= {"uid": about["Uid"], "groups": about["Groups"], "capabilities": about["CapEff"]}
+    alone = own is not None and told.get("uid") == [str(own)] * 4 and len(told["groups"]) <= 1
+    runs = told["ActiveState"] == "active" and told["UnitFileState"] == "enabled"
+    holds = runs and alone and int(told["capabilities"][0], 16) == 0
+    return Row("the view's service", "active, enabled, its own user, no group and no capability else", told, holds)
+
+
+def _token_is_roots(pi: Container, token: str) -> Row:
+    file = (pi.root / TOKEN.lstrip("/")).stat()
+    found = {"mode": f"{file.st_mode & 0o777:o}", "uid": file.st_uid, "letters": len(token)}
+    told = token in _journal(pi)
+    holds = found == {"mode": "600", "uid": 0, "letters": 24} and not told
+    return Row("the token", "root's alone, in no journal", found | {"in the journal": told}, holds)
+
+
+def _doors(port: int, token: str) -> list[Row]:
+    """Who is let in, and where it listens."""
+    whole = f"/?token={token}"
+    own = f"http://127.0.0.1:{port}"
+    asked = {
+        "no token": status(port, "/"),
+        "another token": status(port, "/?token=" + "x" * len(token)),
+        "a part of the token": status(port, whole[:-1]),
+        "another host's name": status(port, whole, Host="evil.example"),
+        "another page's script": status(port, f"/ws?token={token}", Origin="http://evil.example"),
+        "our own page's script without a token": status(port, "/ws", Origin=own),
+    }
+    right = status(port, whole)
+    at = listening(port)
+    return [
+        Row("the page, without its token, by another name or page", "403 each", asked, set(asked.values()) == {403}),
+        Row("the page, with its token", "200", right, right == 200),
+        Row("where it listens", "127.0.0.1 alone", at, at == [LOOPBACK]),
+    ]
+
+
+# ---- beside a drive
+
+
+def _beside(pi: Container, pins: Pins, port: int, token: str, stop_s: float) -> Iterator[Row]:
+    url = f"http://127.0.0.1:{port}/?token={token}"
+    if not wait_for(lambda: show(pi, "StatusText")["StatusText"].startswith("disarmed"), READY_S):
+        raise EmulationError(f"the service is not ready: {show(pi, 'ActiveState', 'StatusText')}")
+    with Page(url) as page:
+        seen = _shows(page, lambda newest: newest["phase"] == WAITING and newest["stopped"])
+        yield Row("what a page shows of a disarmed car", "waiting, at rest", _brief(page), seen)
+        _arm(pi, pins)
+        drive = show(pi, "MainPID", "NRestarts")
+        seen = _shows(page, _drives)
+        yield Row("what it shows of an armed drive", "driving, with picture and pins", _brief(page), seen)
+    yield from _killed(pi, pins, port, token, drive)
+    with Page(url) as page:
+        yield Row("a page of the view's next start", "driving", _brief(page), _shows(page, _drives))
+        yield from _stop(pi, pins, page, stop_s, drive)
+
+
+def _arm(pi: Container, pins: Pins) -> None:
+    """Until the car moves."""
+    asked_s = time.monotonic()
+    pi.inside(f"{VENV}/bin/rover", "arm-car", "--yes")
+    if not wait_for(lambda: moving(pins.since(asked_s)), DRIVES_S):
+        raise EmulationError(f"the car does not drive, its service says: {show(pi, 'StatusText')['StatusText']}")
+
+
+def _killed(pi: Container, pins: Pins, port: int, token: str, drive: dict[str, str]) -> Iterator[Row]:
+    """The view is killed while the car drives: the drive goes on, and systemd starts the view again."""
+    before = show(pi, "MainPID", "NRestarts", unit=VIEW_UNIT)
+    os.kill(pi.pid_of(int(before["MainPID"])), signal.SIGKILL)
+    at_s = time.monotonic()
+    time.sleep(WITHOUT_S)
+    driven = moving(pins.since(at_s + WITHOUT_S / 2))
+    after = show(pi, "MainPID", "NRestarts", "ActiveState", "StatusText")
+    same = {name: after[name] for name in drive} == drive
+    found = {"pulses that move the car": len(driven), **after}
+    holds = bool(driven) and same and after["StatusText"].startswith("driving")
+    yield Row("a drive whose view is killed", "drives on, in the same process", found, holds)
+    served = wait_for(lambda: status(port, f"/?token={token}") == 200, START_S, 0.5)
+    now = show(pi, "MainPID", "NRestarts", "ActiveState", unit=VIEW_UNIT)
+    again = int(now["NRestarts"]) == int(before["NRestarts"]) + 1 and now["MainPID"] != before["MainPID"]
+    found = {**now, "after_s": round(time.monotonic() - at_s, 1)}
+    yield Row("a view that was killed", "started again by systemd, once", found, served and again)
+
+
+def _stop(pi: Container, pins: Pins, page: Page, stop_s: float, drive: dict[str, str]) -> Iterator[Row]:
+    """The button: the car stops and stays so, and the service waits disarmed."""
+    before_s = page.stop()
+    seen = _shows(page, lambda newest: newest["phase"] != DRIVING and newest["stopped"])
+    time.sleep(STOPPED_S)
+    off = stopped(pins.since(before_s - 1), before_s)
+    after_s = None if off["after_ms"] is None else off["after_ms"] / 1e3
+    late = [at for at in moving(pins.since(before_s)) if at > before_s + stop_s]
+    found = {"drove": off["drove"], "throttle_off_s": after_s, "moved later": len(late)}
+    holds = off["drove"] and after_s is not None and after_s <= stop_s and not late
+    yield Row("the page's button", f"throttle off within {stop_s:g} s, and it stays off", found, holds)
+    yield Row("what the page says of it", "stopped", _brief(page), seen)
+    told = show(pi, "MainPID", "NRestarts", "ActiveState", "StatusText")
+    waits = told["ActiveState"] == "active" and told["StatusText"].startswith("disarmed")
+    same = {name: told[name] for name in drive} == drive
+    yield Row("the drive service after it", "disarmed, in the same process", told, waits and same)
+
+
+def _after_the_drive(pi: Container) -> Row:
+    """What the flight log says of the view."""
+    log = (pi.root / STATE.lstrip("/") / "flight.log").read_text(errors="replace")
+    said = {
+        "stopped from the view (127.0.0.1)": log.count('"ended: stopped from the view (127.0.0.1)'),
+        "the view is gone": log.count('"the view is gone'),
+        "not fed": log.count("the view is not fed"),
+    }
+    holds = list(said.values()) == [1, 1, 0]
+    return Row("the flight log, of the view", "stopped by it once, gone once", said, holds)
+
+
+def _shows(page: Page, wanted: Callable[[dict[str, Any]], object]) -> bool:
+    return wait_for(lambda: wanted(page.newest), SEEN_S, 0.05)
+
+
+def _drives(newest: dict[str, Any]) -> bool:
+    return bool(newest["phase"] == DRIVING and newest["pins"] and newest["jpeg_bytes"] and not newest["stopped"])
+
+
+def _brief(page: Page) -> dict[str, Any]:
+    keys = ("phase", "text", "pins", "who", "stopped", "jpeg_bytes", "missing")
+    return {key: page.newest.get(key) for key in keys}
+
+
+# ---- what systemd and the disk say
+
+
+def _state(pi: Container) -> dict[str, str]:
+    return show(pi, "LoadState", "ActiveState", "UnitFileState", "NRestarts", unit=VIEW_UNIT)
+
+
+def _journal(pi: Container) -> str:
+    return pi.inside("journalctl", f"--unit={VIEW_UNIT}", "--output=cat", "--no-pager", check=False).stdout
+
+
+def _uid(pi: Container, user: str) -> int | None:
+    line = re.search(rf"^{user}:[^:]*:(\d+):", (pi.root / "etc/passwd").read_text(), re.M)
+    return int(line[1]) if line else None
