@@ -13,17 +13,19 @@ import os
 import re
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from lab.driving.page import Page
+from lab.driving.pins import STOPPED_THROTTLE_US
 from lab.pi.container import Container
 from lab.pi.emulation import EmulationError, wait_for
-from lab.pi.pulses import Pins, moving, stopped
+from lab.pi.pulses import READ_S, Pins, moving, stopped
 from lab.pi.service_proofs import READY_S, STATE, VENV, show
 from rover_lib.onboard.feed import DRIVING, WAITING
 from rover_lib.onboard.service import UNIT
+from rover_lib.world.standin import PinEvent
 
 VIEW_UNIT, VIEW_USER = "rover-view.service", "rover-view"
 TOKEN = "/etc/rover/view.token"
@@ -175,35 +177,37 @@ def _beside(pi: Container, pins: Pins, port: int, token: str, stop_s: float) -> 
     with Page(url) as page:
         seen = _shows(page, lambda newest: newest["phase"] == WAITING and newest["stopped"])
         yield Row("what a page shows of a disarmed car", "waiting, at rest", _brief(page), seen)
-        _arm(pi, pins)
+        armed_s = _arm(pi, pins)
         drive = show(pi, "MainPID", "NRestarts")
         seen = _shows(page, _drives)
         yield Row("what it shows of an armed drive", "driving, with picture and pins", _brief(page), seen)
-    yield from _killed(pi, pins, port, token, drive)
+    yield from _killed(pi, pins, port, token, armed_s, drive)
     with Page(url) as page:
-        yield Row("a page of the view's next start", "driving", _brief(page), _shows(page, _drives))
-        yield from _stop(pi, pins, page, stop_s, drive)
+        seen = _shows(page, _drives)
+        yield Row("a page of the view's next start", "driving", _brief(page), seen)
+        yield from _stop(pi, pins, page, stop_s, armed_s, drive)
 
 
-def _arm(pi: Container, pins: Pins) -> None:
-    """Until the car moves."""
+def _arm(pi: Container, pins: Pins) -> float:
+    """Until the car moves; when it was asked to (monotonic seconds)."""
     asked_s = time.monotonic()
     pi.inside(f"{VENV}/bin/rover", "arm-car", "--yes")
     if not wait_for(lambda: moving(pins.since(asked_s)), DRIVES_S):
         raise EmulationError(f"the car does not drive, its service says: {show(pi, 'StatusText')['StatusText']}")
+    return asked_s
 
 
-def _killed(pi: Container, pins: Pins, port: int, token: str, drive: dict[str, str]) -> Iterator[Row]:
+def _killed(pi: Container, pins: Pins, port: int, token: str, armed_s: float, drive: dict[str, str]) -> Iterator[Row]:
     """The view is killed while the car drives: the drive goes on, and systemd starts the view again."""
     before = show(pi, "MainPID", "NRestarts", unit=VIEW_UNIT)
     os.kill(pi.pid_of(int(before["MainPID"])), signal.SIGKILL)
     at_s = time.monotonic()
     time.sleep(WITHOUT_S)
-    driven = moving(pins.since(at_s + WITHOUT_S / 2))
+    throttle = throttles(pins.since(armed_s), at_s, at_s + WITHOUT_S - READ_S)
     after = show(pi, "MainPID", "NRestarts", "ActiveState", "StatusText")
     same = {name: after[name] for name in drive} == drive
-    found = {"pulses that move the car": len(driven), **after}
-    holds = bool(driven) and same and after["StatusText"].startswith("driving")
+    found = {"throttle_us": sorted(set(throttle)), **after}
+    holds = min(throttle, default=0) > STOPPED_THROTTLE_US and same and after["StatusText"].startswith("driving")
     yield Row("a drive whose view is killed", "drives on, in the same process", found, holds)
     served = wait_for(lambda: status(port, f"/?token={token}") == 200, START_S, 0.5)
     now = show(pi, "MainPID", "NRestarts", "ActiveState", unit=VIEW_UNIT)
@@ -212,16 +216,19 @@ def _killed(pi: Container, pins: Pins, port: int, token: str, drive: dict[str, s
     yield Row("a view that was killed", "started again by systemd, once", found, served and again)
 
 
-def _stop(pi: Container, pins: Pins, page: Page, stop_s: float, drive: dict[str, str]) -> Iterator[Row]:
+def _stop(pi: Container, pins: Pins, page: Page, stop_s: float, armed_s: float, drive: dict[str, str]) -> Iterator[Row]:
     """The button: the car stops and stays so, and the service waits disarmed."""
-    before_s = page.stop()
+    at_s = page.stop()
     seen = _shows(page, lambda newest: newest["phase"] != DRIVING and newest["stopped"])
     time.sleep(STOPPED_S)
-    off = stopped(pins.since(before_s - 1), before_s)
-    after_s = None if off["after_ms"] is None else off["after_ms"] / 1e3
-    late = [at for at in moving(pins.since(before_s)) if at > before_s + stop_s]
-    found = {"drove": off["drove"], "throttle_off_s": after_s, "moved later": len(late)}
-    holds = off["drove"] and after_s is not None and after_s <= stop_s and not late
+    events = pins.since(armed_s)
+    before, after = throttles(events, at_s - READ_S, at_s), throttles(events, at_s + stop_s, time.monotonic())
+    found = {
+        "throttle_us before": sorted(set(before)),
+        "throttle off after_ms": stopped(events, at_s)["after_ms"],
+        "throttle_us later": sorted(set(after)),
+    }
+    holds = min(before, default=0) > STOPPED_THROTTLE_US >= max(after, default=1e9)
     yield Row("the page's button", f"throttle off within {stop_s:g} s, and it stays off", found, holds)
     yield Row("what the page says of it", "stopped", _brief(page), seen)
     told = show(pi, "MainPID", "NRestarts", "ActiveState", "StatusText")
@@ -240,6 +247,16 @@ def _after_the_drive(pi: Container) -> Row:
     }
     holds = list(said.values()) == [1, 1, 0]
     return Row("the flight log, of the view", "stopped by it once, gone once", said, holds)
+
+
+def throttles(events: Sequence[PinEvent], from_s: float, until_s: float) -> list[float]:
+    """The throttle's pulses (microseconds) in a time: the one that it begins with, and each other one.
+
+    events: from before that time on; of a pulse that stays as it is, the Arduino's emulator tells once.
+    """
+    pulses = [(e.monotonic_s, e.pulse_us) for e in events if e.pin == "throttle" and e.kind == "pulse"]
+    before = [us for at_s, us in pulses if at_s <= from_s]
+    return before[-1:] + [us for at_s, us in pulses if from_s < at_s <= until_s]
 
 
 def _shows(page: Page, wanted: Callable[[dict[str, Any]], object]) -> bool:

@@ -11,8 +11,20 @@ from aiohttp import web
 
 from lab.pi import container, view_proofs
 from lab.pi.emulation import EmulationError
-from lab.pi.view_proofs import FILES, TOKEN, VIEW_UNIT, VIEW_USER, listening, page_token, status, view_again, view_gone
+from lab.pi.view_proofs import (
+    FILES,
+    TOKEN,
+    VIEW_UNIT,
+    VIEW_USER,
+    listening,
+    page_token,
+    status,
+    throttles,
+    view_again,
+    view_gone,
+)
 from rover_lib.onboard.view import Address, View
+from rover_lib.world.standin import PinEvent
 
 ROOT = Path(__file__).parents[3]
 SECRET = "a" * 24
@@ -85,6 +97,13 @@ def test_the_doors_of_a_view_are_shut_and_one_that_is_open_is_seen(monkeypatch):
         shut = view_proofs._doors(port, SECRET)[0]
         assert not shut.holds and shut.found["no token"] == 200, shut
     assert status(port, "/") == 0 and [row.holds for row in view_proofs._doors(port, SECRET)] == [False] * 3
+
+
+def test_a_throttle_that_stays_as_it_is_is_told_once():
+    events = [PinEvent(at, "pulse", "throttle", us, 1016.0) for at, us in ((1.0, 120.0), (2.0, 300.0), (5.0, 120.0))]
+    events += [PinEvent(3.5, "pulse", "steering", 1500.0, 20000.0), PinEvent(3.6, "line", "", 0.0, 0.0)]
+    assert throttles(events, 3.0, 4.0) == [300.0] and throttles(events, 3.0, 5.0) == [300.0, 120.0]
+    assert throttles(events, 0.5, 0.9) == [] and throttles(events, 6.0, 7.0) == [120.0]
 
 
 def test_the_token_of_a_rover_without_a_view_is_an_error(tmp_path):
