@@ -10,10 +10,12 @@ around it has what that lacks: checksums of every byte, and readers that all eng
 nor protobuf.
 """
 
+import contextlib
 import os
 import re
 import struct
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -65,6 +67,26 @@ def open_archive(path: Path | str) -> zipfile.ZipFile:
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as e:
         raise ArtifactError(f"{path}: not an artifact, or cut short ({e})", remedy="copy the file again") from None
     return z
+
+
+class Unknown(Exception):
+    """Something that the programs and models of artifacts do not have; its text names it."""
+
+
+@contextlib.contextmanager
+def nothing_unknown(path: Path | str, what: str) -> Iterator[None]:
+    """Of an archive's records while they are checked: raises ArtifactError for Unknown, and for what cannot be read.
+
+    what: that is checked, in a word.
+    """
+    try:
+        yield
+    except Unknown as e:
+        raise ArtifactError(
+            f"{path}: its {what} has what no artifact has", found=e, remedy="do not load it; quantize again"
+        ) from None
+    except (zipfile.BadZipFile, OSError, RuntimeError) as e:
+        raise ArtifactError(f"{path}: damaged ({e})", remedy="copy the file again") from None
 
 
 def read_record(z: zipfile.ZipFile, name: str) -> bytes:

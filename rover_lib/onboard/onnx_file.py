@@ -13,8 +13,7 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from rover_lib.onboard.archive import ONNX, read_record
-from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.archive import ONNX, Unknown, nothing_unknown, read_record
 
 OPSET, NODES, NAME_BYTES = 17, 5000, 200
 LARGEST_NUMBER = 10_000_000  # of an attribute
@@ -39,23 +38,13 @@ VARINT, EIGHT_BYTES, BYTES, FOUR_BYTES = 0, 1, 2, 5  # protobuf's wire types
 Value = int | memoryview
 
 
-class _Unknown(Exception):
-    """Something that the models of artifacts do not have; its text names it."""
-
-
 def check_model(z: zipfile.ZipFile, path: Path | str) -> None:
     """Raise ArtifactError unless the archive's model is of the one form that artifacts have.
 
     z: from open_archive(). Nothing in it is run, and no tensor is made.
     """
-    try:
+    with nothing_unknown(path, "model"):
         _check_model(memoryview(read_record(z, ONNX)))
-    except _Unknown as e:
-        raise ArtifactError(
-            f"{path}: its model has what no artifact has", found=e, remedy="do not load it; quantize again"
-        ) from None
-    except (zipfile.BadZipFile, OSError, RuntimeError) as e:
-        raise ArtifactError(f"{path}: damaged ({e})", remedy="copy the file again") from None
 
 
 def _check_model(model: memoryview) -> None:
@@ -68,9 +57,9 @@ def _check_model(model: memoryview) -> None:
             known = dict(_fields(_bytes(value), OPSET_IMPORT, "an opset"))
             opsets.append((_text(known.get("domain", memoryview(b""))), known.get("version")))
     if graphs != 1:
-        raise _Unknown(f"{graphs} graphs")
+        raise Unknown(f"{graphs} graphs")
     if opsets != [("", OPSET)]:
-        raise _Unknown(f"the operator sets {opsets}"[:80])
+        raise Unknown(f"the operator sets {opsets}"[:80])
 
 
 def _check_graph(graph: memoryview) -> None:
@@ -82,7 +71,7 @@ def _check_graph(graph: memoryview) -> None:
         elif field == "initializer":
             _check_tensor(_bytes(value))
     if nodes > NODES:
-        raise _Unknown(f"{nodes} nodes")
+        raise Unknown(f"{nodes} nodes")
 
 
 def _check_node(node: memoryview) -> None:
@@ -94,18 +83,18 @@ def _check_node(node: memoryview) -> None:
         elif field == "attribute":
             _check_attribute(_bytes(value))
     if kind not in OPERATORS:
-        raise _Unknown(f"the operator {kind!r}"[:80])
+        raise Unknown(f"the operator {kind!r}"[:80])
 
 
 def _check_attribute(attribute: memoryview) -> None:
     for field, value in _fields(attribute, ATTRIBUTE, "an attribute"):
         if field == "name" and (name := _text(value)) not in ATTRIBUTES:
-            raise _Unknown(f"the attribute {name!r}"[:80])
+            raise Unknown(f"the attribute {name!r}"[:80])
         if field in ("i", "ints"):
             number = value if isinstance(value, int) else LARGEST_NUMBER + 1
             number -= (number >> 63) << 64  # two's complement
             if abs(number) > LARGEST_NUMBER:
-                raise _Unknown(f"the number {number}")
+                raise Unknown(f"the number {number}")
 
 
 def _check_tensor(tensor: memoryview) -> None:
@@ -116,25 +105,25 @@ def _check_tensor(tensor: memoryview) -> None:
         elif field == "raw_data":
             stored += len(_bytes(value))
         elif not isinstance(value, int):
-            raise _Unknown(f"a tensor whose {field} is no number")
+            raise Unknown(f"a tensor whose {field} is no number")
         elif field == "dims":
             sizes.append(value)
         else:
             kind = value
     if kind not in ITEM_BYTES:
-        raise _Unknown(f"a tensor of type {kind}")
+        raise Unknown(f"a tensor of type {kind}")
     if math.prod(sizes) * ITEM_BYTES[kind] != stored:
-        raise _Unknown(f"a tensor of {sizes} in {stored} bytes"[:80])
+        raise Unknown(f"a tensor of {sizes} in {stored} bytes"[:80])
 
 
 def _fields(message: memoryview, known: dict[int, str], what: str) -> Iterator[tuple[str, Value]]:
-    """(field, value) of a protobuf message: a number, or the bytes. Raises _Unknown for a field that is not known."""
+    """(field, value) of a protobuf message: a number, or the bytes. Raises Unknown for a field that is not known."""
     at, end = 0, len(message)
     while at < end:
         key, at = _varint(message, at)
         number, wire = key >> 3, key & 7
         if number not in known:
-            raise _Unknown(f"{what} with field {number}")
+            raise Unknown(f"{what} with field {number}")
         if wire == VARINT:
             value, at = _varint(message, at)
             yield known[number], value
@@ -144,9 +133,9 @@ def _fields(message: memoryview, known: dict[int, str], what: str) -> Iterator[t
         elif wire in (EIGHT_BYTES, FOUR_BYTES):
             size = 8 if wire == EIGHT_BYTES else 4
         else:
-            raise _Unknown(f"{what} of wire type {wire}")
+            raise Unknown(f"{what} of wire type {wire}")
         if size > end - at:
-            raise _Unknown(f"{what} that is cut short")
+            raise Unknown(f"{what} that is cut short")
         yield known[number], message[at : at + size]
         at += size
 
@@ -161,17 +150,17 @@ def _varint(message: memoryview, at: int) -> tuple[int, int]:
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
             return value, at
-    raise _Unknown("a number without end")
+    raise Unknown("a number without end")
 
 
 def _bytes(value: Value) -> memoryview:
     if isinstance(value, int):
-        raise _Unknown("a number where bytes should be")
+        raise Unknown("a number where bytes should be")
     return value
 
 
 def _text(value: Value) -> str:
     raw = _bytes(value)
     if len(raw) > NAME_BYTES:
-        raise _Unknown(f"a name of {len(raw)} bytes")
+        raise Unknown(f"a name of {len(raw)} bytes")
     return bytes(raw).decode("utf-8", "replace")

@@ -19,8 +19,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.archive import read_record
-from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.archive import Unknown, nothing_unknown, read_record
 
 LARGEST_NUMBER = 10_000_000  # of a size or an index in the program
 TO_THE_END = 2**63 - 1  # of a slice
@@ -61,11 +60,11 @@ def check_program(z: zipfile.ZipFile, path: Path | str) -> None:
 
     z: from open_archive(). Nothing in it is run, and no tensor is made.
     """
-    try:
+    with nothing_unknown(path, "program"):
         sizes = {r.filename.removeprefix("archive/"): r.file_size for r in z.infolist()}
         programs = [n for n in sizes if n.endswith(".py") and sizes[n]]
         if len(programs) != 1:
-            raise _Unknown(f"{len(programs)} programs")
+            raise Unknown(f"{len(programs)} programs")
         name = _Program(read_record(z, f"archive/{programs[0]}")).name
         module = programs[0].removeprefix("code/").removesuffix(".py").replace("/", ".")
         for record in sizes:
@@ -73,16 +72,10 @@ def check_program(z: zipfile.ZipFile, path: Path | str) -> None:
                 _check_opcodes(read_record(z, f"archive/{record}"), {"torch.jit._pickle.build_intlist"})
         attributes = _read_pickle(read_record(z, "archive/data.pkl"), {}, f"{module}.{name}")
         if not isinstance(attributes, _Module):
-            raise _Unknown("a module that is none")
+            raise Unknown("a module that is none")
         stored = {n.removeprefix("constants/"): size for n, size in sizes.items() if n.startswith("constants/")}
         if not isinstance(_read_pickle(read_record(z, "archive/constants.pkl"), stored), tuple):
-            raise _Unknown("constants that are none")
-    except _Unknown as e:
-        raise ArtifactError(
-            f"{path}: its program has what no artifact has", found=e, remedy="do not load it; quantize again"
-        ) from None
-    except (zipfile.BadZipFile, OSError, RuntimeError) as e:
-        raise ArtifactError(f"{path}: damaged ({e})", remedy="copy the file again") from None
+            raise Unknown("constants that are none")
 
 
 def unknown_operators(graph: Any) -> list[str]:
@@ -93,25 +86,21 @@ def unknown_operators(graph: Any) -> list[str]:
     return sorted({n.kind() for n in nodes} - known | {"a block" for n in nodes if list(n.blocks())})
 
 
-class _Unknown(Exception):
-    """Something that the programs of artifacts do not have; its text names it."""
-
-
 class _Program:
-    """A program in the text of TorchScript. Raises _Unknown if it is not of the one form that artifacts have."""
+    """A program in the text of TorchScript. Raises Unknown if it is not of the one form that artifacts have."""
 
     def __init__(self, source: bytes):
         if not SOURCE.fullmatch(source):
-            raise _Unknown(f"the character {SOURCE.sub(b'', source, count=1)[:1].decode('latin-1')!r}")
+            raise Unknown(f"the character {SOURCE.sub(b'', source, count=1)[:1].decode('latin-1')!r}")
         try:
             body = ast.parse(source).body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as e:
-            raise _Unknown(f"a program that cannot be read ({type(e).__name__})") from None
+            raise Unknown(f"a program that cannot be read ({type(e).__name__})") from None
         match body:
             case [ast.ClassDef(name=name, bases=[ast.Name(id="Module")], keywords=[], decorator_list=[], body=parts)]:
                 self.name = name
             case _:
-                raise _Unknown("more than a class of type Module")
+                raise Unknown("more than a class of type Module")
         match parts:
             case [
                 ast.Assign(targets=[ast.Name(id="__parameters__")], value=ast.List(elts=[])),
@@ -121,18 +110,18 @@ class _Program:
                 self._known: set[str] = set()
                 self._method(forward)
             case _:
-                raise _Unknown(f"a class with {', '.join(self._describe(p) for p in parts[:5])}")
+                raise Unknown(f"a class with {', '.join(self._describe(p) for p in parts[:5])}")
 
     def _method(self, forward: ast.FunctionDef) -> None:
         given = forward.args
         if given.posonlyargs or given.vararg or given.kwonlyargs or given.kwarg or given.defaults or not given.args:
-            raise _Unknown("arguments of another form")
+            raise Unknown("arguments of another form")
         for argument in given.args[1:]:
             match argument.annotation:
                 case ast.Name(id="Tensor"):
                     self._define(argument.arg)
                 case _:
-                    raise _Unknown("an argument that is no tensor")
+                    raise Unknown("an argument that is no tensor")
         *steps, last = forward.body
         for step in steps:
             match step:
@@ -140,16 +129,16 @@ class _Program:
                     self._expression(value)
                     self._define(name)
                 case _:
-                    raise _Unknown(self._describe(step))
+                    raise Unknown(self._describe(step))
         match last:
             case ast.Return(value=ast.expr() as value):
                 self._expression(value)
             case _:
-                raise _Unknown(self._describe(last))
+                raise Unknown(self._describe(last))
 
     def _define(self, name: str) -> None:
         if name in RESERVED:
-            raise _Unknown(f"a variable called {name}")
+            raise Unknown(f"a variable called {name}")
         self._known.add(name)
 
     def _expression(self, value: ast.expr) -> None:
@@ -168,9 +157,9 @@ class _Program:
                 pass
             case ast.Call(func=called, args=parts, keywords=[]):
                 if (name := ast.unparse(called)) not in OPERATORS:
-                    raise _Unknown(name[:80])
+                    raise Unknown(name[:80])
             case _:
-                raise _Unknown(self._describe(value))
+                raise Unknown(self._describe(value))
         for part in parts:
             self._expression(part)
 
@@ -183,19 +172,19 @@ class _Program:
 
 
 def _check_opcodes(raw: bytes, names: set[str] | None = None) -> None:
-    """Raise _Unknown for an opcode that is not needed, or for a global that is not among names."""
+    """Raise Unknown for an opcode that is not needed, or for a global that is not among names."""
     count = 0
     try:
         for count, (opcode, argument, _) in enumerate(pickletools.genops(raw)):
             if opcode.name not in OPCODES:
-                raise _Unknown(f"a pickle with {opcode.name}")
+                raise Unknown(f"a pickle with {opcode.name}")
             if opcode.name == "GLOBAL" and names is not None and (name := str(argument).replace(" ", ".")) not in names:
-                raise _Unknown(f"a pickle with {name[:80]}")
+                raise Unknown(f"a pickle with {name[:80]}")
             # Python's reader and torch's make room for as many entries as such a number says.
             if "PUT" in opcode.name and isinstance(argument, int) and argument > count:
-                raise _Unknown(f"a pickle with {opcode.name} {argument}")
+                raise Unknown(f"a pickle with {opcode.name} {argument}")
     except ValueError as e:
-        raise _Unknown(f"a pickle that cannot be read ({str(e)[:80]})") from None
+        raise Unknown(f"a pickle that cannot be read ({str(e)[:80]})") from None
 
 
 def _read_pickle(raw: bytes, storages: dict[str, int], module: str = "") -> Any:
@@ -203,10 +192,10 @@ def _read_pickle(raw: bytes, storages: dict[str, int], module: str = "") -> Any:
     _check_opcodes(raw)
     try:
         return _Reader(raw, storages, module).load()
-    except _Unknown:
+    except Unknown:
         raise
     except Exception as e:  # whatever hinders Python from reading it
-        raise _Unknown(f"a pickle that cannot be read ({type(e).__name__})") from None
+        raise Unknown(f"a pickle that cannot be read ({type(e).__name__})") from None
 
 
 class _Storage(tuple):
@@ -222,7 +211,7 @@ class _Module:
 
     def __setstate__(self, state: Any) -> None:
         if state != {}:
-            raise _Unknown(f"attributes, such as {str(next(iter(state)))[:80]!r}" if state else "attributes")
+            raise Unknown(f"attributes, such as {str(next(iter(state)))[:80]!r}" if state else "attributes")
 
 
 class _Conv2d:
@@ -233,7 +222,7 @@ class _Conv2d:
             case ("2", [_Tensor() as config, _Tensor() as weight], [_Tensor() | None]):
                 if config == (11,) and len(weight) == 4:
                     return
-        raise _Unknown("weights of a convolution in another form")
+        raise Unknown("weights of a convolution in another form")
 
 
 class _Linear:
@@ -243,7 +232,7 @@ class _Linear:
         match state:
             case (_Tensor() as weight, _Tensor() | None) if len(weight) == 2:
                 return
-        raise _Unknown("weights of a linear layer in another form")
+        raise Unknown("weights of a linear layer in another form")
 
 
 class _Reader(pickle.Unpickler):
@@ -268,7 +257,7 @@ class _Reader(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if (known := self._known.get(f"{module}.{name}")) is None:
-            raise _Unknown(f"{module}.{name}"[:80])
+            raise Unknown(f"{module}.{name}"[:80])
         return known
 
     def persistent_load(self, pid: Any) -> _Storage:
@@ -276,16 +265,16 @@ class _Reader(pickle.Unpickler):
             case ("storage", str(kind), str(key), "cpu", int(items)) if kind in ITEM_BYTES:
                 if self._storages.get(key) == items * ITEM_BYTES[kind]:
                     return _Storage((ITEM_BYTES[kind], items))
-        raise _Unknown(f"a tensor without its bytes, {str(pid)[:80]}")
+        raise Unknown(f"a tensor without its bytes, {str(pid)[:80]}")
 
     @staticmethod
     def _tensor(storage: Any, offset: Any, sizes: Any, strides: Any, needs_gradient: Any, hooks: Any) -> _Tensor:
         numbers = (offset, *sizes, *strides)
         if not isinstance(storage, _Storage) or not all(type(n) is int and n >= 0 for n in numbers):
-            raise _Unknown("a tensor of another form")
+            raise Unknown("a tensor of another form")
         last = offset + sum((n - 1) * stride for n, stride in zip(sizes, strides, strict=True))
         if math.prod(sizes) > storage[1] or (math.prod(sizes) and last >= storage[1]):
-            raise _Unknown(f"a tensor of {list(sizes)} on {storage[1]} items")
+            raise Unknown(f"a tensor of {list(sizes)} on {storage[1]} items")
         return _Tensor(sizes)
 
     def _quantized(
@@ -299,11 +288,11 @@ class _Reader(pickle.Unpickler):
             ) and scales == zero_points == (sizes[axis],):
                 pass
             case _:
-                raise _Unknown("a quantized tensor of another form")
+                raise Unknown("a quantized tensor of another form")
         return self._tensor(storage, offset, sizes, strides, needs_gradient, hooks)
 
     @staticmethod
     def _list(values: Any, kind: Any = "List[Optional[Tensor]]") -> list:
         if not isinstance(values, list) or kind != "List[Optional[Tensor]]":
-            raise _Unknown(f"a list of {str(kind)[:80]}")
+            raise Unknown(f"a list of {str(kind)[:80]}")
         return values
