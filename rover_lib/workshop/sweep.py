@@ -212,41 +212,51 @@ def _settings_of(job: Job, folder: Path) -> Iterator[None]:
         path.unlink(missing_ok=True)
 
 
-def do(part: str, work: Work, job: Job, folder: Path) -> str:
+def do(part: str, work: Work, job: Job, folder: Path, fingerprint: str) -> str:
     """Do one part of a job, "prepare" or "benchmark", unless it is done. Returns its name.
+
+    fingerprint: of the job's files as the sweep found them. Files that change meanwhile are another sweep's: it finds
+    another one, and makes the run again.
 
     One process at a time works on a job: where a lost worker is still alive, its successor waits for it, and then finds
     the work done.
     """
     with (folder / f".{job.name}.lock").open("w") as lock:
         fcntl.lockf(lock, fcntl.LOCK_EX)  # which works on a network's file systems too
-        if part not in parts_done(job, folder):
+        if part not in parts_done(job, folder, fingerprint):
             getattr(work, part)(job, folder)
             done = ["prepare"] if part == "prepare" else ["prepare", "benchmark"]
-            content = {"fingerprint": fingerprint(job), "done": done, **asdict(job)}
+            content = {"fingerprint": fingerprint, "done": done, **asdict(job)}
             with atomic_path(folder / job.name / JOB) as temporary:
                 temporary.write_text(json.dumps(content, indent=2) + "\n")
     return job.name
 
 
-def parts_done(job: Job, folder: Path) -> list[str]:
+def parts_done(job: Job, folder: Path, fingerprint: str) -> list[str]:
     """What is done of a job, of the very files that it names. A job.json that cannot be read counts as none."""
     try:
         content = json.loads((folder / job.name / JOB).read_text())
-        return list(content["done"]) if content["fingerprint"] == fingerprint(job) else []
+        return list(content["done"]) if content["fingerprint"] == fingerprint else []
     except (OSError, ValueError, KeyError, TypeError):
         return []
 
 
-def fingerprint(job: Job) -> str:
-    """Changes with the checkpoint's and the recordings' files: by name, size and time, as hashing them takes long."""
-    digest = hashlib.sha256()
-    for place in (Path(job.checkpoint), Path(job.episodes)):
-        files = [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.is_file())
-        for path in files:
-            at = path.stat()
-            digest.update(f"{path} {at.st_size} {at.st_mtime_ns}\n".encode())
-    return digest.hexdigest()
+def fingerprints(jobs: Sequence[Job]) -> dict[str, str]:
+    """Of each job, by its name: changes with the checkpoint's and the recordings' files, by name, size and time, as
+    hashing them takes long. A place that many jobs have is looked through once.
+    """
+    places = {place for job in jobs for place in (job.checkpoint, job.episodes)}
+    found = {place: _files_in(Path(place)) for place in places}
+    return {job.name: hashlib.sha256(found[job.checkpoint] + found[job.episodes]).hexdigest() for job in jobs}
+
+
+def _files_in(place: Path) -> bytes:
+    """A line for each file, in order."""
+    lines = []
+    for path in [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.is_file()):
+        at = path.stat()
+        lines.append(f"{path} {at.st_size} {at.st_mtime_ns}\n")
+    return "".join(lines).encode()
 
 
 # --- the cluster ------------------------------------------------------------------------------------------------------
@@ -313,11 +323,13 @@ def sweep(
 
     folder, work, failed = Path(folder).resolve(), work or Notebooks(), dict[str, str]()
     folder.mkdir(parents=True, exist_ok=True)
-    by_name = {job.name: job for job in jobs}
+    by_name, marks = {job.name: job for job in jobs}, fingerprints(jobs)
 
     def submit(part: str, job: Job) -> "Future":
         needs = {"resources": {TIMING: 1}} if part == "benchmark" else {}
-        return client.submit(do, part, work, job, folder, key=f"{part}-{job.name}", pure=False, **needs)
+        return client.submit(
+            do, part, work, job, folder, marks[job.name], key=f"{part}-{job.name}", pure=False, **needs
+        )
 
     def follow(futures: Sequence["Future"], then: Callable[[str], "Future | None"], desc: str, total: int) -> None:
         completed = as_completed(futures)
@@ -329,7 +341,7 @@ def sweep(
             else:
                 failed[name] = _sentence(error)
 
-    missing = {name: parts_done(job, folder) for name, job in by_name.items()}
+    missing = {name: parts_done(job, folder, marks[name]) for name, job in by_name.items()}
     prepare = [name for name, done in missing.items() if "prepare" not in done]
     first = [submit("prepare", by_name[name]) for name in prepare]
     if together:
@@ -360,16 +372,17 @@ def _sentence(error: BaseException) -> str:
 # --- what came out ----------------------------------------------------------------------------------------------------
 
 
-def rows(jobs: Sequence[Job], folder: Path | str) -> list[dict[str, Any]]:
+def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> list[dict[str, Any]]:
     """One for each whole run, from the JSON that it left: its settings, and figures of its static INT8 artifact.
 
+    marks: what `fingerprints` says of the jobs.
     error_pct: the worse action's, against FP32; to_recorded_pct: against what the driver did. best: no other is at
     least as good in error to the recordings, time and size, and better in one of them.
     """
     found = []
     for job in jobs:
         run = Path(folder) / job.name
-        if "benchmark" not in parts_done(job, Path(folder)):
+        if "benchmark" not in parts_done(job, Path(folder), marks[job.name]):
             continue
         compared = read_stage(run / "compare.json", "compare")["metrics"]
         timed = next(read_stage(p, "benchmark") for p in sorted(run.glob("benchmark-*.json")))
@@ -405,10 +418,10 @@ def write_report(jobs: Sequence[Job], folder: Path | str, failed: Mapping[str, s
     """Leave sweep.json and sweep.png in the sweep's folder; returns the JSON's content."""
     from rover_lib.workshop.plots.sweep import pareto
 
-    folder, found = Path(folder), rows(jobs, folder)
-    inputs = {job.name: fingerprint(job) for job in jobs}
+    folder, marks = Path(folder), fingerprints(jobs)
+    found = rows(jobs, folder, marks)
     metrics = {"runs": found, "failed": dict(failed), "missing": len(jobs) - len(found) - len(failed)}
-    content = write_stage(folder / REPORT, "sweep", params={"mode": MODE}, metrics=metrics, inputs=inputs)
+    content = write_stage(folder / REPORT, "sweep", params={"mode": MODE}, metrics=metrics, inputs=marks)
     if found:
         with atomic_path(folder / FIGURE) as temporary:
             pareto(found).savefig(temporary, format="png", dpi=200)

@@ -101,14 +101,26 @@ def test_a_run_has_its_own_values_of_params_yml(tmp_path):
 def test_what_was_made_of_other_files_is_made_again(tmp_path, sheet):
     job = Sheet.read(sheet()).jobs()[0]
     stub = Stub(tmp_path / "log")
+    mark = sweeping.fingerprints([job])[job.name]
     for part in ("prepare", "prepare"):
-        sweeping.do(part, stub, job, tmp_path)
+        sweeping.do(part, stub, job, tmp_path, mark)
     assert stub.log.read_text().count("prepared") == 1
     (tmp_path / "best_model.pth").write_text("another")
-    sweeping.do("prepare", stub, job, tmp_path)
+    other = sweeping.fingerprints([job])[job.name]
+    assert other != mark and sweeping.parts_done(job, tmp_path, other) == []
+    sweeping.do("prepare", stub, job, tmp_path, other)
     assert stub.log.read_text().count("prepared") == 2
     (tmp_path / job.name / "job.json").write_text("{")
-    assert sweeping.parts_done(job, tmp_path) == []
+    assert sweeping.parts_done(job, tmp_path, other) == []
+
+
+def test_files_that_many_runs_have_are_looked_through_once(tmp_path, sheet, monkeypatch):
+    jobs = Sheet.read(sheet()).jobs()
+    walked = []
+    monkeypatch.setattr(sweeping, "_files_in", lambda place: walked.append(place) or str(place).encode())
+    marks = sweeping.fingerprints(jobs)
+    assert len(jobs) > 1 and list(marks) == [job.name for job in jobs]
+    assert len(walked) == len(set(walked)) == len({p for job in jobs for p in (job.checkpoint, job.episodes)})
 
 
 def test_the_best_are_those_that_no_other_beats():
