@@ -3,7 +3,10 @@
 `checkpoint` reads both again. `origin` goes into both: where the weights come from, as plain JSON.
 """
 
+import contextlib
 import json
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,7 @@ import torch
 from torch import Tensor
 
 from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
 from rover_lib.workshop.checkpoint import ORIGIN
 from rover_lib.workshop.training import trainer_config
@@ -81,13 +85,47 @@ def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], o
     (folder / ORIGIN).write_text(json.dumps(origin, indent=2) + "\n")
 
 
+def write_both(
+    folder: Path,
+    config: ActConfig,
+    weights: dict[str, Tensor],
+    best_val_loss: float,
+    origin: dict[str, Any],
+    **settings: Any,
+) -> dict[str, str]:
+    """pretrained_model/ in a folder, and best_model.pth where the trainer's format can hold the policy. Arguments as of
+    `write_trainer`. Returns sha256 by name: of the weights' file of the one, and of the other.
+    """
+    files = {"model.safetensors": folder / "pretrained_model" / "model.safetensors"}
+    write_lerobot(folder / "pretrained_model", config, weights, origin)
+    if trainer_can_hold(config):
+        files["best_model.pth"] = folder / "best_model.pth"
+        write_trainer(files["best_model.pth"], config, weights, best_val_loss, origin, **settings)
+    return {name: sha256_of(path) for name, path in files.items()}
+
+
+@contextlib.contextmanager
+def made_beside(folder: Path, last: str) -> Iterator[Path]:
+    """A hidden folder beside a run's, empty: what is in it when the block ends well moves into the run's folder, the
+    file `last` last. Nothing does otherwise, and the hidden one goes.
+    """
+    new = folder.with_name(f".{folder.name}.made")  # not `.new`, in which a run of that name may wait to go on
+    shutil.rmtree(new, ignore_errors=True)  # of a process that was killed
+    new.mkdir(parents=True)
+    try:
+        yield new
+        _take_place(new, folder, last)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+
+
 def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
     """Mean and standard deviation whose normalisation, LeRobot's eps included, is x * scale + shift."""
     scale, shift = torch.tensor(norm.scale, dtype=torch.float64), torch.tensor(norm.shift, dtype=torch.float64)
     return {"mean": (-shift / scale).float().reshape(shape), "std": (1 / scale - EPS).float().reshape(shape)}
 
 
-def take_place(new: Path, folder: Path, last: str) -> None:
+def _take_place(new: Path, folder: Path, last: str) -> None:
     """Move what is whole into a run's folder, the file `last` last; what was there goes when its successor is there."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in sorted(new.iterdir(), key=lambda p: p.name == last):

@@ -26,7 +26,7 @@ from torch import Tensor
 from rover_lib.onboard import preprocess
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.stage import atomic_path, sha256_of, write_stage
+from rover_lib.onboard.stage import atomic_path, write_stage
 from rover_lib.workshop import act, training
 from rover_lib.workshop import lessons as lessons_module
 from rover_lib.workshop import pipeline as quantization
@@ -34,7 +34,7 @@ from rover_lib.workshop import student as student_module
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint_files import take_place, trainer_can_hold, write_lerobot, write_trainer
+from rover_lib.workshop.checkpoint_files import made_beside, write_both
 from rover_lib.workshop.choose import Chooser
 from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.episodes import Sample
@@ -480,25 +480,17 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
     loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
     recipe = asdict(work.recipe) | {"device": work.device.type}
     origin = {"teacher_sha256": teacher.sha256, "teacher_format": teacher.format, "distilled_by": recipe}
-    new = folder.with_name(f".{folder.name}.distilled")
-    shutil.rmtree(new, ignore_errors=True)
-    new.mkdir(parents=True)
-    try:
-        files = {"model.safetensors": "pretrained_model/model.safetensors"}
-        write_lerobot(new / "pretrained_model", work.config, taught.weights, origin)
-        if trainer_can_hold(work.config):
-            settings = {
-                "learning_rate": work.recipe.rate,
-                "batch_size": work.recipe.batch,
-                "data_dir": work.opened.recordings.root.name,
-                "output_dir": folder.name,
-                "device": work.device.type,
-                "seed": work.recipe.seed,
-            }
-            write_trainer(new / "best_model.pth", work.config, taught.weights, loss, origin, **settings)
-            files["best_model.pth"] = "best_model.pth"
-        hashes = {name: sha256_of(new / path) for name, path in files.items()}
-        student = load_checkpoint(new / ("best_model.pth" if "best_model.pth" in files else "pretrained_model"))
+    settings = {
+        "learning_rate": work.recipe.rate,
+        "batch_size": work.recipe.batch,
+        "data_dir": work.opened.recordings.root.name,
+        "output_dir": folder.name,
+        "device": work.device.type,
+        "seed": work.recipe.seed,
+    }
+    with made_beside(folder, "distill.json") as new:
+        hashes = write_both(new, work.config, taught.weights, loss, origin, **settings)
+        student = load_checkpoint(new / ("best_model.pth" if "best_model.pth" in hashes else "pretrained_model"))
         samples, parity = thinned(parts.choosing, quantization.CHOOSING_FRAMES), quantization.Recipe.of(params()).parity
         export(rounded, student, new / "policy_static.pt", samples, calibration, parity)
         write_stage(
@@ -519,9 +511,6 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
             },
             inputs={teacher.path.name: teacher.sha256} | work.opened.recordings.hashes(),
         )
-        take_place(new, folder, "distill.json")
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
     shutil.rmtree(taught.folder)
     return folder
 

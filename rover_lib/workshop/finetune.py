@@ -32,12 +32,12 @@ from rover_lib.onboard import preprocess
 from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.recording import HUMAN, recorded_car
-from rover_lib.onboard.stage import sha256_of, write_stage
+from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import act, training
 from rover_lib.workshop import lessons as lessons_module
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint_files import take_place, trainer_can_hold, write_lerobot, write_trainer
+from rover_lib.workshop.checkpoint_files import made_beside, write_both
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.episodes import load_recordings, split
 from rover_lib.workshop.improved import Judged, verdict
@@ -539,24 +539,17 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
     errors = [e for each in judged if each.kind == OLD for e in each.after.values() if e is not None]
     described = asdict(recipe) | {"device": work.device.type}
     origin = {"parent_sha256": parent.sha256, "parent_format": parent.format, "finetuned_by": described}
-    new = folder.with_name(f".{folder.name}.finetuned")
-    shutil.rmtree(new, ignore_errors=True)
-    new.mkdir(parents=True)
-    try:
-        files = {"model.safetensors": "pretrained_model/model.safetensors"}
-        write_lerobot(new / "pretrained_model", parent.config, taught.weights, origin)
-        if trainer_can_hold(parent.config):
-            settings = {
-                "learning_rate": recipe.rate,
-                "batch_size": recipe.batch,
-                "data_dir": material.recordings[-1].root.name,
-                "output_dir": folder.name,
-                "device": work.device.type,
-                "seed": recipe.seed,
-            }
-            loss = float(np.mean(errors)) / 100 if errors else float("nan")
-            write_trainer(new / "best_model.pth", parent.config, taught.weights, loss, origin, **settings)
-            files["best_model.pth"] = "best_model.pth"
+    settings = {
+        "learning_rate": recipe.rate,
+        "batch_size": recipe.batch,
+        "data_dir": material.recordings[-1].root.name,
+        "output_dir": folder.name,
+        "device": work.device.type,
+        "seed": recipe.seed,
+    }
+    loss = float(np.mean(errors)) / 100 if errors else float("nan")
+    with made_beside(folder, "finetune.json") as new:
+        hashes = write_both(new, parent.config, taught.weights, loss, origin, **settings)
         write_stage(
             new / "finetune.json",
             "finetune",
@@ -567,13 +560,10 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
                 "verdict": verdict(judged),
                 "losses": taught.losses,
                 "warnings": not_judged(material.action_range()),
-                "files_sha256": {name: sha256_of(new / path) for name, path in files.items()},
+                "files_sha256": hashes,
             },
             inputs={parent.path.name: parent.sha256}
             | {f"{r.root.name}/{name}": digest for r in material.recordings for name, digest in r.hashes().items()},
         )
-        take_place(new, folder, "finetune.json")
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
     shutil.rmtree(taught.folder)
     return folder
