@@ -35,6 +35,8 @@ SEEN_S = 30.0  # until a page shows what has happened
 DRIVES_S = 30.0  # from a request until the car drives
 WITHOUT_S = 3.0  # that a drive goes on beside a view that was killed; longer than the Arduino's 150 ms
 STOPPED_S = 2.0  # after a stop in which nothing may move the car any more
+ATTEMPTS = 3  # at a drive that this machine spoilt; one that is spoilt each time fails
+BUSY = ("the Arduino has not answered for", "the newest plan is too old to drive by")
 LOOPBACK = "0100007F"  # 127.0.0.1, as the kernel writes it
 LISTENS = "0A"
 
@@ -59,14 +61,22 @@ def view_beside_a_drive(pi: Container, pins: Pins, port: int, stop_s: float) -> 
         told = show(pi, "ActiveState", "SubState", "StatusText", "Result", unit=VIEW_UNIT)
         raise EmulationError(f"the view serves no page: {told}; {_journal(pi)[-800:]}")
     rows = [_started(pi), _token_is_roots(pi, token), *_doors(port, token)]
-    pi.inside("systemctl", "reset-failed", UNIT, check=False)
-    pi.inside("systemctl", "start", UNIT)
-    try:
-        rows += _beside(pi, pins, port, token, stop_s)
-    finally:
-        pi.inside("systemctl", "stop", UNIT)
-    rows.append(_after_the_drive(pi))
-    return rows
+    for attempt in range(1, ATTEMPTS + 1):
+        pi.inside("systemctl", "reset-failed", UNIT, VIEW_UNIT, check=False)  # which sets their counts of starts to 0
+        pi.inside("systemctl", "start", UNIT)
+        try:
+            beside = list(_beside(pi, pins, port, token, stop_s))
+        finally:
+            pi.inside("systemctl", "stop", UNIT)
+        log = (pi.root / STATE.lstrip("/") / "flight.log").read_text(errors="replace")
+        if attempt == ATTEMPTS or not spoilt(log):
+            break
+    return [*rows, *beside, _after_the_drive(log)]
+
+
+def spoilt(log: str) -> list[str]:
+    """How drives of a flight log ended because this machine had no time for the emulated Arduino, or for a plan."""
+    return re.findall(rf'"ended: ({"|".join(BUSY)})', log)
 
 
 def view_again(pi: Container, port: int) -> list[Row]:
@@ -237,9 +247,8 @@ def _stop(pi: Container, pins: Pins, page: Page, stop_s: float, armed_s: float, 
     yield Row("the drive service after it", "disarmed, in the same process", told, waits and same)
 
 
-def _after_the_drive(pi: Container) -> Row:
+def _after_the_drive(log: str) -> Row:
     """What the flight log says of the view."""
-    log = (pi.root / STATE.lstrip("/") / "flight.log").read_text(errors="replace")
     said = {
         "stopped from the view (127.0.0.1)": log.count('"ended: stopped from the view (127.0.0.1)'),
         "the view is gone": log.count('"the view is gone'),

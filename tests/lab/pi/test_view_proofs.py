@@ -18,6 +18,7 @@ from lab.pi.view_proofs import (
     VIEW_USER,
     listening,
     page_token,
+    spoilt,
     status,
     throttles,
     view_again,
@@ -104,6 +105,14 @@ def test_a_throttle_that_stays_as_it_is_is_told_once():
     events += [PinEvent(3.5, "pulse", "steering", 1500.0, 20000.0), PinEvent(3.6, "line", "", 0.0, 0.0)]
     assert throttles(events, 3.0, 4.0) == [300.0] and throttles(events, 3.0, 5.0) == [300.0, 120.0]
     assert throttles(events, 0.5, 0.9) == [] and throttles(events, 6.0, 7.0) == [120.0]
+
+
+def test_a_drive_that_this_machine_spoilt_is_no_fault_of_the_view():
+    by_us = '{"event": "the view is gone"}\n{"event": "ended: stopped from the view (127.0.0.1)"}\n'
+    assert not spoilt(by_us) and view_proofs._after_the_drive(by_us).holds
+    busy = '{"event": "ended: the Arduino has not answered for 187 ms, the link is behind"}\n'
+    assert len(spoilt(busy + by_us)) == 1 and not view_proofs._after_the_drive(busy).holds
+    assert not spoilt('{"event": "ended: the camera is gone"}') and not view_proofs._after_the_drive(by_us * 2).holds
 
 
 def test_the_token_of_a_rover_without_a_view_is_an_error(tmp_path):
