@@ -136,7 +136,7 @@ def listening(port: int, tables: tuple[str, ...] = ("/proc/net/tcp", "/proc/net/
 
 def _started(pi: Container) -> Row:
     """A service of its own user, in no group but its own, at boot too."""
-    told = show(pi, "ActiveState", "UnitFileState", "MainPID", unit=VIEW_UNIT)
+    told: dict[str, Any] = {**show(pi, "ActiveState", "UnitFileState", "MainPID", unit=VIEW_UNIT)}
     own = _uid(pi, VIEW_USER)
     with contextlib.suppress(EmulationError, OSError):
         lines = Path(f"/proc/{pi.pid_of(int(told['MainPID']))}/status").read_text().splitlines()
@@ -216,13 +216,13 @@ def _killed(pi: Container, pins: Pins, port: int, token: str, armed_s: float, dr
     throttle = throttles(pins.since(armed_s), at_s, at_s + WITHOUT_S - READ_S)
     after = show(pi, "MainPID", "NRestarts", "ActiveState", "StatusText")
     same = {name: after[name] for name in drive} == drive
-    found = {"throttle_us": sorted(set(throttle)), **after}
+    kept = {"throttle_us": sorted(set(throttle)), **after}
     holds = min(throttle, default=0) > STOPPED_THROTTLE_US and same and after["StatusText"].startswith("driving")
-    yield Row("a drive whose view is killed", "drives on, in the same process", found, holds)
+    yield Row("a drive whose view is killed", "drives on, in the same process", kept, holds)
     served = wait_for(lambda: status(port, f"/?token={token}") == 200, START_S, 0.5)
     now = show(pi, "MainPID", "NRestarts", "ActiveState", unit=VIEW_UNIT)
     again = int(now["NRestarts"]) == int(before["NRestarts"]) + 1 and now["MainPID"] != before["MainPID"]
-    found = {**now, "after_s": round(time.monotonic() - at_s, 1)}
+    found: dict[str, Any] = {**now, "after_s": round(time.monotonic() - at_s, 1)}
     yield Row("a view that was killed", "started again by systemd, once", found, served and again)
 
 
