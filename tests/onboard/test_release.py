@@ -60,12 +60,19 @@ def quick(models: Path) -> Releases:
     return r
 
 
-@pytest.fixture
-def releases(tmp_path, two) -> Releases:
-    """A rover that drives by the first of the two."""
-    r = quick(tmp_path / "models")
+@pytest.fixture(scope="session")
+def first_models(two, keys, tmp_path_factory) -> Path:
+    """The models of a rover that drives by the first of the two."""
+    models = tmp_path_factory.mktemp("rover") / "models"
+    r = Releases(models, check=quick(models).check, signers=keys / "signers")
     r.switch(r.stage(two[0]).name)
-    return r
+    return models
+
+
+@pytest.fixture
+def releases(tmp_path, first_models) -> Releases:
+    """A rover that drives by the first of the two, to do anything with."""
+    return quick(Path(shutil.copytree(first_models, tmp_path / "models", symlinks=True)))
 
 
 @pytest.fixture
@@ -170,6 +177,7 @@ def lose(folder: Path, inodes: set[int]) -> None:
             path.write_bytes(b"")
 
 
+PART_BYTES = 100_000  # of a transfer here: an artifact is several parts
 STEPS = 34  # of a deployment; test_cuts_are_all_of_a_deployment holds it to what is
 
 
@@ -258,13 +266,21 @@ def test_nothing_unsynced_when_current_is_switched(releases, two):
 # Transfers
 
 
-@pytest.fixture
-def packed(two, tmp_path, monkeypatch, keys) -> Path:
+@pytest.fixture(scope="session")
+def all_packed(two, keys, tmp_path_factory) -> Path:
     """The second of the two, in parts."""
-    monkeypatch.setattr("rover_lib.onboard.release.PART_BYTES", 100_000)
-    folder = tmp_path / "packed"
-    assert pack(two[1], folder, key=keys / "ours")["parts"] == len(list(folder.glob("part-*"))) > 3
+    folder = tmp_path_factory.mktemp("laptop") / "packed"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rover_lib.onboard.release.PART_BYTES", PART_BYTES)
+        assert pack(two[1], folder, key=keys / "ours")["parts"] == len(list(folder.glob("part-*"))) > 3
     return folder
+
+
+@pytest.fixture
+def packed(all_packed, tmp_path, monkeypatch) -> Path:
+    """The second of the two, in parts, to do anything with."""
+    monkeypatch.setattr("rover_lib.onboard.release.PART_BYTES", PART_BYTES)
+    return Path(shutil.copytree(all_packed, tmp_path / "packed"))
 
 
 @pytest.mark.slow
