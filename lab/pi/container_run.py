@@ -84,14 +84,16 @@ def run_container(
     *,
     engine: str = "torch",
     short: bool = False,
+    view: bool = False,
     faults: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> PiReport:
     """All of it; the report is written to `output` whatever fails.
 
     demo: a run's folder with ARTIFACTS. engine: what computes the policy on the Pi, as rover_engine. short: provision,
-    deploy, one fault of a deployment, an armed drive and the view, which is what CI has time for. faults: of
-    deployments, and the fleet, too, which are met with torch's artifacts only. say: told a line for each step.
+    deploy, one fault of a deployment and an armed drive, which is what CI has time for. view: its service too, which
+    all have that are not short. faults: of deployments, and the fleet, too, which are met with torch's artifacts only.
+    say: told a line for each step.
     Raises RoverError where it cannot begin: no root, packages that cannot be installed, no artifacts.
     """
     output, demo = Path(output), Path(demo)
@@ -110,7 +112,7 @@ def run_container(
     ):
         run = _Run(report, Path(folder), log, engine)
         try:
-            run.all(artifacts[0], artifacts[1], short=short, faults=faults)
+            run.all(artifacts[0], artifacts[1], short=short, view=view, faults=faults)
         except RoverError as error:
             report.wrong.append(str(error))
         finally:
@@ -137,7 +139,7 @@ class _Run:
             "rover_view_port": free_port(),  # the network is this machine's, which may have a view of its own
         }
 
-    def all(self, static: Path, other: Path, *, short: bool, faults: bool) -> None:
+    def all(self, static: Path, other: Path, *, short: bool, view: bool, faults: bool) -> None:
         begun = time.monotonic()
         with self.report.step("system") as row:
             debian_image()
@@ -147,11 +149,12 @@ class _Run:
                 pi.boot()
             with _car(pi) as pins:
                 if short:
+                    self.variables["rover_view"] = view
                     self.one_fault(pi, static)
-                    self.view(pi, pins)
-                    self.no_view(pi)
-                    self.environment(pi)
-                    return
+                    if view:
+                        self.view(pi, pins)
+                        self.no_view(pi)
+                    return self.environment(pi)
                 driving_s = self.playbooks(pi, static, other)
                 self.metrics["driving_after_s"] = round(driving_s - begun, 1)
                 self.metrics["plays_s"] = round(time.monotonic() - begun, 1)
@@ -200,7 +203,6 @@ class _Run:
 
     def one_fault(self, pi: Container, static: Path) -> None:
         """A deployment that fails, leaves the rover as it was and is healed by another; it then drives what came."""
-        self.variables["rover_view"] = True
         with _bytecode_from_here(pi.root):
             self.play("provision", pi)
         self.play("deploy", pi, rover_artifact=str(static))
