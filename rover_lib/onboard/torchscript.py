@@ -10,6 +10,7 @@ is, without looking whether its bytes are there (torch 2.8, tests/onboard/test_h
 """
 
 import ast
+import contextlib
 import io
 import math
 import pickle
@@ -22,6 +23,7 @@ from typing import Any
 from rover_lib.onboard.archive import Unknown, nothing_unknown, read_record
 
 LARGEST_NUMBER = 10_000_000  # of a size or an index in the program
+PARSED = 5  # times, of a program that Python fails to parse by a fault of its own
 TO_THE_END = 2**63 - 1  # of a slice
 
 OPERATORS = frozenset({
@@ -86,6 +88,18 @@ def unknown_operators(graph: Any) -> list[str]:
     return sorted({n.kind() for n in nodes} - known | {"a block" for n in nodes if list(n.blocks())})
 
 
+def _parsed(source: bytes) -> ast.Module:
+    """Raises as ast.parse does, SystemError only if it does so each time.
+
+    Python 3.11 counts the depth of a tree for the whole process: another thread's, or one that garbage collection comes
+    between, makes "AST constructor recursion depth mismatch" of a program that is right (python/cpython#106905).
+    """
+    for _ in range(PARSED - 1):
+        with contextlib.suppress(SystemError):
+            return ast.parse(source)
+    return ast.parse(source)
+
+
 class _Program:
     """A program in the text of TorchScript. Raises Unknown if it is not of the one form that artifacts have."""
 
@@ -93,8 +107,8 @@ class _Program:
         if not SOURCE.fullmatch(source):
             raise Unknown(f"the character {SOURCE.sub(b'', source, count=1)[:1].decode('latin-1')!r}")
         try:
-            body = ast.parse(source).body
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as e:
+            body = _parsed(source).body
+        except (SyntaxError, ValueError, RecursionError, MemoryError, SystemError) as e:
             raise Unknown(f"a program that cannot be read ({type(e).__name__})") from None
         match body:
             case [ast.ClassDef(name=name, bases=[ast.Name(id="Module")], keywords=[], decorator_list=[], body=parts)]:

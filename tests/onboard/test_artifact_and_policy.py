@@ -1,5 +1,6 @@
 """The artifact alone: what it holds, what it refuses, and that it drives without the workshop."""
 
+import ast
 import io
 import mmap
 import shutil
@@ -258,3 +259,26 @@ print("drove")
 """
     done = subprocess.run([python, "-I", "-c", program], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0 and done.stdout.strip() == "drove", done.stderr
+
+
+def test_a_parser_that_fails_by_itself_is_asked_again(artifacts, monkeypatch):
+    """Python 3.11's does, at times, where several threads parse; seen when policies were loaded beside each other."""
+    parse, failures = ast.parse, iter(["depth mismatch", "depth mismatch"])
+
+    def failing(*args):
+        for text in failures:
+            raise SystemError(text)
+        return parse(*args)
+
+    with monkeypatch.context() as patched:  # pytest parses too
+        patched.setattr(ast, "parse", failing)
+        artifact.check_artifact(artifacts["static"])
+
+
+def test_a_parser_that_always_fails_is_no_traceback(artifacts, monkeypatch):
+    def failing(*args):
+        raise SystemError("depth mismatch")
+
+    with monkeypatch.context() as patched, pytest.raises(ArtifactError, match=r"cannot be read \(SystemError\)"):
+        patched.setattr(ast, "parse", failing)
+        artifact.check_artifact(artifacts["static"])
