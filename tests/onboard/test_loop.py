@@ -333,7 +333,10 @@ def test_a_human_who_never_says_so(link, clock):
 
 
 def test_what_happens_before_it_is_armed_is_no_fault_of_a_drive(link, clock):
-    link.arm = lambda: (_ for _ in ()).throw(LinkError("no transmitter"))
+    def arm():
+        raise LinkError("no transmitter")
+
+    link.arm = arm
     with pytest.raises(LinkError, match="no transmitter"):
         go(Always(), link, clock)
 

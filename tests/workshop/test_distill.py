@@ -2,11 +2,11 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from interrupted import interrupt, save_each_step
 from policies import TINY, lerobot_policy, of_a_cars_size, trainer_content
 from recorded import record_drives
 
@@ -94,17 +94,8 @@ def test_distill_json_judges_it_on_held_out_episodes(taught, episodes):
 def test_killed_in_the_middle_it_goes_on_and_gives_the_same(
     teacher, episodes, recipe, taught, tmp_path, monkeypatch, step
 ):
-    steps = []
-
-    def dies(*args):
-        steps.append(1)
-        if len(steps) == step:
-            raise KeyboardInterrupt
-        return training.descend(*args)
-
-    monkeypatch.setattr(distill_module, "Resumable", partial(training.Resumable, every_s=0.0))
-    monkeypatch.setattr(training, "SAVING_SHARE", 1e9)  # after every step, however long that takes
-    monkeypatch.setattr(distill_module, "descend", dies)
+    save_each_step(monkeypatch, distill_module)
+    steps = interrupt(monkeypatch, distill_module, "descend", at=step)
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with pytest.raises(KeyboardInterrupt):
         distill(teacher, episodes, "fast", SHAPE, **arguments)
@@ -120,19 +111,10 @@ def test_killed_in_the_middle_it_goes_on_and_gives_the_same(
 @pytest.mark.slow
 def test_the_teacher_itself_learns_to_be_int8(teacher, episodes, recipe, tmp_path, monkeypatch):
     """And nothing else; killed in the middle, too."""
-    steps = []
-
-    def dies(*args):
-        steps.append(1)
-        if len(steps) == 2:
-            raise KeyboardInterrupt
-        return training.descend(*args)
-
     arguments = {"qat": True, "runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
-        patch.setattr(distill_module, "Resumable", partial(training.Resumable, every_s=0.0))
-        patch.setattr(training, "SAVING_SHARE", 1e9)
-        patch.setattr(distill_module, "descend", dies)
+        save_each_step(patch, distill_module)
+        steps = interrupt(patch, distill_module, "descend", at=2)
         with pytest.raises(KeyboardInterrupt):
             distill(teacher, episodes, "int8", StudentShape(), **arguments)
         folder = distill(teacher, episodes, "int8", StudentShape(), **arguments)
@@ -187,7 +169,7 @@ def test_what_was_there_stays_until_the_new_is_whole(teacher, episodes, recipe, 
     (tmp_path / "fast" / "compare.json").write_text("of a run")
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
-        patch.setattr(distill_module, "write_stage", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+        interrupt(patch, distill_module, "write_stage")
         with pytest.raises(KeyboardInterrupt):
             distill(teacher, episodes, "fast", SHAPE, **arguments)
     assert (tmp_path / "fast" / "pretrained_model" / "config.json").read_text() == "old"

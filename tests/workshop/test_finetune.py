@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ import torch
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from interrupted import interrupt, save_each_step
 from policies import TINY, lerobot_policy, of_a_cars_size, smooth_frame, trainer_content
 
 from rover_lib.cli import main
@@ -21,7 +21,6 @@ from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import finetune as finetune_module
-from rover_lib.workshop import training
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.finetune import Recipe, finetune, human_samples
@@ -171,17 +170,8 @@ def test_finetune_json_says_what_was_learned_from_and_judges_each_episode(taught
 def test_killed_in_either_phase_it_goes_on_and_gives_the_same(
     checkpoint, old, new, recipe, taught, tmp_path, monkeypatch, step
 ):
-    steps = []
-
-    def dies(*args):
-        steps.append(1)
-        if len(steps) == step:
-            raise KeyboardInterrupt
-        return training.descend(*args)
-
-    monkeypatch.setattr(finetune_module, "Resumable", partial(training.Resumable, every_s=0.0))
-    monkeypatch.setattr(training, "SAVING_SHARE", 1e9)  # after every step, however long that takes
-    monkeypatch.setattr(finetune_module, "descend", dies)
+    save_each_step(monkeypatch, finetune_module)
+    steps = interrupt(monkeypatch, finetune_module, "descend", at=step)
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with pytest.raises(KeyboardInterrupt):
         finetune(checkpoint, [old, new], "better", **arguments)
@@ -205,19 +195,10 @@ def test_killed_while_it_looks_at_the_recordings_it_goes_on(
     checkpoint, old, new, recipe, taught, tmp_path, monkeypatch, asked
 ):
     """In the old ones, and in the new ones."""
-    blocks, features = [], finetune_module.BatchedPolicy.features
-
-    def dies(self, frames):
-        blocks.append(1)
-        if len(blocks) == asked:
-            raise KeyboardInterrupt
-        return features(self, frames)
-
-    monkeypatch.setattr(finetune_module, "Resumable", partial(training.Resumable, every_s=0.0))
-    monkeypatch.setattr(training, "SAVING_SHARE", 1e9)
+    save_each_step(monkeypatch, finetune_module)
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
-        patch.setattr(finetune_module.BatchedPolicy, "features", dies)
+        interrupt(patch, finetune_module.BatchedPolicy, "features", at=asked)
         with pytest.raises(KeyboardInterrupt):
             finetune(checkpoint, [old, new], "better", **arguments)
     assert_same(finetune(checkpoint, [old, new], "better", **arguments), taught)
@@ -227,7 +208,7 @@ def test_killed_while_it_looks_at_the_recordings_it_goes_on(
 def test_killed_while_it_writes_it_leaves_nothing_half(checkpoint, old, new, recipe, taught, tmp_path, monkeypatch):
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
-        patch.setattr(finetune_module, "write_stage", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+        interrupt(patch, finetune_module, "write_stage")
         with pytest.raises(KeyboardInterrupt):
             finetune(checkpoint, [old, new], "better", **arguments)
     assert not (tmp_path / "better").exists()
