@@ -26,7 +26,7 @@ help:
 	@echo "For who changes something; CONTRIBUTING.md says what each proves and how long it takes:"
 	@echo "make test-fast                              what a minute and a half can prove"
 	@echo "make test                                   lint, tests and notebooks, on the demo's run"
-	@echo "make check-release                          what takes an hour and a quiet machine"
+	@echo "make check-release                          what takes two hours and a quiet machine"
 	@echo "make arm NAME=demo [PEERS=1]                count a run's instructions on an emulated Cortex-A76; NAME=full makes"
 	@echo "                                            a policy of the real car's size, LEARNED=1 one that has learned to"
 	@echo "                                            drive (an hour or more), PEERS=1 adds other runtimes"

@@ -143,7 +143,7 @@ def view(ctx: click.Context, output: Path, artifact: Path, pairs: int, stops: in
     """Measure what a view costs a drive, how old its picture is, and how soon its button stops the car.
 
     About 10 minutes. Leaves OUTPUT as JSON; exit code 1 if a gate of lab/params.yml does not hold. Needs Debian's
-    packages for the Arduino's firmware and simavr, see README.
+    packages for the Arduino's firmware and simavr, see docs/first_hour.md.
     """
     from lab.driving.view_bench import measure
 
