@@ -16,7 +16,6 @@ REPOSITORY = arduino.REPOSITORY
 symbol = arduino.symbol
 PULSE, CUT, LINE_IN, RESET = 1, 2, 3, 4
 PIN = {"steering": 0, "throttle": 1}
-BYTE_US = 1e6 / 11520
 
 
 @functools.cache

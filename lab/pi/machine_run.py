@@ -36,7 +36,6 @@ from rover_lib.world.standin import REST_US
 
 STAGE = "pi"
 REPOSITORY = Path(__file__).parents[2]
-ANSIBLE = REPOSITORY / "ansible"
 PORT, CAMERA, MODEL = "/dev/rover-arduino", "/dev/video0", "/var/lib/rover/models/current/policy.pt"
 SIZE = (640, 360)
 FRAMES = 150  # of the recordings, 5 s

@@ -141,18 +141,6 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
     return policy
 
 
-def check_parity(policy: Policy) -> dict[str, float]:
-    """Run the artifact's parity vectors.
-
-    Returns the largest difference per action. Raises ArtifactError beyond the manifest's tolerance.
-
-    FP32 differs between processors by the order of sums only. INT8 differs more, because its float parts (exp,
-    LayerNorm) round differently and each flipped rounding grows over the layers.
-    """
-    vectors = read_parity(policy.path)
-    return _check_differences(policy, _predict(policy, vectors), vectors)
-
-
 def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> np.ndarray:
     """(n, chunk, A) float32: the policy's answers to the parity vectors."""
     frames = [vectors[f"frame_{c}"] for c in policy.cameras]
@@ -167,15 +155,18 @@ def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> np.ndarray:
         ) from None
 
 
-def _check_differences(policy: Policy, chunks: np.ndarray, vectors: Mapping[str, np.ndarray]) -> dict[str, float]:
+def _check_differences(policy: Policy, chunks: np.ndarray, vectors: Mapping[str, np.ndarray]) -> None:
+    """Raise ArtifactError where the answers, (n, chunk, A), are further from the vectors' than the manifest tolerates.
+
+    FP32 differs between processors by the order of sums only. INT8 differs more, because its float parts (exp,
+    LayerNorm) round differently and each flipped rounding grows over the layers.
+    """
     difference = np.abs(chunks - vectors["chunk"]).max((0, 1))
     tolerance = policy.manifest["parity"]["tolerance"]
-    result = {name: float(d) for name, d in zip(policy.action_names, difference, strict=True)}
-    for name, d in result.items():
+    for name, d in zip(policy.action_names, difference.tolist(), strict=True):
         if not d <= tolerance[name]:  # NaN is not within
             raise ArtifactError(
                 f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}, "
                 f"at most {tolerance[name]:.3g} is rounding",
                 remedy="do not drive with it",
             )
-    return result

@@ -72,7 +72,7 @@ def test_a_reader_who_has_seen_enough_is_no_error():
             print("more", file=unread, flush=True)
 
 
-def test_completion_is_of_commands_and_options(monkeypatch):
+def test_completion_is_of_commands_and_options():
     """What docs/install.md puts into ~/.bashrc asks this."""
     words = {"_ROVER_COMPLETE": "bash_complete", "COMP_CWORD": "1"}
     found = CliRunner().invoke(main, [], prog_name="rover", env=words | {"COMP_WORDS": "rover ins"})

@@ -251,10 +251,6 @@ def test_no_quantized_weights_of_another_form_are_packed(artifacts, tmp_path, ed
 # Archives: names, and readers that would see different things
 
 
-def with_bytes(edit: Edit) -> Callable[[Path], None]:
-    return lambda path: path.write_bytes(edit(path.read_bytes())) and None
-
-
 @pytest.mark.parametrize(
     "name",
     ["archive/../../harm", "/harm", "archive/model.json", "archive/data/0", "archive/code/__torch__/../x.py",

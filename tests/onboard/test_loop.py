@@ -614,7 +614,7 @@ def test_an_artifact_that_changes_is_noticed_once(tmp_path):
     assert "gone on disk" in next(iter(watch()))
 
 
-def test_what_is_ridden_through_is_said(link, clock, monkeypatch):
+def test_what_is_ridden_through_is_said(link, monkeypatch):
     report, spent, system_s = Report(), [100, 1000, 7], [0.0]
     link.garbled = 3
     link.status = replace(STATUS, bad_lines=4)

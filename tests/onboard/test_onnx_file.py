@@ -88,7 +88,7 @@ def test_no_protobuf_is_refused(raw, onnx_static, tmp_path):
         load_policy(path)
 
 
-def test_policy_for_two_engines_is_refused(artifacts, onnx_static, tmp_path):
+def test_policy_for_two_engines_is_refused(artifacts, tmp_path):
     path = rewritten(artifacts["static"], tmp_path / "two.pt", {}, {ONNX: b"x"})
     with pytest.raises(ArtifactError, match="two engines"):
         check_artifact(path)

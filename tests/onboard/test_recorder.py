@@ -301,7 +301,7 @@ def test_a_full_disk_is_seen_before_it_is_full(tmp_path, monkeypatch):
     assert len(load_recordings(folder, chunk=2).samples) == 1
 
 
-def test_episodes_take_no_more_than_they_may(tmp_path, monkeypatch):
+def test_episodes_take_no_more_than_they_may(tmp_path):
     picture = np.random.default_rng(0).integers(0, 256, (360, 640, 3), np.uint8)  # 500 kB as JPEG
     camera = FakeCamera()
     (tmp_path / "episode_before" / "frames").mkdir(parents=True)

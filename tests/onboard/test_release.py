@@ -341,7 +341,7 @@ def test_packing_a_smaller_artifact_leaves_no_part_of_the_larger_one(packed, two
     assert set(contents(packed)) == {"part-0000", "release.json"}
 
 
-def test_a_flipped_byte_on_the_way_is_found_and_the_same_transfer_repeated_heals(releases, packed, two):
+def test_a_flipped_byte_on_the_way_is_found_and_the_same_transfer_repeated_heals(releases, packed):
     old, part = releases.current, packed / "part-0002"
     good = part.read_bytes()
     part.write_bytes(bytes([good[0] ^ 1]) + good[1:])
@@ -438,7 +438,7 @@ def test_what_cannot_drive_cannot_be_allowed(two):
         inspect_artifact(two[0], allow=["torch"])
 
 
-def test_a_rover_with_another_chunk_or_camera(two, tmp_path):
+def test_a_rover_with_another_chunk_or_camera(two):
     with pytest.raises(ReleaseError, match=r"plans 32 actions, this rover takes 50"):
         inspect_artifact(two[0], Expected(chunk=50))
     with pytest.raises(ReleaseError, match=r"this rover has cam_front at 1\.33 to 1"):

@@ -226,7 +226,7 @@ COMMANDS = [(s, 0, 1567, 209, 21316, 1016) for s in (99.90, 99.933, 99.966)]
         ("k", 99.96, 2),  # that was known before it was sent
     ],
 )
-def test_a_command_that_was_not_taken_is_not_written(monkeypatch, result, at_s, kept):
+def test_a_command_that_was_not_taken_is_not_written(result, at_s, kept):
     time, written = Time(), Written()
     recorder = TakeoverRecorder(written, "static")
     for row in COMMANDS:

@@ -281,7 +281,7 @@ def test_bytes_between_lines_do_not_matter(tmp_path_factory, good, junk, at):
     assert flight.damaged == sum(bool(part) for j in junk for part in j.split(b"\n"))
 
 
-def test_what_is_no_log(tmp_path, good):
+def test_what_is_no_log(tmp_path):
     with pytest.raises(LogError, match=r"nothing\.log: cannot be read \(No such file"):
         read_log(tmp_path / "nothing.log")
     with pytest.raises(LogError, match="cannot be read"):

@@ -144,7 +144,7 @@ def test_an_observation_is_what_the_features_say(rover):
     assert not np.array_equal(rover.get_observation()["cam_front"], picture)  # each picture once
 
 
-def test_colours_are_rgb(make_rover, standin, noise):
+def test_colours_are_rgb(make_rover, standin):
     import cv2
 
     rover, feed = make_rover(standin.port)

@@ -73,7 +73,7 @@ def test_what_is_left_is_one_policy_in_two_formats(taught, teacher):
 
 
 @pytest.mark.slow
-def test_distill_json_judges_it_on_held_out_episodes(taught, episodes):
+def test_distill_json_judges_it_on_held_out_episodes(taught):
     content = json.loads((taught / "distill.json").read_text())
     of_teacher, of_student = content["metrics"]["students"]
     assert of_teacher["teacher_steering_pct"] == of_teacher["teacher_throttle_pct"] == 0

@@ -160,7 +160,7 @@ def test_calibration_set_is_the_recordings_and_what_the_first_part_makes_of_them
         assert np.abs(features[i] - wanted.numpy()).max() < 1e-4 * wanted.abs().max()
 
 
-def test_model_scripts_normalise_and_name_layers(kit, checkpoint):
+def test_model_scripts_normalise_and_name_layers(kit):
     for chip in CHIPS:
         script = (kit / f"backbone_{chip}.alls").read_text()
         mean, std = (json.loads(x) for x in re.search(r"normalization\((\[.*?\]), (\[.*?\])\)", script).groups())

@@ -114,7 +114,7 @@ def test_what_was_made_of_other_files_is_made_again(tmp_path, sheet):
     assert sweeping.parts_done(job, tmp_path, other) == []
 
 
-def test_files_that_many_runs_have_are_looked_through_once(tmp_path, sheet, monkeypatch):
+def test_files_that_many_runs_have_are_looked_through_once(sheet, monkeypatch):
     jobs = Sheet.read(sheet()).jobs()
     walked = []
     monkeypatch.setattr(sweeping, "_files_in", lambda place: walked.append(place) or str(place).encode())

@@ -202,7 +202,7 @@ def test_the_compiler_is_named_when_it_cannot_be_installed(tmp_path, monkeypatch
         peers._compile(tmp_path)
 
 
-def test_counts_of_another_policy_are_refused(tiny_run, tmp_path):
+def test_counts_of_another_policy_are_refused(tmp_path):
     with pytest.raises(CountError, match=r"arm\.json: not found; count the run's own artifacts first"):
         peers.count_peers(tmp_path)
     (tmp_path / "policy_fp32.pt").write_bytes(b"one")
