@@ -9,7 +9,7 @@ one kind of car after the other, they get the neutral of each: so the wheels are
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -99,6 +99,32 @@ def measure(
         ends[where] = held.throttle_us if where in ("forward", "back") else held.steering_us
         notify(f"{where}: {ends[where]} us")
     ask("Let go of both sticks.")
+    _check_throws(rest, ends)
+    fast = rest.throttle_period_us < PERIOD_MIN_US
+    if fast and ends["forward"] > FAST_PULSE_MAX_US:
+        notify(f"full throttle is {ends['forward']} us; the firmware takes {FAST_PULSE_MAX_US} for it on such a car")
+        ends["forward"] = FAST_PULSE_MAX_US
+    steering = {
+        "period_us": rest.steering_period_us,
+        "left_us": ends["left"],
+        "neutral_us": rest.steering_us,
+        "right_us": ends["right"],
+    }
+    throttle = {
+        "period_us": rest.throttle_period_us,
+        "neutral_us": rest.throttle_us,
+        "forward_us": ends["forward"],
+    }
+    if _goes_back(rest, ends) and not fast:
+        throttle["reverse_us"] = ends["back"]
+    return Car.of({**more, "steering": steering, "throttle": throttle}, "the measured car")
+
+
+def _check_throws(rest: Held, ends: Mapping[str, int]) -> None:
+    """Raises CarError for a stick that hardly moved, and for steering that went the same way twice.
+
+    ends: microseconds of the stick's channel by where it was held, "left", "right", "forward" and "back".
+    """
     for name, ways, neutral_us, least_us in (
         ("steering", ("left", "right"), rest.steering_us, STEERING_THROW_US),
         ("throttle", ("forward",), rest.throttle_us, THROTTLE_THROW_US),
@@ -116,31 +142,18 @@ def measure(
             found=f"left {ends['left']}, rest {rest.steering_us} and right {ends['right']} us",
             remedy="let go of the stick before it is measured at rest, and set the trim to its middle",
         )
-    fast = rest.throttle_period_us < PERIOD_MIN_US
-    if fast and ends["forward"] > FAST_PULSE_MAX_US:
-        notify(f"full throttle is {ends['forward']} us; the firmware takes {FAST_PULSE_MAX_US} for it on such a car")
-        ends["forward"] = FAST_PULSE_MAX_US
-    throttle = {
-        "period_us": rest.throttle_period_us,
-        "neutral_us": rest.throttle_us,
-        "forward_us": ends["forward"],
-    }
+
+
+def _goes_back(rest: Held, ends: Mapping[str, int]) -> bool:
+    """Whether the throttle has a reverse. Raises CarError where it went the same way backwards as forwards."""
     backwards_us = (rest.throttle_us - ends["back"]) * (1 if ends["forward"] > rest.throttle_us else -1)
-    if backwards_us > RETURNS_US and not fast:
-        throttle["reverse_us"] = ends["back"]
-    elif backwards_us < -RETURNS_US:
+    if backwards_us < -RETURNS_US:
         raise CarError(
             "the throttle went the same way backwards as forwards",
             found=f"rest {rest.throttle_us}, forward {ends['forward']} and back {ends['back']} us",
             remedy="move the stick from its rest to the other end",
         )
-    steering = {
-        "period_us": rest.steering_period_us,
-        "left_us": ends["left"],
-        "neutral_us": rest.steering_us,
-        "right_us": ends["right"],
-    }
-    return Car.of({**more, "steering": steering, "throttle": throttle}, "the measured car")
+    return backwards_us > RETURNS_US
 
 
 def _find(link: Link, sleep: Callable[[float], None]) -> None:
