@@ -23,7 +23,7 @@ import numpy as np
 
 from rover_lib.onboard.errors import ParamsError, PolicyError
 from rover_lib.onboard.floor import floor_ms
-from rover_lib.onboard.host import Host, throttled_means
+from rover_lib.onboard.host import Host, throttled_means, usable_cores
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
@@ -168,7 +168,7 @@ def benchmark(
         if name is not None and name not in policies:
             raise ParamsError(f"no policy {name!r} to benchmark", found=names, remedy="name one of them")
     host = host or Host()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     threads_before = {name: policies[name].threads for name in names if hasattr(policies[name], "threads")}
     if options.threads is not None:
         _set_threads(policies, dict.fromkeys(threads_before, options.threads or cores))

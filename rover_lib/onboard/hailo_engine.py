@@ -6,7 +6,6 @@ compute something else on the chip: the parity vectors that every artifact has a
 """
 
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 
 from rover_lib.onboard.archive import HEF, ONNX, open_archive, read_record
 from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.host import usable_cores
 
 TIMEOUT_MS = 1000  # for one inference: some thirty times what one should take
 LARGEST_SIDE = 8192  # of an output
@@ -53,8 +53,7 @@ class HailoEngine:
         self._answers = {name: np.empty(shape, np.float32) for name, shape in self._runs["outputs"].items()}
         for name, buffer in self._answers.items():
             self._bindings.output(self._outputs[name]).set_buffer(buffer)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self.set_threads(threads or cores)
+        self.set_threads(threads or usable_cores())
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
         """As engines.Engine."""

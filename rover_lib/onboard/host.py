@@ -72,6 +72,11 @@ class Host:
         }
 
 
+def usable_cores() -> int:
+    """How many cores this process may run on: fewer than the machine's where somebody has chosen them for it."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def throttled_means(value: str | None) -> list[str] | None:
     """The sentences behind get_throttled's bits; None if there was no reading."""
     if value is None:

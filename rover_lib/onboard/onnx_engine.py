@@ -1,6 +1,5 @@
 """Artifacts run by ONNX Runtime, for a rover without torch."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import onnxruntime
 
 from rover_lib.onboard.archive import ONNX, open_archive, read_record
 from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.host import usable_cores
 
 onnxruntime.disable_telemetry_events()  # nobody was asked
 ERRORS_ONLY = 3  # of ONNX Runtime's log, which warns of what a machine without a graphics card lacks
@@ -68,8 +68,7 @@ class OnnxEngine:
 
 def load(path: Path, manifest: dict[str, Any], threads: int | None) -> OnnxEngine:
     """Raises ArtifactError for a model that ONNX Runtime refuses, or with other inputs than its manifest says."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    engine = OnnxEngine(path, threads or cores)
+    engine = OnnxEngine(path, threads or usable_cores())
     wanted = ["state", *(f"frame_{c['name']}" for c in manifest["cameras"])]
     if engine._names != wanted:
         raise ArtifactError(
