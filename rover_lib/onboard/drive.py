@@ -35,8 +35,9 @@ from rover_lib.onboard.recording import Controls, read_controls, recorded_car
 from rover_lib.onboard.service import CHECK_S, NotArmed, Service
 from rover_lib.onboard.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.signal_event import SignalEvent
+from rover_lib.onboard.status_line import StatusLine
 from rover_lib.onboard.takeover import TakeoverRecorder
-from rover_lib.onboard.telemetry import FlightLog, StatusLine
+from rover_lib.onboard.telemetry import FlightLog
 from rover_lib.onboard.watch import (
     HealthWatch,
     MemoryWatch,

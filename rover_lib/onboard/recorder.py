@@ -23,7 +23,7 @@ from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
 from rover_lib.onboard.recording import EpisodeExists, EpisodeWriter
 from rover_lib.onboard.servo_link import ServoLink
 from rover_lib.onboard.signal_event import SignalEvent
-from rover_lib.onboard.telemetry import StatusLine
+from rover_lib.onboard.status_line import StatusLine
 from rover_lib.onboard.watch import signals
 
 SPARE_BYTES = 16_000_000  # of the disk are left alone; finishing an episode needs some, and so does the rest of a Pi

@@ -1,4 +1,4 @@
-"""The flight log, one line per control tick, and the status line for people. Neither ever holds up the loop.
+"""The flight log, one line per control tick. It never holds up the loop.
 
     with FlightLog(path, header={"hz": 30, "fade_s": 0.5, "stop_s": 1.0}, max_bytes=10_000_000, keep=3) as log:
         log.tick(Tick(t_s=time.monotonic() - log.start_s, ...))
@@ -10,9 +10,9 @@ values between commas, an empty one where there is none; events, and what the ma
 are lines of JSON. All end in a checksum (CRC-16 of what stands before it): a line that a power cut or a full disk
 damaged is skipped, not believed.
 
-`tick` and `event` put their row into a bounded queue, nothing else. Three threads do what can take long or fail: one
+`tick` and `event` put their row into a bounded queue, nothing else. Two threads do what can take long or fail: one
 reads the machine, writes the file and syncs it; one passes events on to `logging` (logger "rover"), whose stream may
-be a terminal that somebody stopped; one writes the status line.
+be a terminal that somebody stopped.
 """
 
 import binascii
@@ -24,7 +24,6 @@ import logging
 import math
 import os
 import shutil
-import sys
 import threading
 import time
 from collections import deque
@@ -33,7 +32,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -587,109 +586,3 @@ def _row(line: bytes) -> list[Any] | Event | dict[str, Any] | None:
         ]
     except (ValueError, KeyError):
         return None
-
-
-class StatusLine:
-    """One line for people on a stream, from a thread of its own, from entering the context until leaving it.
-
-        with StatusLine(lambda: f"{speed} m/s") as status:
-            logging.getLogger("rover").addHandler(status.handler)
-
-    A terminal has one line that is written over 4 times a second; anything else gets a line every 10 s. What goes to
-    `handler` is written above that line, and waits for nothing: a terminal that was stopped gets it later, or never.
-    """
-
-    def __init__(
-        self,
-        callback: Callable[[], str],
-        stream: TextIO | None = None,
-        *,
-        every_s: float = 0.25,
-        plain_every_s: float = 10.0,
-    ):
-        self._callback = callback
-        self._stream = stream if stream is not None else sys.stderr
-        self._terminal = self._stream.isatty()
-        try:
-            self._fd: int | None = self._stream.fileno()
-        except (OSError, AttributeError):
-            self._fd = None
-        self._every_s = every_s if self._terminal else plain_every_s
-        self._lines: deque[str] = deque(maxlen=QUEUE_EVENTS)
-        self._wake = threading.Event()
-        self._closing = False
-        self._thread = threading.Thread(target=self._run, name="status line", daemon=True)
-        self.handler: logging.Handler = _StatusHandler(self)
-
-    def __enter__(self) -> "StatusLine":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
-    def say(self, text: str) -> None:
-        """Write a line that stays. Waits for nothing."""
-        self._lines.append(text)
-        self._wake.set()
-
-    def close(self) -> None:
-        """Write what is left, and end. Waits half a second at most."""
-        self._closing = True
-        self._wake.set()
-        self._thread.join(0.5)
-
-    def _run(self) -> None:
-        due_s = time.monotonic() + self._every_s
-        while True:
-            self._wake.wait(max(0.0, due_s - time.monotonic()))
-            self._wake.clear()
-            closing = self._closing
-            text = "".join(f"{self._clear}{self._lines.popleft()}\n" for _ in range(len(self._lines)))
-            due = time.monotonic() >= due_s
-            if closing or due or self._terminal:
-                text += self._status() + ("\n" if closing or not self._terminal else "")
-            if due:
-                due_s = time.monotonic() + self._every_s
-            try:
-                self._write(text)
-            except (OSError, ValueError):  # nobody is there to read
-                return
-            if closing:
-                return
-
-    @property
-    def _clear(self) -> str:
-        return "\r\x1b[K" if self._terminal else ""
-
-    def _status(self) -> str:
-        try:
-            text = self._callback()
-        except Exception as error:
-            text = f"no status: {type(error).__name__}: {error}"
-        if self._terminal and self._fd is not None:
-            with contextlib.suppress(OSError):
-                text = text[: (os.get_terminal_size(self._fd).columns or 80) - 1]
-        return self._clear + text
-
-    def _write(self, text: str) -> None:
-        if self._fd is None:
-            self._stream.write(text)
-            self._stream.flush()
-            return
-        # Not through the stream's buffer: its lock, held by a thread that is stuck, would hang the program's end.
-        data = text.encode(errors="replace")
-        while data:
-            data = data[os.write(self._fd, data) :]
-
-
-class _StatusHandler(logging.Handler):
-    def __init__(self, status: StatusLine):
-        super().__init__()
-        self._status = status
-
-    def emit(self, record: logging.LogRecord) -> None:
-        try:
-            self._status.say(self.format(record))
-        except Exception:  # as logging asks of a handler: a record that cannot be formatted ends nothing
-            self.handleError(record)
