@@ -1,6 +1,6 @@
 """What other engines execute for the same policy on the same emulated Cortex-A76.
 
-    count_peers("runs/full")      # adds metrics.peers to runs/full/arm.json, which judge.count_run has written
+    count_peers("runs/full")      # adds metrics.peers to runs/full/arm.json, which count_run.count_run has written
 
 Each engine quantizes the float policy with its own tools, on the frames that calibrated ours, and is judged on the same
 held-out frames. It brings packages of its own, pinned here, that are laid before ours on Python's path, on this machine

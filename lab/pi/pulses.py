@@ -12,7 +12,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.telemetry import Flight
 from rover_lib.world.standin import PinEvent
 
-# A command counts from the next pulse that begins after it has come, sent anew if need be (drive.RESEND_S), until that
+# A command counts from the next pulse that begins after it has come, sent anew if need be (loop.RESEND_S), until that
 # of the next command. So a pulse is one of the commands of the last 33 + 18 + 21 ms and some for the serial line.
 HELD_S = 0.1
 ERROR_S = 0.02  # of one clock seen from the other, over ssh: 5 ms by what is read, and half of how long that takes
