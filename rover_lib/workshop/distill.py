@@ -45,9 +45,10 @@ from rover_lib.workshop.lessons import BatchedPolicy, Lessons, in_another_light,
 from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.quantize import QuantizedPolicy, quantize
+from rover_lib.workshop.run_folder import run_folder
 from rover_lib.workshop.samples import Source
 from rover_lib.workshop.scheme import Scheme
-from rover_lib.workshop.session import SMALL_GMAC, Opened, load
+from rover_lib.workshop.session import SMALL_GMAC, Opened, load, training_device
 from rover_lib.workshop.student import StudentShape, gmac, initial_weights, student_config
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 
@@ -113,24 +114,19 @@ def distill(
     Raises DistillError for a student, a device or recordings that cannot be; CheckpointError, EpisodeError,
     TrainingError.
     """
-    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-    if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
-        raise DistillError("device must be cpu, or cuda where torch finds one", found=device, remedy="leave it out")
-    if Path(name).name != name or name.startswith("."):
-        raise DistillError("a run's name must be a plain folder name", found=repr(name))
+    folder, where = run_folder(runs_dir, name, DistillError), training_device(device, DistillError)
     recipe = recipe or Recipe(**params()["distill"])
     if recipe.seed < 0:
         raise DistillError("a seed must be at least 0", found=recipe.seed)
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint
     config = student_config(teacher, shape)
-    work = _Work(opened, config, recipe, qat, torch.device(device), progress)
+    work = _Work(opened, config, recipe, qat, where, progress)
     if work.is_teacher and not qat:
         remedy = "give it a smaller picture or fewer layers, or train it for INT8 with --qat"
         raise DistillError("this student would be its teacher", remedy=remedy)
     with threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()):
-        taught = _taught(work)
-        return _leave(Path(runs_dir).resolve() / name, work, taught)
+        return _leave(folder, work, _taught(work))
 
 
 @dataclass(frozen=True, eq=False)

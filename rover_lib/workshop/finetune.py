@@ -52,8 +52,9 @@ from rover_lib.workshop.lessons import (
     plans_of,
 )
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.run_folder import run_folder
 from rover_lib.workshop.samples import Episode, Recordings, Sample, Source
-from rover_lib.workshop.session import SMALL_GMAC
+from rover_lib.workshop.session import SMALL_GMAC, training_device
 from rover_lib.workshop.student import gmac
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 
@@ -130,17 +131,12 @@ def finetune(
     Raises FinetuneError for a name, a device or recordings that cannot be; CheckpointError, EpisodeError,
     TrainingError.
     """
-    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-    if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
-        raise FinetuneError("device must be cpu, or cuda where torch finds one", found=device, remedy="leave it out")
-    if Path(name).name != name or name.startswith("."):
-        raise FinetuneError("a run's name must be a plain folder name", found=repr(name))
-    folder = Path(runs_dir).resolve() / name
+    folder, where = run_folder(runs_dir, name, FinetuneError), training_device(device, FinetuneError)
     if folder.exists():
         raise FinetuneError(f"{folder}: is there already", remedy="give another --name, or move that run away")
     recipe = recipe or Recipe.of(params())
     parent, material = _opened(checkpoint, episodes, recipe, progress)
-    work = _Work(parent, material, recipe, torch.device(device), progress)
+    work = _Work(parent, material, recipe, where, progress)
     with threads(1 if gmac(parent.config) < SMALL_GMAC else torch.get_num_threads()):
         return _leave(folder, work, _taught(work))
 

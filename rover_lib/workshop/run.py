@@ -26,6 +26,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
+from rover_lib.workshop.run_folder import run_folder
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
@@ -89,17 +90,13 @@ def run(
     Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C, the old run
     is as it was and nothing is left of the new one.
     """
-    if not re.fullmatch(r"\w[\w.-]*", name):
-        raise NotebookError(
-            "a run's name must be a plain folder name", found=repr(name), remedy="use letters, digits and _"
-        )
+    folder = run_folder(runs_dir, name, NotebookError)
     sources = [Path(notebooks) / f"{n}.ipynb" for n in NAMES]
     if missing := [s.name for s in sources if not s.is_file()]:
         raise NotebookError(f"{notebooks}: no {missing[0]} in it", remedy="run from a checkout of the project")
     known = set().union(*(parameters_of(s) for s in sources))
     if unknown := sorted(set(overrides) - known):
         raise NotebookError(f"no notebook has a parameter {unknown}", remedy=f"known are {sorted(known)}")
-    folder = Path(runs_dir).resolve() / name
     new, old = folder.with_name(f".{name}.new"), folder.with_name(f".{name}.old")
     if old.exists():  # the last one was killed while it took its place
         _put_back(old, folder)

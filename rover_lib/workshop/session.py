@@ -63,3 +63,11 @@ def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:
             f"{again.recordings.root}: has other episodes than notebook 01 loaded", remedy="run notebook 01 again"
         )
     return again
+
+
+def training_device(asked: str | None, error: type[RoverError]) -> torch.device:
+    """Where a policy learns: 'cpu' or 'cuda' as asked for, None for the best there is. Raises `error` for another."""
+    there = torch.cuda.is_available()
+    if asked not in (None, "cpu", "cuda") or (asked == "cuda" and not there):
+        raise error("device must be cpu, or cuda where torch finds one", found=asked, remedy="leave it out")
+    return torch.device(asked or ("cuda" if there else "cpu"))

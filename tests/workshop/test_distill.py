@@ -201,6 +201,7 @@ def test_a_teacher_of_another_car_is_refused(episodes, recipe, tmp_path):
         ({"shape": StudentShape()}, "would be its teacher"),
         ({"shape": StudentShape(54, 96), "device": "tpu"}, "device must be"),
         ({"shape": StudentShape(54, 96), "name": "../fast"}, "plain folder name"),
+        ({"shape": StudentShape(54, 96), "name": ""}, "plain folder name"),
         ({"shape": StudentShape(54, 96), "recipe": Recipe(**{**params()["distill"], "seed": -1})}, "seed must be"),
     ],
 )

@@ -266,6 +266,7 @@ def refused(says, checkpoint, episodes, tmp_path, **options):
     [
         ({"device": "tpu"}, "device must be"),
         ({"name": "../better"}, "plain folder name"),
+        ({"name": ""}, "plain folder name"),
     ],
 )
 def test_arguments_that_cannot_be_are_refused(checkpoint, old, new, tmp_path, options, says):
