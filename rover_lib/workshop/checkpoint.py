@@ -5,6 +5,7 @@ Nothing is built from a number that a file only claims: every size is bounded fi
 hold or by what no policy reaches.
 """
 
+import hashlib
 import json
 import re
 import stat
@@ -12,7 +13,7 @@ import warnings
 import zipfile
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,18 @@ class Checkpoint:
     weights: dict[str, Tensor] = field(repr=False)
     sha256: str  # of the trainer's file, or of model.safetensors
     report: dict[str, Any] = field(repr=False)
+
+    @property
+    def identity(self) -> str:
+        """Hex digits of all that it computes by: the sha256 of a trainer's file, which holds everything.
+
+        Beside the weights of LeRobot's folder lie its config and its statistics, in files of their own: who puts other
+        statistics there has another policy of the same sha256.
+        """
+        if self.format == "trainer":
+            return self.sha256
+        said = json.dumps([self.sha256, asdict(self.config)], sort_keys=True)
+        return hashlib.sha256(said.encode()).hexdigest()
 
     def at_size(self, height: int, width: int) -> "Checkpoint":
         """The same weights for images of another size, in pixels: none of ACT's weights depends on it.

@@ -179,9 +179,11 @@ def _taught(work: _Work) -> _Taught:
     recipe, progress = work.recipe, work.progress
     samples = thinned(work.opened.parts.calibration, recipe.samples)
     sees = {
-        "teacher": work.teacher.sha256,
+        "teacher": work.teacher.identity,
         "size": work.config.image_sizes,
         "pictures": [(s.episode, s.frame_path.name, s.frame_path.stat().st_size) for s in samples],
+        "rows": [s.row for s in samples],  # a dataset's pictures are many in one file
+        "states": zlib.crc32(np.stack([s.state for s in samples]).tobytes()),
         "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
         "recipe": [recipe.batch, recipe.backbone_steps, recipe.rate],
         "at": [work.device.type, recipe.seed],

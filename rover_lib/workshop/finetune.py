@@ -370,8 +370,9 @@ def _refuse_strangers(work: _Work, lessons: Lessons) -> None:
 def _sees(work: _Work, kind: str, samples: Sequence[Sample]) -> dict[str, Any]:
     """What lessons depend on."""
     return {
-        "parent": work.parent.sha256,
+        "parent": work.parent.identity,
         "pictures": [(s.episode, s.frame_name, s.row, s.frame_path.stat().st_size) for s in samples],
+        "states": zlib.crc32(np.stack([s.state for s in samples]).tobytes()),
         "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
         "pads": zlib.crc32(np.stack([s.is_pad for s in samples]).tobytes()),
         "kind": kind,

@@ -138,7 +138,7 @@ class Calibration:
 
     samples: int
     smooth: float | None
-    checkpoint: str  # sha256
+    checkpoint: str  # its identity
     image_sizes: tuple[tuple[int, int], ...]  # (height, width), one per camera
     channels: Maxima = field(repr=False)  # in_max, out_max, and the same after scaling
     observers: dict[str, Tensor] = field(repr=False)  # state of the prepared graph's observers
@@ -206,7 +206,7 @@ def calibrate(
     return Calibration(
         samples=len(samples),
         smooth=smooth,
-        checkpoint=checkpoint.sha256,
+        checkpoint=checkpoint.identity,
         image_sizes=config.image_sizes,
         channels=channels,
         observers=observers,
@@ -312,14 +312,14 @@ def _behind(prepared: nn.Module, node: Node) -> Node | None:
 
 def observed_graph(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:
     """The observed graph as calibration left it, its observers seeing no more."""
-    if calibration.checkpoint != checkpoint.sha256:
-        raise QuantizeError("the calibration was made with another checkpoint", remedy="calibrate again")
     if calibration.image_sizes != checkpoint.config.image_sizes:
         raise QuantizeError(
             f"the calibration was made with images of {calibration.image_sizes}, the policy takes "
             f"{checkpoint.config.image_sizes} (height, width)",
             remedy="calibrate again",
         )
+    if calibration.checkpoint != checkpoint.identity:
+        raise QuantizeError("the calibration was made with another checkpoint", remedy="calibrate again")
     if scheme.smooth != calibration.smooth:
         raise QuantizeError(
             f"the calibration was made with smooth {calibration.smooth}, the scheme has {scheme.smooth}"

@@ -153,7 +153,7 @@ def write_load(run_dir: Path | str, loaded: Opened, note: str = "", fit: Mapping
     model = ACT(checkpoint.config, checkpoint.weights)
     work = {"macs_by_block": multiply_accumulates(model), "parameters_by_block": parameters_by_block(model)}
     metrics: dict[str, Any] = {
-        "checkpoint": checkpoint.report | {"sha256": checkpoint.sha256} | work,
+        "checkpoint": checkpoint.report | {"sha256": checkpoint.sha256, "identity": checkpoint.identity} | work,
         "recordings": recordings.summary(),
         "split": loaded.parts.episodes,
     }

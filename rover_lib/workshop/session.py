@@ -54,9 +54,17 @@ def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:
         torch.set_num_threads(1)
     given = stage["params"]
     again = load(given["checkpoint"], Source.loaded(given), progress)
-    if again.checkpoint.sha256 != stage["metrics"]["checkpoint"]["sha256"]:
+    loaded, now = stage["metrics"]["checkpoint"], again.checkpoint
+    if now.sha256 != loaded["sha256"] or now.identity != loaded.get("identity", now.identity):  # older runs lack it
+        found = "the same weights, and another config or other statistics" if now.sha256 == loaded["sha256"] else None
         raise RoverError(
-            f"{again.checkpoint.path}: is not what notebook 01 loaded any more", remedy="run notebook 01 again"
+            f"{now.path}: is not what notebook 01 loaded any more", found=found, remedy="run notebook 01 again"
+        )
+    if (layout := again.recordings.layout.words()) != stage["metrics"]["recordings"].get("layout", layout):
+        raise RoverError(
+            f"{again.recordings.root}: says something else of its numbers than when notebook 01 loaded it",
+            found=layout,
+            remedy="run notebook 01 again",
         )
     if again.parts.episodes != stage["metrics"]["split"]:
         raise RoverError(

@@ -12,6 +12,7 @@ from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
+from rover_lib.workshop.observe import calibrate
 
 SETTINGS = {
     "learning_rate": 1e-4, "batch_size": 4, "data_dir": "episodes", "output_dir": "fast", "device": "cpu", "seed": 0
@@ -67,6 +68,17 @@ def test_lerobots_folder(config, weights, tmp_path, norms):
     ours = predictions(ACT(read.config, read.weights), [inputs_of(sample, config)])[0]
     assert (ours - expected).abs().max() < 1e-5
     assert (lerobots_chunk(tmp_path / "pretrained_model", sample, config) - expected).abs().max() < 1e-5
+
+
+def test_other_statistics_beside_the_same_weights_are_another_policy(config, weights, tmp_path):
+    made = {}
+    for name, throttle in (("as it was", 0.02), ("again", 0.02), ("corrected", 0.03)):
+        norms = {"action_unnorm": Affine((0.4, throttle), (0.1, 0.05))}
+        write_lerobot(tmp_path / name, replace(config, **norms), weights, ORIGIN)
+        made[name] = load_checkpoint(tmp_path / name)
+    was, again, corrected = made.values()
+    assert was.sha256 == corrected.sha256 and was.identity == again.identity != corrected.identity
+    assert calibrate(was, memory_samples(2)).checkpoint == was.identity
 
 
 def test_the_trainers_format_has_no_place_for_normalised_actions(config, weights, tmp_path):

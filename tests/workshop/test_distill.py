@@ -15,7 +15,9 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import load_policy
 from rover_lib.workshop import distill as distill_module
 from rover_lib.workshop import training
+from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint_files import write_lerobot
 from rover_lib.workshop.distill import Recipe, distill, summary
 from rover_lib.workshop.student import StudentShape
 
@@ -151,6 +153,23 @@ def test_the_next_student_of_the_same_picture_asks_nothing_again(teacher, episod
     assert len(kinds) == 8 + 3  # no backbone
     assert (tmp_path / "first" / "best_model.pth").read_bytes() == before
     assert [p.name.split("-")[0] for p in (tmp_path / "cache").iterdir()] == ["lessons"]
+
+
+@pytest.mark.slow
+def test_a_teacher_with_other_statistics_is_asked_again(teacher, episodes, recipe, tmp_path, monkeypatch):
+    """Its weights are the same: what it planned with the wrong statistics lies in the cache."""
+    was = load_checkpoint(teacher)
+    plans, rows = [], np.arange(2 * recipe.samples)
+    monkeypatch.setattr(distill_module, "_refuse_strangers", lambda room: plans.append(room.lessons.plans[rows]))
+    for shift in (0.0, 0.02, 0.02):
+        config = replace(was.config, action_unnorm=Affine((1.0, 1.0), (0.0, shift)))
+        write_lerobot(tmp_path / "teacher", config, was.weights, {})
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            interrupt(patch, distill_module, "_train_backbone")
+            distill(tmp_path / "teacher", episodes, "fast", SHAPE, runs_dir=tmp_path, recipe=recipe, device="cpu")
+    before, corrected, again = plans
+    assert corrected[..., 1] - before[..., 1] == pytest.approx(0.02, abs=1e-6)
+    assert np.array_equal(corrected, again)
 
 
 @pytest.mark.slow

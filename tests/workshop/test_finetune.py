@@ -21,7 +21,9 @@ from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import finetune as finetune_module
+from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint_files import write_lerobot
 from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.finetune import Recipe, finetune, human_samples
 from rover_lib.workshop.samples import Episode, Sample
@@ -249,6 +251,22 @@ def test_new_demonstrations_alone_are_learned_from_too(checkpoint, old, recipe, 
     metrics = read_stage(folder / "finetune.json", "finetune")["metrics"]
     assert metrics["learned_from"]["corrections"] == 0 and metrics["learned_from"]["new_demonstrations"] == 20
     assert {row["kind"] for row in metrics["held_out"]} == {"old"}
+
+
+@pytest.mark.slow
+def test_a_policy_with_other_statistics_is_asked_again(checkpoint, old, new, recipe, tmp_path, monkeypatch):
+    """Its weights are the same: what it planned with the wrong statistics lies in the cache."""
+    was = load_checkpoint(checkpoint)
+    plans, rows = [], np.arange(2 * recipe.samples)
+    monkeypatch.setattr(finetune_module, "_refuse_strangers", lambda work, each: plans.append(each.plans[rows]))
+    for shift in (0.0, 0.02):
+        config = replace(was.config, action_unnorm=Affine((1.0, 1.0), (0.0, shift)))
+        write_lerobot(tmp_path / "parent", config, was.weights, {})
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            interrupt(patch, finetune_module, "_train")
+            finetune(tmp_path / "parent", [old, new], "better", runs_dir=tmp_path, recipe=recipe, device="cpu")
+    before, corrected = plans
+    assert corrected[..., 1] - before[..., 1] == pytest.approx(0.02, abs=1e-6)
 
 
 # --- what cannot be ---

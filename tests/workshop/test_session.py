@@ -1,0 +1,49 @@
+"""A run goes on from what its notebook 01 loaded, and from nothing else."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from recorded import record_drives
+
+from rover_lib.onboard.errors import RoverError
+from rover_lib.workshop.act import Affine
+from rover_lib.workshop.checkpoint_files import write_lerobot
+from rover_lib.workshop.pipeline import write_load
+from rover_lib.workshop.session import load, opened
+
+
+@pytest.fixture
+def written(tiny, tmp_path):
+    """Writes the tiny policy as a LeRobot folder whose throttle has that scale."""
+
+    def write(scale):
+        config = replace(tiny.config, action_unnorm=Affine((0.4, scale), (0.1, 0.05)))
+        write_lerobot(tmp_path / "pretrained_model", config, tiny.weights, {})
+        return tmp_path / "pretrained_model"
+
+    return write
+
+
+@pytest.mark.slow
+def test_statistics_that_changed_since_are_refused(written, tmp_path):
+    """Of the same weights: the plans of an artifact that is made now would be other ones than the run judged."""
+    drives = record_drives(tmp_path / "episodes", frames=40)
+    write_load(tmp_path, load(written(0.02), drives))
+    assert opened(tmp_path).checkpoint.config.action_unnorm.scale == pytest.approx((0.4, 0.02))
+    written(0.03)
+    with pytest.raises(RoverError, match="not what notebook 01 loaded any more, found the same weights, and another"):
+        opened(tmp_path)
+
+
+@pytest.mark.slow
+def test_recordings_that_now_name_their_numbers_otherwise_are_refused(written, tmp_path):
+    drives = record_drives(tmp_path / "episodes", frames=40)
+    write_load(tmp_path, load(written(0.02), drives))
+    stage = json.loads((tmp_path / "load.json").read_text())
+    stage["metrics"]["recordings"]["layout"] = (
+        "camera: the car's; state: throttle, steering; action: steering, throttle"
+    )
+    (tmp_path / "load.json").write_text(json.dumps(stage))
+    with pytest.raises(RoverError, match="says something else of its numbers"):
+        opened(tmp_path)
