@@ -418,6 +418,7 @@ def rovers(
 
 
 def in_parallel(task: Callable[[DeploymentBench], Any], benches: Sequence[DeploymentBench]) -> list[Any]:
+    """What the task returns for each rover. Where one raises, all rovers are switched off, and that is raised."""
     with ThreadPoolExecutor(len(benches)) as pool:
         futures = [pool.submit(task, bench) for bench in benches]
         try:
@@ -431,6 +432,7 @@ def in_parallel(task: Callable[[DeploymentBench], Any], benches: Sequence[Deploy
 
 
 def give_first_model(benches: Sequence[DeploymentBench]) -> None:
+    """Deploys to the rovers that have none of our models in use. Raises EmulationError if that fails."""
     without = [bench for bench in benches if bench.mode_in_use()[0] not in bench.artifacts]
     if not without:
         return

@@ -310,6 +310,7 @@ class Kit:
         folder.mkdir()
 
     def write(self, samples: Sequence[Sample], recipe: Recipe) -> dict[str, Any]:
+        """All files of the kit; the content of kit.json. samples: those that calibrate. recipe: of the parity."""
         for name, model in (("backbone", self.front.model), ("whole", self.whole.model), ("transformer", self.rest)):
             onnx.save(model, self.folder / f"{name}.onnx")
         self._calibrate(samples)
@@ -550,6 +551,7 @@ class Estimate:
 
 
 def estimate(network: Network, chip: Chip) -> Estimate:
+    """Time of one inference on that chip, computed from the zoo's rates of alike networks; nobody has measured it."""
     gop = 2 * network.macs / 1e9
     slow = DETR_GOP * chip.detr
     words = f"{gop:.1f} GOP / ({DETR_GOP} GOP x {chip.detr:g}/s) = {1000 * gop / slow:.1f} ms"
@@ -622,6 +624,7 @@ def model_script(network: Network, chip: Chip, config: ActConfig, samples: int) 
 
 
 def compile_script(chip: Chip) -> str:
+    """compile_<chip>.sh."""
     return f"""#!/bin/sh
 # sh compile_{chip.name}.sh [backbone|whole], where Hailo's Dataflow Compiler {chip.compiler}.x is installed
 exec python3 "$(dirname "$0")/compile.py" {chip.name} "${{1:-backbone}}"

@@ -340,6 +340,7 @@ def observed_graph(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibrat
 
 
 def scaled_model(checkpoint: Checkpoint, calibration: Calibration, *, for_int8: bool) -> ACT:
+    """The float policy with the calibration's channel scales, if it has some. for_int8: as of ACT."""
     model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
     if calibration.smooth is not None:
         apply_channel_scales(model, calibration.channels, calibration.smooth)

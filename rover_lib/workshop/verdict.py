@@ -388,6 +388,7 @@ def _because(
 
 
 def against(row: Mapping[str, Any]) -> str:
+    """A gate that was judged, in words: what it is of, what was found, and the limit."""
     return (
         f"{row['words']}: {row['found']:.3g}, {'at least' if row['relation'] == '>=' else 'at most'} {row['limit']:g}"
     )
@@ -430,6 +431,7 @@ def _cautions(
 
 
 def count(number: int, what: str) -> str:
+    """A number of things in words, such as 2 episodes."""
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 

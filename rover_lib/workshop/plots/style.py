@@ -193,12 +193,14 @@ def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:
 
 
 def simd_bars(ax: Axes, y: np.ndarray, total: np.ndarray, simd: np.ndarray) -> None:
+    """Bars of instructions, parted into SIMD and others. y: places, total, simd: in 10^9, (n,) each."""
     ax.barh(y, simd, color=SLATE, label="SIMD (vector) instructions")
     ax.barh(y, total - simd, left=simd, color=MIST, label="all others")
     bar_values(ax, y, total, "{:.3g}")
 
 
 def action_colour(key: str, index: int) -> str:
+    """Of an action, or of a key that begins with one, such as steering_mae_pct. index: for one without its own."""
     return COLOURS.get(key.split("_")[0], OTHERS[index % len(OTHERS)])
 
 
