@@ -672,8 +672,15 @@ class Normaliser:
             if self.old:
                 span = b - a if inverse else b - a + self.eps
             scale, shift = (span / 2, a + span / 2) if inverse else (2 / span, -2 * a / span - 1)
-        if not (torch.isfinite(scale).all() and torch.isfinite(shift).all()):
+        if not (torch.isfinite(scale.float()).all() and torch.isfinite(shift.float()).all()):  # as they are used
             raise CheckpointError(f"{self.where}: statistics of '{key}' are not finite", remedy="compute them again")
+        if (wrong := b < 0 if mode == "MEAN_STD" else b < a).any():
+            what = "a negative std" if mode == "MEAN_STD" else f"a {pairs[mode][0]} above its {pairs[mode][1]}"
+            raise CheckpointError(
+                f"{self.where}: statistics of '{key}' have {what}, which would turn it around",
+                found=f"{a[wrong].tolist()} and {b[wrong].tolist()}",
+                remedy="compute them again",
+            )
         return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
 
     def _would_be_raw(self, key: str, kind: str, mode: str | None, stats: Mapping[str, Tensor]) -> CheckpointError:
