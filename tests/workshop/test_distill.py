@@ -10,7 +10,7 @@ from interrupted import interrupt, save_each_step
 from policies import TINY, lerobot_policy, of_a_cars_size, trainer_content
 from recorded import record_drives
 
-from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.errors import DistillError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import load_policy
 from rover_lib.workshop import distill as distill_module
@@ -65,7 +65,7 @@ def test_what_is_left_is_one_policy_in_two_formats(taught, teacher):
     assert (ours.config.decoder_layers, ours.config.feedforward) == (1, 64)
     assert all(torch.equal(weight, lerobots.weights[name]) for name, weight in ours.weights.items())
     origin = json.loads((taught / "pretrained_model" / "origin.json").read_text())
-    assert origin == ours.report["trainer_config"]["origin"]
+    assert origin == ours.report["trainer_config"]["origin"] | {"rate_hz": 30.0}
     assert origin["teacher_sha256"] == load_checkpoint(teacher).sha256
     assert origin["distilled_by"]["transformer_steps"] == 8
     files = ["best_model.pth", "distill.json", "policy_static.pt", "pretrained_model"]
@@ -173,6 +173,21 @@ def test_a_teacher_with_other_statistics_is_asked_again(teacher, episodes, recip
 
 
 @pytest.mark.slow
+def test_a_student_may_be_called_teacher_and_its_name_is_one_process(teacher, episodes, recipe, tmp_path, monkeypatch):
+    real, arguments = distill_module._taught, {"runs_dir": tmp_path, "recipe": recipe.of_steps(4), "device": "cpu"}
+
+    def while_another_starts(work):
+        with pytest.raises(RoverError, match="another process is at work in it"):
+            distill(teacher, episodes, "teacher", SHAPE, **arguments)
+        return real(work)
+
+    monkeypatch.setattr(distill_module, "_taught", while_another_starts)
+    folder = distill(teacher, episodes, "teacher", SHAPE, **arguments)
+    rows = json.loads((folder / "distill.json").read_text())["metrics"]["students"]
+    assert [row["name"] for row in rows] == ["teacher", "teacher"] and rows[0]["gmac"] > rows[1]["gmac"]
+
+
+@pytest.mark.slow
 def test_it_learns_what_its_teacher_plans(teacher, episodes, recipe, tmp_path):
     longer = replace(recipe, backbone_steps=1, transformer_steps=60, together_steps=1, to_recorded=0.0)
     folder = distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path, recipe=longer, device="cpu")
@@ -220,6 +235,7 @@ def test_a_teacher_of_another_car_is_refused(episodes, recipe, tmp_path):
         ({"shape": StudentShape()}, "would be its teacher"),
         ({"shape": StudentShape(54, 96), "device": "tpu"}, "device must be"),
         ({"shape": StudentShape(54, 96), "name": "../fast"}, "plain folder name"),
+        ({"shape": StudentShape(54, 96), "name": ""}, "plain folder name"),
         ({"shape": StudentShape(54, 96), "recipe": Recipe(**{**params()["distill"], "seed": -1})}, "seed must be"),
     ],
 )
