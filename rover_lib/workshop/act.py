@@ -77,7 +77,7 @@ class ActConfig:
     dilation: bool = False
     pre_norm: bool = False
     activation: str = "relu"
-    rate_hz: float = 30.0
+    rate_hz: float = 30.0  # steps of a plan in a second
     image_norm: tuple[Affine, ...] = field(default_factory=lambda: (imagenet(),))  # of pixels in [0, 1]
     state_norm: Affine | None = None
     action_unnorm: Affine | None = None

@@ -35,6 +35,7 @@ TRAINER_KEYS = {  # of the trainer's config: what the shape of the policy needs
 }  # fmt: skip
 TRAINER_CAMERA = "cam_front"
 TWO_ACTIONS = ("steering", "throttle")
+RATE_HZ = 30.0  # of a plan's steps, where nothing says it: the trainer's recordings
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)  # what weights and statistics can be
 BEFORE_ZIP = bytes.fromhex("80028a0a6cfc9c46f9206aa85019")  # first bytes of what torch.save wrote before 1.6
 
@@ -127,10 +128,11 @@ class Checkpoint:
 
         LeRobot's checkpoints say neither what their numbers are, nor in what order, nor how many plans' steps make a
         second: the dataset that they were trained on does. So their weights are put into the recordings' order. The
-        trainer's files, and what we write, are always of [steering, throttle], 30 times a second.
+        trainer's files, and what we write, are always of [steering, throttle] and of a known rate, the trainer's 30 a
+        second.
 
         Raises CheckpointError for another count of cameras, states or actions than recorded, and for one of those
-        policies if the recordings have another rate.
+        policies if the recordings have another rate or other names.
         """
         c, rate_hz = self.config, layout.rate_hz
         has = len(c.cameras), len(c.state_names), len(c.action_names)
@@ -149,6 +151,13 @@ class Checkpoint:
                     f"{self.path}: plans {c.rate_hz:g} steps a second",
                     found=f"recordings of {rate_hz:g} frames a second",
                     remedy="give recordings of that rate",
+                )
+            pairs = (c.state_names, layout.state_names), (c.action_names, layout.action_names)
+            if any(own == TWO_ACTIONS != recorded_names for own, recorded_names in pairs):
+                raise CheckpointError(
+                    f"{self.path}: a policy of {listed(TWO_ACTIONS)}",
+                    found=f"recordings of state {listed(layout.state_names)} and action {listed(layout.action_names)}",
+                    remedy="if they are the same, say so in the order of the recordings' numbers: --action-names",
                 )
             return self
 
@@ -495,6 +504,7 @@ def _load_lerobot(folder: Path) -> Checkpoint:
         image_norm=tuple(inner.affine(c, "VISUAL", 3) or Affine((1.0,) * 3, (0.0,) * 3) for c in sizes),
         state_norm=inner.affine("observation.state", "STATE", states[0]),
         action_unnorm=outer.affine("action", "ACTION", actions[0], inverse=True),
+        rate_hz=_own_rate_hz(folder),
     )
     for name, shape, size in (
         ("observation.state", states, len(config.state_names)),
@@ -511,6 +521,18 @@ def _load_lerobot(folder: Path) -> Checkpoint:
         "written_here": (folder / ORIGIN).exists(),
     }
     return _checked(folder, "lerobot", config, weights, sha256_of(file), file.stat().st_size, extra)
+
+
+def _own_rate_hz(folder: Path) -> float:
+    """Steps of a plan in a second: what we noted in a folder that we wrote, else the usual."""
+    if not (folder / ORIGIN).exists():
+        return RATE_HZ
+    rate_hz = _read_json(folder / ORIGIN).get("rate_hz", RATE_HZ)
+    if isinstance(rate_hz, bool) or not isinstance(rate_hz, (int, float)) or not 0 < rate_hz <= 1000:
+        raise CheckpointError(
+            f"{folder / ORIGIN}: 'rate_hz' must be above 0 and at most 1000", found=shown(rate_hz), remedy=COPY_AGAIN
+        )
+    return float(rate_hz)
 
 
 def _features(folder: Path, raw: Mapping[str, Any], key: str) -> dict[str, tuple[str, list[int]]]:
@@ -672,8 +694,15 @@ class Normaliser:
             if self.old:
                 span = b - a if inverse else b - a + self.eps
             scale, shift = (span / 2, a + span / 2) if inverse else (2 / span, -2 * a / span - 1)
-        if not (torch.isfinite(scale).all() and torch.isfinite(shift).all()):
+        if not (torch.isfinite(scale.float()).all() and torch.isfinite(shift.float()).all()):  # as they are used
             raise CheckpointError(f"{self.where}: statistics of '{key}' are not finite", remedy="compute them again")
+        if (wrong := b < 0 if mode == "MEAN_STD" else b < a).any():
+            what = "a negative std" if mode == "MEAN_STD" else f"a {pairs[mode][0]} above its {pairs[mode][1]}"
+            raise CheckpointError(
+                f"{self.where}: statistics of '{key}' have {what}, which would turn it around",
+                found=f"{a[wrong].tolist()} and {b[wrong].tolist()}",
+                remedy="compute them again",
+            )
         return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
 
     def _would_be_raw(self, key: str, kind: str, mode: str | None, stats: Mapping[str, Tensor]) -> CheckpointError:

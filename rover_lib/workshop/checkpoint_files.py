@@ -1,11 +1,11 @@
 """Checkpoints out: a policy's weights as the trainer's best_model.pth, and as LeRobot's pretrained_model/ folder.
 
-`checkpoint` reads both again. `origin` goes into both: where the weights come from, as plain JSON.
+`checkpoint` reads both again. `origin` goes into both: where the weights come from, as plain JSON. In LeRobot's folder
+it also says how many steps of a plan make a second, for which neither format has a place.
 """
 
 import contextlib
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,18 +14,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
-from rover_lib.workshop.checkpoint import ORIGIN
+from rover_lib.workshop.alone import alone_in
+from rover_lib.workshop.checkpoint import ORIGIN, RATE_HZ
 from rover_lib.workshop.training import trainer_config
 
 EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
 
 
 def trainer_can_hold(config: ActConfig) -> bool:
-    """Whether the trainer's format has a place for this policy's normalisation: ImageNet's of one camera, no other."""
-    return config.image_norm == (imagenet(),) and config.state_norm is None and config.action_unnorm is None
+    """Whether the trainer's format has a place for this policy: 30 steps a second, ImageNet's normalisation of one
+    camera, no other.
+    """
+    normal = config.image_norm == (imagenet(),) and config.state_norm is None and config.action_unnorm is None
+    return normal and config.rate_hz == RATE_HZ
 
 
 def write_trainer(
@@ -39,12 +43,12 @@ def write_trainer(
     """One file in the format of the user's trainer. weights: LeRobot's names without the leading `model.`. settings: of
     its training, as `training.trainer_config` wants them.
 
-    No optimizer state: it was of another loss. Raises CheckpointError for a policy whose normalisation that format
-    cannot hold: it knows ImageNet's for the picture, and none for states and actions.
+    No optimizer state: it was of another loss. Raises CheckpointError for a policy whose rate or normalisation that
+    format cannot hold: it knows ImageNet's for the picture, and none for states and actions.
     """
     if not trainer_can_hold(config):
         raise CheckpointError(
-            f"{path}: the trainer's format has no place for this policy's normalisation",
+            f"{path}: the trainer's format has no place for this policy's normalisation or rate",
             remedy="use LeRobot's folder",
         )
     content = {
@@ -82,7 +86,7 @@ def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], o
     policy.save_pretrained(folder)
     for processor in make_act_pre_post_processors(policy.config, stats):
         processor.save_pretrained(folder)
-    (folder / ORIGIN).write_text(json.dumps(origin, indent=2) + "\n")
+    (folder / ORIGIN).write_text(json.dumps(origin | {"rate_hz": config.rate_hz}, indent=2) + "\n")
 
 
 def write_both(
@@ -108,15 +112,15 @@ def write_both(
 def made_beside(folder: Path, last: str) -> Iterator[Path]:
     """A hidden folder beside a run's, empty: what is in it when the block ends well moves into the run's folder, the
     file `last` last. Nothing does otherwise, and the hidden one goes.
+
+    Raises RoverError where the run's folder is a file, and while another process makes a run of that name.
     """
-    new = folder.with_name(f".{folder.name}.made")  # not `.new`, in which a run of that name may wait to go on
-    shutil.rmtree(new, ignore_errors=True)  # of a process that was killed
-    new.mkdir(parents=True)
-    try:
+    if folder.exists() and not folder.is_dir():
+        raise RoverError(f"{folder}: is a file, and not a run's folder", remedy="give another --name")
+    # not `.new`, in which a run of that name may wait to go on
+    with alone_in(folder.with_name(f".{folder.name}.made")) as new:
         yield new
         _take_place(new, folder, last)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
 
 
 def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
@@ -130,6 +134,11 @@ def _take_place(new: Path, folder: Path, last: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for path in sorted(new.iterdir(), key=lambda p: p.name == last):
         place, old = folder / path.name, new / f"{path.name}.old"
-        if place.is_dir():
-            place.rename(old)
-        path.rename(place)
+        try:
+            if place.is_dir() or (place.exists() and path.is_dir()):
+                place.rename(old)
+            path.rename(place)
+        except BaseException:
+            if old.exists() and not place.exists():
+                old.rename(place)
+            raise

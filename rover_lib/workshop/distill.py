@@ -112,7 +112,7 @@ def distill(
     Ended at any moment and started again with the same arguments, it goes on and gives the same student. What was
     in the run's folder before stays until the new is whole.
     Raises DistillError for a student, a device or recordings that cannot be; CheckpointError, EpisodeError,
-    TrainingError.
+    TrainingError; RoverError while another process makes a run of that name.
     """
     folder, where = run_folder(runs_dir, name, DistillError), training_device(device, DistillError)
     recipe = recipe or Recipe(**params()["distill"])
@@ -125,8 +125,14 @@ def distill(
     if work.is_teacher and not qat:
         remedy = "give it a smaller picture or fewer layers, or train it for INT8 with --qat"
         raise DistillError("this student would be its teacher", remedy=remedy)
-    with threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()):
-        return _leave(folder, work, _taught(work))
+    with (
+        made_beside(folder, "distill.json") as new,
+        threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()),
+    ):
+        taught = _taught(work)
+        _leave(new, name, work, taught)
+    shutil.rmtree(taught.folder)
+    return folder
 
 
 @dataclass(frozen=True, eq=False)
@@ -451,28 +457,25 @@ def summary(content: dict[str, Any]) -> str:
 # --- what is left in the run's folder ---------------------------------------------------------------------------------
 
 
-def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
-    """Judge the student, and put its files and distill.json into the run's folder, each whole or not at all."""
+def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
+    """Judge the student, and write its files and distill.json into a folder that will be the run's of that name."""
     teacher, parts, action_range = work.teacher, work.opened.parts, work.opened.recordings.action_range()
     held_out = thinned(parts.held_out, work.recipe.judged_frames)
     choosing = thinned(parts.choosing, work.recipe.judged_frames)
-    plans = {
-        "teacher": _plans(work, teacher.config, teacher.weights, held_out),
-        folder.name: _plans(work, work.config, taught.weights, held_out),
-    }
-    configs = {"teacher": teacher.config, folder.name: work.config}
+    planned = _plans(work, teacher.config, teacher.weights, held_out)
+    own = _plans(work, work.config, taught.weights, held_out)
     students = [
-        _row(name, configs[name], work.qat and name != "teacher")
-        | errors_of(planned, plans["teacher"], held_out, action_range)
-        for name, planned in plans.items()
+        _row(called, config, qat) | errors_of(plans, planned, held_out, action_range)
+        for called, config, qat, plans in (
+            ("teacher", teacher.config, False, planned),
+            (name, work.config, work.qat, own),
+        )
     ]
     rounded, calibration = _rounded(work, taught.weights)
-    students[1] |= _int8_errors(work, taught.weights, rounded, held_out, plans["teacher"])
+    students[1] |= _int8_errors(work, taught.weights, rounded, held_out, planned)
     unrounded = None
     if taught.unrounded:
-        unrounded = _int8_errors(
-            work, taught.unrounded, _rounded(work, taught.unrounded)[0], held_out, plans["teacher"]
-        )
+        unrounded = _int8_errors(work, taught.unrounded, _rounded(work, taught.unrounded)[0], held_out, planned)
     chosen = _plans(work, work.config, taught.weights, choosing)
     driven = ~np.stack([s.is_pad for s in choosing])
     loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
@@ -482,35 +485,32 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
         "learning_rate": work.recipe.rate,
         "batch_size": work.recipe.batch,
         "data_dir": work.opened.recordings.root.name,
-        "output_dir": folder.name,
+        "output_dir": name,
         "device": work.device.type,
         "seed": work.recipe.seed,
     }
-    with made_beside(folder, "distill.json") as new:
-        hashes = write_both(new, work.config, taught.weights, loss, origin, **settings)
-        student = load_checkpoint(new / ("best_model.pth" if "best_model.pth" in hashes else "pretrained_model"))
-        samples, parity = thinned(parts.choosing, quantization.CHOOSING_FRAMES), quantization.Recipe.of(params()).parity
-        export(rounded, student, new / "policy_static.pt", samples, calibration, parity)
-        write_stage(
-            new / "distill.json",
-            "distill",
-            params=recipe,
-            metrics={
-                "students": students,
-                "losses": taught.losses,
-                "feed_forward": taught.narrowed,
-                "before_qat": unrounded,
-                "gates": [_quantization_gate(students[1])],
-                "judged_frames": len(held_out),
-                "held_out_episodes": parts.episodes["held_out"],
-                "warnings": not_judged(action_range),
-                "note": NOBODY_DROVE,
-                "files_sha256": hashes,
-            },
-            inputs={teacher.path.name: teacher.sha256} | work.opened.recordings.hashes(),
-        )
-    shutil.rmtree(taught.folder)
-    return folder
+    hashes = write_both(new, work.config, taught.weights, loss, origin, **settings)
+    student = load_checkpoint(new / ("best_model.pth" if "best_model.pth" in hashes else "pretrained_model"))
+    samples, parity = thinned(parts.choosing, quantization.CHOOSING_FRAMES), quantization.Recipe.of(params()).parity
+    export(rounded, student, new / "policy_static.pt", samples, calibration, parity)
+    write_stage(
+        new / "distill.json",
+        "distill",
+        params=recipe,
+        metrics={
+            "students": students,
+            "losses": taught.losses,
+            "feed_forward": taught.narrowed,
+            "before_qat": unrounded,
+            "gates": [_quantization_gate(students[1])],
+            "judged_frames": len(held_out),
+            "held_out_episodes": parts.episodes["held_out"],
+            "warnings": not_judged(action_range),
+            "note": NOBODY_DROVE,
+            "files_sha256": hashes,
+        },
+        inputs={teacher.path.name: teacher.sha256} | work.opened.recordings.hashes(),
+    )
 
 
 def _quantization_gate(student: dict[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,6 @@ drive came out, by LeRobot's `next.success`, `next.reward` and `next.done`.
 
 import json
 import os
-import shutil
 import warnings
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -30,6 +29,7 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.recording import HIT, HUMAN, NOBODY, POLICY
+from rover_lib.workshop.alone import alone_in
 from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.lerobot_dataset import (
     ACTION,
@@ -64,10 +64,10 @@ def export_dataset(
     video: AV1, LeRobot's usual, far smaller and not equal to the last bit; else PNG in parquet, which is. size:
     (height, width) of the pictures, resized as a rover resizes what its camera gives; None: as recorded. The folder
     appears when it is whole. Raises EpisodeError for recordings that cannot be used, of several rates or, without a
-    size, of several picture sizes, and for a folder that is there.
+    size, of several picture sizes, and for a folder that is there; RoverError while another process makes it.
     """
     out = Path(out)
-    if out.exists():
+    if out.exists() or out.is_symlink():
         raise EpisodeError(f"{out}: is there already", remedy="give a new folder, or remove it")
     if size and not SIDES_PX[0] <= min(size) <= max(size) <= SIDES_PX[1]:
         raise EpisodeError(
@@ -77,14 +77,11 @@ def export_dataset(
     if recordings.layout.rate_hz is not None:
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = _rate_hz(recordings)
-    new = out.with_name(f".{out.name}.new")
-    shutil.rmtree(new, ignore_errors=True)
-    try:
+    with alone_in(out.with_name(f".{out.name}.new")) as beside:
+        new = beside / out.name
         report = _write(recordings, new, rate_hz, video, size, progress)
         (new / REPORT).write_text(json.dumps(report, indent=2) + "\n")
         new.rename(out)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
     return report
 
 
@@ -145,7 +142,7 @@ def _write(
     said = _Said.of(recordings)
     picture = {"dtype": "video" if video else "image", "shape": shape, "names": ["height", "width", "channels"]}
     dataset = LeRobotDataset.create(
-        repo_id=f"local/{root.name.strip('.').removesuffix('.new')}",
+        repo_id=f"local/{root.name}",
         fps=rate_hz,
         features={f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers, **said.features},
         root=root,

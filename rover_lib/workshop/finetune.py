@@ -15,6 +15,7 @@ a fiftieth of the rate. The run's folder gets best_model.pth, pretrained_model/ 
 Letters: n samples, B batch, C chunk, A actions.
 """
 
+import math
 import shutil
 import sys
 import zlib
@@ -55,11 +56,12 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run_folder import run_folder
 from rover_lib.workshop.samples import Episode, Recordings, Sample, Source
 from rover_lib.workshop.session import SMALL_GMAC, training_device
-from rover_lib.workshop.student import gmac
+from rover_lib.workshop.student import gmac, not_a_cars
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 
 OLD, NEW = "old", "new"
 TOGETHER_SLOWER = 50  # times the first phase's rate: a backbone that sees is not to be unlearned
+OTHER_RATE = 0.2  # of the time between two frames
 FADED = (0.1, 1.0)  # shares of new recordings' steering that stay in their states
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonstrations", "corrections")
 
@@ -94,6 +96,8 @@ class Recipe:
         counts = self.samples, self.batch, self.judged_frames
         if min(counts) < 1 or min(self.transformer_steps, self.together_steps, self.seed) < 0:
             raise FinetuneError("samples, batch and frames must be at least 1, steps and seed at least 0", found=self)
+        if not all(map(math.isfinite, (self.rate, self.correction_weight, self.focus))):
+            raise FinetuneError("rate, correction_weight and focus must be finite", found=self)
         if not (self.rate > 0 and self.correction_weight > 0 and self.focus >= 0):
             raise FinetuneError("rate and correction_weight must be above 0, focus at least 0", found=self)
         if not (0 <= self.held_out_share < 1 and 0 <= self.to_parent <= 1):
@@ -129,16 +133,28 @@ def finetune(
     Ended at any moment and started again with the same arguments, it goes on and gives the same policy; the folder
     appears when all is there.
     Raises FinetuneError for a name, a device or recordings that cannot be; CheckpointError, EpisodeError,
-    TrainingError.
+    TrainingError; RoverError while another process makes a run of that name.
     """
     folder, where = run_folder(runs_dir, name, FinetuneError), training_device(device, FinetuneError)
     if folder.exists():
-        raise FinetuneError(f"{folder}: is there already", remedy="give another --name, or move that run away")
+        raise _is_there(folder)
     recipe = recipe or Recipe.of(params())
     parent, material = _opened(checkpoint, episodes, recipe, progress)
     work = _Work(parent, material, recipe, where, progress)
-    with threads(1 if gmac(parent.config) < SMALL_GMAC else torch.get_num_threads()):
-        return _leave(folder, work, _taught(work))
+    with (
+        made_beside(folder, "finetune.json") as new,
+        threads(1 if gmac(parent.config) < SMALL_GMAC else torch.get_num_threads()),
+    ):
+        if folder.exists():  # by another process, just now
+            raise _is_there(folder)
+        taught = _taught(work)
+        _leave(new, name, work, taught)
+    shutil.rmtree(taught.folder)
+    return folder
+
+
+def _is_there(folder: Path) -> FinetuneError:
+    return FinetuneError(f"{folder}: is there already", remedy="give another --name, or move that run away")
 
 
 # --- what is learned from ---------------------------------------------------------------------------------------------
@@ -205,12 +221,8 @@ def _opened(
             remedy="give the checkpoint that it was made of: best_model.pth, or LeRobot's pretrained_model folder",
         )
     parent = load_checkpoint(checkpoint)
+    _refuse_no_car(parent)
     c = parent.config
-    if len(c.cameras) != 1 or c.state_names != c.action_names or len(c.action_names) != 2:
-        raise FinetuneError(
-            f"{parent.path}: only a policy of one camera, steering and throttle can learn from recordings of a car",
-            found=f"{len(c.cameras)} cameras, {len(c.state_names)} states and {len(c.action_names)} actions",
-        )
     sources = [Source.of(each) for each in episodes]
     if not sources:
         raise FinetuneError("there are no recordings to learn from", remedy="give the old ones, then the new ones")
@@ -222,10 +234,12 @@ def _opened(
     policies = [parent.recorded_as(recordings.layout) for recordings in read]
     if any(policy.config != policies[0].config for policy in policies):
         raise FinetuneError(
-            "the recordings name or order their states and actions differently", found=", ".join(places)
+            "the recordings name, order or time their states and actions differently", found=", ".join(places)
         )
+    _refuse_no_car(policies[0])
     _refuse_another_car(read)
     _refuse_another_camera(read)
+    _refuse_another_rate(read, policies[0].config.rate_hz)
     return policies[0], _parted(read, recipe)
 
 
@@ -280,6 +294,15 @@ def _driven_by_humans(samples: Sequence[Sample], episodes: Sequence[Episode]) ->
     return tuple(s for e in episodes if e.id in names for s in human_samples(e) if (s.episode, s.row) in wanted)
 
 
+def _refuse_no_car(policy: Checkpoint) -> None:
+    if found := not_a_cars(policy.config):
+        raise FinetuneError(
+            f"{policy.path}: only a policy of one camera, steering and throttle can learn from recordings of a car",
+            found=found,
+            remedy="if it is one, name its numbers so in the dataset's meta/info.json",
+        )
+
+
 def _refuse_another_car(read: Sequence[Recordings]) -> None:
     first = read[0].episodes[0]
     car = recorded_car(first.path)
@@ -303,6 +326,19 @@ def _refuse_another_camera(read: Sequence[Recordings]) -> None:
                 found=f"{own_width}x{own_height} beside {width}x{height}",
                 remedy="a policy looks through one camera: give recordings of that one alone",
             )
+
+
+def _refuse_another_rate(read: Sequence[Recordings], rate_hz: float) -> None:
+    """A plan's steps are frames: of 15 a second, the car would do in half the time what the human did."""
+    for recordings in read:
+        for episode in recordings.episodes:
+            steps_s = np.diff([s.time_s for s in episode.samples]) / np.diff([s.row for s in episode.samples])
+            if len(steps_s) and abs(float(np.median(steps_s)) * rate_hz - 1) > OTHER_RATE:
+                raise FinetuneError(
+                    f"{episode.path}: the policy plans {rate_hz:g} steps a second",
+                    found=f"{episode.id} of {1 / np.median(steps_s):.1f} frames a second",
+                    remedy="give recordings of that rate alone: a camera halves its own in the dark",
+                )
 
 
 # --- learning ---------------------------------------------------------------------------------------------------------
@@ -529,8 +565,8 @@ def _judged(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
     return judged
 
 
-def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
-    """Judge the policy and leave its files and finetune.json in the run's folder, which appears whole or not at all."""
+def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
+    """Judge the policy, and write its files and finetune.json into a folder that will be the run's of that name."""
     parent, material, recipe = work.parent, work.material, work.recipe
     judged = _judged(work, taught.weights)
     errors = [e for each in judged if each.kind == OLD for e in each.after.values() if e is not None]
@@ -540,27 +576,24 @@ def _leave(folder: Path, work: _Work, taught: _Taught) -> Path:
         "learning_rate": recipe.rate,
         "batch_size": recipe.batch,
         "data_dir": material.recordings[-1].root.name,
-        "output_dir": folder.name,
+        "output_dir": name,
         "device": work.device.type,
         "seed": recipe.seed,
     }
     loss = float(np.mean(errors)) / 100 if errors else float("nan")
-    with made_beside(folder, "finetune.json") as new:
-        hashes = write_both(new, parent.config, taught.weights, loss, origin, **settings)
-        write_stage(
-            new / "finetune.json",
-            "finetune",
-            params=described,
-            metrics={
-                "learned_from": {kind: material.count(kind) for kind in KINDS} | {"not_imitated": material.left_out},
-                "held_out": [each.row() for each in judged],
-                "verdict": verdict(judged),
-                "losses": taught.losses,
-                "warnings": not_judged(material.action_range()),
-                "files_sha256": hashes,
-            },
-            inputs={parent.path.name: parent.sha256}
-            | {f"{r.root.name}/{name}": digest for r in material.recordings for name, digest in r.hashes().items()},
-        )
-    shutil.rmtree(taught.folder)
-    return folder
+    hashes = write_both(new, parent.config, taught.weights, loss, origin, **settings)
+    write_stage(
+        new / "finetune.json",
+        "finetune",
+        params=described,
+        metrics={
+            "learned_from": {kind: material.count(kind) for kind in KINDS} | {"not_imitated": material.left_out},
+            "held_out": [each.row() for each in judged],
+            "verdict": verdict(judged),
+            "losses": taught.losses,
+            "warnings": not_judged(material.action_range()),
+            "files_sha256": hashes,
+        },
+        inputs={parent.path.name: parent.sha256}
+        | {f"{r.root.name}/{name}": digest for r in material.recordings for name, digest in r.hashes().items()},
+    )

@@ -127,6 +127,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     pictures = _Pictures(dataset, cameras)
     _check_rate(root, columns, float(info["fps"]))
     number = columns["episode_index"]
+    _check_episodes(root, dataset, number)
     starts = np.flatnonzero(np.diff(number, prepend=-1))
     exported, faults = _exported(root, len(starts), INTERVENTION in columns)
     episodes = []
@@ -222,6 +223,8 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
         what = f"has no camera {shown(missing[0])}" if missing else f"has {len(keys)} cameras"
         remedy = "say what the policy looks through: --camera NAME, with commas between several"
         raise EpisodeError(f"{root}: {what}", found=listed(keys), remedy=remedy)
+    if len(set(names)) < len(names):
+        raise EpisodeError(f"{root}: a camera is given twice", found=listed(names), remedy="name each once: --camera")
     cameras = tuple(_Camera(name, keys[name], _picture_size(root, keys[name], features[keys[name]])) for name in names)
     for key in (STATE, ACTION):
         if key not in features or len(features[key]["shape"]) != 1:
@@ -269,6 +272,8 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     """The names in a feature, in each of the forms in which LeRobot's users write them; none where there are none."""
     names = feature.get("names")
     if isinstance(names, dict) and names and all(type(v) is int for v in names.values()):
+        if len(set(names.values())) < len(names):
+            return ()  # two names of one column
         names = sorted(names, key=names.__getitem__)  # by column
     elif isinstance(names, dict) and len(names) == 1:
         (names,) = names.values()  # {"motors": [...]}
@@ -354,11 +359,28 @@ def _check_rate(root: Path, columns: Mapping[str, np.ndarray], fps: float) -> No
     """Raise EpisodeError for frames that do not come `fps` a second: the steps of a plan would not be what they say."""
     times_s, number = columns["timestamp"].astype(np.float64), columns["episode_index"]
     steps_s = np.diff(times_s)[number[1:] == number[:-1]]
-    if len(odd := steps_s[np.abs(steps_s * fps - 1) > UNEVEN]):
+    if len(odd := steps_s[~(np.abs(steps_s * fps - 1) <= UNEVEN)]):  # so that NaN is odd
         raise EpisodeError(
             f"{root}: meta/info.json says {fps:g} frames a second, but {len(odd)} frames come at another rate",
             found=f"{odd[0]:.4f} s after the one before",
             remedy="correct the rate, or record again",
+        )
+
+
+def _check_episodes(root: Path, dataset: "LeRobotDataset", number: np.ndarray) -> None:
+    """Raise EpisodeError where the table of episodes is not that of the frames, whose episodes are `number`, (n,).
+
+    LeRobot takes the row of that number, whatever episode it is of, and finds an episode's pictures by it.
+    """
+    with _said_of(root, "its table of episodes cannot be read"):
+        table = dataset.meta.episodes.select_columns(["episode_index", "length"]).with_format("numpy")[:]
+        index, lengths = (np.asarray(table[key]) for key in ("episode_index", "length"))
+        agree = np.array_equal(index, np.arange(len(index))) and np.array_equal(number, np.repeat(index, lengths))
+    if not agree:
+        raise EpisodeError(
+            f"{root}: meta/episodes and the frames in data do not belong together",
+            found=f"{len(index)} episodes of {lengths.sum()} frames beside {len(np.unique(number))} of {len(number)}",
+            remedy=COPY_AGAIN,
         )
 
 

@@ -22,8 +22,10 @@ import nbformat
 from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 
+from rover_lib.onboard.artifact import ONNX_SUFFIX
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
+from rover_lib.workshop.alone import alone_in
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
 from rover_lib.workshop.run_folder import run_folder
@@ -32,6 +34,7 @@ NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
 # Of a run that is there: what `make arm` and `rover world latency`, `students` and `learn` execute.
 AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")
+OWN_FILES = ("calibration*.pt", "policy_*.pt", f"policy_*{ONNX_SUFFIX}")
 KERNEL_ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",  # rover_lib/__init__.py says why; a cell may import torch before it
     # Both are known, and noise in a stored output: QNNPACK ignores reduce_range, tqdm misses widgets.
@@ -88,7 +91,7 @@ def run(
     own files are replaced (`_own`); recordings, a checkpoint and benchmarks of other hosts in its folder stay.
 
     Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C, the old run
-    is as it was and nothing is left of the new one.
+    is as it was and nothing is left of the new one. RoverError while another process makes a run of that name.
     """
     folder = run_folder(runs_dir, name, NotebookError)
     sources = [Path(notebooks) / f"{n}.ipynb" for n in NAMES]
@@ -98,17 +101,15 @@ def run(
     if unknown := sorted(set(overrides) - known):
         raise NotebookError(f"no notebook has a parameter {unknown}", remedy=f"known are {sorted(known)}")
     new, old = folder.with_name(f".{name}.new"), folder.with_name(f".{name}.old")
-    if old.exists():  # the last one was killed while it took its place
-        _put_back(old, folder)
-    shutil.rmtree(new, ignore_errors=True)
-    new.mkdir(parents=True)
     given = {
         "run_dir": str(new),
         "checkpoint": absolute(checkpoint),
         "episodes": absolute(episodes),
         **overrides,
     }
-    try:
+    with alone_in(new):
+        if old.exists():  # the last one was killed while it took its place
+            _put_back(old, folder)
         others = _benchmarks_of_other_hosts(folder)
         for path in others:  # notebook 05 shows them
             shutil.copy2(path, new)
@@ -120,8 +121,6 @@ def run(
             (new / path.name).unlink()
         _say_final_paths(new, folder)
         _take_place(new, folder, old)
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
     return folder
 
 
@@ -132,7 +131,7 @@ def _own(folder: Path) -> list[Path]:
     names += [*(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures", "report.html"]
     if (folder / "08_distill.ipynb").exists():  # a teacher's; a student's distill.json is of what its run begins with
         names.append("distill.json")
-    own = [folder / n for n in names] + [*folder.glob("calibration*.pt"), *folder.glob("policy_*.pt")]
+    own = [folder / n for n in names] + [p for pattern in OWN_FILES for p in folder.glob(pattern)]
     return [path for path in own if path.exists()]
 
 

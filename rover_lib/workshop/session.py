@@ -60,10 +60,11 @@ def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:
         raise RoverError(
             f"{now.path}: is not what notebook 01 loaded any more", found=found, remedy="run notebook 01 again"
         )
-    if (layout := again.recordings.layout.words()) != stage["metrics"]["recordings"].get("layout", layout):
+    layout = stage["metrics"].get("recordings", {}).get("layout")
+    if layout and layout != again.recordings.layout.words():
         raise RoverError(
             f"{again.recordings.root}: says something else of its numbers than when notebook 01 loaded it",
-            found=layout,
+            found=again.recordings.layout.words(),
             remedy="run notebook 01 again",
         )
     if again.parts.episodes != stage["metrics"]["split"]:

@@ -20,6 +20,8 @@ from torch import Tensor, nn
 from rover_lib.onboard.errors import DistillError
 from rover_lib.workshop.act import ACT, ActConfig, FeedForward, multiply_accumulates
 from rover_lib.workshop.checkpoint import Checkpoint, expected_shapes
+from rover_lib.workshop.samples import ACTION_NAMES
+from rover_lib.workshop.untrusted import listed
 
 RIDGE = 1e-4  # of the mean square of a unit: keeps `down` near the teacher's where the frames say nothing
 ROWS = 4096  # tokens that are multiplied at once: the sums are double, and memory is small
@@ -40,10 +42,11 @@ def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
     that a car's recordings cannot teach; CheckpointError for an image size that the teacher's weights do not run at.
     """
     c = teacher.config
-    if len(c.cameras) != 1 or c.state_names != c.action_names or len(c.action_names) != 2:
+    if found := not_a_cars(c):
         raise DistillError(
             f"{teacher.path}: only a policy of one camera, steering and throttle can teach from recordings of a car",
-            found=f"{len(c.cameras)} cameras, {len(c.state_names)} states and {len(c.action_names)} actions",
+            found=found,
+            remedy="if it is one, say which number is what: --action-names",
         )
     ((height, width),) = c.image_sizes
     wanted = {
@@ -66,6 +69,17 @@ def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
         feedforward=shape.feedforward or c.feedforward,
         vae_layers=0,
     )
+
+
+def not_a_cars(config: ActConfig) -> str | None:
+    """What a policy has instead of one camera, and steering and throttle as its states and its actions; None: it has
+    those. What we teach is also shown mirrored, with the first number negated, and left behind under these names.
+    """
+    c = config
+    if len(c.cameras) == 1 and c.state_names == c.action_names == ACTION_NAMES:
+        return None
+    states, actions = listed(c.state_names), listed(c.action_names)
+    return f"{len(c.cameras)} cameras, of state {states}, of action {actions}"
 
 
 def gmac(config: ActConfig) -> float:

@@ -169,7 +169,7 @@ def test_what_a_run_was_not_asked_to_know_is_refused(one_notebook, tmp_path):
 
 
 OF_ARTIFACTS = ("load.json", "run.json", "report.html", "arm.json", "drive.json", "06_arm.ipynb", "07_drive.ipynb")
-OF_ARTIFACTS += ("policy_static.pt",)
+OF_ARTIFACTS += ("policy_static.pt", "policy_static.onnx.zip")
 OF_OTHERS = ("benchmark-pi.json", "best_model.pth", "episodes/frame.jpg")
 
 
@@ -212,6 +212,19 @@ def test_a_run_that_does_not_end_costs_nothing_of_the_last_one(one_notebook, old
     with pytest.raises(type(error)):
         run_with(monkeypatch, one_notebook, old_run, ends_early)
     assert contents(old_run.parent) == before
+
+
+def test_a_second_run_of_the_same_name_waits_for_the_first(one_notebook, old_run, monkeypatch):
+    """It would have removed what the first had made, and executed its own notebooks among the first one's files."""
+
+    def while_another_starts(source, folder, given, bars):
+        whole(source, folder, given, bars)
+        monkeypatch.setattr(runs, "_execute", lambda *args: pytest.fail("it began"))
+        with pytest.raises(runs.RoverError, match="another process is at work in it"):
+            runs.run("ck", "episodes", "mine", runs_dir=old_run.parent, notebooks=one_notebook)
+
+    run_with(monkeypatch, one_notebook, old_run, while_another_starts)
+    assert (old_run / "policy_static.pt").read_text() == "new"
 
 
 def test_a_whole_run_takes_the_place_of_the_last_one(one_notebook, old_run, monkeypatch):

@@ -582,6 +582,23 @@ def test_statistics_of_one_feature_missing(copied, feature):
     assert ONLY_WEIGHTS in str(refused_quickly(copied))
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("observation.state.std", [0.5, -0.5], "a negative std, which would turn it around, found ["),
+        ("action.max", [0.5, 9.0], "'action' have a min above its max, which would turn it around, found ["),
+        ("observation.state.mean", [1e300, 0.0], "statistics of 'observation.state' are not finite"),
+    ],
+)
+def test_statistics_that_nothing_has_are_refused(copied, key, value, says):
+    stats = load_file(copied / "stats.safetensors")
+    save_file(stats | {key: torch.tensor(value, dtype=torch.float64)}, copied / "stats.safetensors")
+    assert says in str(refused_quickly(copied))
+    constant = {"observation.state.std": torch.zeros(2), "action.max": stats["action.min"].clone()}
+    save_file(stats | constant, copied / "stats.safetensors")
+    assert ONLY_WEIGHTS in str(refused_quickly(copied))
+
+
 @pytest.mark.parametrize("missing", [(INNER,), (OUTER,), (INNER, OUTER)])
 def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copied, missing):
     for file in missing:

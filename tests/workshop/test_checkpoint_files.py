@@ -1,5 +1,6 @@
 """What is written is read again as it was: here, and by LeRobot itself."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
 from rover_lib.workshop.observe import calibrate
+from rover_lib.workshop.samples import Layout
 
 SETTINGS = {
     "learning_rate": 1e-4, "batch_size": 4, "data_dir": "episodes", "output_dir": "fast", "device": "cpu", "seed": 0
@@ -68,6 +70,24 @@ def test_lerobots_folder(config, weights, tmp_path, norms):
     ours = predictions(ACT(read.config, read.weights), [inputs_of(sample, config)])[0]
     assert (ours - expected).abs().max() < 1e-5
     assert (lerobots_chunk(tmp_path / "pretrained_model", sample, config) - expected).abs().max() < 1e-5
+
+
+def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_path):
+    """A student of 15 steps a second would drive twice as fast as one of 30; the trainer's file cannot say it."""
+    slow = replace(config, rate_hz=15.0)
+    write_lerobot(tmp_path, slow, weights, ORIGIN)
+    read = load_checkpoint(tmp_path)
+    assert read.config.rate_hz == read.recorded_as(Layout()).config.rate_hz == 15
+    assert read.recorded_as(Layout(("cam_front",), rate_hz=15.0)) is read
+    with pytest.raises(CheckpointError, match="plans 15 steps a second, found recordings of 30 frames"):
+        read.recorded_as(Layout(("cam_front",), rate_hz=30.0))
+    assert json.loads((tmp_path / "origin.json").read_text()) == ORIGIN | {"rate_hz": 15.0}
+    with pytest.raises(CheckpointError, match="no place for this policy's normalisation or rate"):
+        write_trainer(tmp_path / "best_model.pth", slow, weights, 0.25, ORIGIN, **SETTINGS)
+    for damaged in ('{"rate_hz": 0}', '{"rate_hz": NaN}', '{"rate_hz": true}'):
+        (tmp_path / "origin.json").write_text(damaged)
+        with pytest.raises(CheckpointError, match="'rate_hz' must be above 0"):
+            load_checkpoint(tmp_path)
 
 
 def test_other_statistics_beside_the_same_weights_are_another_policy(config, weights, tmp_path):

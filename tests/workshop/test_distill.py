@@ -10,7 +10,7 @@ from interrupted import interrupt, save_each_step
 from policies import TINY, lerobot_policy, of_a_cars_size, trainer_content
 from recorded import record_drives
 
-from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.errors import DistillError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import load_policy
 from rover_lib.workshop import distill as distill_module
@@ -65,7 +65,7 @@ def test_what_is_left_is_one_policy_in_two_formats(taught, teacher):
     assert (ours.config.decoder_layers, ours.config.feedforward) == (1, 64)
     assert all(torch.equal(weight, lerobots.weights[name]) for name, weight in ours.weights.items())
     origin = json.loads((taught / "pretrained_model" / "origin.json").read_text())
-    assert origin == ours.report["trainer_config"]["origin"]
+    assert origin == ours.report["trainer_config"]["origin"] | {"rate_hz": 30.0}
     assert origin["teacher_sha256"] == load_checkpoint(teacher).sha256
     assert origin["distilled_by"]["transformer_steps"] == 8
     files = ["best_model.pth", "distill.json", "policy_static.pt", "pretrained_model"]
@@ -170,6 +170,21 @@ def test_a_teacher_with_other_statistics_is_asked_again(teacher, episodes, recip
     before, corrected, again = plans
     assert corrected[..., 1] - before[..., 1] == pytest.approx(0.02, abs=1e-6)
     assert np.array_equal(corrected, again)
+
+
+@pytest.mark.slow
+def test_a_student_may_be_called_teacher_and_its_name_is_one_process(teacher, episodes, recipe, tmp_path, monkeypatch):
+    real, arguments = distill_module._taught, {"runs_dir": tmp_path, "recipe": recipe.of_steps(4), "device": "cpu"}
+
+    def while_another_starts(work):
+        with pytest.raises(RoverError, match="another process is at work in it"):
+            distill(teacher, episodes, "teacher", SHAPE, **arguments)
+        return real(work)
+
+    monkeypatch.setattr(distill_module, "_taught", while_another_starts)
+    folder = distill(teacher, episodes, "teacher", SHAPE, **arguments)
+    rows = json.loads((folder / "distill.json").read_text())["metrics"]["students"]
+    assert [row["name"] for row in rows] == ["teacher", "teacher"] and rows[0]["gmac"] > rows[1]["gmac"]
 
 
 @pytest.mark.slow

@@ -32,13 +32,13 @@ FRAMES = 24
 TAKEN_OVER = [POLICY] * 8 + [HUMAN] * 12 + [NOBODY] * 4
 
 
-def record(root, drives=4, drivers=(HUMAN,) * FRAMES, size=(96, 54), offset=0, car=None):
+def record(root, drives=4, drivers=(HUMAN,) * FRAMES, size=(96, 54), offset=0, car=None, rate_hz=30):
     """Drives whose steering and throttle change, and whose pictures do; with who drove at each frame."""
     rng, pwm = np.random.default_rng(offset), PwmCalibration()
     for drive in range(drives):
         with EpisodeWriter(root / f"episode_{offset + drive}", label="", resolution=size, car=car) as writer:
             for i, driver in enumerate(drivers):
-                t_s = i / 30
+                t_s = i / rate_hz
                 pulses = pwm.pulses(0.5 * math.sin(4 * t_s + drive), 0.05 + 0.04 * math.cos(3 * t_s + drive))
                 writer.frame(t_s, smooth_frame(rng, size[1], size[0]))
                 measured = pulses.steering_us, pulses.throttle_us, 21316, 1016
@@ -147,7 +147,7 @@ def test_what_is_left_is_one_policy_in_two_formats_with_its_parent_and_recipe(ta
     assert any(name.startswith("backbone.") for name in moved) and any(name.startswith("decoder.") for name in moved)
     assert not any(name.startswith("vae_") for name in moved)
     origin = json.loads((taught / "pretrained_model" / "origin.json").read_text())
-    assert origin == ours.report["trainer_config"]["origin"]
+    assert origin == ours.report["trainer_config"]["origin"] | {"rate_hz": 30.0}
     assert origin["parent_sha256"] == parent.sha256 and origin["finetuned_by"]["transformer_steps"] == 6
     assert sorted(p.name for p in taught.iterdir()) == ["best_model.pth", "finetune.json", "pretrained_model"]
 
@@ -297,6 +297,7 @@ def test_arguments_that_cannot_be_are_refused(checkpoint, old, new, tmp_path, op
         ({"seed": -1}, "steps and seed"),
         ({"batch": 0}, "at least 1"),
         ({"correction_weight": 0.0}, "above 0"),
+        ({"correction_weight": math.inf}, "must be finite"),
         ({"focus": -1.0}, "focus at least 0"),
         ({"to_parent": 1.5}, "from 0 to 1"),
         ({"held_out_share": 1.0}, "below 1"),
@@ -310,6 +311,16 @@ def test_a_recipe_that_cannot_be_is_refused(recipe, values, says):
 def test_a_run_that_is_there_is_not_overwritten(checkpoint, old, new, tmp_path):
     (tmp_path / "runs" / "better").mkdir(parents=True)
     refused("is there already", checkpoint, [old, new], tmp_path)
+
+
+def test_a_run_that_another_process_made_meanwhile_is_not_overwritten(checkpoint, old, new, tmp_path, monkeypatch):
+    real = finetune_module._opened
+    monkeypatch.setattr(
+        finetune_module, "_opened", lambda *args: ((tmp_path / "runs" / "better").mkdir(parents=True), real(*args))[1]
+    )
+    with pytest.raises(FinetuneError, match="is there already"):
+        finetune(checkpoint, [old, new], "better", runs_dir=tmp_path / "runs", device="cpu")
+    assert [p.name for p in (tmp_path / "runs").iterdir()] == ["better"]
 
 
 def test_without_a_new_episode_there_is_nothing_to_learn(checkpoint, old, tmp_path):
@@ -326,12 +337,30 @@ def test_another_camera_is_refused(checkpoint, old, tmp_path):
     refused("its camera has another shape", checkpoint, [old, square], tmp_path)
 
 
+def test_recordings_of_another_rate_are_refused(checkpoint, old, tmp_path):
+    """A plan has 30 steps a second: learned from 15, the car would do all of it in half the time."""
+    dark = record(tmp_path / "dark", drives=2, drivers=TAKEN_OVER, offset=90, rate_hz=15)
+    refused("plans 30 steps a second, found episode_90 of 15.0 frames", checkpoint, [old, dark], tmp_path)
+
+
 def test_another_car_is_refused(checkpoint, old, tmp_path):
     other = Car()
     channel = replace(other.pwm.steering, neutral_pct=7.0)
     other = replace(other, pwm=replace(other.pwm, steering=channel))
     others = record(tmp_path / "other", drives=1, drivers=TAKEN_OVER, car=other)
     refused("was recorded with another car", checkpoint, [old, others], tmp_path)
+
+
+def test_a_policy_of_two_wheels_is_not_taught_to_steer(checkpoint, old, new, tmp_path, monkeypatch):
+    """Every sample is shown mirrored too, with its first number negated: of a wheel that is another drive."""
+    wheels = ("left", "right")
+    real = finetune_module.load_checkpoint
+    monkeypatch.setattr(
+        finetune_module,
+        "load_checkpoint",
+        lambda path: replace(c := real(path), config=replace(c.config, state_names=wheels, action_names=wheels)),
+    )
+    refused("found 1 cameras, of state left, right, of action left, right", checkpoint, [old, new], tmp_path)
 
 
 def test_the_same_recordings_twice_are_refused(checkpoint, old, tmp_path):

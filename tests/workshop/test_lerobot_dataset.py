@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
+import pandas
 import pytest
 import torch
 from click.testing import CliRunner
@@ -87,6 +88,7 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         (features(state=TWO), "'observation.state' does not say which of its 2 numbers is what"),
         (features(action=TWO | {"names": ["steering"]}), "has 2 numbers, their names are steering"),
         (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
+        (features(action=TWO | {"names": {"steering": 1, "throttle": 1}}), "'action' does not say which of its 2"),
         (features(), "has no meta/tasks.parquet"),
     ],
 )
@@ -96,6 +98,7 @@ def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
 
 def test_a_camera_that_is_not_there_is_refused(tmp_path):
     assert "has no camera 'left', found front" in refused(Source.of(written(tmp_path, info()), camera="left"))
+    assert "given twice, found front, front; name each once" in refused(Source.of(tmp_path, camera="front,front"))
 
 
 def test_our_own_recordings_say_their_names_themselves(tmp_path):
@@ -215,6 +218,18 @@ def test_names_decide_the_order_or_the_user_does(datasets, tmp_path):
     assert result.exit_code == 0 and "steering (column 1)" in result.output
 
 
+def rows(kept):
+    """Leaves those of the table's rows, in that order, and says in meta/info.json as many episodes."""
+
+    def change(path):
+        table = pandas.read_parquet(path)
+        left = table.iloc[kept]
+        left.to_parquet(path)
+        edit(path.parents[3] / "meta/info.json", lambda c: c.update(total_episodes=len(left)))
+
+    return change
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -228,6 +243,8 @@ def cut(path):
         ("image", "meta/episodes/chunk-000/file-000.parquet", cut, "LeRobot cannot read it"),
         ("video", "videos/observation.images.cam_front/chunk-000/file-000.mp4", cut, "cannot be decoded"),
         ("video", "videos/observation.images.cam_front/chunk-000/file-000.mp4", lambda p: p.unlink(), "mp4: not there"),
+        ("image", "meta/episodes/chunk-000/file-000.parquet", rows(slice(2)), "2 episodes of 21 frames beside 3 of 33"),
+        ("video", "meta/episodes/chunk-000/file-000.parquet", rows([1, 0, 2]), "do not belong together"),
         ("image", "meta/info.json", lambda p: edit(p, lambda c: c.update(fps=30)), "30 frames a second, but 30 frames"),
         ("image", "meta/info.json",
          lambda p: edit(p, lambda c: c["features"]["action"].update(shape=[3])), "has 3 numbers, their names are"),
@@ -303,6 +320,10 @@ def test_a_policy_of_other_numbers_or_another_rate_is_refused(trained, tiny):
     with pytest.raises(CheckpointError, match="30 steps a second, found recordings of 20 frames a second"):
         tiny.recorded_as(Layout(("cam_front",), rate_hz=20.0))
     assert tiny.recorded_as(Layout(("front",), rate_hz=30.0)) is tiny
+    wheels, ours = ("left", "right"), ("steering", "throttle")
+    for layout in (Layout(("front",), wheels, wheels, 30.0), Layout(("front",), wheels, ours, 30.0)):
+        with pytest.raises(CheckpointError, match=r"of steering, throttle, found recordings of state left, right and"):
+            tiny.recorded_as(layout)
     twice = replace(tiny, config=replace(tiny.config, cameras=("front", "wrist")))
     with pytest.raises(CheckpointError, match="2, 2, 2, found recordings of 1, 2, 2"):
         twice.recorded_as(Layout())  # our own

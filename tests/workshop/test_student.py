@@ -105,9 +105,10 @@ def test_a_picture_that_the_policy_cannot_see_is_refused(tiny, height, width, sa
 
 def test_a_policy_of_an_arm_teaches_no_car(tiny):
     names = tuple(f"joint_{i}" for i in range(6))
-    arm = replace(tiny, config=replace(tiny.config, state_names=names, action_names=names))
-    with pytest.raises(DistillError, match="6 actions"):
-        student_config(arm, StudentShape())
+    for other, found in ((names, "joint_0, joint_1, "), (("left", "right"), "of state left, right, of action left")):
+        arm = replace(tiny, config=replace(tiny.config, state_names=other, action_names=other))
+        with pytest.raises(DistillError, match=found):
+            student_config(arm, StudentShape())
 
 
 def test_units_are_chosen_by_frames(tiny):
