@@ -235,6 +235,12 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
 @click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="The student's picture [default: its teacher's].")
 @click.option("--decoder-layers", type=int, metavar="N", help="Keep only the first N decoder layers [default: all].")
 @click.option("--feedforward", type=int, metavar="N", help="Keep the N best units of each feed-forward [default: all].")
+@click.option(
+    "--backbone-channels",
+    type=float,
+    metavar="SHARE",
+    help="Keep that share, say 0.5, of the channels inside the backbone's blocks [default: all].",
+)
 @click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
 @click.option("--samples", type=click.IntRange(min=1), help="Frames to learn from [default: params.yml].")
@@ -248,8 +254,6 @@ def distill(
     checkpoint: Path,
     episodes: "Source",
     size: tuple[int, int] | None,
-    decoder_layers: int | None,
-    feedforward: int | None,
     samples: int | None,
     steps: int | None,
     seed: int | None,
@@ -269,7 +273,8 @@ def distill(
 
     recipe = Recipe.of(params(), steps, samples, seed)
     height, width = size or (None, None)
-    shape = StudentShape(height, width, decoder_layers, feedforward)
+    parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
+    shape = StudentShape(height, width, **parts)
     folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal(), **options)
     content = read_stage(folder / "distill.json", "distill")
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")

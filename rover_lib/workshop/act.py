@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
 Projection = nn.Linear | nn.Conv2d
+Pair = tuple[Tensor, Tensor]  # weight and bias
 Layer = TypeVar("Layer", nn.Linear, nn.Conv2d, nn.LayerNorm)
 
 # (block, convolutions per block, blocks per stage, channels out of layer4), from torchvision.models.resnet
@@ -167,17 +168,36 @@ def layer_norm(w: Weights) -> nn.LayerNorm:
     return _load(nn.LayerNorm(w["weight"].shape[0], device="meta"), w["weight"], w["bias"])
 
 
-def folded_conv(w: Weights, bn: Weights, stride: int, padding: int, dilation: int = 1) -> nn.Conv2d:
-    """A convolution without bias and the frozen batch norm behind it, as one convolution."""
-    weight, bias = folded(w, bn)
+def conv(weight: Tensor, bias: Tensor, stride: int, padding: int, dilation: int = 1) -> nn.Conv2d:
     out_channels, in_channels, size, _ = weight.shape
     return _load(nn.Conv2d(in_channels, out_channels, size, stride, padding, dilation, device="meta"), weight, bias)
 
 
-def folded(w: Weights, bn: Weights) -> tuple[Tensor, Tensor]:
+def folded_conv(w: Weights, bn: Weights, stride: int, padding: int) -> nn.Conv2d:
+    """A convolution without bias and the frozen batch norm behind it, as one convolution."""
+    return conv(*folded(w, bn), stride, padding)
+
+
+def folded(w: Weights, bn: Weights) -> Pair:
     """Weight and bias of `folded_conv`."""
     gain = bn["weight"] * (bn["running_var"] + 1e-5).rsqrt()  # eps of torchvision's FrozenBatchNorm2d
     return w["weight"] * gain[:, None, None, None], bn["bias"] - bn["running_mean"] * gain
+
+
+def folded_block(w: Weights, kind: str) -> list[Pair]:
+    """Weight and bias of a ResNet block's convolutions, without the channels inside it that are always zero.
+
+    Such a channel has no weight that is not zero and no positive bias, so that ReLU leaves nothing of it whatever the
+    block sees: without it the block is the same function. `channels` makes them.
+    """
+    pairs = [folded(w.at(f"conv{i}"), w.at(f"bn{i}")) for i in range(1, (2 if kind == "basic" else 3) + 1)]
+    for i, (weight, bias) in enumerate(pairs[:-1]):
+        alive = (weight != 0).flatten(1).any(1) | (bias > 0)
+        alive[0] |= not alive.any()  # a convolution has one channel at least
+        if not alive.all():
+            reader, reader_bias = pairs[i + 1]
+            pairs[i : i + 2] = [(weight[alive], bias[alive]), (reader[:, alive], reader_bias)]
+    return pairs
 
 
 class Pixels(nn.Module):
@@ -277,13 +297,13 @@ class Residual(nn.Module):
 
     def __init__(self, w: Weights, kind: str, stride: int, dilation: int):
         super().__init__()
-        if kind == "basic":
-            plan = [("1", stride, 1, 1), ("2", 1, 1, 1)]
-        else:
-            plan = [("1", 1, 0, 1), ("2", stride, dilation, dilation), ("3", 1, 0, 1)]
+        plans = {  # stride, padding and dilation of each
+            "basic": [(stride, 1, 1), (1, 1, 1)],
+            "bottleneck": [(1, 0, 1), (stride, dilation, dilation), (1, 0, 1)],
+        }
         layers: list[nn.Module] = []
-        for n, s, padding, d in plan:
-            layers += [folded_conv(w.at(f"conv{n}"), w.at(f"bn{n}"), s, padding, d), nn.ReLU()]
+        for (weight, bias), geometry in zip(folded_block(w, kind), plans[kind], strict=True):
+            layers += [conv(weight, bias, *geometry), nn.ReLU()]
         self.body = nn.Sequential(*layers[:-1])
         has_shortcut = "downsample" in w
         self.shortcut = (
@@ -301,10 +321,10 @@ class Backbone(nn.Module):
     def __init__(self, w: Weights, config: ActConfig, columns: bool):
         super().__init__()
         kind, depths, _ = BACKBONES[config.backbone]
-        conv = folded_conv(w.at("conv1"), w.at("bn1"), 2, 3)
+        stem = folded_conv(w.at("conv1"), w.at("bn1"), 2, 3)
         if columns:
-            conv = column_conv(conv, config.image_norm[0])
-        self.stem = nn.Sequential(conv, nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+            stem = column_conv(stem, config.image_norm[0])
+        self.stem = nn.Sequential(stem, nn.ReLU(), nn.MaxPool2d(3, 2, 1))
         self.layer1: nn.Sequential
         self.layer2: nn.Sequential
         self.layer3: nn.Sequential

@@ -4,7 +4,8 @@
 
 The student begins with its teacher's weights (see `student`) and learns in phases: its backbone to see what the teacher
 sees, its transformer on what that backbone sees, then all together at a tenth of the rate. It learns what the teacher
-plans, and a little what was recorded. With qat it then learns on, rounded as its export rounds it (see `fake_quant`).
+plans, and a little what was recorded. Channels that it is to do without go after the first phase (see `channels`). With
+qat it then learns on, rounded as its export rounds it (see `fake_quant`).
 The run's folder gets best_model.pth, pretrained_model/, policy_static.pt and distill.json.
 
 Letters: n samples, B batch, C chunk, A actions.
@@ -27,12 +28,13 @@ from rover_lib.onboard import preprocess
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, write_stage
-from rover_lib.workshop import act, training
+from rover_lib.workshop import act, channels, refit, training
 from rover_lib.workshop import lessons as lessons_module
 from rover_lib.workshop import pipeline as quantization
 from rover_lib.workshop import student as student_module
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.cache import cache_root, key_of
+from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint_files import made_beside, write_both
 from rover_lib.workshop.choose import Chooser
@@ -52,6 +54,7 @@ from rover_lib.workshop.session import SMALL_GMAC, Opened, load, training_device
 from rover_lib.workshop.student import StudentShape, gmac, initial_weights, student_config
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 
+Notes = dict[str, list[dict[str, Any]]]  # of what a student does without, by part
 NOBODY_DROVE = "Judged on recordings alone: nobody drove."
 
 
@@ -121,9 +124,10 @@ def distill(
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint
     config = student_config(teacher, shape)
-    work = _Work(opened, config, recipe, qat, where, progress)
+    share = None if shape.backbone_channels == 1 else shape.backbone_channels
+    work = _Work(opened, config, share, recipe, qat, where, progress)
     if work.is_teacher and not qat:
-        remedy = "give it a smaller picture or fewer layers, or train it for INT8 with --qat"
+        remedy = "give it a smaller picture, fewer layers or channels, or train it for INT8 with --qat"
         raise DistillError("this student would be its teacher", remedy=remedy)
     with (
         made_beside(folder, "distill.json") as new,
@@ -137,10 +141,11 @@ def distill(
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """What is to be done. config: the student's."""
+    """What is to be done. config: the student's. share: of its backbone's inner channels that stay, None for all."""
 
     opened: Opened
     config: ActConfig
+    share: float | None
     recipe: Recipe
     qat: bool
     device: torch.device
@@ -153,7 +158,7 @@ class _Work:
     @property
     def is_teacher(self) -> bool:
         """Whether the student has its teacher's shape: then there is only rounding to learn."""
-        return self.config == replace(self.teacher.config, vae_layers=0)
+        return self.share is None and self.config == replace(self.teacher.config, vae_layers=0)
 
     def rng(self, phase: str) -> np.random.Generator:
         """Random numbers of a phase, the same in every process."""
@@ -169,13 +174,14 @@ class _Work:
 
 @dataclass(frozen=True, eq=False)
 class _Taught:
-    """A student: weights by LeRobot's names without the leading `model.`, losses by phase, what `initial_weights` noted
-    of its feed-forwards. folder: where its phases are saved.
+    """A student: weights by LeRobot's names without the leading `model.`, losses by phase. notes: what was left out of
+    its "backbone", see `without_channels`, and of each "feed_forward", see `initial_weights`. folder: where its phases
+    are saved.
     """
 
     weights: dict[str, Tensor]
     losses: dict[str, list[float]]
-    narrowed: list[dict[str, Any]]
+    notes: Notes
     unrounded: dict[str, Tensor] | None  # the weights before quantization-aware training
     folder: Path
 
@@ -195,21 +201,24 @@ def _taught(work: _Work) -> _Taught:
         "at": [work.device.type, recipe.seed],
         "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
     }
-    sources = [sys.modules[__name__], lessons_module, student_module, training, preprocess, act]
+    sources = [sys.modules[__name__], lessons_module, student_module, channels, refit, training, preprocess, act]
     folder = cache_root() / f"lessons-{key_of(sees, *sources)}"
-    whole = sees | {"student": asdict(work.config), "whole": asdict(recipe), "qat": work.qat}
+    whole = sees | {"student": asdict(work.config), "share": work.share, "whole": asdict(recipe), "qat": work.qat}
     own = cache_root() / f"student-{key_of(whole, *sources)}"
-    channels = work.teacher.weights["encoder_img_feat_input_proj.weight"].shape[1]
+    depth = work.teacher.weights["encoder_img_feat_input_proj.weight"].shape[1]
     with Resumable(folder, progress) as saved:
-        lessons = Lessons.open(folder, samples, work.config, channels, work.rng("states"))
+        lessons = Lessons.open(folder, samples, work.config, depth, work.rng("states"))
         room = _Room(work, lessons)
         lessons.ask(saved, work.teacher, work.rng("teacher"), work.device)
         _refuse_strangers(room)
         backbone = _train_backbone(room, saved)
         losses = dict(saved.losses)
     with Resumable(own, progress) as saved:
-        weights, narrowed = _start(room, backbone, own)
+        weights, notes = _start(room, backbone, own)
         policy = BatchedPolicy(work.config, weights).to(work.device)
+        if work.share is not None:
+            room = _Room(work, lessons.apart(own))
+            room.lessons.see(saved, policy, work.rng("tokens"))
         policy.thaw()
         unrounded = None
         if not work.is_teacher:
@@ -219,7 +228,7 @@ def _taught(work: _Work) -> _Taught:
             unrounded = policy.weights()
             _train_rounded(room, policy, saved, own)
         losses |= saved.losses
-    return _Taught(policy.weights(), losses, narrowed, unrounded, own)
+    return _Taught(policy.weights(), losses, notes, unrounded, own)
 
 
 class _Room:
@@ -265,7 +274,8 @@ def _refuse_strangers(room: _Room) -> None:
 
 
 def _train_backbone(room: _Room, saved: Resumable) -> dict[str, Tensor]:
-    """Phase one: the backbone, at the student's picture size, to the teacher's feature map. Then its tokens.
+    """Phase one: the backbone, at the student's picture size, to the teacher's feature map. Then its tokens, unless it
+    is to lose channels.
 
     Returns its weights by LeRobot's names. At the teacher's own size it is the teacher's, as it is.
     """
@@ -282,22 +292,28 @@ def _train_backbone(room: _Room, saved: Resumable) -> dict[str, Tensor]:
         shown = torch.from_numpy(lessons.maps[2 * rows + views]).to(work.device).float()
         error = (policy.features(room.pictures(rows, views, rng)) - shown).square().mean() / shown.square().mean()
         saved.losses["backbone"].append(descend(error, backbone, optimizer, scheduler))
-    if not work.is_teacher:
+    if not work.is_teacher and work.share is None:
         lessons.see(saved, policy, work.rng("tokens"))
     return {name: value for name, value in policy.weights().items() if name.startswith("backbone.")}
 
 
-def _start(room: _Room, backbone: dict[str, Tensor], folder: Path) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
-    """The student before its transformer learns, and what was noted of its feed-forwards. Kept in the folder."""
+def _start(room: _Room, backbone: dict[str, Tensor], folder: Path) -> tuple[dict[str, Tensor], Notes]:
+    """The student before its transformer learns, and what was noted of what it does without. Kept in the folder."""
     path = folder / "start.pt"
     if not path.exists():
-        lessons, teacher = room.lessons, room.work.teacher
-        rows = thinned(range(len(lessons)), room.work.recipe.unit_frames)
+        lessons, work = room.lessons, room.work
+        rows = thinned(range(len(lessons)), work.recipe.unit_frames)
         states = torch.from_numpy(lessons.data.states)
         inputs = ((states[i][None], torch.from_numpy(lessons.frames[np.array([i])][0])) for i in rows)
-        seeing = replace(teacher, weights=teacher.weights | backbone)
+        seeing = replace(work.teacher, weights=work.teacher.weights | backbone)
+        weights, narrowed = initial_weights(seeing, work.config, inputs)
+        thinner: list[dict[str, Any]] = []
+        if work.share is not None:
+            pictures = work.progress(lessons.each_once(), desc="channels", total=lessons.blocks)
+            shown = (torch.from_numpy(block) for block in pictures)
+            weights, thinner = without_channels(weights, work.config, work.share, shown, work.rng("channels"))
         with atomic_path(path) as temporary:
-            torch.save(initial_weights(seeing, room.work.config, inputs), temporary)
+            torch.save((weights, {"backbone": thinner, "feed_forward": narrowed}), temporary)
     return torch.load(path, weights_only=True)
 
 
@@ -413,8 +429,10 @@ def _int8_errors(
     return errors
 
 
-def _row(name: str, config: ActConfig, qat: bool) -> dict[str, Any]:
-    """A policy's shape, as a row of the frontier begins."""
+def _row(
+    name: str, config: ActConfig, weights: dict[str, Tensor], share: float | None = None, qat: bool = False
+) -> dict[str, Any]:
+    """A policy's shape, as a row of the frontier begins. share: of the backbone's inner channels, None: all."""
     ((height, width),) = config.image_sizes
     return {
         "name": name,
@@ -422,8 +440,9 @@ def _row(name: str, config: ActConfig, qat: bool) -> dict[str, Any]:
         "width": width,
         "decoder_layers": config.decoder_layers,
         "feedforward": config.feedforward,
+        "backbone_channels": share,
         "qat": qat,
-        "gmac": gmac(config),
+        "gmac": gmac(config, weights),
     }
 
 
@@ -434,6 +453,8 @@ def summary(content: dict[str, Any]) -> str:
     lines = [f"errors on held-out episodes, % of the recorded range ({', '.join(actions)})"]
     for row in metrics["students"]:
         shape = f"{row['width']}x{row['height']}, {row['decoder_layers']} decoder layer(s) of {row['feedforward']}"
+        if share := row.get("backbone_channels"):
+            shape += f", {share:.0%} of the backbone's channels"
         pairs = []
         for to in ("teacher", "recorded"):
             errors = [shown_pct(row[f"{to}_{action}_pct"]).strip() for action in actions]
@@ -465,10 +486,10 @@ def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
     planned = _plans(work, teacher.config, teacher.weights, held_out)
     own = _plans(work, work.config, taught.weights, held_out)
     students = [
-        _row(called, config, qat) | errors_of(plans, planned, held_out, action_range)
-        for called, config, qat, plans in (
-            ("teacher", teacher.config, False, planned),
-            (name, work.config, work.qat, own),
+        row | errors_of(plans, planned, held_out, action_range)
+        for row, plans in (
+            (_row("teacher", teacher.config, teacher.weights), planned),
+            (_row(name, work.config, taught.weights, work.share, work.qat), own),
         )
     ]
     rounded, calibration = _rounded(work, taught.weights)
@@ -500,7 +521,7 @@ def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
         metrics={
             "students": students,
             "losses": taught.losses,
-            "feed_forward": taught.narrowed,
+            **taught.notes,
             "before_qat": unrounded,
             "gates": [_quantization_gate(students[1])],
             "judged_frames": len(held_out),

@@ -21,17 +21,17 @@ from rover_lib.workshop.act import (
     BACKBONES,
     ActConfig,
     Columns,
+    Pair,
     Weights,
     block_of,
     fits_columns,
     folded,
+    folded_block,
     of_columns,
 )
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.observe import Calibration, RangeObserver, observed_graph, scaled_model
 from rover_lib.workshop.scheme import KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
-
-Pair = tuple[Tensor, Tensor]  # weight and bias
 
 
 class Rounded(nn.Module):
@@ -140,8 +140,8 @@ def parameters(config: ActConfig, weights: Mapping[str, Tensor]) -> Iterator[tup
     kind, depths, _ = BACKBONES[config.backbone]
     for stage, depth in enumerate(depths, 1):
         for name in (f"backbone.layer{stage}.{block}" for block in range(depth)):
-            for i in range(2 if kind == "basic" else 3):
-                yield f"{name}.body.{2 * i}", folded(w.at(f"{name}.conv{i + 1}"), w.at(f"{name}.bn{i + 1}"))
+            for i, folded_pair in enumerate(folded_block(w.at(name), kind)):
+                yield f"{name}.body.{2 * i}", folded_pair
             if f"{name}.downsample" in w:
                 yield f"{name}.shortcut", folded(w.at(f"{name}.downsample.0"), w.at(f"{name}.downsample.1"))
     yield "image_project", pair(w.at("encoder_img_feat_input_proj"))

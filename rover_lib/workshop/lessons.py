@@ -10,7 +10,7 @@ the states are another sample's, and the teacher is asked with those: a plan is 
 Letters: B batch, C chunk, A actions, D channels of the feature map, h and w of it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -169,6 +169,21 @@ class Lessons:
         frames = self.frames[rows]
         return np.where((views == MIRRORED)[:, None, None, None], frames[:, :, ::-1], frames)
 
+    @property
+    def blocks(self) -> int:
+        """How often a policy is asked about all of them, a few at once."""
+        return _blocks(len(self))
+
+    def each_once(self) -> Iterator[np.ndarray]:
+        """(B, height, width, 3) uint8: every sample's picture, each second one mirrored, a few at once."""
+        for block in range(self.blocks):
+            rows = _rows(block, len(self))
+            yield self.pictures(rows, rows % len(VIEWS))
+
+    def apart(self, folder: Path) -> "Lessons":
+        """The same with tokens of their own, still empty, in a folder: of a student that sees like no other."""
+        return replace(self, tokens=RowFile(folder / "tokens", self.tokens.shape, np.float16))
+
     def recorded(self, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
         """(B, C, A) float32, what the driver did next, mirrored where views says so."""
         return self.data.chunks[rows] * np.where((views == MIRRORED)[:, None], MIRROR, 1)[:, None].astype(np.float32)
@@ -177,7 +192,7 @@ class Lessons:
     def ask(self, saved: Resumable, teacher: Checkpoint, rng: np.random.Generator, device: torch.device) -> None:
         """Ask the teacher about every sample, or about those that are left. Raises EpisodeError for a lost picture."""
         policy: BatchedPolicy | None = None
-        blocks = saved.steps("teacher", _blocks(len(self)), rng, frames=self.frames, maps=self.maps, plans=self.plans)
+        blocks = saved.steps("teacher", self.blocks, rng, frames=self.frames, maps=self.maps, plans=self.plans)
         for block in blocks:
             policy = policy or BatchedPolicy(teacher.config, teacher.weights).to(device)
             rows, grid = _rows(block, len(self)), (self.maps.shape[1], self.maps.shape[2])
@@ -209,7 +224,7 @@ class Lessons:
     def see(self, saved: Resumable, student: BatchedPolicy, rng: np.random.Generator) -> None:
         """The student's own feature maps, of every sample in both views."""
         device = student.image_scale.device
-        for block in saved.steps("tokens", _blocks(len(self)), rng, tokens=self.tokens):
+        for block in saved.steps("tokens", self.blocks, rng, tokens=self.tokens):
             frames = torch.from_numpy(self.frames[_rows(block, len(self))]).to(device)
             self.tokens.append(student.features(torch.stack([frames, frames.flip(2)], 1).flatten(0, 1)).half().cpu())
 

@@ -9,6 +9,7 @@ are taken as they are; of the decoder's layers the first; of every feed-forward 
 training by recordings needs, the VAE's encoder, is left out: a student is taught plans.
 """
 
+from collections import defaultdict
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -18,23 +19,26 @@ import torch
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import DistillError
-from rover_lib.workshop.act import ACT, ActConfig, FeedForward, multiply_accumulates
+from rover_lib.workshop.act import ACT, BACKBONES, ActConfig, FeedForward, multiply_accumulates
 from rover_lib.workshop.checkpoint import Checkpoint, expected_shapes
+from rover_lib.workshop.refit import Gram, refitted
 from rover_lib.workshop.samples import ACTION_NAMES
 from rover_lib.workshop.untrusted import listed
-
-RIDGE = 1e-4  # of the mean square of a unit: keeps `down` near the teacher's where the frames say nothing
-ROWS = 4096  # tokens that are multiplied at once: the sums are double, and memory is small
 
 
 @dataclass(frozen=True)
 class StudentShape:
-    """What of a student's shape may differ from its teacher's; None: as the teacher's."""
+    """What of a student's shape may differ from its teacher's; None: as the teacher's.
+
+    backbone_channels: the share of the channels inside the backbone's blocks that it computes. In its files they are
+    all there, the others as zeros: see `channels`.
+    """
 
     height: int | None = None
     width: int | None = None
     decoder_layers: int | None = None
     feedforward: int | None = None
+    backbone_channels: float | None = None
 
 
 def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
@@ -62,6 +66,15 @@ def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
                 found=own,
                 remedy="a student is a part of its teacher; train a larger policy on recordings instead",
             )
+    if (share := shape.backbone_channels) is not None:
+        if not 0 < share <= 1:
+            raise DistillError(
+                "the share of the backbone's channels must be above 0, at most 1", found=share, remedy="0.5 keeps half"
+            )
+        if BACKBONES[c.backbone][0] != "basic":
+            raise DistillError(
+                "channels can be left out of ResNets of basic blocks only", found=c.backbone, remedy="leave that out"
+            )
     smaller = teacher.at_size(shape.height or height, shape.width or width).config
     return replace(
         smaller,
@@ -82,9 +95,9 @@ def not_a_cars(config: ActConfig) -> str | None:
     return f"{len(c.cameras)} cameras, of state {states}, of action {actions}"
 
 
-def gmac(config: ActConfig) -> float:
-    """Multiply-accumulates of one inference, in 10^9."""
-    weights = {name: torch.zeros(shape) for name, shape in expected_shapes(config).items()}
+def gmac(config: ActConfig, weights: dict[str, Tensor] | None = None) -> float:
+    """Multiply-accumulates of one inference, in 10^9. weights: None for those of a policy without dead channels."""
+    weights = weights or {name: torch.ones(shape) for name, shape in expected_shapes(config).items()}
     return sum(multiply_accumulates(ACT(config, weights)).values()) / 1e9
 
 
@@ -124,22 +137,11 @@ def _grams(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> dict[str, Tensor
     By LeRobot's name of the layer: (units + 1, units + 1) float64. The mean magnitude of a unit that ReLU cuts is its
     product with the 1; for other activations the root of its mean square stands for it, see `_narrowed`.
     """
-    sums: dict[str, Tensor] = {}
-    waiting: dict[str, list[Tensor]] = {}
-    counts: dict[str, int] = {}
-
-    def add(name: str) -> None:
-        h = torch.cat(waiting.pop(name)).double()
-        h = torch.cat([h, h.new_ones(len(h), 1)], 1)
-        sums[name] = sums.get(name, 0) + h.T @ h
-        counts[name] = counts.get(name, 0) + len(h)
+    grams: dict[str, Gram] = defaultdict(Gram)
 
     def watch(name: str):
         def hook(_: nn.Module, args: tuple[Tensor]) -> None:
-            rows = waiting.setdefault(name, [])
-            rows.append(args[0][0].clone())
-            if sum(map(len, rows)) >= ROWS:
-                add(name)
+            grams[name].add(args[0][0])
 
         return hook
 
@@ -149,11 +151,9 @@ def _grams(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> dict[str, Tensor
                 hooks.enter_context(module.down.register_forward_pre_hook(watch(_lerobots(name))))
         for x in inputs:
             model(*x)
-    for name in list(waiting):
-        add(name)
-    if not sums:
+    if not grams:
         raise DistillError("choosing units needs frames", found="none", remedy="record more episodes")
-    return {name: total / counts[name] for name, total in sums.items()}
+    return {name: gram.mean() for name, gram in grams.items()}
 
 
 def _lerobots(name: str) -> str:
@@ -169,24 +169,11 @@ def _narrowed(
     down, bias = weights[f"{layer}.linear2.weight"].double(), weights[f"{layer}.linear2.bias"].double()
     magnitude = gram[-1, :-1].abs() if (gram[-1, :-1] >= 0).all() else gram.diagonal()[:-1].sqrt()
     best = (magnitude * down.norm(dim=0)).topk(units).indices.sort().values
-    rows = torch.cat([best, torch.tensor([len(gram) - 1])])  # and the 1 that carries the bias
-    whole = torch.cat([down, bias[:, None]], 1).T  # (units + 1, dim)
-    cut = whole[rows]
-    inside = gram[rows][:, rows]
-    # least squares of what is missing, so that where the frames say nothing the teacher's own weights stay
-    ridge = RIDGE * inside.diagonal()[:-1].mean() * torch.eye(len(rows), dtype=gram.dtype)
-    refit = cut + torch.linalg.solve(inside + ridge, gram[rows] @ whole - inside @ cut)
-
-    def error_pct(own: Tensor) -> float:
-        off = -whole.clone()
-        off[rows] += own
-        return 100 * ((off * (gram @ off)).sum() / (whole * (gram @ whole)).sum()).clamp(min=0).sqrt().item()
-
+    refit, errors = refitted(torch.cat([down, bias[:, None]], 1).T, gram, best)
     made = {
         f"{layer}.linear1.weight": weights[f"{layer}.linear1.weight"][best].clone(),
         f"{layer}.linear1.bias": weights[f"{layer}.linear1.bias"][best].clone(),
         f"{layer}.linear2.weight": refit[:-1].T.float().contiguous(),
         f"{layer}.linear2.bias": refit[-1].float(),
     }
-    note = {"layer": layer, "units": units, "of": len(gram) - 1}
-    return made, note | {"error_pct": error_pct(cut), "error_refit_pct": error_pct(refit)}
+    return made, {"layer": layer, "units": units, "of": len(gram) - 1, **errors}

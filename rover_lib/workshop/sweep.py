@@ -34,7 +34,16 @@ if TYPE_CHECKING:
 
 JOB, REPORT, FIGURE = "job.json", "sweep.json", "sweep.png"
 TIMING = "timing"  # the resource of a worker that has a machine to itself while it works
-STUDENT_OPTIONS = ("size", "decoder_layers", "feedforward", "qat", "steps", "samples", "seed")  # as of `rover distill`
+STUDENT_OPTIONS = (  # as of `rover distill`
+    "size",
+    "decoder_layers",
+    "feedforward",
+    "backbone_channels",
+    "qat",
+    "steps",
+    "samples",
+    "seed",
+)
 OF_A_RUN = ("run_dir", "checkpoint", "episodes")  # parameters that the sweep itself sets
 MODE = "static"  # the artifact that a run is judged by
 

@@ -172,6 +172,8 @@ def _students(root: Path) -> list[Row]:
     def row(student: Mapping[str, Any]) -> Row:
         layers = f"{student['decoder_layers']} decoder layers of {student['feedforward']}"
         low, high = student["computed_ms"]
+        if share := student.get("backbone_channels"):
+            layers += f", {share:.0%} of the backbone's channels"
         return (
             f"{student['name']}: {student['width']}x{student['height']}, {layers}",
             format(student["size_mb"], ".1f"),

@@ -81,7 +81,8 @@ def recommendation(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any])
 
 def shape_of(row: Mapping[str, Any]) -> str:
     layers = f"{row['decoder_layers']} decoder layer{'s' if row['decoder_layers'] != 1 else ''}"
-    return f"{row['width']}x{row['height']}, {layers} of {row['feedforward']}{', QAT' if row['qat'] else ''}"
+    share = f", {row['backbone_channels']:.0%} of the channels" if row.get("backbone_channels") else ""
+    return f"{row['width']}x{row['height']}, {layers} of {row['feedforward']}{share}{', QAT' if row['qat'] else ''}"
 
 
 def table(metrics: Mapping[str, Any]) -> Table:

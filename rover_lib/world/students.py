@@ -205,6 +205,7 @@ def _row(run: _Run) -> dict[str, Any]:
         "height": camera["height"],
         "width": camera["width"],
         **{key: run.shape[key] for key in ("decoder_layers", "feedforward", "qat")},
+        "backbone_channels": run.shape.get("backbone_channels"),  # students of before had all
         "gmac": run.manifest["gmac"],
         "instructions_g": run.counts and run.counts["instructions_g"],
         "simd_g": run.counts and run.counts["simd_g"],

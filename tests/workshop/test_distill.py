@@ -14,10 +14,11 @@ from rover_lib.onboard.errors import DistillError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import load_policy
 from rover_lib.workshop import distill as distill_module
-from rover_lib.workshop import training
-from rover_lib.workshop.act import Affine
+from rover_lib.workshop import session, training
+from rover_lib.workshop.act import ACT, Affine, inputs_of
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot
+from rover_lib.workshop.compare import LerobotEager
 from rover_lib.workshop.distill import Recipe, distill, summary
 from rover_lib.workshop.student import StudentShape
 
@@ -108,6 +109,41 @@ def test_killed_in_the_middle_it_goes_on_and_gives_the_same(
     assert all(torch.equal(weight, expected[name]) for name, weight in weights_of(folder).items())
     losses = [json.loads((f / "distill.json").read_text())["metrics"]["losses"] for f in (folder, taught)]
     assert losses[0] == losses[1]
+
+
+@pytest.mark.slow
+def test_a_student_of_half_the_channels_keeps_its_zeros(teacher, episodes, recipe, tmp_path, monkeypatch):
+    """Through all phases, a kill among them, to the INT8 artifact; LeRobot's forward gives what ours gives."""
+    shape, arguments = StudentShape(backbone_channels=0.5), {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
+    with monkeypatch.context() as patch:
+        save_each_step(patch, distill_module)
+        steps = interrupt(patch, distill_module, "descend", at=2)
+        with pytest.raises(KeyboardInterrupt):
+            distill(teacher, episodes, "thin", shape, qat=True, **arguments)
+        (own,) = (tmp_path / "cache").glob("student-*")
+        began, _ = torch.load(own / "start.pt", weights_only=True)
+        folder = distill(teacher, episodes, "thin", shape, qat=True, **arguments)
+    assert len(steps) == 8 + 3 + 3 + 1  # no backbone, and only the step that was interrupted again
+    ends = load_checkpoint(folder / "pretrained_model")
+    for name in (f"backbone.layer{i}.{j}" for i in (1, 2, 3, 4) for j in (0, 1)):
+        gone = (began[f"{name}.conv1.weight"] == 0).flatten(1).all(1)
+        assert gone.sum() * 2 == len(gone)
+        for part in ("conv1.weight", "bn1.weight", "bn1.bias"):
+            left = ends.weights[f"{name}.{part}"].reshape(len(gone), -1)
+            assert torch.equal(left.any(1), ~gone), part
+        assert not torch.equal(ends.weights[f"{name}.conv1.weight"], began[f"{name}.conv1.weight"])
+    content = json.loads((folder / "distill.json").read_text())
+    of_teacher, of_student = content["metrics"]["students"]
+    assert of_student["gmac"] < 0.56 * of_teacher["gmac"] and of_student["backbone_channels"] == 0.5
+    assert [note["block"] for note in content["metrics"]["backbone"]][-1] == "backbone.layer4.1"
+    assert "50% of the backbone's channels" in summary(content)
+    artifact = load_policy(folder / "policy_static.pt")
+    assert artifact.manifest["gmac"] == pytest.approx(of_student["gmac"])
+    assert (folder / "policy_static.pt").stat().st_size < 8e6  # 12 with all channels
+    sample = session.load(folder / "best_model.pth", episodes).parts.held_out[0]
+    lerobots = LerobotEager(ends).predict_chunk(sample.frame_bgr(), sample.state)
+    ours = ACT(ends.config, ends.weights)(*inputs_of(sample, ends.config))[0].numpy()
+    assert np.abs(ours - lerobots).max() < 1e-5
 
 
 @pytest.mark.slow

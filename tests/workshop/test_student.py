@@ -90,6 +90,8 @@ def test_down_is_refitted_by_least_squares(tiny, inputs):
         (StudentShape(decoder_layers=3), "decoder layers must be from 1 to its teacher's, 2, found 3"),
         (StudentShape(decoder_layers=0), "found 0"),
         (StudentShape(feedforward=129), "feed-forward must be from 1"),
+        (StudentShape(backbone_channels=0), "above 0, at most 1, found 0"),
+        (StudentShape(backbone_channels=1.5), "found 1.5"),
     ],
 )
 def test_a_student_is_no_larger_than_its_teacher(tiny, shape, says):
@@ -109,6 +111,12 @@ def test_a_policy_of_an_arm_teaches_no_car(tiny):
         arm = replace(tiny, config=replace(tiny.config, state_names=other, action_names=other))
         with pytest.raises(DistillError, match=found):
             student_config(arm, StudentShape())
+
+
+def test_channels_of_a_bottleneck_stay(tiny):
+    deep = replace(tiny, config=replace(tiny.config, backbone="resnet50"))
+    with pytest.raises(DistillError, match="basic blocks only, found resnet50"):
+        student_config(deep, StudentShape(backbone_channels=0.5))
 
 
 def test_units_are_chosen_by_frames(tiny):

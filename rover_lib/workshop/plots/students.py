@@ -48,9 +48,10 @@ def frontier(students: Sequence[Mapping[str, Any]], chosen: str) -> Figure:
 
 
 def _label(row: Mapping[str, Any]) -> str:
+    share = f", {row['backbone_channels']:.0%}" if row.get("backbone_channels") else ""
     return (
         f"{row['name']}\n{row['width']}x{row['height']}, {row['decoder_layers']} x {row['feedforward']}"
-        f"{', QAT' if row['qat'] else ''}"
+        f"{share}{', QAT' if row['qat'] else ''}"
     )
 
 

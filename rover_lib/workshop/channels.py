@@ -1,0 +1,117 @@
+"""A backbone with fewer channels inside its blocks, in LeRobot's shape: those left out are zeros in the file.
+
+    weights, notes = without_channels(weights, config, 0.5, pictures, rng)
+
+A basic block's first convolution gives channels that its second one alone reads; no residual sum sees them. One after
+the other is kept that those before it explain least, and the second convolution is refitted to what all of them gave.
+LeRobot runs such a file as any other. Our policies are built without channels that are always zero
+(`act.folded_block`), and training keeps them so: where a filter and its reader are zero both, neither gets a gradient.
+"""
+
+from collections.abc import Iterable
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from rover_lib.workshop.act import BACKBONES, ActConfig
+from rover_lib.workshop.lessons import BatchedPolicy
+from rover_lib.workshop.refit import Gram, refitted
+
+TILE = 16  # XNNPACK's INT8 kernels compute so many channels at once: counts between cost as much as the next
+PATCHES = 8  # taken of a picture's feature map in each block, at random
+TAPS = 9  # of a kernel of 3x3
+CENTRE = TAPS // 2
+
+
+def kept_of(channels: int, share: float) -> int:
+    """How many of a block's inner channels stay: the nearest multiple of TILE, one at least."""
+    return min(channels, max(1, int(channels * share / TILE + 0.5)) * TILE)
+
+
+@torch.no_grad()
+def without_channels(
+    weights: dict[str, Tensor], config: ActConfig, share: float, pictures: Iterable[Tensor], rng: np.random.Generator
+) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
+    """The same policy with that share of each block's inner channels; the others are zeros.
+
+    weights: by LeRobot's names without the leading `model.`, of a backbone of basic blocks. share: above 0, at most 1.
+    pictures: (B, height, width, 3) uint8 RGB each, of the policy's size. rng: chooses where in the pictures.
+    Returns the weights, float32, and of each block that lost channels {"block", "channels", "of", "error_pct",
+    "error_refit_pct"}: how far its second convolution is off on the pictures, see `refit.refitted`.
+    """
+    made = {name: weight.detach().float().cpu().clone() for name, weight in weights.items()}
+    _, depths, _ = BACKBONES[config.backbone]
+    names = [f"backbone.layer{stage}.{block}" for stage, depth in enumerate(depths, 1) for block in range(depth)]
+    widths = {name: len(made[f"{name}.bn1.weight"]) for name in names}
+    names = [name for name in names if kept_of(widths[name], share) < widths[name]]
+    notes = []
+    for name, gram in _grams(BatchedPolicy(config, made), names, pictures, rng).items():
+        kept = _chosen(gram, made[f"{name}.conv2.weight"], kept_of(widths[name], share))
+        errors = _leave_out(made, name, kept, gram)
+        notes.append({"block": name, "channels": len(kept), "of": widths[name], **errors})
+    return made, notes
+
+
+def _grams(
+    policy: BatchedPolicy, names: list[str], pictures: Iterable[Tensor], rng: np.random.Generator
+) -> dict[str, Tensor]:
+    """By block, the mean of u u^T, u a patch that its second convolution reads, (channels * TAPS,), and a 1."""
+    grams = {name: Gram() for name in names}
+
+    def watch(gram: Gram):
+        def hook(conv2: nn.Module, args: tuple[Tensor]) -> None:
+            patches = F.unfold(args[0], 3, padding=1).transpose(1, 2)  # (B, places, channels * TAPS)
+            for of_picture in patches:
+                gram.add(of_picture[rng.permutation(len(of_picture))[:PATCHES]])
+
+        return hook
+
+    with ExitStack() as hooks:
+        for name, gram in grams.items():
+            conv2 = policy.backbone.get_submodule(f"{name.removeprefix('backbone.')}.conv2")
+            hooks.enter_context(conv2.register_forward_pre_hook(watch(gram)))
+        for shown in pictures:
+            policy.features(shown)
+    return {name: gram.mean() for name, gram in grams.items()}
+
+
+def _chosen(gram: Tensor, reader: Tensor, count: int) -> Tensor:
+    """(count,) channels, in order: the next is always the one that those before it explain least, times its reader.
+
+    That is a Cholesky decomposition with pivots. What a channel means alone, by its size or by its gradient, says
+    nothing of what the others could say for it.
+    """
+    channels = reader.shape[1]
+    centres = torch.cat([torch.arange(channels) * TAPS + CENTRE, torch.tensor([len(gram) - 1])])
+    rest = gram[centres][:, centres]
+    read = reader.double().square().sum((0, 2, 3))
+    chosen: list[int] = []
+    for _ in range(count + 1):
+        last = chosen[-1] if chosen else channels  # first the 1: a channel that never changes is in the bias
+        rest -= torch.outer(rest[:, last], rest[last]) / rest[last, last].clamp(min=1e-12)
+        unexplained = rest.diagonal()[:-1] * read
+        unexplained[chosen] = -torch.inf
+        chosen.append(int(unexplained.argmax()))
+    return torch.tensor(chosen[:count]).sort().values
+
+
+def _leave_out(weights: dict[str, Tensor], name: str, kept: Tensor, gram: Tensor) -> dict[str, float]:
+    """Zero a block's other channels and refit their reader, in place; its batch norm takes the constant."""
+    reader = weights[f"{name}.conv2.weight"]
+    outputs, channels = reader.shape[:2]
+    whole = torch.cat([reader.double().flatten(1), torch.zeros(outputs, 1, dtype=torch.float64)], 1).T
+    inputs = (kept[:, None] * TAPS + torch.arange(TAPS)).flatten()
+    refit, errors = refitted(whole, gram, inputs)
+    gone = torch.ones(channels, dtype=torch.bool)
+    gone[kept] = False
+    for part in ("conv1.weight", "bn1.weight", "bn1.bias"):
+        weights[f"{name}.{part}"][gone] = 0
+    reader.zero_()
+    reader[:, kept] = refit[:-1].T.reshape(outputs, len(kept), 3, 3).float()
+    gain = weights[f"{name}.bn2.weight"] * (weights[f"{name}.bn2.running_var"] + 1e-5).rsqrt()
+    weights[f"{name}.bn2.bias"] += gain * refit[-1].float()
+    return errors

@@ -1,0 +1,65 @@
+"""A layer that reads fewer inputs than before, refitted to the output that all of them gave.
+
+gram = Gram()
+gram.add(rows)                                        # what the layer reads, as often as wanted
+weight, errors = refitted(whole, gram.mean(), kept)
+"""
+
+import torch
+from torch import Tensor
+
+RIDGE = 1e-4  # of the mean square of an input: keeps the weights near what they were where the rows say nothing
+ROWS = 4096  # that are multiplied at once: the sums are double, and memory is small
+
+
+class Gram:
+    """The mean of x x^T over rows that come a few at a time, x a row and a 1 behind it."""
+
+    def __init__(self) -> None:
+        self._sum: Tensor | None = None
+        self._waiting: list[Tensor] = []
+        self._count = 0
+
+    def add(self, rows: Tensor) -> None:
+        """rows: (n, inputs), on any device."""
+        self._waiting.append(rows.cpu().clone())
+        if sum(map(len, self._waiting)) >= ROWS:
+            self._multiply()
+
+    def mean(self) -> Tensor:
+        """(inputs + 1, inputs + 1) float64, of one row at least."""
+        if self._waiting:
+            self._multiply()
+        assert self._sum is not None
+        return self._sum / self._count
+
+    def _multiply(self) -> None:
+        x = torch.cat(self._waiting).double()
+        self._waiting = []
+        x = torch.cat([x, x.new_ones(len(x), 1)], 1)
+        if self._sum is None:
+            self._sum = x.new_zeros(x.shape[1], x.shape[1])
+        self._sum.addmm_(x.T, x)
+        self._count += len(x)
+
+
+def refitted(whole: Tensor, gram: Tensor, kept: Tensor) -> tuple[Tensor, dict[str, float]]:
+    """The weights of the inputs that stay, by least squares.
+
+    whole: (inputs + 1, outputs) float64, a row of weights for each input, and the bias. gram: of `Gram.mean`. kept:
+    (n,) which inputs stay. Returns (n + 1, outputs) float64, and how far the output is off on the rows, in percent of
+    its own size: error_pct with the others left out, error_refit_pct with the rest refitted.
+    """
+    rows = torch.cat([kept, torch.tensor([len(gram) - 1])])  # and the 1 that carries the bias
+    cut = whole[rows]
+    inside = gram[rows][:, rows]
+    # least squares of what is missing, so that where the rows say nothing the old weights stay
+    ridge = RIDGE * inside.diagonal()[:-1].mean() * torch.eye(len(rows), dtype=gram.dtype)
+    refit = cut + torch.linalg.solve(inside + ridge, gram[rows] @ whole - inside @ cut)
+
+    def error_pct(own: Tensor) -> float:
+        off = -whole.clone()
+        off[rows] += own
+        return 100 * ((off * (gram @ off)).sum() / (whole * (gram @ whole)).sum()).clamp(min=0).sqrt().item()
+
+    return refit, {"error_pct": error_pct(cut), "error_refit_pct": error_pct(refit)}

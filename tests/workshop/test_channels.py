@@ -1,0 +1,184 @@
+"""A backbone does without channels: in LeRobot's shape nothing else changes, and training keeps it so."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from policies import memory_samples
+
+from rover_lib.workshop.act import ACT, inputs_of, multiply_accumulates, predictions
+from rover_lib.workshop.channels import _chosen, _leave_out, kept_of, without_channels
+from rover_lib.workshop.fake_quant import parameters
+from rover_lib.workshop.lessons import BatchedPolicy
+from rover_lib.workshop.observe import calibrate
+from rover_lib.workshop.quantize import int8_layers, quantize
+from rover_lib.workshop.refit import Gram
+from rover_lib.workshop.scheme import Scheme
+
+BLOCKS = [f"backbone.layer{stage}.{block}" for stage in (1, 2, 3, 4) for block in (0, 1)]
+PARTS = ("conv1.weight", "bn1.weight", "bn1.bias")
+
+
+@pytest.fixture(scope="module")
+def thin(tiny):
+    """The tiny policy with every second inner channel zero, in half of the blocks by ReLU: its bias is below zero."""
+    weights = {k: v.clone() for k, v in tiny.weights.items()}
+    for i, name in enumerate(BLOCKS):
+        for part in PARTS:
+            weights[f"{name}.{part}"][::2] = 0
+        weights[f"{name}.bn1.bias"][::2] = -(i % 2)
+    return replace(tiny, weights=weights)
+
+
+def lerobots(checkpoint, samples):
+    """(n, C, A) of LeRobot's own forward."""
+    policy = BatchedPolicy(checkpoint.config, checkpoint.weights)
+    states, frames = zip(*(inputs_of(s, checkpoint.config) for s in samples), strict=True)
+    with torch.inference_mode():
+        return policy(torch.stack(frames), torch.cat(states))
+
+
+def test_channels_that_are_always_zero_are_not_there_and_nothing_changes(tiny, thin):
+    model, samples = ACT(thin.config, thin.weights), memory_samples(2)
+    assert model.backbone.layer4[1].body[0].weight.shape == (256, 512, 3, 3)
+    assert model.backbone.layer4[1].body[2].weight.shape == (512, 256, 3, 3)
+    expected = lerobots(thin, samples)
+    assert expected.std() > 1e-3 and (expected - lerobots(tiny, samples)).abs().max() > 1e-3
+    assert (predictions(model, [inputs_of(s, thin.config) for s in samples]) - expected).abs().max() < 1e-5
+
+
+def test_a_channel_that_is_constant_but_not_zero_stays(thin):
+    """Its reader is at the picture's border too, where it meets zeros."""
+    weights = {k: v.clone() for k, v in thin.weights.items()}
+    weights["backbone.layer4.1.bn1.bias"][::2] = 1
+    steady, samples = replace(thin, weights=weights), memory_samples(2)
+    model = ACT(thin.config, weights)
+    assert model.backbone.layer4[1].body[0].weight.shape == (512, 512, 3, 3)
+    ours = predictions(model, [inputs_of(s, thin.config) for s in samples])
+    assert (ours - lerobots(steady, samples)).abs().max() < 1e-5
+
+
+def test_half_of_the_channels_is_half_of_the_blocks_arithmetic(tiny, thin):
+    whole, half = (multiply_accumulates(ACT(c.config, c.weights)) for c in (tiny, thin))
+    assert half["backbone.layer1"] * 2 == whole["backbone.layer1"]  # the other stages have shortcuts
+    assert 0.5 < half["backbone.layer4"] / whole["backbone.layer4"] < 0.51
+    assert {k: n for k, n in half.items() if "layer" not in k} == {k: n for k, n in whole.items() if "layer" not in k}
+
+
+def test_a_block_without_any_channel_is_its_shortcut(tiny):
+    weights = {k: v.clone() for k, v in tiny.weights.items()}
+    for part in PARTS:
+        weights[f"backbone.layer1.0.{part}"].zero_()
+    dead = replace(tiny, weights=weights)
+    ours = predictions(ACT(dead.config, weights), [inputs_of(s, dead.config) for s in memory_samples(1)])
+    assert (ours - lerobots(dead, memory_samples(1))).abs().max() < 1e-5
+
+
+def test_int8_that_can_be_trained_does_without_them_too(thin):
+    model = dict(ACT(thin.config, thin.weights, for_int8=True).named_parameters())
+    for name, (weight, bias) in parameters(thin.config, thin.weights):
+        assert torch.equal(weight.reshape(model[f"{name}.weight"].shape), model[f"{name}.weight"])
+        assert torch.equal(bias, model[f"{name}.bias"])
+
+
+def test_training_leaves_zeros_alone(thin):
+    """Zero filter, zero batch norm and zero reader: none of them has a gradient, nor any decay."""
+    weights = {k: v.clone() for k, v in thin.weights.items()}
+    for name in BLOCKS:
+        weights[f"{name}.bn1.bias"][::2] = 0
+        weights[f"{name}.conv2.weight"][:, ::2] = 0
+    policy = BatchedPolicy(thin.config, weights)
+    policy.thaw()
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=0.1, weight_decay=0.1)
+    state, frame = inputs_of(memory_samples(1)[0], thin.config)
+    policy(frame[None], state).square().sum().backward()
+    optimizer.step()
+    after = policy.weights()
+    for name in BLOCKS:
+        for part in (*PARTS, "conv2.weight"):
+            key, axis = f"{name}.{part}", int(part == "conv2.weight")
+            was, now = (w[key].transpose(0, axis) for w in (weights, after))
+            assert not now[::2].any(), key
+            assert (now[1::2] != was[1::2]).any(), key
+
+
+@pytest.mark.parametrize(
+    ("channels", "share", "kept"), [(64, 0.5, 32), (64, 0.6, 32), (64, 0.65, 48), (512, 0.01, 16), (512, 1.0, 512)]
+)
+def test_counts_are_what_kernels_compute_at_once(channels, share, kept):
+    assert kept_of(channels, share) == kept
+
+
+def patches_of(h):
+    return F.unfold(h, 3, padding=1).transpose(1, 2).flatten(0, 1)
+
+
+@pytest.fixture
+def block():
+    """A block's weights by LeRobot's names, and 8 channels: 4 are mixtures of the others, and one is constant."""
+    generator = torch.Generator().manual_seed(0)
+    h = torch.rand(20, 8, 5, 6, generator=generator)
+    h[:, [1, 3, 4, 7]] = torch.einsum("oi,nihw->nohw", torch.rand(4, 4, generator=generator), h[:, [0, 2, 5, 6]])
+    h[:, 5] = 0.7
+    sizes = {"conv1.weight": (8, 6, 3, 3), "conv2.weight": (6, 8, 3, 3), "bn1.weight": (8,), "bn1.bias": (8,)}
+    sizes |= {"bn2.weight": (6,), "bn2.bias": (6,), "bn2.running_var": (6,)}
+    gram = Gram()
+    gram.add(patches_of(h))
+    weights = {f"b.{name}": torch.rand(size, generator=generator) + 0.1 for name, size in sizes.items()}
+    return SimpleNamespace(h=h, weights=weights, gram=gram.mean())
+
+
+def test_what_others_can_say_goes_first(block):
+    """All that changes is in four channels and their mixtures: four that stay must span it."""
+    kept = _chosen(block.gram, block.weights["b.conv2.weight"], 4)
+    values = block.h.transpose(0, 1).flatten(1)
+    centred = values - values.mean(1, keepdim=True)
+    rank = torch.linalg.matrix_rank
+    assert rank(centred[kept]) == rank(centred) == 4 and 5 not in kept
+
+
+def test_the_reader_is_refitted_by_least_squares(block):
+    """Against torch's lstsq on the patches themselves."""
+    kept, before = torch.tensor([0, 2]), {k: v.clone() for k, v in block.weights.items()}
+    errors = _leave_out(block.weights, "b", kept, block.gram)
+    w = block.weights
+    assert not w["b.conv1.weight"][[1, 3, 4, 5, 6, 7]].any() and not w["b.conv2.weight"][:, [1, 3, 4, 5, 6, 7]].any()
+    assert torch.equal(w["b.conv1.weight"][kept], before["b.conv1.weight"][kept])
+
+    def normed(weights, h):
+        gain = weights["b.bn2.weight"] / (weights["b.bn2.running_var"] + 1e-5).sqrt()
+        out = F.conv2d(h, weights["b.conv2.weight"], padding=1).transpose(0, 1).flatten(1)
+        return out * gain[:, None], weights["b.bn2.bias"][:, None]
+
+    (wanted, shift), (own, own_shift) = normed(before, block.h), normed(w, block.h)
+    few = patches_of(block.h[:, kept]).double()
+    few = torch.cat([few, few.new_ones(len(few), 1)], 1)
+    best = few @ torch.linalg.lstsq(few, wanted.T.double()).solution - wanted.T
+    off = (own + own_shift - wanted - shift).norm()
+    assert best.norm() <= off < 1.01 * best.norm()
+    assert errors["error_refit_pct"] < errors["error_pct"]
+    gain = (before["b.bn2.weight"] / (before["b.bn2.running_var"] + 1e-5).sqrt())[:, None]  # of the norm behind it
+    share = ((own + own_shift - wanted - shift) / gain).norm() / (wanted / gain).norm()
+    assert errors["error_refit_pct"] == pytest.approx(100 * share.item(), rel=1e-2)
+
+
+@pytest.mark.slow
+def test_a_policy_in_lerobots_shape_that_computes_half(tiny):
+    """INT8 of it acts, and is half as large in the blocks."""
+    pictures = torch.stack([inputs_of(s, tiny.config)[1] for s in memory_samples(16)])
+    made, notes = without_channels(tiny.weights, tiny.config, 0.5, pictures.split(4), np.random.default_rng(0))
+    assert {k: v.shape for k, v in made.items()} == {k: v.shape for k, v in tiny.weights.items()}
+    assert [n["block"] for n in notes] == BLOCKS and all(2 * n["channels"] == n["of"] for n in notes)
+    assert all(n["error_refit_pct"] < n["error_pct"] for n in notes)
+    half = replace(tiny, weights=made)
+    layers = int8_layers(quantize(half, Scheme(), calibrate(half, memory_samples(4))).module)
+    assert layers["backbone.layer4.0.body.0"].weight().shape == (256, 256, 3, 3)
+    assert layers["backbone.layer4.0.body.2"].weight().shape == (512, 256, 3, 3)
+    model, samples = ACT(tiny.config, made), memory_samples(3, seed=5)
+    ours = predictions(model, [inputs_of(s, tiny.config) for s in samples])
+    assert (ours - lerobots(half, samples)).abs().max() < 1e-5
+    again, nothing = without_channels(made, tiny.config, 1.0, [], np.random.default_rng(0))
+    assert nothing == [] and all(torch.equal(value, made[name]) for name, value in again.items())
