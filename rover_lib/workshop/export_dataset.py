@@ -42,13 +42,20 @@ from rover_lib.workshop.lerobot_dataset import (
     SUCCESS,
 )
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.samples import ACTION_NAMES, CAMERA, Episode, Recordings, Sample
+from rover_lib.workshop.samples import (
+    ACTION_NAMES,
+    CAMERA,
+    Episode,
+    Recordings,
+    Sample,
+    frame_rate_hz,
+    is_another_rate,
+)
 
 NAME = "cam_front"  # of the camera, as in the trainer's policies
 REWARD, DONE = "next.reward", "next.done"
 SIDES_PX = 16, 8192  # of a picture, as an artifact takes them
 SHORTEST = 2  # rows of an episode: of one there is no spread to normalise by
-OTHER_RATE = 0.2  # of the usual time between two frames
 
 
 def export_dataset(
@@ -87,22 +94,18 @@ def export_dataset(
 
 def _rate_hz(recordings: Recordings) -> int:
     """Frames a second, by the usual time between two; a rate belongs to a whole dataset."""
-    steps_s = {e.id: _step_s(e) for e in recordings.episodes if len(e.samples) > 1}
-    if not steps_s:
+    rates = {e.id: found for e in recordings.episodes if (found := frame_rate_hz(e.samples)) is not None}
+    if not rates:
         raise EpisodeError(f"{recordings.root}: no episode of two frames", remedy="record longer ones")
-    usual_s = float(np.median(list(steps_s.values())))
-    if odd := {name: s for name, s in steps_s.items() if abs(s / usual_s - 1) > OTHER_RATE}:
-        name, step_s = next(iter(odd.items()))
+    usual_hz = float(np.median(list(rates.values())))
+    if odd := {name: found for name, found in rates.items() if is_another_rate(found, usual_hz)}:
+        name, found_hz = next(iter(odd.items()))
         raise EpisodeError(
-            f"{recordings.root}: most episodes have {1 / usual_s:.1f} frames a second, {len(odd)} have another rate",
-            found=f"{1 / step_s:.1f} in {name}",
+            f"{recordings.root}: most episodes have {usual_hz:.1f} frames a second, {len(odd)} have another rate",
+            found=f"{found_hz:.1f} in {name}",
             remedy="export those of each rate by themselves",
         )
-    return max(round(1 / usual_s), 1)
-
-
-def _step_s(episode: Episode) -> float:
-    return float(np.median(np.diff([s.time_s for s in episode.samples])))
+    return max(round(usual_hz), 1)
 
 
 def _runs(samples: tuple[Sample, ...]) -> Iterator[list[Sample]]:

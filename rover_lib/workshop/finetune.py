@@ -54,14 +54,13 @@ from rover_lib.workshop.lessons import (
 )
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run_folder import run_folder
-from rover_lib.workshop.samples import Episode, Recordings, Sample, Source
+from rover_lib.workshop.samples import Episode, Recordings, Sample, Source, frame_rate_hz, is_another_rate
 from rover_lib.workshop.session import SMALL_GMAC, training_device
 from rover_lib.workshop.student import gmac, not_a_cars
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 
 OLD, NEW = "old", "new"
 TOGETHER_SLOWER = 50  # times the first phase's rate: a backbone that sees is not to be unlearned
-OTHER_RATE = 0.2  # of the time between two frames
 FADED = (0.1, 1.0)  # shares of new recordings' steering that stay in their states
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonstrations", "corrections")
 
@@ -328,17 +327,14 @@ def _refuse_another_camera(read: Sequence[Recordings]) -> None:
             )
 
 
-def _refuse_another_rate(read: Sequence[Recordings], rate_hz: float) -> None:
-    """A plan's steps are frames: of 15 a second, the car would do in half the time what the human did."""
-    for recordings in read:
-        for episode in recordings.episodes:
-            steps_s = np.diff([s.time_s for s in episode.samples]) / np.diff([s.row for s in episode.samples])
-            if len(steps_s) and abs(float(np.median(steps_s)) * rate_hz - 1) > OTHER_RATE:
-                raise FinetuneError(
-                    f"{episode.path}: the policy plans {rate_hz:g} steps a second",
-                    found=f"{episode.id} of {1 / np.median(steps_s):.1f} frames a second",
-                    remedy="give recordings of that rate alone: a camera halves its own in the dark",
-                )
+def _refuse_another_rate(read: Sequence[Recordings], plans_hz: float) -> None:
+    for episode in (episode for recordings in read for episode in recordings.episodes):
+        if is_another_rate(found_hz := frame_rate_hz(episode.samples), plans_hz):
+            raise FinetuneError(
+                f"{episode.path}: the policy plans {plans_hz:g} steps a second",
+                found=f"{episode.id} of {found_hz:.1f} frames a second",
+                remedy="give recordings of that rate alone: a camera halves its own in the dark",
+            )
 
 
 # --- learning ---------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ of its state must be of the size that it was trained on, once both are normalise
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from rover_lib.workshop.cells import Table
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.judge import Range, constant_actions
+from rover_lib.workshop.samples import Sample, frame_rate_hz, is_another_rate
 
 FRAMES = 12  # planned in FP32: ten seconds for a policy of full size
 BEYOND = 0.5  # of the recorded range, past either end: further than a policy overshoots
@@ -42,11 +44,15 @@ class Action:
 
 @dataclass(frozen=True)
 class Fit:
-    """What `fits` found. largest_state: (S,) by name, of the normalised recorded states, None if they stay raw."""
+    """What `fits` found. largest_state: (S,) by name, of the normalised recorded states, None if they stay raw.
+    plans_hz: the policy's steps a second. other_rates_hz: frames a second, by episode, where they are others.
+    """
 
     frames: int
     actions: tuple[Action, ...]
     largest_state: dict[str, float] | None
+    plans_hz: float
+    other_rates_hz: dict[str, float]
 
     def table(self) -> Table:
         """For a reader: where actions were recorded, and where this policy's lie on the same frames."""
@@ -70,6 +76,11 @@ class Fit:
             if not largest <= LARGEST_STATE:
                 what = f"the policy is told up to {largest:.3g} standard deviations"
                 warnings.append(f"state {name}: {what}; {remedy}")
+        if self.other_rates_hz:
+            episode, found_hz = next(iter(self.other_rates_hz.items()))
+            others = f" and {len(self.other_rates_hz) - 1} more" if len(self.other_rates_hz) > 1 else ""
+            what = f"the policy plans {self.plans_hz:g} steps a second, and {episode}{others} has {found_hz:.1f} frames"
+            warnings.append(f"{what}: the car would drive at another speed than the human did")
         return warnings
 
     def summary(self) -> dict[str, Any]:
@@ -81,11 +92,11 @@ class Fit:
         return {"frames": self.frames, "actions": actions, "warnings": self.warnings()}
 
 
-def fits(checkpoint: Checkpoint, samples: Sequence[Any], action_range: Mapping[str, Range]) -> Fit:
+def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mapping[str, Range]) -> Fit:
     """Plan on a few of the samples in FP32 and hold the plans against what was recorded there.
 
-    samples: with frame_bgr(), state (S,), chunk (C, A) and is_pad (C,). An action that never changes in the recordings
-    is left out: nobody knows how far it may go.
+    samples: of whole episodes, one after the other; the rate of each is held against the policy's. An action that never
+    changes in the recordings is left out: nobody knows how far it may go.
     """
     config, few = checkpoint.config, thinned(samples, FRAMES)
     plans = predictions(ACT(config, checkpoint.weights), [inputs_of(s, config) for s in few]).numpy()
@@ -104,4 +115,9 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Any], action_range: Mapping[s
     if (norm := config.state_norm) is not None:
         states = np.stack([s.state for s in samples]) * np.asarray(norm.scale) + np.asarray(norm.shift)
         largest = dict(zip(config.state_names, np.abs(states).max(0).tolist(), strict=True))
-    return Fit(len(few), tuple(actions), largest)
+    return Fit(len(few), tuple(actions), largest, config.rate_hz, _other_rates_hz(samples, config.rate_hz))
+
+
+def _other_rates_hz(samples: Sequence[Sample], plans_hz: float) -> dict[str, float]:
+    rates = {name: frame_rate_hz(list(episode)) for name, episode in groupby(samples, key=lambda s: s.episode)}
+    return {name: found for name, found in rates.items() if found is not None and is_another_rate(found, plans_hz)}

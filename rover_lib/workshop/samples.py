@@ -4,7 +4,7 @@
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,8 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.picture import PictureError, read_jpeg
 from rover_lib.onboard.recording import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
+
+OTHER_RATE = 0.2  # of the usual time between two frames
 
 ACTION_NAMES = CHANNELS
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
@@ -122,6 +124,21 @@ class Sample:
             raise EpisodeError(
                 f"{self.frame_path}: {e.what}", found=e.found, remedy="delete it or record the episode again"
             ) from None
+
+
+def frame_rate_hz(samples: Sequence[Sample]) -> float | None:
+    """Frames a second of one episode, by the usual time between two of its samples; None where there are not two."""
+    if len(samples) < 2:
+        return None
+    step_s = float(np.median(np.diff([s.time_s for s in samples]) / np.diff([s.row for s in samples])))
+    return 1 / step_s if step_s > 0 else None
+
+
+def is_another_rate(found_hz: float | None, rate_hz: float) -> bool:
+    """Whether an episode of found_hz frames a second was not recorded at rate_hz. A plan's steps are frames: of 15 a
+    second, a car that takes 30 would do in half the time what the human did.
+    """
+    return found_hz is not None and abs(rate_hz / found_hz - 1) > OTHER_RATE
 
 
 @dataclass(frozen=True, eq=False)

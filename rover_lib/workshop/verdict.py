@@ -397,9 +397,10 @@ def against(row: Mapping[str, Any]) -> str:
 def _cautions(
     stages: Stages, params: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]], best: Mapping[str, Any]
 ) -> list[str]:
-    """What limits the verdict: too few recordings, nobody who drove, a time that is not a Pi's."""
+    """What limits the verdict: numbers that do not fit, too few recordings, nobody who drove, a time not of a Pi."""
     compared, split = stages["compare"], stages["load"]["split"]
-    lines = []
+    unfit = stages["load"].get("fit", {}).get("warnings", [])
+    lines = [f"Do not drive before this is clear: {warning.removesuffix('?')}." for warning in unfit]
     shared = set(split["held_out"]) & set(split["calibration"])
     if shared or len(split["held_out"]) < params["verdict"]["held_out_episodes"]:
         alone = ", which calibrated too" if shared else ""

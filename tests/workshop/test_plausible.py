@@ -16,6 +16,9 @@ NAMES = ("steering", "throttle")
 class Driven(MemorySample):
     chunk: np.ndarray
     is_pad: np.ndarray
+    row: int
+    time_s: float
+    episode: str = "episode_1"
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +28,7 @@ def driven(tiny):
     plans = predictions(ACT(tiny.config, tiny.weights), [inputs_of(s, tiny.config) for s in samples]).numpy()
     noisy = plans + rng.normal(0, 0.1, plans.shape) * plans.std((0, 1))
     none = np.zeros(plans.shape[1], bool)
-    return [Driven(s.state, s.picture, chunk, none) for s, chunk in zip(samples, noisy, strict=True)]
+    return [Driven(s.state, s.picture, noisy[i], none, i, i / 30) for i, s in enumerate(samples)]
 
 
 def ranges(driven):
@@ -67,3 +70,18 @@ def test_statistics_of_other_states_are_said(tiny, driven):
 def test_an_action_that_never_changes_is_left_out(tiny, driven):
     fit = fits(tiny, driven, ranges(driven) | {"throttle": (0.1, 0.1)})
     assert [a.name for a in fit.actions] == ["steering"]
+
+
+@pytest.mark.parametrize(("hz", "warned"), [(28.0, False), (33.0, False), (15.0, True), (60.0, True)])
+def test_recordings_of_another_rate_are_said(tiny, driven, hz, warned):
+    """The trainer's file does not say how fast it plans, which is 30 steps a second. Of 15, it drives twice as fast."""
+    half = len(driven) // 2
+    slow = [replace(s, episode="episode_2", time_s=s.row / hz) for s in driven[half:]]
+    found = [w for w in of(tiny, driven[:half] + slow).warnings() if "steps a second" in w]
+    assert len(found) == warned
+    if warned:
+        assert f"the policy plans 30 steps a second, and episode_2 has {hz:.1f} frames" in found[0]
+
+
+def test_a_frame_that_is_missing_makes_no_other_rate(tiny, driven):
+    assert of(tiny, driven[::3]).other_rates_hz == {}

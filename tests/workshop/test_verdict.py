@@ -126,6 +126,12 @@ def test_what_ignores_its_camera_is_not_deployed(demo):
     assert judge(demo)["deploy"] == "static"
 
 
+def test_numbers_that_do_not_fit_the_recordings_are_said_first(demo):
+    demo["load"]["fit"] = {"warnings": ["throttle: far outside; are these the statistics that it was trained with?"]}
+    first = judge(demo)["cautions"][0]
+    assert first.startswith("Do not drive before this is clear: throttle: far outside") and first.endswith("with.")
+
+
 def test_a_size_that_misses_its_gate_wants_a_smaller_policy(demo):
     demo["compare"]["modes"]["static"]["size_mb"] = 120.0
     (failed,) = judge(demo)["failed"]  # not once more by the original's limit
