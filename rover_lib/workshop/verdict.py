@@ -178,6 +178,7 @@ def in_words(mode: str, key: str) -> str:
         "peak_memory_mb": f"memory of {of} while it predicts, MB",
         "peak_memory_loading_mb": f"memory of {of} while it is loaded, MB",
         "error, x workstation's": f"error of {of} on the emulated core, times the workstation's",
+        "error, x torch's": f"error of {of} on the emulated core, times torch's there",
         "frames judged on the core": f"frames that judged {of} on the emulated core",
         "tenth off the third, %": f"tenth plan of {of} against its third, % of instructions",
         "backbone values that differ": f"values of the backbone of {of} that differ from the workstation's",
@@ -196,14 +197,16 @@ def gate_in_words(gate: str) -> str:
     What is in words already stays as it is.
     """
     name, _, key = gate.partition(" ")
-    mode, _, size = name.removeprefix("policy_").partition("_")
+    stem, dot, _ = name.removeprefix("policy_").partition(".onnx")
+    mode, _, size = stem.partition("_")
     if mode not in CALLED or not key:
         for known, words in OF_BENCHMARKS.items():
             gate = gate.replace(known, words)
         return gate
     original = ", as the original promised" if key in ("model_size_mb", "accuracy_loss_pct") else ""
-    words = in_words(mode, key) + original
-    return words.replace(CALLED[mode], f"{CALLED[mode]} at {'x'.join(reversed(size.split('x')))}") if size else words
+    at = f" at {'x'.join(reversed(size.split('x')))}" if size else ""
+    engine = " for ONNX Runtime" if dot else ""
+    return (in_words(mode, key) + original).replace(CALLED[mode], f"{CALLED[mode]}{at}{engine}")
 
 
 def _failed(
