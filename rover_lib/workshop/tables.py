@@ -9,6 +9,7 @@ once. A field without its JSON is empty; a row of which nothing was measured, as
 
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -164,23 +165,24 @@ def _drives(root: Path) -> list[Row]:
     ]
 
 
-def _students(root: Path) -> list[Row]:
-    """The full-size policy that has learned, and what was distilled from it."""
-    rows = _metrics(root / "results" / "full", "distill")["students"]
+def _students(run: str, root: Path) -> list[Row]:
+    """The policy of that run, and what was distilled from it."""
+    rows = _metrics(root / "results" / run, "distill")["students"]
     actions = [key.removeprefix("recorded_").removesuffix("_pct") for key in rows[0] if key.startswith("recorded_")]
 
     def row(student: Mapping[str, Any]) -> Row:
-        layers = f"{student['decoder_layers']} decoder layers of {student['feedforward']}"
+        count = student["decoder_layers"]
+        layers = f"{count} decoder layer{'s' if count > 1 else ''} of {student['feedforward']}"
         low, high = student["computed_ms"]
         if share := student.get("backbone_channels"):
             layers += f", {share:.0%} of the backbone's channels"
         return (
             f"{student['name']}: {student['width']}x{student['height']}, {layers}",
             format(student["size_mb"], ".1f"),
-            f"{student['instructions_g']:.2f} ({student['simd_g']:.2f})",
-            f"{low:.0f} to {high:.0f}",
+            f"{student['instructions_g']:.3g} ({student['simd_g']:.3g})",
+            f"{low:.2g} to {high:.2g}",
             f"{student['hits']} of {student['trials']}",
-            f"{student['pushed_hits']} of {student['pushed_trials']} at {student['pushed_latency_ms']:.0f} ms",
+            f"{student['pushed_hits']} of {student['pushed_trials']} at {student['pushed_latency_ms']:.2g} ms",
             " / ".join(f"{student[f'recorded_{action}_pct']:.2f}" for action in actions),
         )
 
@@ -216,7 +218,8 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "demo": _demo,
     "faults": _faults,
     "drives": _drives,
-    "students": _students,
+    "students": partial(_students, "full"),
+    "channels": partial(_students, "channels"),
     "learning": _learning,
     "parameters": _parameters,
 }
