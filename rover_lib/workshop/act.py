@@ -178,9 +178,14 @@ def folded_conv(w: Weights, bn: Weights, stride: int, padding: int) -> nn.Conv2d
     return conv(*folded(w, bn), stride, padding)
 
 
+def norm_gain(bn: Weights) -> Tensor:
+    """What a frozen batch norm multiplies each channel by, (channels,)."""
+    return bn["weight"] * (bn["running_var"] + 1e-5).rsqrt()  # eps of torchvision's FrozenBatchNorm2d
+
+
 def folded(w: Weights, bn: Weights) -> Pair:
     """Weight and bias of `folded_conv`."""
-    gain = bn["weight"] * (bn["running_var"] + 1e-5).rsqrt()  # eps of torchvision's FrozenBatchNorm2d
+    gain = norm_gain(bn)
     return w["weight"] * gain[:, None, None, None], bn["bias"] - bn["running_mean"] * gain
 
 

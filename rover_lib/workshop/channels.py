@@ -17,11 +17,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_lib.workshop.act import BACKBONES, ActConfig
+from rover_lib.workshop.act import BACKBONES, ActConfig, Weights, norm_gain
 from rover_lib.workshop.lessons import BatchedPolicy
 from rover_lib.workshop.refit import Gram, refitted
 
-TILE = 16  # XNNPACK's INT8 kernels compute so many channels at once: counts between cost as much as the next
+TILE = 16  # XNNPACK's INT8 kernels compute 16 channels at a time: 17 cost as much as 32
 PATCHES = 8  # taken of a picture's feature map in each block, at random
 TAPS = 9  # of a kernel of 3x3
 CENTRE = TAPS // 2
@@ -112,6 +112,5 @@ def _leave_out(weights: dict[str, Tensor], name: str, kept: Tensor, gram: Tensor
         weights[f"{name}.{part}"][gone] = 0
     reader.zero_()
     reader[:, kept] = refit[:-1].T.reshape(outputs, len(kept), 3, 3).float()
-    gain = weights[f"{name}.bn2.weight"] * (weights[f"{name}.bn2.running_var"] + 1e-5).rsqrt()
-    weights[f"{name}.bn2.bias"] += gain * refit[-1].float()
+    weights[f"{name}.bn2.bias"] += norm_gain(Weights(weights).at(f"{name}.bn2")) * refit[-1].float()
     return errors
