@@ -70,5 +70,5 @@ class RoverArtifactConfig(PreTrainedConfig):
 
 
 def not_trained() -> PolicyError:
-    """For all that LeRobot's training asks."""
+    """The error for all that LeRobot's training asks of a policy."""
     return PolicyError("an artifact is not trained", remedy="train its checkpoint, and `rover run` that")

@@ -55,7 +55,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
             _log.warning("the policy's process is not confined: %s", self._process.unconfined)
 
     def get_optim_params(self) -> dict:
-        """Raises PolicyError."""
+        """Raises PolicyError: nothing in an artifact can be trained."""
         raise not_trained()
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
@@ -95,7 +95,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, *, config: Any = None, **kwargs: Any):
-        """Of a folder that pack() wrote. Raises ParamsError for a repository of the Hub: artifacts are files here."""
+        """The policy in a folder that pack() wrote. Raises ParamsError for all else, a repository of the Hub too."""
         folder = Path(pretrained_name_or_path)
         if not folder.is_dir():
             raise ParamsError(f"{folder}: not a folder", remedy="`python -m lerobot_robot_rover` packs an artifact")

@@ -94,7 +94,7 @@ class Ride:
     # ---- in the thread: the pilot of loop.drive
 
     def ready(self, stop: threading.Event) -> None:
-        """There is an action from the start."""
+        """Waits for nothing: there is an action from the start."""
 
     def order(self, now_s: float) -> Order:
         """The newest action. Raises CameraError for a camera by which nobody should drive."""
@@ -107,7 +107,7 @@ class Ride:
         return Order(steering, throttle, pulses.steering_us, pulses.throttle_us, frame=number)
 
     def sent(self, at_s: float, order: Order) -> None:
-        """It went out."""
+        """Notes when an order went out."""
         self._sight.sent(at_s, order.throttle)
 
     def _late(self) -> str | None:

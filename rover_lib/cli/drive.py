@@ -6,15 +6,24 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.cli import FILE, LOG_DRIVE, drive_options, open_view, run_drive, sum_up, view_options
-from rover_lib.onboard.kinds import PathTo
+from rover_lib.onboard.cli import LOG_DRIVE, drive_options, open_view, run_drive, sum_up, view_options
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.kinds import Output, PathTo
 
 
 @click.command(short_help="Drive a car, or the balloon world, by an artifact.")
 @drive_options
 @click.option("--world", "in_world", is_flag=True, help="The balloon world instead of a car, in real time.")
-@click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="With --world: of a plan, at least.")
-@click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
+@click.option(
+    "--latency-ms", type=click.FloatRange(min=0), default=0, help="With --world: how long a plan takes, at least."
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=10_000,
+    show_default=True,
+    help="With --world: seed of the first world.",
+)
 @click.pass_context
 def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **options: Any) -> None:
     """Drive ARTIFACT: arms the car once camera, plan and Arduino are ready, and stops it whatever fails.
@@ -51,15 +60,19 @@ def view(file: Path | None, drive: int, **options: Any) -> None:
 
 @click.command(short_help="Sum up a flight log, and draw it.")
 @click.argument("file", type=PathTo("flight log"))
-@click.option("-o", "--output", type=FILE, help="The figure to write [default: FILE.png].")
+@click.option("-o", "--output", type=Output(), help="The figure to write [default: FILE.png].")
 @LOG_DRIVE
-@click.option("--video", type=FILE, help="A film of the drive: .mp4, or .webp for a page.")
-@click.option("--mcap", type=FILE, help="The drive for Foxglove or Rerun, with its pictures where there are some.")
+@click.option("--video", type=Output(), help="A film of the drive: .mp4, or .webp for a page.")
+@click.option("--mcap", type=Output(), help="The drive for Foxglove or Rerun, with its pictures where there are some.")
 @click.option(
     "--pictures", type=PathTo("recordings"), help="The drive's episode [default: the one that the log names]."
 )
-@click.option("--video-hz", type=click.FloatRange(1, 60), default=30, show_default=True, help="Of it, a second.")
-@click.option("--video-width", type=click.IntRange(160, 1920), default=640, show_default=True, help="Of it, in pixels.")
+@click.option(
+    "--video-hz", type=click.FloatRange(1, 60), default=30, show_default=True, help="Pictures a second of the film."
+)
+@click.option(
+    "--video-width", type=click.IntRange(160, 1920), default=640, show_default=True, help="Width of the film in pixels."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")
 def log(
     file: Path,
@@ -103,6 +116,9 @@ def log(
 
         output = output or file.with_name(f"{file.name}.png")
         figure = flight_figure(flight)
+        if output.suffix.lower()[1:] not in figure.canvas.get_supported_filetypes():
+            found = output.suffix or "no ending"
+            raise RoverError(f"{output}: no figure has that ending", found=found, remedy="say .png, .pdf or .svg")
         with atomic_path(output) as temporary:
             figure.savefig(temporary)
         click.echo(f"drawn: {output}", err=as_json)

@@ -12,7 +12,7 @@ import click
 
 from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
 from rover_lib.onboard.columns import aligned
-from rover_lib.onboard.kinds import PathTo
+from rover_lib.onboard.kinds import Output, PathTo
 from rover_lib.workshop.progress import terminal
 
 if TYPE_CHECKING:
@@ -163,9 +163,15 @@ def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | N
 @click.command(short_help="Make one artifact of a checkpoint.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES)
-@click.option("-o", "--output", type=FILE, required=True, help="The artifact to write.")
+@click.option("-o", "--output", type=Output("artifact"), required=True, help="The artifact to write.")
 @click.option("--mode", type=click.Choice(["fp32", "dynamic", "static"]), default="static", show_default=True)
-@click.option("--kind", type=click.Choice(["symmetric", "affine"]), default="symmetric", show_default=True)
+@click.option(
+    "--kind",
+    type=click.Choice(["symmetric", "affine"]),
+    default="symmetric",
+    show_default=True,
+    help="How activations become INT8; affine is the usual recipe, and slow on a Pi.",
+)
 @click.option(
     "--observer", type=click.Choice(["histogram", "minmax", "percentile"]), default="histogram", show_default=True
 )
@@ -325,7 +331,9 @@ def finetune(
 @click.argument("run_dir", type=PathTo("run"))
 @click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")
 @click.option("--hailo", "kit", type=FILE, metavar="OUT", help="A kit for Hailo's compiler, in the new folder OUT.")
-@click.option("--samples", type=click.IntRange(min=1), default=1024, show_default=True, help="The kit's calibration.")
+@click.option(
+    "--samples", type=click.IntRange(min=1), default=1024, show_default=True, help="Frames to calibrate the kit with."
+)
 def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
     """Write the policies of the run in RUN_DIR for another engine.
 
@@ -358,7 +366,7 @@ def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
 @click.argument("episodes", type=EPISODES)
 @click.argument("out", type=FILE)
 @click.option("--video", is_flag=True, help="AV1 video, far smaller and not equal to the last bit [default: images].")
-@click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="Of the pictures [default: as recorded].")
+@click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="Size of the pictures [default: as recorded].")
 @AS_JSON
 def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> None:
     """Write our recordings in EPISODES as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.

@@ -1,13 +1,15 @@
 """The balloon world's commands."""
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 
 from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
-from rover_lib.onboard.kinds import PathTo
+from rover_lib.onboard.kinds import Output, PathTo
 from rover_lib.workshop.progress import terminal
 
 
@@ -29,15 +31,15 @@ def record(out_dir: Path, count: int, seed: int) -> None:
 
 @world.command(short_help="Train LeRobot's ACT on recordings.")
 @click.argument("episodes", type=PathTo("recordings"))
-@click.argument("output", type=FILE)
+@click.argument("output", type=Output("checkpoint"))
 @click.option(
-    "--size", type=click.Choice(["small", "full"]), default="small", show_default=True, help="Full: the real car's."
+    "--size", type=click.Choice(["small", "full"]), default="small", show_default=True, help="full: the real car's."
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps [default: the recipe's].")
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
 def train(episodes: Path, output: Path, **options: Any) -> None:
-    """Train LeRobot's ACT on EPISODES and write the checkpoint OUTPUT, in the format of the user's trainer.
+    """Train LeRobot's ACT on EPISODES and write the checkpoint OUTPUT, as a trainer's .pth.
 
     `small` takes minutes on two cores, `full`, the policy of the real car, about an hour: at a quarter of its pixels,
     then carried to 640x360. Ended at any moment (Ctrl-C, a power cut), the same command goes on where it was. Until it
@@ -55,7 +57,7 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
 @world.command(short_help="Drive an artifact through unseen worlds; count hits.")
 @click.argument("artifact", type=ARTIFACT)
 @click.option("--worlds", type=click.IntRange(min=1), default=40, show_default=True)
-@click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
+@click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Seed of the first world.")
 @AS_JSON
 def trial(artifact: Path, worlds: int, seed: int, as_json: bool) -> None:
     """Drive ARTIFACT through worlds that it has never seen, and count the balloons it hits."""
@@ -81,10 +83,24 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
     from rover_lib.workshop.run import execute
     from rover_lib.world.latency import table
 
-    (run_dir / "drive.json").unlink(missing_ok=True)  # measured by another version, perhaps
-    execute("07_drive", run_dir, worlds=worlds)
+    with _anew(run_dir / "drive.json"):  # that one may be of another version
+        execute("07_drive", run_dir, worlds=worlds)
     content = read_stage(run_dir / "drive.json", "drive")
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
+
+
+@contextlib.contextmanager
+def _anew(file: Path) -> Iterator[None]:
+    """Inside there is no such file, so that it is made; where it is not, the one of before is back."""
+    before = file.with_name(f".{file.name}.before")  # of a process that was killed, if it is there now
+    if file.exists():
+        file.replace(before)
+    try:
+        yield
+    finally:
+        if before.exists() and not file.exists():
+            before.replace(file)
+        before.unlink(missing_ok=True)
 
 
 @world.command(short_help="Judge distilled policies beside their teacher.")
@@ -119,11 +135,15 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
 @click.argument("run_dir", type=PathTo("run"))
 @click.option("--out", type=FILE, help="For what it records and learns [default: <RUN_DIR>-learn].")
 @click.option("--rounds", type=click.IntRange(min=1), default=3, show_default=True)
-@click.option("--drives", type=click.IntRange(min=1), default=20, show_default=True, help="Of each round.")
+@click.option("--drives", type=click.IntRange(min=1), default=20, show_default=True, help="Drives in each round.")
 @click.option(
-    "--worlds", type=click.IntRange(min=1), default=200, show_default=True, help="That judge, pushed; half as many not."
+    "--worlds",
+    type=click.IntRange(min=1),
+    default=200,
+    show_default=True,
+    help="Pushed worlds that judge, and half as many left alone.",
 )
-@click.option("--steps", type=click.IntRange(min=1), help="Of learning, each time [default: params.yml].")
+@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of each learning [default: params.yml].")
 @AS_JSON
 def learn(run_dir: Path, out: Path | None, worlds: int, as_json: bool, **options: Any) -> None:
     """Let the policy in RUN_DIR drive while an expert takes over where a human would, and learn on from that.

@@ -42,7 +42,8 @@ class CarShape:
 
     @classmethod
     def of(cls, car: Car | None = None) -> "CarShape":
-        """Of this car, or another. Raises ParamsError for what makes none, CarError as this_car()."""
+        """The shape of this machine's car, or of another. Raises ParamsError for numbers that no car has, CarError as
+        this_car()."""
         car = car or this_car()
         section: dict[str, Any] = params()["view"]
         measured = {"wheelbase_m": car.wheelbase_m, "focal": car.focal_px / WIDTH_PX}

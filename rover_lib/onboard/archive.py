@@ -134,6 +134,8 @@ def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
     names, total = set(), 0
     for record in records:
         name = record.filename.removeprefix("archive/")
+        if name == ".data/version":  # where torch puts it for an operator that has changed since, as gelu has
+            name = "version"
         known = [limit for pattern, limit in KNOWN_RECORDS if pattern.fullmatch(name)]
         if not known or not record.filename.startswith("archive/"):
             raise ArtifactError(

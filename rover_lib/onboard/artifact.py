@@ -32,8 +32,8 @@ ONNX_SUFFIX = ".onnx.zip"  # of artifacts for ONNX Runtime, where torch's end in
 MANGLED = re.compile(rb"___torch_mangle_\d+")
 MANIFEST_KEYS: dict[str, type | tuple[type, ...]] = {
     "schema": int,
-    "mode": str,  # fp32, dynamic, static, mixed
-    "scheme": str,  # float, symmetric, affine
+    "mode": str,  # one of MODES
+    "scheme": str,  # one of SCHEMES
     "engine": str,  # see engines.py
     "cameras": list,  # [{name, height, width}], in the graph's order
     "state_names": list,
@@ -53,7 +53,7 @@ SCHEMES = ("float", "dynamic", "symmetric", "affine")
 # What the reader takes, whatever a manifest says; both ends included
 SIDE_PX, CHUNK, RATE_HZ = (16, 8192), (1, 256), (5.0, 120.0)
 WEIGHTS_MB, GMAC = (0.0, 1000.0), (0.0, 1000.0)
-MOST_NAMES, NAME_LENGTH = 64, 64
+MOST_NAMES, NAME_LENGTH, MOST_DEPTH = 64, 64, 8
 MOST_VECTORS = 16
 # How far parity vectors may differ on a car: FP32 policies by the order of sums, INT8 ones by flipped roundings, which
 # were 0.13 on the worst of those with random weights and 0.03 on trained ones.
@@ -80,7 +80,7 @@ def save_artifact(
 
 
 def save_onnx(path: Path | str, model: bytes, manifest: dict[str, Any], parity: "dict[str, np.ndarray]") -> str:
-    """As save_artifact(), of an .onnx."""
+    """As save_artifact(), of an ONNX model's bytes."""
     records = {f"archive/extra/{name}": content for name, content in _extra(path, manifest, parity).items()}
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as z:
         for name, content in {ONNX: model, **records}.items():
@@ -98,7 +98,7 @@ def _extra(path: Path | str, manifest: dict[str, Any], parity: "dict[str, np.nda
 
 
 def car_of(manifest: dict[str, Any]) -> Car:
-    """Whose recordings an artifact was calibrated with; one that does not say it is for the first recordings' car.
+    """The car whose recordings an artifact was calibrated with, from its manifest; Car() where that names none.
 
     Raises ArtifactError for a description of no car.
     """
@@ -198,6 +198,7 @@ def check_manifest(manifest: Any, where: str) -> None:
         raise ArtifactError(
             f"{where}: its manifest is no JSON object", found=type(manifest).__name__, remedy="quantize again"
         )
+    _check_values(manifest, where, MOST_DEPTH)
     if manifest.get("schema") != SCHEMA:
         raise ArtifactError(
             f"{where}: manifest schema {manifest.get('schema')!r}, this rover_lib reads {SCHEMA}",
@@ -256,13 +257,28 @@ def check_manifest(manifest: Any, where: str) -> None:
             )
 
 
+def _check_values(value: Any, where: str, depth: int) -> None:
+    """Raise ArtifactError for values nested deeper than that, and for text that would act on the terminal it is shown
+    on: whoever reads a manifest says its values in sentences, and keeps some in a release.
+    """
+    if isinstance(value, str) and not value.isprintable():
+        raise ArtifactError(
+            f"{where}: its manifest holds text that cannot be printed", found=ascii(value)[:60], remedy="quantize again"
+        )
+    inner = [*value, *value.values()] if isinstance(value, dict) else value if isinstance(value, list) else []
+    if inner and not depth:
+        raise ArtifactError(f"{where}: its manifest is nested more than {MOST_DEPTH} deep", remedy="quantize again")
+    for each in inner:
+        _check_values(each, where, depth - 1)
+
+
 def _is_within(value: Any, limits: tuple[float, float]) -> bool:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return number and limits[0] <= value <= limits[1] and value != math.inf
 
 
 def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and 0 < len(value) <= NAME_LENGTH and value.isprintable() and "/" not in value
+    return isinstance(value, str) and 0 < len(value) <= NAME_LENGTH and "/" not in value
 
 
 def _out_of_range(where: str, manifest: dict[str, Any], key: str, limits: tuple[float, float]) -> ArtifactError:

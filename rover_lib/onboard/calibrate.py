@@ -37,7 +37,7 @@ class Link(Protocol):
     """What this needs of a ServoLink."""
 
     def tell(self, car: Car) -> None:
-        """The Arduino's pins are that car's from now on."""
+        """Make the Arduino's pins that car's from now on."""
 
     def latest(self) -> Telemetry | None:
         """The newest status."""

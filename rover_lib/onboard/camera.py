@@ -156,7 +156,7 @@ class Camera:
 
     @property
     def frames(self) -> int:
-        """Count of those that came until now."""
+        """How many frames have come until now."""
         return self._frame.number if self._frame else 0
 
     @property
@@ -248,7 +248,9 @@ class _Stamps:
         self._first: deque[tuple[float, float, float]] = deque(maxlen=DECIDING)  # stamp, and age by either clock
 
     def captured_s(self, stamp_s: float | None) -> float | None:
-        """By the clock, of a frame that has just come; None before the decision. No stamp: its arrival.
+        """When a frame that has just come was taken, seconds by the clock; None before the decision.
+
+        A frame without a stamp was taken when it arrived.
 
         Raises PictureError for a stamp that cannot be right.
         """

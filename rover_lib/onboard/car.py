@@ -1,7 +1,7 @@
 """The car: its servo pulses, the most throttle that a host gets, its camera and its wheels. All from one file, car.yml.
 
-    car = this_car()
-    ServoLink("/dev/ttyUSB0", car).send_action(steering=0.2, throttle=0.1)
+    with ServoLink("/dev/ttyUSB0", this_car()) as link:
+        link.send_action(steering=0.2, throttle=0.1)
 
 Where there is no car.yml it is the car that the recordings are of, with the constants that were checked on them. The
 Arduino is told the same numbers, and takes none beyond the limits that its firmware was compiled with; they stand here
@@ -104,7 +104,7 @@ class Car:
 
     @property
     def id(self) -> int:
-        """By which both sides know that they mean the same car: CRC-32 of the numbers."""
+        """CRC-32 of the numbers, by which host and Arduino know that they mean the same car."""
         return zlib.crc32(struct.pack("<9H", *self.numbers))
 
     @property
@@ -114,13 +114,13 @@ class Car:
 
     @property
     def cap(self) -> float:
-        """The throttle that the cap lets through forward, an action."""
+        """The most throttle forward that the cap lets through, an action in [0, 1]."""
         throttle = self.pwm.throttle
         return min(self.cap_us / abs(throttle.pulse_us(throttle.high) - throttle.neutral_us), 1.0)
 
     @property
     def focal_px(self) -> float:
-        """Of its camera, for a picture of 640 pixels."""
+        """Focal length of its camera in pixels, for a picture 640 pixels wide."""
         return round(WIDTH_PX / 2 / math.tan(math.radians(self.field_of_view_deg) / 2), 2)
 
     def drives_like(self, other: "Car") -> bool:
@@ -131,7 +131,7 @@ class Car:
         return mine == others
 
     def description(self) -> dict[str, Any]:
-        """As car.yml has it; Car.of() makes the same car of it."""
+        """What car.yml says of it; Car.of() makes the same car of this."""
         steering, throttle = self.pwm.steering, self.pwm.throttle
         reverse = {"reverse_us": throttle.pulse_us(throttle.low)} if self.reverses else {}
         return {
@@ -305,7 +305,7 @@ def this_car() -> Car:
 
 
 def yaml_of(car: Car) -> str:
-    """What a car.yml of it says."""
+    """The text of a car.yml that describes it."""
     import yaml
 
     return "# The car, as `rover calibrate` found it; docs/build.md says what each is. Pulses in microseconds.\n" + (

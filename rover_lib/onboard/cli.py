@@ -17,7 +17,7 @@ import click
 
 from rover_lib.onboard.columns import aligned, benchmark_rows, number
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import PathTo
+from rover_lib.onboard.kinds import Output, PathTo, check_output
 
 FILE = click.Path(path_type=Path)
 ARTIFACT = PathTo("artifact")
@@ -28,7 +28,7 @@ CAMERA = click.option(
     "--camera", default="0", show_default=True, help="Number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
 )
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's.")
+PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's serial port.")
 LOG_DRIVE = click.option(
     "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
 )
@@ -182,6 +182,13 @@ def drive_options(command: Callable) -> Callable:
     return command
 
 
+def _spares(_: click.Context, __: click.Parameter, file: Any) -> Any:
+    """The file, which costs nothing else of the user's. Raises KindError."""
+    if file and file.name != "-":
+        check_output(Path(file.name), None, appended=True)
+    return file
+
+
 DRIVE_OPTIONS = (
     click.argument("artifact", type=ARTIFACT, required=False),
     CAMERA,
@@ -189,24 +196,37 @@ DRIVE_OPTIONS = (
     click.option("--hz", type=click.FloatRange(10, 100), default=30.0, show_default=True, help="Commands a second."),
     click.option("--dry-run", is_flag=True, help="No Arduino, no motor: logs what would be sent."),
     click.option("--record", type=FILE, help="Write the drive as an episode into this folder."),
-    click.option("--record-mb", type=click.FloatRange(min=1), help="Most megabytes of that folder."),
+    click.option("--record-mb", type=click.FloatRange(min=1), help="At most this many megabytes in that folder."),
     click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive."),
     click.option("--ticks", type=click.IntRange(min=1), help="End after this number of commands."),
-    click.option("--throttle-limit", type=click.FloatRange(0, 1), help="[default: params.yml; with --replay: none]"),
     click.option(
-        "--blend-ticks", type=click.IntRange(min=0), help="Of a fresh plan taking over [default: params.yml]."
+        "--throttle-limit",
+        type=click.FloatRange(0, 1),
+        help="Most throttle [default: params.yml; with --replay: none].",
+    ),
+    click.option(
+        "--blend-ticks",
+        type=click.IntRange(min=0),
+        help="Commands in which a fresh plan takes over [default: params.yml].",
     ),
     click.option("--ensemble", type=float, help="LeRobot's temporal ensembling with this coefficient, such as 0.01."),
-    click.option("--threads", type=click.IntRange(min=1), help="The policy's [default: all cores but one]."),
+    click.option("--threads", type=click.IntRange(min=1), help="Threads of the policy [default: all cores but one]."),
     click.option(
-        "--log", "log_file", type=FILE, help="Flight log [default: rover/flight.log in the user's state folder]."
+        "--log",
+        "log_file",
+        type=Output("flight log", appended=True),
+        help="Flight log [default: rover/flight.log in the user's state folder].",
     ),
     click.option(
-        "--json", "json_file", type=click.File("w", lazy=True), help="Write what the drive was there; - prints it."
+        "--json",
+        "json_file",
+        type=click.File("w", lazy=True),
+        callback=_spares,
+        help="Write a summary of the drive there; - prints it.",
     ),
     click.option("--replay", type=PathTo("recordings"), help="Send this episode's pulses; no policy, no camera."),
     click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder, FIFO or .mjpeg."),
-    click.option("--view", type=FILE, help="Socket of the view that may look [default: that of your `rover view`]."),
+    click.option("--view", type=FILE, help="Socket of the view that shows it [default: that of your `rover view`]."),
     click.option("--service", is_flag=True, help="As a systemd service: disarmed until `rover arm-car`."),
 )
 
@@ -266,8 +286,14 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
     "--hz", type=click.FloatRange(5, 50), default=30.0, show_default=True, help="Controls and frames a second."
 )
 @click.option("--max-seconds", type=SECONDS, help="Longest duration of an episode.")
-@click.option("--label", default="", help='What is done, such as "hit red balloon".')
-@click.option("--episodes", type=click.IntRange(min=1), default=1, show_default=True, help="One after another.")
+@click.option("--label", default="", help='What is done in them, such as "hit red balloon".')
+@click.option(
+    "--episodes",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Episodes to record, one after another.",
+)
 @click.pass_context
 def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -> None:
     """Record a human who drives with the transmitter: episode folders in OUT_DIR, to train and calibrate with.
@@ -342,8 +368,10 @@ def doctor(
 @PORT
 @click.option("--output", type=FILE, help="The file [default: where the other commands look for car.yml].")
 @click.option("--name", default="my car", show_default=True, help="What to call the car.")
-@click.option("--field-of-view-deg", type=float, help="Of the camera, from left to right [default: the first car's].")
-@click.option("--wheelbase-m", type=float, help="From axle to axle [default: the first car's].")
+@click.option(
+    "--field-of-view-deg", type=float, help="What the camera sees, from left to right [default: the balloon world's]."
+)
+@click.option("--wheelbase-m", type=float, help="From axle to axle [default: the balloon world's].")
 @click.option("--force", is_flag=True, help="Replace a file that is there.")
 def calibrate(
     port: str,
@@ -404,7 +432,7 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 @click.option("--iterations", type=click.IntRange(min=1), default=100, show_default=True)
 @click.option("--threads", type=click.IntRange(min=0), default=0, show_default=True, help="0: all cores.")
 @click.option("--duration", type=float, help="Soak for this many seconds instead, with a time series.")
-@click.option("--output", type=FILE, help="Write benchmark JSON there, for notebook 05.")
+@click.option("--output", type=Output("stage"), help="Write benchmark JSON there, for notebook 05.")
 @click.option("--gates", is_flag=True, help="Hold the first artifact against the original's gates in params.yml.")
 @AS_JSON
 def benchmark(
@@ -419,7 +447,8 @@ def benchmark(
 ) -> None:
     """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors.
 
-    The first artifact's figures stand at the top level. Needs nothing but the artifact: this is what runs on the Pi.
+    With --json or --output the first artifact's figures are at the top level. Needs nothing but the artifacts: this is
+    what runs on the Pi.
     """
     from rover_lib.onboard.artifact import content_hash, distinct_names, read_parity
     from rover_lib.onboard.benchmark import BenchmarkOptions
@@ -467,7 +496,11 @@ def benchmark(
 @click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive [default: the service's].")
 @click.option("--heartbeat-s", type=SECONDS, help="End the drive when no `rover heartbeat` comes for this long.")
 @click.option(
-    "--wait-s", type=click.FloatRange(min=0), default=60, show_default=True, help="For what arming needs of a human."
+    "--wait-s",
+    type=click.FloatRange(min=0),
+    default=60,
+    show_default=True,
+    help="How long to wait for what arming needs of a human.",
 )
 def arm_car(yes: bool, model: str, max_seconds: float | None, heartbeat_s: float | None, wait_s: float) -> None:
     """Arm the car whose service waits for it (rover-drive.service): it drives at once. Needs root.
@@ -497,9 +530,11 @@ def heartbeat() -> None:
 
 @main.group(short_help="The models on a rover: stage, switch, roll back.")
 @click.option("--models", type=FILE, default="/var/lib/rover/models", show_default=True, help="The rover's models.")
-@click.option("--chunk", type=click.IntRange(min=1), default=32, show_default=True, help="Actions of a plan.")
+@click.option("--chunk", type=click.IntRange(min=1), default=32, show_default=True, help="Actions in a plan.")
 @click.option("--camera", default="cam_front", show_default=True, help="The policy's name for this rover's camera.")
-@click.option("--aspect", type=float, default=1.78, show_default=True, help="Of its pictures, width to height.")
+@click.option(
+    "--aspect", type=float, default=1.78, show_default=True, help="Width of its pictures divided by their height."
+)
 @click.option("--signers", type=FILE, help="Whose artifacts it takes [default: /etc/rover/allowed_signers].")
 @click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
 @click.pass_context
@@ -625,11 +660,15 @@ def view_options(command: Callable) -> Callable:
 
 
 VIEW_OPTIONS = (
-    click.option("--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="0: any."),
-    click.option("--interface", default="", help="A network that it serves too, such as wlan0 [default: none]."),
-    click.option("--token-file", type=FILE, help="What the URL must have [default: a new one, printed]."),
-    click.option("--feed", type=FILE, help="Socket at which drives come [default: that of your `rover drive`]."),
-    click.option("--drive-user", help="Whose drives may come, beside this user's own."),
+    click.option(
+        "--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="Port of the page; 0: any."
+    ),
+    click.option("--interface", default="", help="A network that may open it too, such as wlan0 [default: none]."),
+    click.option(
+        "--token-file", type=FILE, help="File with the token that the URL must have [default: a new one, printed]."
+    ),
+    click.option("--feed", type=FILE, help="Socket to which drives connect [default: that of your `rover drive`]."),
+    click.option("--drive-user", help="A user whose drives it shows, beside your own."),
 )
 
 

@@ -16,12 +16,12 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def number(value: float | None, form: str = ".1f") -> str:
-    """A dash where nothing was measured."""
+    """A number in that form; a dash where nothing was measured."""
     return "-" if value is None or not math.isfinite(value) else format(value, form)
 
 
 def ratio(over: float | None, under: float | None) -> float | None:
-    """None where one of them was not measured, or is 0."""
+    """over / under; None where one of them was not measured, or is 0."""
     return over / under if over and under else None
 
 

@@ -63,7 +63,7 @@ def refuse_root() -> None:
 
 
 def memory_mb(artifact: Path | str, threads: int) -> float:
-    """What it may take to load an artifact and to run it."""
+    """Megabytes of memory that a process may take to load an artifact and to run it."""
     return MEMORY_MB + MEMORY_PER_FILE * Path(artifact).stat().st_size / 1e6 + THREAD_MB * threads
 
 

@@ -59,7 +59,7 @@ class Car(Protocol):
     port: str
 
     def summary(self) -> dict[str, Any]:
-        """What became of it, for the report."""
+        """What became of the car, for the drive's report."""
 
 
 @dataclass(frozen=True)
@@ -377,7 +377,7 @@ class _Arming:
                     self._log.event(f"recorded: {outcome}")
 
     def arm(self) -> Telemetry | None:
-        """For the loop's hooks; raises RoverError where it is refused, and may be called again then."""
+        """Arm the car, for the loop's hooks. Raises RoverError where that is refused; it may be called again then."""
         with ExitStack() as recording, ExitStack() as driving:
             driving.enter_context(self._planner.without_rest())
             if self._options.record:
@@ -395,14 +395,14 @@ class _Arming:
         return telemetry
 
     def record(self, *row: Any, **columns: Any) -> None:
-        """For the loop's hooks: a command goes into the episode."""
+        """Write a command into the episode, for the loop's hooks."""
         if self._recorder:
             self._recorder.command(*row, **columns)
 
     def record_human(self, link: ServoLink, stop: threading.Event, over: Callable[[], str | None]) -> None:
         """After a takeover, where the drive is recorded: until the human lets go, or as TakeoverRecorder.human() ends.
 
-        Raises nothing: the human has the car, and opening the port again might take it from him.
+        Raises nothing: the human has the car, and opening the port again might take it away.
         """
         if not self._recorder:
             return

@@ -35,10 +35,10 @@ class Engine(Protocol):
 
     @property
     def threads(self) -> int:
-        """That compute."""
+        """How many threads compute."""
 
     def set_threads(self, threads: int) -> None:
-        """As threads says; of torch, those of the whole process."""
+        """Compute with that many threads from now on; torch's are those of the whole process."""
 
 
 def module_of(name: str) -> Any:

@@ -68,29 +68,29 @@ class Feed:
         self.dropped = 0  # messages for which there was no room
 
     def close(self) -> None:
-        """Nobody is fed any more."""
+        """Show nothing to anybody any more."""
         if self._socket:
             self._socket.close()
             self._socket = None
 
     def tick(self, report: Report, camera: Camera | None, pilot: PolicyPilot | None, tick: Tick) -> None:
-        """After a command went out. camera, pilot: None of a replay."""
+        """Call this after each command that went out. camera, pilot: None for a replay."""
         self._ticks.append((tick.t_s, tick.late_ms))
         if self._due():
             self._show(DRIVING, "", report, camera, pilot=pilot, tick=tick)
 
     def waiting(self, report: Report, camera: Camera | None, link: ServoLink | None, said: str = "") -> None:
-        """While nobody has armed the car. said: how the drive before this one ended."""
+        """Call this while nobody has armed the car. said: how the drive before this one ended."""
         if self._due():
             self._show(WAITING, said, report, camera, link=link)
 
     def taken_over(self, report: Report, camera: Camera | None, link: ServoLink | None, said: str) -> None:
-        """While a human is recorded who took over. said: in words."""
+        """Call this while a human who took over is recorded. said: that, in words."""
         if self._due():
             self._show(TAKEN, said, report, camera, link=link)
 
     def ended(self, report: Report, camera: Camera | None, link: ServoLink | None) -> None:
-        """Once, after a drive, with what the pins do now; where the view is busy, for LAST_S."""
+        """Call this once after a drive: it shows what the pins do now, and tries for LAST_S where the view is busy."""
         end_s = self._clock() + LAST_S
         self._ticks.clear()
         while self._connected() and not self._show(ENDED, report.ended, report, camera, link=link):
@@ -99,7 +99,7 @@ class Feed:
             self._sleep(LAST_S / 10)
 
     def over(self) -> str | None:
-        """For the loop, at each tick: why this drive is over, None if nobody asked for a stop."""
+        """Why this drive is over, None if nobody asked for a stop. The loop asks at each tick."""
         for _ in range(ASKED_MOST if self._socket else 0):
             try:
                 asked = self._socket.recv(64) if self._socket else b""

@@ -35,7 +35,7 @@ class Host:
         return max(cpu or readings.values(), default=None)
 
     def clock_mhz(self) -> float | None:
-        """The slowest core's clock now."""
+        """The slowest core's clock now; None where the machine does not say."""
         files = self.sys_root.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_cur_freq")
         return min((khz / 1000 for f in files if (khz := _number_in(f)) is not None), default=None)
 

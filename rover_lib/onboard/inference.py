@@ -214,7 +214,7 @@ class PolicyProcess:
 
     @property
     def rate_hz(self) -> float:
-        """Of the actions of a chunk."""
+        """Actions a second that a chunk is meant for."""
         return float(self.manifest["rate_hz"])
 
     @property
@@ -224,7 +224,7 @@ class PolicyProcess:
 
     @property
     def pids(self) -> tuple[int, ...]:
-        """Of the process."""
+        """The policy's process, or nothing where none runs."""
         return (self._process.pid,) if self._process else ()
 
     def predict(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
@@ -278,7 +278,7 @@ class PolicyProcess:
 
 
 def delayed(predict: Predict, latency_s: float) -> Predict:
-    """predict, but an answer takes at least latency_s."""
+    """The same as predict, but an answer takes at least latency_s."""
 
     def predict_delayed(frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
         end = time.monotonic() + latency_s

@@ -8,6 +8,7 @@ left to the command, whose own error says what is wrong with it.
 """
 
 import json
+import os
 import stat
 import zipfile
 from pathlib import Path
@@ -80,6 +81,39 @@ def check_kind(path: Path | str, wanted: str) -> None:
     kind = found[0]
     what = "an artifact already" if (kind, wanted) == ("artifact", "checkpoint") else CALLED[kind]
     raise KindError(f"{path}: this is {what}, not {CALLED[takes[0]]}", remedy=INSTEAD.get((kind, wanted), remedy))
+
+
+def check_output(path: Path, kind: str | None, *, appended: bool = False) -> None:
+    """Raise KindError for a file that a command shall not write: see `Output`."""
+    if path.is_dir():
+        raise KindError(f"{path}: this is a folder, and one file is to be written", remedy="name the file in it")
+    there = path.exists()
+    if found := set(kinds_of(path)) - {kind}:
+        raise KindError(f"{path}: this is {CALLED[found.pop()]}, and would be lost", remedy="give another name")
+    if there and not path.is_file() and not appended:
+        raise KindError(f"{path}: this is no ordinary file, and would be replaced by one", remedy="give another name")
+    folder = next((p for p in path.absolute().parents if p.exists()), Path("/"))
+    if not (there and appended) and not (folder.is_dir() and os.access(folder, os.W_OK)):
+        what = "cannot be written to" if folder.is_dir() else "this is a file, not a folder"
+        raise KindError(f"{folder}: {what}", remedy="name a file elsewhere")
+
+
+class Output(click.Path):
+    """A command's option that names a file to write. Refused before any work is one that could not be written, and one
+    that would cost what is there, as far as that is known here and of another kind than what is written.
+
+    kind: a key of CALLED, or None for what is none of these. appended: to what is there, instead of replacing it.
+    """
+
+    def __init__(self, kind: str | None = None, *, appended: bool = False):
+        super().__init__(path_type=Path)
+        self.kind, self.appended = kind, appended
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        path = Path(str(super().convert(value, param, ctx)))
+        if not (ctx and ctx.resilient_parsing):
+            check_output(path, self.kind, appended=self.appended)
+        return path
 
 
 class PathTo(click.Path):

@@ -87,11 +87,11 @@ class Policy:
 
     @property
     def threads(self) -> int:
-        """That compute an inference."""
+        """How many threads compute an inference."""
         return self._engine.threads
 
     def set_threads(self, threads: int) -> None:
-        """From now on. Some engines load the artifact again for it."""
+        """Compute with that many threads from now on. Some engines load the artifact again for it."""
         self._engine.set_threads(threads)
 
 

@@ -148,12 +148,12 @@ class Recorder:
 
     @property
     def controls(self) -> int:
-        """Count of those written."""
+        """How many controls were written."""
         return self._writer.controls
 
     @property
     def frames(self) -> int:
-        """Count of those written."""
+        """How many frames were written."""
         return self._writer.frames
 
     def _fail(self, sentence: str) -> None:

@@ -222,14 +222,20 @@ def _about(artifact: Path, manifest: dict[str, Any]) -> dict[str, Any]:
         "bytes": artifact.stat().st_size,
         "mode": manifest["mode"],
         # Nothing of when: the same artifact from the same place must not look like another one to Ansible.
-        "origin": {"file": str(artifact.absolute()), "host": socket.gethostname()},
+        "origin": {"file": _file(artifact), "host": socket.gethostname()},
         "checkpoint": manifest["checkpoint"].get("sha256", ""),
     }
 
 
+def _file(path: Path) -> str:
+    """Where a file is, in text that can be printed, as a rover takes it: a folder's name may hold a no-break space."""
+    text = str(path.absolute())
+    return text if text.isprintable() else ascii(text)[1:-1]
+
+
 @dataclass(frozen=True)
 class Staged:
-    """name: of the release. changed: it was not there before."""
+    """What staging came to. name: of the release. changed: it was not there before."""
 
     name: str
     changed: bool
@@ -283,7 +289,7 @@ class Releases:
 
     @property
     def policy(self) -> Path:
-        """What the service loads."""
+        """The artifact that the service loads."""
         return self.current_link / POLICY
 
     def path_of(self, name: str) -> Path:
@@ -410,7 +416,7 @@ class Releases:
                 raise ReleaseError(
                     f"{source}: contains {here['name'][:12]}, not {about['name'][:12]}", remedy="pack it again"
                 )
-            here["origin"] = about["origin"] if about else {**here["origin"], "file": str(source.absolute())}
+            here["origin"] = about["origin"] if about else {**here["origin"], "file": _file(source)}
             if existing := self._intact(here["name"]):
                 return Staged(existing, False)
             _write(new / DIGEST, f"{arrived}  {POLICY}\n")
@@ -638,7 +644,10 @@ class Releases:
 
 
 def sandboxed(name: str) -> None:
-    """A check: `rover release verify NAME` in the service's sandbox, as the unit that provision.yml installed."""
+    """Check a release by `rover release verify NAME` in the service's sandbox, with the unit of provision.yml.
+
+    Raises ReleaseError if it does not pass, with what it said.
+    """
     unit = SANDBOX.format(name)
     started = subprocess.run(["systemctl", "start", unit], capture_output=True, text=True)
     if started.returncode:

@@ -207,15 +207,15 @@ class Service:
         raise NotArmed("told to stop before a human armed the car")
 
     def check_request(self) -> None:
-        """For who arms, just before the Arduino is told: raises NotArmed where the operator asked too long ago."""
+        """Call this just before the Arduino is told to arm. Raises NotArmed where the operator asked too long ago."""
         check_age(self._clock() - self._asked_s)
 
     def alive(self) -> None:
-        """For what goes on after a drive has ended, at each of its turns: the watchdog hears of it."""
+        """Tell the watchdog that what goes on after a drive is alive; to be called at each of its turns."""
         self._rounds += 1
 
     def over(self) -> str | None:
-        """For the loop: why this drive is over by what was requested, None if it is not."""
+        """Why this drive is over by what was requested, None if it is not. The loop asks at each tick."""
         request, now = self._request or Request(), self._clock()
         if request.max_seconds is not None and now - self._armed_s >= request.max_seconds:
             return f"{request.max_seconds:g} s, as requested"

@@ -150,7 +150,7 @@ class Telemetry:
 
 
 def frame(body: str) -> bytes:
-    """The line of a body: with its CRC-32 and its end."""
+    """The line that a body is sent as, with its CRC-32 and its end."""
     return f"{body}*{zlib.crc32(body.encode('ascii')):08X}\n".encode("ascii")
 
 

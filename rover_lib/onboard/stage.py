@@ -27,7 +27,10 @@ SCHEMA = 1
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """A temporary path beside `path`; renamed onto it when the block ends well, removed when it does not."""
+    """A temporary path beside `path`; renamed onto it when the block ends well, removed when it does not.
+
+    Raises RoverError where torch.save has no room.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{path.suffix}")
@@ -39,6 +42,10 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         with temporary.open("rb") as f:
             os.fsync(f.fileno())  # a power cut after the rename must not leave an empty file
         temporary.replace(path)
+    except RuntimeError as error:
+        if "inline_container" not in str(error):  # torch's writer of files, which drops the system's error
+            raise
+        raise RoverError(f"{path}: cannot be written whole", remedy="is the disk full?") from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -62,7 +69,7 @@ def sha256_of(path: Path | str) -> str:
 
 
 def version_of(package: str) -> str | None:
-    """Of an installed package; None if it is not."""
+    """The version of an installed package, None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

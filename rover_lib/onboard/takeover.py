@@ -5,7 +5,7 @@
     ...                                              # the loop raises TakenOver: it has ended, and armed nothing
     takeover = recorder.human(link, armed, rate_hz=30, stop=stop)
 
-From the takeover on the car is the human's: here statuses of the Arduino are read and written down, until he lets go,
+From the takeover on the car is the human's: here statuses of the Arduino are read and written down, until they let go,
 and nothing is sent to it. Each control has a column `driver`, one of recording.DRIVERS. A human's pulses are those of
 the receiver, as the Arduino measures them; where its pins do something else (a throttle that waits until it was at
 rest, a signal that was lost), nobody drives.

@@ -365,7 +365,7 @@ class _LogFile:
         return fd
 
     def sync(self) -> None:
-        """Until what was written is on the disk."""
+        """Wait until what was written is on the disk."""
         os.fsync(self.open())
 
     def close(self) -> None:

@@ -9,7 +9,7 @@ from rover_lib.onboard.wheel_version import UNTAGGED
 
 
 def versions() -> list[str]:
-    """A line for each."""
+    """A line each for rover, Python and every engine's package."""
     lines = [f"rover {_version('rover-policy') or f'{UNTAGGED}, not installed'}", f"Python {platform.python_version()}"]
     for engine, package in PACKAGES.items():
         there = f"{package} {_version(package) or ''}".rstrip() if find_spec(package) else f"{package} is not installed"

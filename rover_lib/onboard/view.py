@@ -83,7 +83,7 @@ class Address:
 
     def is_ours(self, host: str) -> bool:
         """Whether a request's Host: header names this machine. An address cannot be made to lead elsewhere; a name that
-        somebody else owns can, and then his page would be taken for ours."""
+        somebody else owns can, and then their page would be taken for ours."""
         match = HOST.fullmatch(host)
         if not match:
             return False
@@ -95,7 +95,7 @@ class Address:
 
 
 def new_token() -> str:
-    """One that nobody guesses."""
+    """A token that nobody guesses."""
     return secrets.token_urlsafe(16)
 
 
@@ -229,6 +229,8 @@ class View:
             with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) as other:
                 if other.connect_ex(str(place)) == 0:
                     raise ViewError(f"{place}: another view listens there", remedy="end that one first")
+            if place.exists() and not place.is_socket():
+                raise ViewError(f"{place}: is there, and is no socket", remedy="name another with --feed")
             place.unlink(missing_ok=True)  # of one that was killed
             wire.bind(str(place))
             place.chmod(0o666 if self._open_to_all else 0o600)

@@ -157,7 +157,7 @@ def unfinished_drive(log: Path | str) -> str | None:
 
 
 class HealthWatch:
-    """For drive's `watch`: what was out of the ordinary since it was asked last, a sentence for each.
+    """What was out of the ordinary since it was asked last, a sentence for each: `warnings` of loop.Hooks.
 
     link: None drives no motor.
     """

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from torch import Tensor
 
-from rover_lib.onboard.errors import CheckpointError, RoverError
-from rover_lib.onboard.stage import sha256_of
+from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
 from rover_lib.workshop.alone import alone_in
-from rover_lib.workshop.checkpoint import ORIGIN, RATE_HZ
+from rover_lib.workshop.lerobot_checkpoint import ORIGIN, RATE_HZ
 from rover_lib.workshop.training import trainer_config
 
 EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
@@ -44,7 +45,7 @@ def write_trainer(
     its training, as `training.trainer_config` wants them.
 
     No optimizer state: it was of another loss. Raises CheckpointError for a policy whose rate or normalisation that
-    format cannot hold: it knows ImageNet's for the picture, and none for states and actions.
+    format cannot hold: it knows ImageNet's for the picture, and none for states and actions; and as `atomic_path`.
     """
     if not trainer_can_hold(config):
         raise CheckpointError(
@@ -59,11 +60,15 @@ def write_trainer(
         "best_val_loss": np.float64(best_val_loss),
         "config": trainer_config(config, **settings) | {"use_vae": config.vae_layers > 0, "origin": origin},
     }
-    torch.save(content, path)
+    with atomic_path(path) as temporary:
+        torch.save(content, temporary)
 
 
 def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], origin: dict[str, Any]) -> None:
-    """A folder that LeRobot's ACTPolicy.from_pretrained and its processors load. weights: as for `write_trainer`."""
+    """A folder that LeRobot's ACTPolicy.from_pretrained and its processors load. weights: as for `write_trainer`.
+
+    Raises CheckpointError on a full disk.
+    """
     # here, because it takes ten seconds to import
     from lerobot.configs.types import NormalizationMode
     from lerobot.policies.act.processor_act import make_act_pre_post_processors
@@ -83,7 +88,10 @@ def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], o
     if (scaled := config.action_unnorm) is not None:
         stats["action"] = {"mean": torch.tensor(scaled.shift), "std": torch.tensor(scaled.scale)}
     folder.mkdir(parents=True, exist_ok=True)
-    policy.save_pretrained(folder)
+    try:
+        policy.save_pretrained(folder)
+    except SafetensorError as error:
+        raise CheckpointError(f"{folder}: cannot be written whole", remedy="is the disk full?") from error
     for processor in make_act_pre_post_processors(policy.config, stats):
         processor.save_pretrained(folder)
     (folder / ORIGIN).write_text(json.dumps(origin | {"rate_hz": config.rate_hz}, indent=2) + "\n")
@@ -113,10 +121,8 @@ def made_beside(folder: Path, last: str) -> Iterator[Path]:
     """A hidden folder beside a run's, empty: what is in it when the block ends well moves into the run's folder, the
     file `last` last. Nothing does otherwise, and the hidden one goes.
 
-    Raises RoverError where the run's folder is a file, and while another process makes a run of that name.
+    Raises RoverError while another process makes a run of that name.
     """
-    if folder.exists() and not folder.is_dir():
-        raise RoverError(f"{folder}: is a file, and not a run's folder", remedy="give another --name")
     # not `.new`, in which a run of that name may wait to go on
     with alone_in(folder.with_name(f".{folder.name}.made")) as new:
         yield new

@@ -201,7 +201,10 @@ def artifacts(run_dir: Path | str) -> dict[str, Path]:
 
 
 def load_policies(run_dir: Path | str, threads: int | None = None) -> dict[str, Policy]:
-    """Every artifact of a run, loaded and checked as on the Pi. ArtifactError for one that does not pass."""
+    """Every artifact of a run by mode, loaded and checked as on the Pi.
+
+    Raises ArtifactError for one that does not pass, PolicyError where there is no policy_fp32.pt.
+    """
     policies = {mode: load_policy(path, threads=threads) for mode, path in artifacts(run_dir).items()}
     if "fp32" not in policies:
         raise PolicyError(f"{run_dir}: no policy_fp32.pt in it", found=sorted(policies), remedy="run notebook 03")

@@ -25,7 +25,8 @@ import torch
 from torch import Tensor
 
 from rover_lib.onboard import preprocess
-from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.artifact import ONNX_SUFFIX
+from rover_lib.onboard.errors import CheckpointError, DistillError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, write_stage
 from rover_lib.workshop import act, channels, refit, training
@@ -43,6 +44,7 @@ from rover_lib.workshop.episodes import Sample
 from rover_lib.workshop.export import export
 from rover_lib.workshop.fake_quant import RoundedPolicy
 from rover_lib.workshop.judge import Range, not_judged, pct_of_range, shown_pct, worst
+from rover_lib.workshop.lerobot_checkpoint import read_origin
 from rover_lib.workshop.lessons import BatchedPolicy, Lessons, in_another_light, judged_ranges, plans_of
 from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
@@ -114,8 +116,8 @@ def distill(
     teacher's own shape, and that is all that is done. device: 'cpu', 'cuda' or None for the best there is.
     Ended at any moment and started again with the same arguments, it goes on and gives the same student. What was
     in the run's folder before stays until the new is whole.
-    Raises DistillError for a student, a device or recordings that cannot be; CheckpointError, EpisodeError,
-    TrainingError; RoverError while another process makes a run of that name.
+    Raises DistillError for a student, a device or recordings that cannot be, and for a run that has a policy which is
+    no student; CheckpointError, EpisodeError, TrainingError; RoverError while another process makes a run of that name.
     """
     folder, where = run_folder(runs_dir, name, DistillError), training_device(device, DistillError)
     recipe = recipe or Recipe(**params()["distill"])
@@ -123,6 +125,7 @@ def distill(
         raise DistillError("a seed must be at least 0", found=recipe.seed)
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint
+    _refuse_another_policy(folder, teacher)
     config = student_config(teacher, shape)
     share = None if shape.backbone_channels == 1 else shape.backbone_channels
     work = _Work(opened, config, share, recipe, qat, where, progress)
@@ -135,8 +138,28 @@ def distill(
     ):
         taught = _taught(work)
         _leave(new, name, work, taught)
-    shutil.rmtree(taught.folder)
+    (folder / f"policy_static{ONNX_SUFFIX}").unlink(missing_ok=True)  # of the policy_static.pt that this one replaced
+    shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
     return folder
+
+
+def _refuse_another_policy(folder: Path, teacher: Checkpoint) -> None:
+    """Raise DistillError if the run's folder holds a policy that somebody trained, and that a student would replace."""
+    remedy = "give another --name"
+    if teacher.path.resolve().is_relative_to(folder):
+        raise DistillError(f"{folder}: holds the teacher, which its student would replace", remedy=remedy)
+    for path in (folder / "best_model.pth", folder / "pretrained_model"):
+        if path.exists() and not _is_student(path):
+            raise DistillError(f"{path}: is no student, and one would replace it", remedy=remedy)
+
+
+def _is_student(path: Path) -> bool:
+    """Whether `distill` has left that checkpoint."""
+    try:
+        origin = load_checkpoint(path).report["trainer_config"]["origin"] if path.is_file() else read_origin(path)
+        return "teacher_sha256" in origin
+    except (CheckpointError, KeyError, TypeError):
+        return False
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,7 +337,16 @@ def _start(room: _Room, backbone: dict[str, Tensor], folder: Path) -> tuple[dict
             weights, thinner = without_channels(weights, work.config, work.share, shown, work.rng("channels"))
         with atomic_path(path) as temporary:
             torch.save((weights, {"backbone": thinner, "feed_forward": narrowed}), temporary)
-    return torch.load(path, weights_only=True)
+    return _kept(path)
+
+
+def _kept(path: Path) -> Any:
+    """What a phase left. Raises TrainingError for a damaged file."""
+    try:
+        return torch.load(path, weights_only=True)
+    except Exception as error:  # whatever such a file makes torch say
+        remedy = f"remove {path.parent} to teach from the beginning"
+        raise TrainingError(f"{path}: cannot go on from it", found=type(error).__name__, remedy=remedy) from error
 
 
 def _train_transformer(room: _Room, policy: BatchedPolicy, saved: Resumable) -> None:
@@ -353,7 +385,7 @@ def _train_rounded(room: _Room, policy: BatchedPolicy, saved: Resumable, folder:
         calibration, scheme = _calibrated(work, student)
         with atomic_path(path) as temporary:
             torch.save({"calibration": calibration.__dict__, "scheme": asdict(scheme)}, temporary)
-    kept = torch.load(path, weights_only=True)
+    kept = _kept(path)
     rounded = RoundedPolicy(student, Scheme(**kept["scheme"]), Calibration(**kept["calibration"])).to(work.device)
     exact = BatchedPolicy(work.config, student.weights).to(work.device)
     optimizer, scheduler = optimiser(policy.parameters(), recipe.qat_rate, recipe.qat_steps)

@@ -30,20 +30,20 @@ from rover_lib.workshop.quantize import QuantizedPolicy, int8_layers
 
 
 class Form(Protocol):
-    """A policy as one engine takes it."""
+    """A policy as one engine takes it. inputs: of each sample (state, frames...), as `inputs_of` gives them."""
 
     engine: str
     versions: dict[str, str]
 
     def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
-        """(n, C, A) raw actions."""
+        """(n, C, A) float32: actions of n inputs, not clipped."""
 
     def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
-        """The artifact; returns its content hash."""
+        """Write the artifact; returns its content hash."""
 
 
 class TorchScript:
-    """Traced and frozen."""
+    """The policy as TorchScript, traced and frozen."""
 
     engine = TORCH
 
@@ -62,7 +62,7 @@ class TorchScript:
 
 
 class Onnx:
-    """Written node by node, see `onnx_graph`."""
+    """The policy as ONNX, written node by node: see `onnx_graph`."""
 
     engine = ONNXRUNTIME
 
@@ -183,7 +183,7 @@ def export(
     calibration: Calibration | None = None,
     parity: Parity | None = None,
 ) -> str:
-    """One artifact, as `Exporter` writes it; returns its content hash."""
+    """Write one artifact as `Exporter.export` does; returns its content hash."""
     return Exporter(checkpoint, samples, parity).export(policy, path, calibration)
 
 

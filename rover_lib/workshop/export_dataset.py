@@ -216,7 +216,7 @@ class _Said:
 
     @property
     def features(self) -> dict[str, Any]:
-        """LeRobot's, as its own commands make them."""
+        """The features that a dataset has of this, as LeRobot's own commands make them."""
 
         def one(dtype: str) -> dict[str, Any]:
             return {"dtype": dtype, "shape": (1,), "names": None}
@@ -225,7 +225,7 @@ class _Said:
         return features | ({REWARD: one("float32"), DONE: one("bool"), SUCCESS: one("bool")} if self.outcome else {})
 
     def of_frame(self, episode: Episode, sample: Sample, last: bool) -> dict[str, Any]:
-        """last: of its episode in the dataset."""
+        """What a frame has of them. last: whether it is the last of its episode in the dataset."""
         row: dict[str, Any] = {}
         if self.intervention:
             row[INTERVENTION] = np.array([sample.driver == HUMAN and episode.by_policy])

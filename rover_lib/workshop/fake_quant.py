@@ -35,7 +35,7 @@ from rover_lib.workshop.scheme import KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 
 
 class Rounded(nn.Module):
-    """What an activation is after it was INT8."""
+    """Rounds an activation as INT8 would, by what its observer saw."""
 
     def __init__(self, observer: RangeObserver):
         super().__init__()

@@ -148,7 +148,7 @@ def finetune(
             raise _is_there(folder)
         taught = _taught(work)
         _leave(new, name, work, taught)
-    shutil.rmtree(taught.folder)
+    shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
     return folder
 
 

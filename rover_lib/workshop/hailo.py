@@ -201,7 +201,7 @@ class Network:
 
 
 def networks(policy: ACT) -> tuple[Network, Network, onnx.ModelProto]:
-    """Of an FP32 policy: `backbone`, `whole`, and the transformer that follows `backbone` on the processor."""
+    """The networks of an FP32 policy: `backbone`, `whole`, and the transformer behind `backbone` for the processor."""
     config = policy.config
     pictures = {f"frame_{n}": torch.zeros(1, 3, *s) for n, s in zip(config.cameras, config.image_sizes, strict=True)}
     grids = [config.grid(*size) for size in config.image_sizes]
@@ -281,7 +281,7 @@ def write_kit(
     leaves nothing half-written.
     """
     out = Path(out)
-    if out.exists():
+    if out.exists() or out.is_symlink():
         raise QuantizeError(f"{out}: exists already", remedy="give a folder that does not")
     recipe = Recipe.of(params(), samples)
     chosen, _ = recipe.choose(loaded.parts.calibration)
@@ -563,7 +563,7 @@ def estimate(network: Network, chip: Chip) -> Estimate:
 
 
 def script_names(network: Network) -> dict[str, str]:
-    """Of the nodes that the model script names: what the compiler should call their layers.
+    """What the compiler should call the layers of the nodes that the model script names, by those nodes' names.
 
     As in the zoo's script for DETR, layers of a kind are numbered in the graph's order, and a product with weights is a
     convolution. compile.py checks it before anything is quantized.
@@ -624,7 +624,7 @@ def model_script(network: Network, chip: Chip, config: ActConfig, samples: int) 
 
 
 def compile_script(chip: Chip) -> str:
-    """compile_<chip>.sh."""
+    """The text of compile_<chip>.sh."""
     return f"""#!/bin/sh
 # sh compile_{chip.name}.sh [backbone|whole], where Hailo's Dataflow Compiler {chip.compiler}.x is installed
 exec python3 "$(dirname "$0")/compile.py" {chip.name} "${{1:-backbone}}"
@@ -632,7 +632,7 @@ exec python3 "$(dirname "$0")/compile.py" {chip.name} "${{1:-backbone}}"
 
 
 def description(kit: Kit, report: Mapping[str, Any]) -> str:
-    """KIT.md."""
+    """The text of KIT.md."""
     lines = [
         "# A kit for Hailo's compiler",
         "",

@@ -31,7 +31,7 @@ class Benchmarks:
     unusable: list[str]
 
     def soaks(self) -> dict[str, dict[str, Any]]:
-        """Those with a time series."""
+        """The benchmarks with a time series, by host."""
         return {host: b for host, b in self.by_host.items() if b["metrics"].get("series")}
 
     def table(self) -> Table:

@@ -37,7 +37,7 @@ class Judged:
     after: Mapping[str, float | None]
 
     def row(self) -> dict[str, Any]:
-        """For JSON."""
+        """The same as plain JSON types."""
         errors: dict[str, float | None] = {}
         for action, before in self.before.items():
             errors |= {f"before_{action}_pct": before, f"after_{action}_pct": self.after[action]}

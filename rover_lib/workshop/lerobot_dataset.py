@@ -8,7 +8,7 @@ guessed, because a throttle in the place of a steering angle trains, calibrates 
 
 import json
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from rover_lib.workshop.samples import (
     Recordings,
     Sample,
     Source,
-    camera_name,
+    camera_names,
 )
 from rover_lib.workshop.untrusted import listed, shown
 
@@ -42,6 +42,7 @@ INFO_BYTES = 5_000_000  # LeRobot's: some kB
 CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 STATE, ACTION = "observation.state", "action"
+NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index")
 INTERVENTION = "intervention"  # as lerobot-rollout writes it: in this frame a human had taken over from a policy
 SUCCESS = "next.success"
 REPORT = "rover_export.json"  # beside a dataset of our own, where it says for each episode:
@@ -76,10 +77,10 @@ class _Pictures:
         with _said_of(path, f"its frame {row} cannot be decoded"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torchvision, about the decoder that LeRobot has chosen
             item = self.dataset[row]
+            # (3, h, w) float32 in [0, 1] each; uint8 / 255 times 255 is exact
+            pixels = [(item[camera.key] * 255).round().byte().permute(1, 2, 0).numpy() for camera in self.cameras]
         frames = {}
-        for camera in self.cameras:
-            pixels = item[camera.key]  # (3, h, w) float32 in [0, 1]
-            frame = (pixels * 255).round().byte().permute(1, 2, 0).numpy()  # uint8 / 255 times 255: exact
+        for camera, frame in zip(self.cameras, pixels, strict=True):
             if frame.shape != (*camera.size, 3):
                 raise EpisodeError(
                     f"{path}: its frame {row} of '{camera.key}' has another shape than meta/info.json says, "
@@ -122,6 +123,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     root = source.path
     info = _read_info(root)
     layout, cameras = _layout(root, info, source)
+    _check_tables(root, info["features"], {*NUMBERS, INTERVENTION, SUCCESS, *(camera.key for camera in cameras)})
     dataset = _opened(root)
     columns = _columns(root, dataset, layout)
     pictures = _Pictures(dataset, cameras)
@@ -214,7 +216,7 @@ def _is_feature(feature: Any) -> bool:
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, tuple[_Camera, ...]]:
     """Which cameras and which numbers are whose."""
     features = info["features"]
-    keys = {camera_name(k): k for k, f in features.items() if f.get("dtype") in ("image", "video")}
+    keys = camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
     if not keys:
         raise EpisodeError(f"{root}: has no camera", found=listed(features), remedy="record one that sees")
     names = source.cameras or (tuple(keys) if len(keys) == 1 else ())
@@ -289,6 +291,24 @@ def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int
     raise EpisodeError(f"{root}: '{key}' is no camera in colour", found=shape, remedy="choose another: --camera NAME")
 
 
+def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> None:
+    """Raise EpisodeError for tables that are not there, and for frames that lack a feature which is read.
+
+    LeRobot's loader fills such a column with nothing: who drove, say, would be nobody's mark instead of a human's.
+    """
+    from pyarrow import parquet  # here, because our own recordings need not wait for it
+
+    for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
+        if not list(root.glob(pattern)):
+            raise EpisodeError(f"{root}: has no {pattern}", remedy=COPY_AGAIN)
+    wanted = [name for name, feature in features.items() if name in read and feature.get("dtype") != "video"]
+    for path in sorted(root.glob("data/*/*.parquet")):
+        with _said_of(path, "LeRobot cannot read it"):
+            columns = parquet.read_schema(path).names
+        if missing := [name for name in wanted if name not in columns]:
+            raise EpisodeError(f"{path}: has no column {listed(missing)}", found=listed(columns), remedy=COPY_AGAIN)
+
+
 def _opened(root: Path) -> "LeRobotDataset":
     """LeRobot's own loader on a local folder. It would fetch what is missing there: here that is an error."""
     # here, because it takes seconds that our own recordings need not wait for
@@ -298,12 +318,15 @@ def _opened(root: Path) -> "LeRobotDataset":
         def download(self, download_videos: bool = True) -> None:
             raise FileNotFoundError("frames of some of its episodes are not there")
 
-    for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
-        if not list(root.glob(pattern)):
-            raise EpisodeError(f"{root}: has no {pattern}", remedy=COPY_AGAIN)
     given = {"repo_id": f"local/{root.resolve().name}", "root": root, "revision": "local"}
     with _said_of(root, "LeRobot cannot read it"):
         meta = LeRobotDatasetMetadata(**given)
+        if meta.total_episodes > len(meta.episodes):  # LeRobot lists them all before it looks at one
+            raise EpisodeError(
+                f"{root}: {INFO} says {shown(meta.total_episodes)} episodes",
+                found=f"{len(meta.episodes)} in meta/episodes",
+                remedy=COPY_AGAIN,
+            )
         for key in meta.video_keys:
             for number in range(meta.total_episodes):
                 if not (video := root / meta.get_video_file_path(number, key)).is_file():
@@ -327,10 +350,9 @@ def _said_of(path: Path, what: str) -> Iterator[None]:
 
 def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
     """All frames' numbers, in their order: state (n, S) and action (n, A) float32 by the layout's names, and times."""
-    names = [STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index"]
     marks = [key for key in (INTERVENTION, SUCCESS) if _is_mark(dataset.meta.features.get(key))]
     with _said_of(root, "its numbers cannot be read"):
-        columns = dataset.hf_dataset.select_columns(names + marks).with_format("numpy")[:]
+        columns = dataset.hf_dataset.select_columns([*NUMBERS, *marks]).with_format("numpy")[:]
         for key in marks:
             columns[key] = np.asarray(columns[key]).reshape(len(columns["timestamp"])).astype(bool)
         for key, order in ((STATE, layout.state_order), (ACTION, layout.action_order)):
@@ -341,7 +363,13 @@ def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str,
         for i, name in enumerate(labels):
             low, high = (lows[i], highs[i]) if key == ACTION else (-np.inf, np.inf)
             values = columns[key][:, i]
-            if wrong := np.flatnonzero(~np.isfinite(values) | (values < low) | (values > high)).tolist():
+            if broken := np.flatnonzero(~np.isfinite(values)).tolist():
+                raise EpisodeError(
+                    f"{root}: {name} of '{key}' is {values[broken[0]]:g} in frame {broken[0]} and {len(broken) - 1} "
+                    "more, which is no number that was recorded",
+                    remedy="leave those episodes out (lerobot-edit-dataset can), or record them again",
+                )
+            if wrong := np.flatnonzero((values < low) | (values > high)).tolist():
                 raise EpisodeError(
                     f"{root}: {name} of '{key}' is {values[wrong[0]]:g} in frame {wrong[0]} and {len(wrong) - 1} more, "
                     f"a rover's lies from {low:g} to {high:g}",
@@ -375,7 +403,9 @@ def _check_episodes(root: Path, dataset: "LeRobotDataset", number: np.ndarray) -
     with _said_of(root, "its table of episodes cannot be read"):
         table = dataset.meta.episodes.select_columns(["episode_index", "length"]).with_format("numpy")[:]
         index, lengths = (np.asarray(table[key]) for key in ("episode_index", "length"))
-        agree = np.array_equal(index, np.arange(len(index))) and np.array_equal(number, np.repeat(index, lengths))
+        # what the lengths come to is asked first: as many numbers are made of them
+        agree = np.array_equal(index, np.arange(len(index))) and lengths.sum() == len(number)
+        agree = agree and np.array_equal(number, np.repeat(index, lengths))
     if not agree:
         raise EpisodeError(
             f"{root}: meta/episodes and the frames in data do not belong together",
@@ -395,9 +425,11 @@ def _episode(
     """rows: of the whole dataset, those of one episode. said: by our own export."""
     meta, first, n = pictures.dataset.meta, int(rows[0]), len(rows)
     number = int(columns["episode_index"][first])
-    name, data = f"episode_{number:06d}", root / meta.get_data_file_path(number)
-    keys = [camera.key for camera in pictures.cameras]
-    files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
+    name, keys = f"episode_{number:06d}", [camera.key for camera in pictures.cameras]
+    with _said_of(root, f"where the files of episode {number} lie, and what its task was, cannot be read"):
+        data = root / meta.get_data_file_path(number)
+        files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
+        task = meta.tasks.index[meta.tasks["task_index"] == columns["task_index"][first]]
     index = np.arange(n)[:, None] + np.arange(chunk)
     actions, pads = columns[ACTION][rows], index >= n
     chunks = actions[np.minimum(index, n - 1)]
@@ -419,7 +451,6 @@ def _episode(
         )
         for k, row in enumerate(rows)
     )
-    task = meta.tasks.index[meta.tasks["task_index"] == columns["task_index"][first]]
     return Episode(
         id=name,
         path=root,

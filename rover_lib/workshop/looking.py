@@ -47,7 +47,7 @@ class Looking:
         return summary
 
     def table(self) -> Table:
-        """The same for a reader."""
+        """The same as a table for people."""
         found, rows = self.summary(), []
         for action in self.report.action_names:
             pct = (shown_pct(found[f"{action}_{name}_pct"]).strip() for name in ("by_picture", "by_state", "apart"))

@@ -90,7 +90,10 @@ class RangeObserver(UniformQuantizationObserverBase):
         return x
 
     def range(self) -> tuple[float, float]:
-        """The range [low, high] to represent, containing 0, by this observer's choice."""
+        """The range [low, high] to represent, containing 0, by this observer's choice.
+
+        Raises QuantizeError if it saw nothing.
+        """
         low, high = self.min_val.item(), self.max_val.item()
         if low > high:
             raise QuantizeError(
@@ -151,7 +154,7 @@ class Calibration:
 
     @classmethod
     def load(cls, path: Path | str) -> "Calibration":
-        """Raises QuantizeError if the file is missing or not a calibration."""
+        """Read what save() wrote. Raises QuantizeError if the file is missing or not a calibration."""
         try:
             return cls(**torch.load(path, weights_only=True))
         except FileNotFoundError:
@@ -231,7 +234,10 @@ def _pattern(block: str, relu: bool) -> str:
 
 
 def qconfig_mapping(config: ActConfig, scheme: Scheme, only: Iterable[str] | None = None) -> QConfigMapping:
-    """The blocks to quantize (all but the scheme's float blocks, or `only` those); others map to None."""
+    """The blocks to quantize (all but the scheme's float blocks, or `only` those); others map to None.
+
+    Raises QuantizeError for a float block that the policy does not have.
+    """
     known = blocks(config)
     if unknown := [b for b in scheme.float_blocks if b not in known]:
         raise QuantizeError(f"scheme: float blocks {unknown} are not in this policy", remedy=f"known are {known}")
@@ -311,7 +317,10 @@ def _behind(prepared: nn.Module, node: Node) -> Node | None:
 
 
 def observed_graph(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:
-    """The observed graph as calibration left it, its observers seeing no more."""
+    """The observed graph as calibration left it, its observers seeing no more.
+
+    Raises QuantizeError for a calibration of another checkpoint, picture size, scheme or version.
+    """
     if calibration.image_sizes != checkpoint.config.image_sizes:
         raise QuantizeError(
             f"the calibration was made with images of {calibration.image_sizes}, the policy takes "

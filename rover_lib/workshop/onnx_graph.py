@@ -16,6 +16,7 @@ know; weights are initializers inside. Same module, same bytes.
 import itertools
 import math
 import operator
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -74,9 +75,10 @@ class _Writer(Interpreter):
         self._constants: dict[str, onnx.TensorProto] = {}
         self._made: list[Tensor] = []  # what the graph returned
         self._taken = 0
+        self.calls: Counter[Any] = Counter()  # of each INT8 convolution
 
     def model(self) -> onnx.ModelProto:
-        """Once it has run."""
+        """The ONNX model of what has run."""
         used = {name for node in self._nodes for name in node.input}
         graph = helper.make_graph(
             self._nodes,
@@ -283,14 +285,19 @@ def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
     whole_bias = torch.quantize_per_channel(bias.detach(), sums, torch.zeros_like(zeros), 0, torch.qint32).int_repr()
     of_stacks = w._is_columns(source)
     inputs = [w._float(source, n.name)]
+    w.calls[n.target] += 1
+    again = f"_{w.calls[n.target]}" if w.calls[n.target] > 1 else ""
     for part, values, steps, zero_type in (
         ("weight", stacked(weight.int_repr()) if of_stacks else weight.int_repr(), scales, np.int8),
         ("bias", whole_bias, sums, np.int32),
     ):
-        name = f"{n.target}.{part}"
+        # A backbone looks through one camera after the other: its weights are stored once, its biases in the steps of
+        # each camera's own pixels.
+        made = f"{n.target}.{part}{again}"
+        name = f"{n.target}.{part}" if part == "weight" else made
         scale = w._constant(f"{name}_scale", steps.float())
         zero = w._constant(f"{name}_zero_point", np.zeros(len(steps), zero_type))
-        inputs.append(w._add("DequantizeLinear", [w._constant(name, values), scale, zero], f"{name}_floats", axis=0))
+        inputs.append(w._add("DequantizeLinear", [w._constant(name, values), scale, zero], f"{made}_floats", axis=0))
     sums_name = w._add("Conv", inputs, f"{n.name}_sums", **_geometry(m, of_stacks=of_stacks))
     return _rounded(w, n, result, sums_name, relu=isinstance(m, fused_int8.ConvReLU2d))
 

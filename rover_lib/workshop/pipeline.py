@@ -49,7 +49,7 @@ class Recipe:
 
     @classmethod
     def of(cls, p: Mapping[str, Any], samples: int | None = None) -> "Recipe":
-        """p: params.yml's content. samples: instead of its own."""
+        """The recipe of params.yml. p: its content. samples: how many calibrate, None for what it says."""
         quantization, parity = p["quantization"], p["parity"]
         return cls(
             samples=samples or p["calibration"]["samples"],

@@ -55,7 +55,7 @@ class Fit:
     other_rates_hz: dict[str, float]
 
     def table(self) -> Table:
-        """For a reader: where actions were recorded, and where this policy's lie on the same frames."""
+        """A table for people: where actions were recorded, and where this policy's lie on the same frames."""
         spans = (
             (a.name, *(f"{low:.3g} to {high:.3g}" for low, high in (a.recorded, a.predicted))) for a in self.actions
         )
@@ -84,7 +84,7 @@ class Fit:
         return warnings
 
     def summary(self) -> dict[str, Any]:
-        """For load.json."""
+        """The same as plain JSON types, for load.json."""
         actions = {
             a.name: {"predicted": list(a.predicted), "beyond_pct": a.beyond_pct, "spread": a.spread}
             for a in self.actions

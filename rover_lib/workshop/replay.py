@@ -56,7 +56,7 @@ class Moment:
 
 
 def moments(file: Path | str, drive: int = -1, pictures: Path | None = None) -> list[Moment]:
-    """Of a flight log, or of a recording alone, a moment for each picture.
+    """A moment for each picture, of a flight log or of a recording alone.
 
     drive: which one of a log. pictures: the episode that was recorded with it, None: the one that the log names. Of a
     folder of several episodes the first. Raises LogError, and EpisodeError where there are no pictures.

@@ -87,7 +87,7 @@ def run(
 
     The new run is made beside the old one of that name, in .<name>.new, and takes its place when it is whole: stage by
     stage a run that fails at its third notebook would have cost the policies of the last good one, and left reports of
-    two runs side by side. So for a while both are on the disk, about 120 MB each for a full-size policy. Only a run's
+    two runs side by side. So for a while both are on the disk, about 570 MB each for a full-size policy. Only a run's
     own files are replaced (`_own`); recordings, a checkpoint and benchmarks of other hosts in its folder stay.
 
     Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C, the old run
@@ -100,7 +100,7 @@ def run(
     known = set().union(*(parameters_of(s) for s in sources))
     if unknown := sorted(set(overrides) - known):
         raise NotebookError(f"no notebook has a parameter {unknown}", remedy=f"known are {sorted(known)}")
-    new, old = folder.with_name(f".{name}.new"), folder.with_name(f".{name}.old")
+    new, old = folder.with_name(f".{folder.name}.new"), folder.with_name(f".{folder.name}.old")
     given = {
         "run_dir": str(new),
         "checkpoint": absolute(checkpoint),
@@ -159,13 +159,14 @@ def _take_place(new: Path, folder: Path, old: Path) -> None:
             (folder / name).rename(old / name)
         for name in made:
             (new / name).rename(folder / name)
+        old.rename(new / "replaced")  # done at once: a kill while it is removed must not leave a part to be put back
     except BaseException:
-        for name in made:
-            if not (new / name).exists():
-                (folder / name).rename(new / name)
-        _put_back(old, folder)
+        if old.exists():
+            for name in made:
+                if not (new / name).exists():
+                    (folder / name).rename(new / name)
+            _put_back(old, folder)
         raise
-    shutil.rmtree(old)
 
 
 def _put_back(old: Path, folder: Path) -> None:

@@ -9,8 +9,13 @@ from rover_lib.onboard.errors import RoverError
 def run_folder(runs_dir: Path | str, name: str, error: type[RoverError]) -> Path:
     """The absolute path of the run of that name, which need not be there yet.
 
-    Raises `error` for a name that would lead elsewhere, or that a folder hidden or without a name would have.
+    Where that is a link, the folder that it leads to: what is made beside a run must be on the same disk.
+    Raises `error` for a name that would lead elsewhere, or that a folder hidden or without a name would have, and for a
+    file of that name.
     """
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise error("a run's name must be a plain folder name", found=repr(name), remedy="use letters, digits and _")
-    return Path(runs_dir).resolve() / name
+    folder = (Path(runs_dir) / name).resolve()
+    if folder.exists() and not folder.is_dir():
+        raise error(f"{folder}: is a file, and not a run's folder", remedy="give another --name")
+    return folder

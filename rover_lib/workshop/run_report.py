@@ -5,6 +5,7 @@ print(text(content["metrics"]))
 """
 
 import os
+import re
 import socket
 from base64 import b64encode
 from collections.abc import Mapping
@@ -12,6 +13,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.columns import aligned, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
@@ -30,7 +32,7 @@ FIGURES = {  # of the run's folder, with what each shows
 }
 # Narrow columns may be scrolled to, but the page itself never is: it is read on a phone beside the track.
 STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;margin:0 auto;max-width:46rem;padding:1rem;color:#222;background:#fff}
+body{font:16px/1.5 system-ui,sans-serif;margin:0 auto;max-width:64rem;padding:1rem;color:#222;background:#fff}
 h1{font-size:1.4rem;line-height:1.25}h2{font-size:1.1rem;margin-top:2rem}
 .verdict{border-left:.4rem solid #2a7;padding:.2rem .8rem;background:#f2faf6}.none{border-color:#c33;background:#fdf3f3}
 .wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
@@ -45,11 +47,12 @@ def write(run_dir: Path | str) -> dict[str, Any]:
     """Judge a run and leave run.json and report.html in its folder. Returns run.json's content.
 
     Made anew of what is there, so that `make arm` and `rover world students` count once they were made. Raises
-    RoverError where a stage is missing.
+    RoverError where a stage is missing, and where an artifact is another one than was compared.
     """
     folder, p = Path(run_dir), params()
     files = _files(folder)
     contents = {stage: read_stage(path, stage) for stage, path in files.items()}
+    _refuse_other_artifacts(folder, contents["quantize"]["metrics"]["modes"])
     given = contents["load"]["params"]
     names = Names(*(_typed(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
     judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names)
@@ -79,6 +82,18 @@ def _files(folder: Path) -> dict[str, Path]:
     if "distill" in files and "recommendation" not in read_stage(files["distill"], "distill")["metrics"]:
         del files["distill"]  # how this policy itself was taught
     return files
+
+
+def _refuse_other_artifacts(folder: Path, modes: Mapping[str, Any]) -> None:
+    """Raise RoverError for a policy_<mode>.pt that was put there later: all figures are of another."""
+    for mode, made in modes.items():
+        path = folder / f"policy_{mode}.pt"
+        if path.is_file() and (found := content_hash(path)) != made["content_hash"]:
+            raise RoverError(
+                f"{path}: is not the artifact that this run made, and its figures are not of it",
+                found=f"content {found[:12]} instead of {made['content_hash'][:12]}",
+                remedy="'rover run' of its checkpoint judges it",
+            )
 
 
 def _typed(path: Path | str) -> str:
@@ -189,8 +204,13 @@ def _html_table(judged: Mapping[str, Any]) -> str:
 
 
 def _list(lines: list[str]) -> str:
-    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+    return "<ul>" + "".join(f"<li>{_marked(line)}</li>" for line in lines) + "</ul>"
 
 
 def _paragraphs(lines: list[str]) -> str:
-    return "".join(f"<p>{escape(line)}</p>" for line in lines)
+    return "".join(f"<p>{_marked(line)}</p>" for line in lines)
+
+
+def _marked(line: str) -> str:
+    """A sentence as HTML, what is between backticks as code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(line))

@@ -65,7 +65,7 @@ class Layout:
     action_order: tuple[int, ...] = (0, 1)
 
     def words(self) -> str:
-        """A line for a user, who should find his own car in it."""
+        """A line in which users should find their own car."""
 
         def columns(names: tuple[str, ...], order: tuple[int, ...]) -> str:
             swapped = list(order) != sorted(order)
@@ -196,7 +196,10 @@ class Recordings:
         return dict(sorted(Counter(words).items()))
 
     def hashes(self) -> dict[str, str]:
-        """SHA-256 of every file that the samples came from, by its path relative to `root`."""
+        """SHA-256 of every file that the samples came from, by its path relative to `root`.
+
+        Raises EpisodeError for one that cannot be read any more.
+        """
         files = {path: None for e in self.episodes for path in (*e.files, *(s.frame_path for s in e.samples))}
         hashes = {}
         for path in files:
@@ -223,9 +226,15 @@ class Recordings:
         }
 
 
-def camera_name(key: str) -> str:
-    """What a policy calls the camera of a LeRobot feature: such names begin in one of two ways."""
-    return key.removeprefix(CAMERA).removeprefix("observation.")
+def camera_names(keys: Iterable[str]) -> dict[str, str]:
+    """The LeRobot features of cameras, by what a policy calls them.
+
+    Such features begin in one of two ways, which is left out; not where two would then have one name, as
+    observation.image and observation.images.image.
+    """
+    keys = list(keys)
+    names = {key.removeprefix(CAMERA).removeprefix("observation."): key for key in keys}
+    return names if len(names) == len(keys) else {key: key for key in keys}
 
 
 def relative(path: Path, root: Path) -> str:

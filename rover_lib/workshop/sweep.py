@@ -1,6 +1,7 @@
 """Many runs from one sheet: checkpoints, students, settings and seeds, as `rover run` makes each, on Dask.
 
-    rows = sweep(Sheet.read("sweep.yml"), "runs/sweep", on_this_machine(workers=2))
+    with on_this_machine(workers=2) as client:
+        failed = sweep(Sheet.read("sweep.yml").jobs(), "runs/sweep", client)
 
 Each run is a folder as any other, with job.json beside its stages. What is there is not made again, so that a sweep
 that was ended goes on where it was. docs/sweep.md has the sheet, clusters, and what a thousand policies take.
@@ -119,7 +120,7 @@ class Sheet:
         return cls([absolute(c) for c in checkpoints], absolute(content["episodes"]), students, of_notebooks, of_params)
 
     def jobs(self) -> list[Job]:
-        """Raises SweepError if two are the same."""
+        """Every combination as a job. Raises SweepError if two are the same."""
         jobs = [
             Job(checkpoint, self.episodes, student, notebooks, params)
             for checkpoint in self.checkpoints
@@ -163,7 +164,7 @@ class Notebooks:
     """The work of `rover distill` and `rover run`."""
 
     def prepare(self, job: Job, folder: Path) -> None:
-        """All but the benchmark."""
+        """Teach the student, if the job has one, and make the run, all but its benchmark."""
         from rover_lib.workshop.run import run
 
         with _settings_of(job, folder):
@@ -171,7 +172,7 @@ class Notebooks:
             run(checkpoint, job.episodes, job.name, runs_dir=folder, timed=False, **job.notebooks)
 
     def benchmark(self, job: Job, folder: Path) -> None:
-        """The benchmark, and the verdict."""
+        """Make the run's benchmark and its verdict."""
         from rover_lib.workshop.run import NAMES, NOTEBOOKS, execute, parameters_of
         from rover_lib.workshop.run_report import write
 
@@ -251,8 +252,8 @@ def parts_done(job: Job, folder: Path, fingerprint: str) -> list[str]:
 
 
 def fingerprints(jobs: Sequence[Job]) -> dict[str, str]:
-    """Of each job, by its name: changes with the checkpoint's and the recordings' files, by name, size and time, as
-    hashing them takes long. A place that many jobs have is looked through once.
+    """A hash for each job, by its name, that changes with the checkpoint's and the recordings' files: with their names,
+    sizes and times, as hashing their content takes long. A place that many jobs have is looked through once.
     """
     places = {place for job in jobs for place in (job.checkpoint, job.episodes)}
     found = {place: _files_in(Path(place)) for place in places}

@@ -131,15 +131,16 @@ def _view(root: Path) -> list[Row]:
     """What a view does to a drive; `python -m lab view`."""
     report = _metrics(root / "results" / "lab", "view")
     stop, late = report["stop"], report["late_ms"]
-    cost = f"{late['with']['p99']:.2f} ms late at p99, {late['without']['p99']:.2f} without, in turns"
-    picture = f"{report['delay_ms']['p95']:.0f} ms old at p95, {report['pictures_hz']:.0f} a second"
+    cost = f"{late['with']['p99']:.2f} ms late at p99, {late['without']['p99']:.2f} without a view, in turns"
+    picture = f"{report['pictures_hz']:.0f} a second, {report['delay_ms']['p95']:.0f} ms old at p95"
     return [
         (
             "the car is stopped by the button of a page, from the click to throttle off",
             f"{stop['stopped']} of {stop['stops']}, at most {stop['stop_ms']['max']:.0f} ms",
         ),
-        (f"a view with {report['pages']} open pages, and the loop's commands", cost),
-        (f"its picture, and its share of a core, {report['cpu_pct']:.1f} %", picture),
+        (f"the loop's commands while a view has {report['pages']} open pages", cost),
+        ("the view's pictures", picture),
+        ("the view's share of a core", f"{report['cpu_pct']:.1f} %"),
     ]
 
 

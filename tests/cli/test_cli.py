@@ -11,6 +11,8 @@ from click.testing import CliRunner
 
 from rover_lib.cli import main
 from rover_lib.onboard import cli as onboard
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.stage import read_stage, write_stage
 
 
 def rover(*args):
@@ -131,6 +133,21 @@ def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):
     assert content == json.loads((folder / "run.json").read_text())
     line = f"mine             {content['metrics']['headline']}"
     assert rover("list", folder.parent).output.splitlines() == [line]
+
+
+@pytest.mark.parametrize("error", [RoverError("07_drive.ipynb: no policy"), KeyboardInterrupt()], ids=repr)
+def test_a_drive_that_does_not_end_costs_nothing_of_the_last_one(tmp_path, monkeypatch, error):
+    file = tmp_path / "drive.json"
+    write_stage(file, "drive", params={}, metrics={"of": "before"})
+
+    def execute(*args, **given):
+        assert not file.exists()  # so that it is measured again
+        raise error
+
+    monkeypatch.setattr("rover_lib.workshop.run.execute", execute)
+    assert rover("world", "latency", tmp_path).exit_code == 1
+    assert read_stage(file, "drive")["metrics"] == {"of": "before"}
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_a_size_is_width_and_height(tmp_path):

@@ -75,6 +75,17 @@ WRONG = [
     ("drive policy_static.pt --dry-run --camera 99", "/dev/video99: no such camera", "rover doctor"),
     ("record out --port ttyNONE --camera 99", "99", ";"),
     ("doctor --receiver --port ttyNONE", "ttyNONE", "is the Arduino plugged in"),
+    # an output that would cost something else
+    ("quantize best_model.pth episodes -o best_model.pth", "best_model.pth: this is a trainer's", "another name"),
+    ("quantize best_model.pth episodes -o episodes", "episodes: this is a folder", "name the file in it"),
+    ("quantize best_model.pth episodes -o notes.txt/a/o.pt", "notes.txt: this is a file", "name a file elsewhere"),
+    ("quantize best_model.pth episodes -o /dev/null", "/dev/null: this is no ordinary file", "another name"),
+    ("benchmark policy_static.pt --output policy_static.pt", "policy_static.pt: this is an artifact", "another name"),
+    ("world train episodes policy_static.pt", "policy_static.pt: this is an artifact", "another name"),
+    ("log flight.log -o flight.log", "flight.log: this is a flight log", "another name"),
+    ("log flight.log --mcap flight.log", "flight.log: this is a flight log", "another name"),
+    ("drive policy_static.pt --log best_model.pth", "best_model.pth: this is a trainer's checkpoint", "another name"),
+    ("drive policy_static.pt --json policy_static.pt", "policy_static.pt: this is an artifact", "another name"),
     # what is not there, or not meant
     ("inspect nothing.pt", "nothing.pt: not found", "pretrained_model"),
     ("drive", "ARTIFACT", "--replay EPISODE"),
@@ -82,16 +93,20 @@ WRONG = [
 ]
 
 
+def contents(folder):
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
 @pytest.mark.parametrize(("command", "thing", "remedy"), WRONG, ids=[command for command, *_ in WRONG])
 def test_names_the_thing_and_the_remedy(here, command, thing, remedy):
-    before = sorted(here.rglob("*"))
+    before = contents(here)
     result = CliRunner().invoke(main, command.split())
     assert result.exit_code != 0
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     (sentence,) = [line for line in result.output.splitlines() if line.startswith(("rover: ", "Error: "))]
     assert thing in sentence and remedy in result.output, result.output
     assert "Traceback" not in result.output
-    assert sorted(here.rglob("*")) == before  # nothing half-written
+    assert contents(here) == before  # nothing half-written, and nothing lost
 
 
 def test_a_workstations_command_on_the_rover_says_where_it_belongs():

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -237,7 +238,7 @@ def test_a_whole_run_takes_the_place_of_the_last_one(one_notebook, old_run, monk
     assert [p.name for p in old_run.parent.iterdir()] == ["mine"]
 
 
-@pytest.mark.parametrize("count", range(0, 12, 2))
+@pytest.mark.parametrize("count", range(0, 16, 2))
 def test_an_interrupt_while_it_takes_its_place_leaves_the_last_one(one_notebook, old_run, monkeypatch, count):
     before, moved = contents(old_run.parent), []
     rename = Path.rename
@@ -280,6 +281,32 @@ def test_a_run_that_was_killed_while_it_took_its_place_is_undone_by_the_next(one
     with pytest.raises(runs.NotebookError):
         run_with(monkeypatch, one_notebook, old_run, fails)
     assert contents(old_run) == before and not beside.exists()
+
+
+def test_a_run_that_is_a_file_or_on_another_disk_is_known_before_the_work(one_notebook, old_run, monkeypatch):
+    (old_run.parent / "link").symlink_to("../disk/large")  # which nothing can be renamed to from beside the link
+
+    def elsewhere(source, folder, given, bars):
+        assert folder.parent == old_run.parents[1] / "disk"
+        (folder / "policy_static.pt").write_text("new")
+
+    run_with(monkeypatch, one_notebook, old_run.parent / "link", elsewhere)
+    assert (old_run.parent / "link" / "policy_static.pt").read_text() == "new"
+    (old_run.parent / "file").write_text("a user's")
+    with pytest.raises(runs.NotebookError, match="file: is a file, and not a run's folder"):
+        run_with(monkeypatch, one_notebook, old_run.parent / "file", lambda *args: pytest.fail("it began"))
+
+
+def test_what_is_removed_of_the_last_run_is_never_put_back(one_notebook, old_run, monkeypatch):
+    """A kill while it is removed left a part of it, which the next run put back into the whole new one."""
+    rmtree = shutil.rmtree
+
+    def removing(path, **options):
+        assert not old_run.with_name(".mine.old").exists()
+        rmtree(path, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", removing)
+    run_with(monkeypatch, one_notebook, old_run, whole)
 
 
 def stream(text, name="stdout"):

@@ -6,6 +6,7 @@ import mmap
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from policies import memory_samples
 import rover_lib
 from rover_lib.onboard import artifact, load_policy, memory
 from rover_lib.onboard.errors import ArtifactError, FrameError, PolicyError
+from rover_lib.onboard.release import pack
 
 FRAME = memory_samples(1)[0].picture
 STATE = np.zeros(2, np.float32)
@@ -69,6 +71,22 @@ def test_equals_the_policy_it_was_made_of(tiny, artifacts):
         expected = ACT(tiny.config, tiny.weights)(*inputs_of(sample, tiny.config))[0].numpy()
     found = policy.run(sample.state, [inputs_of(sample, tiny.config)[1].numpy()])
     assert np.abs(found - expected).max() < 1e-5
+
+
+def test_a_policy_of_gelu_drives_and_is_packed(tiny, tmp_path):
+    """For an operator that has changed since, as gelu has, torch names a record of its archive otherwise."""
+    from rover_lib.workshop.act import ACT, inputs_of
+    from rover_lib.workshop.export import export
+
+    other, path = replace(tiny, config=replace(tiny.config, activation="gelu")), tmp_path / "policy_fp32.pt"
+    model, sample = ACT(other.config, other.weights), memory_samples(1, seed=9)[0]
+    content = export(model, other, path, [sample])
+    assert artifact.content_hash(path) == content
+    found = load_policy(path).predict_unclipped(sample.picture, sample.state)
+    with torch.inference_mode():
+        expected = model(*inputs_of(sample, other.config))[0].numpy()
+    assert np.abs(found - expected).max() < 1e-5
+    pack(path, tmp_path / "packed", allow=("mode",))
 
 
 @pytest.mark.parametrize(

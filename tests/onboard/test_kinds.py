@@ -6,7 +6,7 @@ import zipfile
 
 import pytest
 
-from rover_lib.onboard.kinds import INSTEAD, WANTED, KindError, check_kind, kinds_of
+from rover_lib.onboard.kinds import INSTEAD, WANTED, KindError, check_kind, check_output, kinds_of
 from rover_lib.onboard.stage import write_stage
 from rover_lib.onboard.telemetry import FlightLog
 
@@ -56,6 +56,19 @@ def test_what_cannot_be_told_is_left_to_the_command(tmp_path):
     for name in ("text", "json", "zip", "fifo", "nothing"):
         assert kinds_of(tmp_path / name) == ()
         check_kind(tmp_path / name, "artifact")
+
+
+def test_an_output_takes_the_place_of_its_own_kind_only(tmp_path):
+    artifact = archive(tmp_path / "policy_static.pt", **{"code/net_DOT_py": b""})
+    (tmp_path / "link.pt").symlink_to(artifact)
+    (tmp_path / "dangling.pt").symlink_to("nowhere")
+    (tmp_path / "notes").write_text("unknown: as with any other program, what was asked for is written")
+    for name in ("policy_static.pt", "link.pt", "dangling.pt", "notes", "new.pt", "new/folders/new.pt"):
+        check_output(tmp_path / name, "artifact")
+    for path in (artifact, tmp_path / "link.pt"):
+        with pytest.raises(KindError, match="this is an artifact, and would be lost"):
+            check_output(path, "checkpoint")
+    check_output(tmp_path / "/dev/null", "flight log", appended=True)  # nothing is there to lose
 
 
 def test_another_thing_is_refused_with_what_to_do(tmp_path):

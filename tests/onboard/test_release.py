@@ -293,6 +293,16 @@ def test_parts_make_the_artifact_again(releases, packed, two):
     assert str(two[1].absolute()) in origin
 
 
+def test_an_artifact_in_a_folder_of_any_name_is_taken(releases, two, tmp_path):
+    folder = tmp_path / "my\N{NO-BREAK SPACE}policies, \udcff"
+    folder.mkdir()
+    shutil.copy(two[1], folder / "policy.pt")
+    pack(folder / "policy.pt", tmp_path / "parts")
+    name = releases.stage(tmp_path / "parts", unsigned=True).name
+    (origin,) = (r.origin for r in releases.all() if r.name == name)
+    assert origin.endswith(r"my\xa0policies, \udcff/policy.pt")
+
+
 def test_packing_again_changes_nothing(packed, two, keys):
     def content():
         return {p.name: (p.read_bytes()) for p in packed.iterdir()}

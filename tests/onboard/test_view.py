@@ -421,6 +421,10 @@ def test_what_cannot_be_opened(tmp_path):
     assert not (tmp_path / "view").exists()
     with pytest.raises(v.ViewError, match=r"of nosuch0 .*`ip -brief address` lists the interfaces"):
         v.Address(0, "nosuch0").open()
+    (tmp_path / "view").write_text("a user's")
+    with pytest.raises(v.ViewError, match="view: is there, and is no socket; name another with --feed"):
+        asyncio.run(both())
+    assert (tmp_path / "view").read_text() == "a user's"
     with pytest.raises(v.ViewError, match="no user 'nobody-of-that-name'"):
         v.View(v.Address(0), TOKEN, tmp_path / "view", drive_user="nobody-of-that-name")
 

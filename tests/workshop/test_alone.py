@@ -9,6 +9,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop import alone
 from rover_lib.workshop.alone import alone_in
 from rover_lib.workshop.checkpoint_files import made_beside
+from rover_lib.workshop.run_folder import run_folder
 
 
 def test_while_one_is_in_it_another_is_refused(tmp_path):
@@ -56,9 +57,20 @@ def test_a_folder_that_vanishes_while_it_is_taken_is_made_again(tmp_path, monkey
 
 def test_a_file_in_the_runs_place_is_refused_before_any_work(tmp_path):
     (tmp_path / "mine").write_text("a user's")
-    with pytest.raises(RoverError, match="is a file, and not a run's folder"), made_beside(tmp_path / "mine", "x"):
-        pytest.fail("began")
+    with pytest.raises(RoverError, match="is a file, and not a run's folder"):
+        run_folder(tmp_path, "mine", RoverError)
     assert [p.name for p in tmp_path.iterdir()] == ["mine"]
+
+
+def test_a_run_that_is_a_link_is_made_where_the_link_leads(tmp_path):
+    """Beside the link is another disk, from which nothing can be renamed."""
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "mine").symlink_to("../disk/large")
+    for _ in ("not there yet", "there"):
+        with made_beside(run_folder(tmp_path / "runs", "mine", RoverError), "last.json") as new:
+            assert new.parent == tmp_path / "disk"
+            (new / "last.json").touch()
+    assert [p.name for p in (tmp_path / "runs" / "mine").iterdir()] == ["last.json"]
 
 
 def test_what_is_moved_into_a_runs_folder_costs_nothing_where_it_ends_in_the_middle(tmp_path, monkeypatch):

@@ -22,8 +22,11 @@ from safetensors.torch import load_file, save_file
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.act import ACT, inputs_of
-from rover_lib.workshop.checkpoint import PICKLE_BYTES, expected_shapes, lerobot_folder, load_checkpoint
+from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint_contents import expected_shapes
 from rover_lib.workshop.compare import LerobotEager
+from rover_lib.workshop.lerobot_checkpoint import Normaliser, lerobot_folder
+from rover_lib.workshop.trainer_checkpoint import PICKLE_BYTES
 
 
 def write(content, path):
@@ -532,6 +535,15 @@ def test_a_header_that_lies_is_refused(copied, content, says):
     assert says in str(refused_quickly(copied))
 
 
+@pytest.mark.slow
+def test_two_cameras_of_one_name_keep_their_own(tmp_path):
+    cameras = {"observation.image": (32, 64), "observation.images.image": (64, 32)}
+    lerobot_policy(**TINY, cameras=cameras).save_pretrained(tmp_path)
+    edit(tmp_path / "config.json", lambda c: c.update(normalization_mapping=RAW))
+    config = load_checkpoint(tmp_path).config
+    assert dict(zip(config.cameras, config.image_sizes, strict=True)) == cameras
+
+
 def test_features_that_the_weights_do_not_have_are_refused(copied):
     edit(copied / "config.json", lambda c: c["input_features"]["observation.state"].update(shape=[3]))
     edit(copied / "config.json", lambda c: c.update(normalization_mapping=RAW))
@@ -597,6 +609,19 @@ def test_statistics_that_nothing_has_are_refused(copied, key, value, says):
     constant = {"observation.state.std": torch.zeros(2), "action.max": stats["action.min"].clone()}
     save_file(stats | constant, copied / "stats.safetensors")
     assert ONLY_WEIGHTS in str(refused_quickly(copied))
+
+
+@pytest.mark.parametrize("value", [0.3, -7.7, 1234.5, 0.0])
+def test_a_state_that_never_changed_is_minus_one(copied, value):
+    """As LeRobot makes it, whatever float32 rounds: it adds 1e-8 to no difference, and 2e8 * 0.3 has a unit of 4."""
+    edit(copied / INNER, in_step(lambda s: s["config"]["norm_map"].update(STATE="MIN_MAX")))
+    same, stats = torch.tensor([value, 0.5]), load_file(copied / "stats.safetensors")
+    ends = {"observation.state.min": same, "observation.state.max": torch.tensor([value, 2.5])}
+    save_file(stats | ends, copied / "stats.safetensors")
+    norm = Normaliser(copied, INNER, {}, {}).affine("observation.state", "STATE", 2)
+    scale, shift = torch.tensor(norm.scale), torch.tensor(norm.shift)
+    assert (same * scale + shift).tolist() == [-1, -1]
+    assert ((same + torch.tensor([0, 1])) * scale + shift).tolist() == [-1, 0]
 
 
 @pytest.mark.parametrize("missing", [(INNER,), (OUTER,), (INNER, OUTER)])

@@ -1,6 +1,7 @@
 """What is written is read again as it was: here, and by LeRobot itself."""
 
 import json
+import resource
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 import torch
 from policies import TINY, lerobot_policy, memory_samples
 
-from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
@@ -70,6 +72,30 @@ def test_lerobots_folder(config, weights, tmp_path, norms):
     ours = predictions(ACT(read.config, read.weights), [inputs_of(sample, config)])[0]
     assert (ours - expected).abs().max() < 1e-5
     assert (lerobots_chunk(tmp_path / "pretrained_model", sample, config) - expected).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path, config, weights: write_trainer(path, config, weights, 0.1, {}, **SETTINGS),
+        lambda path, config, weights: write_lerobot(path, config, weights, {}),
+        lambda path, config, weights: _saved(path, weights),
+    ],
+    ids=["trainer's", "LeRobot's", "a training's"],
+)
+def test_a_full_disk_is_one_sentence(config, weights, tmp_path, write):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+        with pytest.raises(RoverError, match="policy: cannot be written whole; is the disk full"):
+            write(tmp_path / "policy", config, weights)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def _saved(path, weights):
+    with atomic_path(path) as temporary:
+        torch.save(weights, temporary)
 
 
 def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_path):

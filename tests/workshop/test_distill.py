@@ -1,7 +1,9 @@
 """A student is taught on recordings alone, whatever interrupts it."""
 
 import json
+import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from interrupted import interrupt, save_each_step
 from policies import TINY, lerobot_policy, of_a_cars_size, trainer_content
 from recorded import record_drives
 
-from rover_lib.onboard.errors import DistillError, RoverError
+from rover_lib.onboard.errors import DistillError, RoverError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import load_policy
 from rover_lib.workshop import distill as distill_module
@@ -235,7 +237,9 @@ def test_it_learns_what_its_teacher_plans(teacher, episodes, recipe, tmp_path):
 def test_what_was_there_stays_until_the_new_is_whole(teacher, episodes, recipe, tmp_path, monkeypatch):
     (tmp_path / "fast" / "pretrained_model").mkdir(parents=True)
     (tmp_path / "fast" / "pretrained_model" / "config.json").write_text("old")
+    (tmp_path / "fast" / "pretrained_model" / "origin.json").write_text('{"teacher_sha256": "old"}')
     (tmp_path / "fast" / "policy_static.pt").write_text("old")
+    (tmp_path / "fast" / "policy_static.onnx.zip").write_text("the same, for ONNX Runtime")
     (tmp_path / "fast" / "compare.json").write_text("of a run")
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
@@ -244,12 +248,13 @@ def test_what_was_there_stays_until_the_new_is_whole(teacher, episodes, recipe, 
             distill(teacher, episodes, "fast", SHAPE, **arguments)
     assert (tmp_path / "fast" / "pretrained_model" / "config.json").read_text() == "old"
     assert (tmp_path / "fast" / "policy_static.pt").read_text() == "old"
-    before = ["compare.json", "policy_static.pt", "pretrained_model"]
+    before = ["compare.json", "policy_static.onnx.zip", "policy_static.pt", "pretrained_model"]
     assert sorted(p.name for p in (tmp_path / "fast").iterdir()) == before
     distill(teacher, episodes, "fast", SHAPE, **arguments)
     assert load_checkpoint(tmp_path / "fast" / "pretrained_model").config.feedforward == 64
     assert load_policy(tmp_path / "fast" / "policy_static.pt").manifest["mode"] == "static"
     assert (tmp_path / "fast" / "compare.json").read_text() == "of a run"
+    assert not (tmp_path / "fast" / "policy_static.onnx.zip").exists()  # it was of another policy
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cache", "fast"]
 
 
@@ -263,6 +268,35 @@ def test_a_teacher_of_another_car_is_refused(episodes, recipe, tmp_path):
     with pytest.raises(DistillError, match="worse than one action for all frames, found steering"):
         distill(tmp_path / "best_model.pth", episodes, "fast", SHAPE, runs_dir=tmp_path, recipe=recipe, device="cpu")
     assert not (tmp_path / "fast").exists()
+
+
+def test_a_damaged_file_of_a_phase_is_one_sentence(tmp_path):
+    torch.save({"weights": torch.ones(100)}, tmp_path / "start.pt")
+    (tmp_path / "start.pt").write_bytes((tmp_path / "start.pt").read_bytes()[:-200])
+    with pytest.raises(TrainingError, match=r"start.pt: cannot go on from it, found \w+; remove .* to teach from the"):
+        distill_module._kept(tmp_path / "start.pt")
+
+
+def test_phases_that_another_process_has_removed_are_no_error(teacher, episodes, tmp_path, monkeypatch):
+    """Who learns the same under another name goes on in the same folder, and may be done first."""
+    monkeypatch.setattr(distill_module, "_taught", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
+    monkeypatch.setattr(distill_module, "_leave", lambda new, *_: (new / "distill.json").touch())
+    folder = distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path, device="cpu")
+    assert [p.name for p in folder.iterdir()] == ["distill.json"]
+
+
+def test_a_policy_that_somebody_trained_is_not_replaced_by_a_student(teacher, episodes, tmp_path):
+    """The teacher's own folder, as in `rover distill runs/full/best_model.pth ... --name full`, and another one's."""
+    own = tmp_path / "full" / "best_model.pth"
+    own.parent.mkdir()
+    shutil.copy(teacher, own)
+    for checkpoint, says in ((own, "full: holds the teacher"), (teacher, "best_model.pth: is no student")):
+        with pytest.raises(DistillError, match=says):
+            distill(checkpoint, episodes, "full", SHAPE, runs_dir=tmp_path)
+    own.rename(tmp_path / "moved.pth")
+    (own.parent / "pretrained_model").mkdir()
+    with pytest.raises(DistillError, match="pretrained_model: is no student, and one would replace it"):
+        distill(teacher, episodes, "full", SHAPE, runs_dir=tmp_path)
 
 
 @pytest.mark.parametrize(

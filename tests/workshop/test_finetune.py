@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,16 +18,21 @@ from rover_lib.cli import main
 from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import finetune as finetune_module
+from rover_lib.workshop import pipeline, session
 from rover_lib.workshop.act import Affine
+from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint_files import write_lerobot
+from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
 from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.finetune import Recipe, finetune, human_samples
+from rover_lib.workshop.pipeline import make_artifact
 from rover_lib.workshop.samples import Episode, Sample
+from rover_lib.workshop.student import gmac
 
 FRAMES = 24
 TAKEN_OVER = [POLICY] * 8 + [HUMAN] * 12 + [NOBODY] * 4
@@ -254,6 +260,31 @@ def test_new_demonstrations_alone_are_learned_from_too(checkpoint, old, recipe, 
 
 
 @pytest.mark.slow
+def test_a_policy_that_does_without_channels_learns_without_them(checkpoint, old, new, recipe, tmp_path):
+    """What `rover distill --backbone-channels` left out stays zero, so its artifact stays as small."""
+    parent, rng = load_checkpoint(checkpoint), np.random.default_rng(0)
+    pictures = [torch.from_numpy(np.stack([smooth_frame(rng, 72, 128) for _ in range(4)]))]
+    thin, notes = without_channels(parent.weights, parent.config, 0.25, pictures, rng)
+    settings = {"learning_rate": 1e-3, "batch_size": 4, "data_dir": "", "output_dir": "", "device": "cpu", "seed": 0}
+    write_trainer(tmp_path / "best_model.pth", parent.config, thin, 0.1, {}, **settings)
+    folder = finetune(tmp_path / "best_model.pth", [old, new], "thin", runs_dir=tmp_path, recipe=recipe, device="cpu")
+    learned = load_checkpoint(folder / "best_model.pth")
+    assert len(notes) == 8
+    for name in (note["block"] for note in notes):
+        for part in ("conv1.weight", "bn1.weight", "bn1.bias", "conv2.weight"):
+            before, after = (of[f"{name}.{part}"] for of in (thin, learned.weights))
+            if part == "conv2.weight":  # which reads the channels
+                before, after = before.transpose(0, 1), after.transpose(0, 1)
+            alive = before.reshape(len(before), -1).any(1)
+            assert torch.equal(after.reshape(len(after), -1).any(1), alive) and alive.sum() * 4 == len(alive)
+        assert not torch.equal(thin[f"{name}.conv2.weight"], learned.weights[f"{name}.conv2.weight"])
+    recipe = replace(pipeline.Recipe.of(params()), samples=8)
+    make_artifact(session.load(folder / "best_model.pth", old), folder / "policy_static.pt", recipe)
+    assert load_policy(folder / "policy_static.pt").manifest["gmac"] == pytest.approx(gmac(parent.config, thin))
+    assert (folder / "policy_static.pt").stat().st_size < 6e6  # 12 with all channels
+
+
+@pytest.mark.slow
 def test_a_policy_with_other_statistics_is_asked_again(checkpoint, old, new, recipe, tmp_path, monkeypatch):
     """Its weights are the same: what it planned with the wrong statistics lies in the cache."""
     was = load_checkpoint(checkpoint)
@@ -306,6 +337,13 @@ def test_arguments_that_cannot_be_are_refused(checkpoint, old, new, tmp_path, op
 def test_a_recipe_that_cannot_be_is_refused(recipe, values, says):
     with pytest.raises(FinetuneError, match=says):
         replace(recipe, **values)
+
+
+def test_phases_that_another_process_has_removed_are_no_error(checkpoint, old, new, tmp_path, monkeypatch):
+    """Who learns the same under another name goes on in the same folder, and may be done first."""
+    monkeypatch.setattr(finetune_module, "_taught", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
+    monkeypatch.setattr(finetune_module, "_leave", lambda new, *_: (new / "finetune.json").touch())
+    assert finetune(checkpoint, [old, new], "better", runs_dir=tmp_path, device="cpu").is_dir()
 
 
 def test_a_run_that_is_there_is_not_overwritten(checkpoint, old, new, tmp_path):

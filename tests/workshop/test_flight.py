@@ -140,6 +140,9 @@ def test_the_command(path):
     other = path.parent / "other.pdf"
     assert json.loads(rover("log", path, "--json", "-o", other).stdout)["ticks"] == 30
     assert other.read_bytes().startswith(b"%PDF")
+    for name in ("other", "other.txt"):
+        refused = rover("log", path, "-o", path.parent / name)
+        assert refused.exit_code == 1 and "no figure has that ending, found" in refused.output
 
 
 def test_the_summary_needs_no_workstation(path, monkeypatch):

@@ -197,8 +197,10 @@ def test_too_few_frames_or_a_folder_that_exists_are_refused_and_leave_nothing(ch
         write_kit(opened(checkpoint), tmp_path / "kit")
     assert not list(tmp_path.iterdir())
     (tmp_path / "kit").mkdir()
-    with pytest.raises(QuantizeError, match="exists already"):
-        write_kit(opened(checkpoint), tmp_path / "kit", samples=FRAMES)
+    (tmp_path / "link").symlink_to("gone")  # onto which no folder can be moved
+    for name in ("kit", "link"):
+        with pytest.raises(QuantizeError, match="exists already"):
+            write_kit(opened(checkpoint), tmp_path / name, samples=FRAMES)
 
 
 @pytest.mark.slow

@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pandas
+import pyarrow
 import pytest
 import torch
 from click.testing import CliRunner
 from policies import TINY, lerobot_policy, memory_samples, smooth_frame
+from pyarrow import parquet
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
@@ -99,6 +101,14 @@ def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
 def test_a_camera_that_is_not_there_is_refused(tmp_path):
     assert "has no camera 'left', found front" in refused(Source.of(written(tmp_path, info()), camera="left"))
     assert "given twice, found front, front; name each once" in refused(Source.of(tmp_path, camera="front,front"))
+
+
+def test_no_camera_hides_another(tmp_path):
+    camera = info()["features"]["observation.images.front"]
+    root = written(tmp_path, features(**{"observation.front": camera}))
+    assert "has 2 cameras, found observation.images.front, observation.front; say what" in refused(root)
+    assert "has no camera 'front', found observation" in refused(Source.of(root, camera="front"))
+    assert "has no meta/tasks.parquet" in refused(Source.of(root, camera="observation.front"))
 
 
 def test_our_own_recordings_say_their_names_themselves(tmp_path):
@@ -230,6 +240,21 @@ def rows(kept):
     return change
 
 
+def column(name, value=...):
+    """Sets the first row's value of a table's column, or leaves the column out."""
+
+    def change(path):
+        read = parquet.read_table(path)
+        at, values = read.column_names.index(name), read.column(name).to_pylist()
+        if value is ...:
+            return parquet.write_table(read.drop_columns([name]), path)
+        values[0] = value
+        read = read.set_column(at, name, pyarrow.array(values, type=read.schema.field(name).type))
+        parquet.write_table(read, path)
+
+    return change
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -254,6 +279,22 @@ def cut(path):
         ("image", "meta/info.json",
          lambda p: edit(p, lambda c: c["features"]["observation.images.cam_front"].update(shape=[36, 64, 3])),
          "has another shape than meta/info.json says"),
+        *(("image", "data/chunk-000/file-000.parquet", column(name), f"has no column {name}, found ")
+          for name in ("action", "timestamp", "observation.images.cam_front")),
+        ("image", "meta/info.json",
+         lambda p: edit(p, lambda c: c["features"].update(intervention={"dtype": "bool", "shape": [1], "names": None})),
+         "has no column intervention, found "),
+        ("image", "data/chunk-000/file-000.parquet", column("observation.state", [0.1, np.inf]),
+         "throttle of 'observation.state' is inf in frame 0 and 0 more, which is no number that was recorded"),
+        # LeRobot would list them all, until no memory is left
+        ("image", "meta/info.json",
+         lambda p: edit(p, lambda c: c.update(total_episodes=10**12)), "says 1000000000000 episodes, found 3 in meta/"),
+        ("image", "meta/episodes/chunk-000/file-000.parquet", column("length", 10**12), "do not belong together"),
+        ("image", "meta/episodes/chunk-000/file-000.parquet", column("data/chunk_index", None),
+         "where the files of episode 0 lie, and what its task was, cannot be read (TypeError"),
+        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.pop("data_path")), "cannot be read (KeyError"),
+        ("image", "meta/tasks.parquet",
+         lambda p: pandas.DataFrame({"number": [0]}, index=["drive"]).to_parquet(p), "cannot be read (KeyError"),
     ],
 )  # fmt: skip
 def test_damage_is_a_sentence(copied, kind, file, damage, says):
@@ -269,7 +310,15 @@ def edit(path, change):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", [(0.1, -0.5), (1500, 0.1), (np.nan, 0.1)])
+def test_one_picture_that_is_not_there_is_a_sentence(copied):
+    root = copied()
+    column("observation.images.cam_front", None)(root / "data/chunk-000/file-000.parquet")
+    with pytest.raises(EpisodeError, match="its frame 0 cannot be decoded"):
+        load_recordings(root, CHUNK).samples[0].frame_bgr()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [(0.1, -0.5), (1500, 0.1)])
 def test_numbers_that_no_rover_has_are_refused(datasets, value):
     assert "a rover's lies from" in refused(datasets(value=value))
 

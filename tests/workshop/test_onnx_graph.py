@@ -1,18 +1,22 @@
 """Policies written as ONNX, run by ONNX Runtime, against the same modules run by torch."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
 import torch
-from policies import TINY, lerobot_policy, memory_samples
+from policies import TINY, MemorySample, lerobot_policy, memory_samples, smooth_frame
 from torch import nn
 
 from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
+from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.observe import calibrate
 from rover_lib.workshop.onnx_graph import graph_of, onnx_model, stacked
 from rover_lib.workshop.quantize import int8_layers, quantize
 from rover_lib.workshop.scheme import Scheme
@@ -29,14 +33,18 @@ def named(inputs, config: ActConfig) -> dict[str, torch.Tensor]:
     return dict(zip(["state", *(f"frame_{c}" for c in config.cameras)], inputs, strict=True))
 
 
-def session(model: onnx.ModelProto) -> onnxruntime.InferenceSession:
+def session(model: onnx.ModelProto, exact: bool = False) -> onnxruntime.InferenceSession:
+    """As a rover runs it. exact: nothing fused, so that INT8 gives what its numbers say, whatever kernels make it."""
+    if not exact:
+        return session_of(model.SerializeToString(), threads=1)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 
-def answers(model: onnx.ModelProto, inputs, config: ActConfig) -> np.ndarray:
-    run = session(model).run
+def answers(model: onnx.ModelProto, inputs, config: ActConfig, exact: bool = False) -> np.ndarray:
+    run = session(model, exact).run
     return np.concatenate([run(None, {k: v.numpy() for k, v in named(x, config).items()})[0] for x in inputs])
 
 
@@ -90,6 +98,48 @@ def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibrati
         weight = layer.weight().int_repr()
         weight = stacked(weight) if name == "backbone.stem.0" else weight
         assert np.array_equal(stored[f"{name}.weight"], weight.numpy())
+
+
+@pytest.mark.slow
+def test_int8_policy_of_two_cameras_is_the_same(tmp_path):
+    """They share a backbone's weights, but not the steps of its numbers."""
+    from test_act import saved
+
+    saved(lerobot_policy(**SHAPES["two cameras, odd"]), tmp_path)
+    checkpoint, rng = load_checkpoint(tmp_path), np.random.default_rng(0)
+    named_sizes = dict(zip(checkpoint.config.cameras, checkpoint.config.image_sizes, strict=True))
+    samples = [
+        MemorySample(
+            sample.state,
+            {name: smooth_frame(rng, *size) // at for at, (name, size) in enumerate(named_sizes.items(), 1)},
+        )
+        for sample in memory_samples(10)
+    ]
+    quantized = quantize(checkpoint, Scheme(), calibrate(checkpoint, samples[:8]))
+    inputs = [inputs_of(s, checkpoint.config) for s in samples[8:]]
+    written = onnx_model(graph_of(quantized.module), named(inputs[0], checkpoint.config), ("chunk",))
+    torchs = predictions(quantized.module, inputs).numpy()
+    own_error = np.abs(torchs - predictions(ACT(checkpoint.config, checkpoint.weights), inputs).numpy()).max()
+    assert np.abs(answers(written, inputs, checkpoint.config, exact=True) - torchs).max() < own_error
+    assert len(written.SerializeToString()) < 15e6  # 12 with one camera
+
+
+@pytest.mark.slow
+def test_int8_policy_of_half_the_channels_is_the_same(tiny):
+    """What `rover distill --backbone-channels 0.5` leaves, computed as the graph says: kernels for AVX2 saturate."""
+    samples, rng = memory_samples(8), np.random.default_rng(0)
+    pictures = [torch.from_numpy(np.stack([sample.picture for sample in samples]))]
+    weights, _ = without_channels(tiny.weights, tiny.config, 0.5, pictures, rng)
+    student = replace(tiny, weights=tiny.weights | weights, sha256="student")
+    quantized = quantize(student, Scheme(), calibrate(student, samples))
+    inputs = [inputs_of(s, tiny.config) for s in memory_samples(4, seed=1)]
+    written = onnx_model(graph_of(quantized.module), named(inputs[0], tiny.config), ("chunk",))
+    torchs = predictions(quantized.module, inputs).numpy()
+    own_error = np.abs(torchs - predictions(ACT(tiny.config, student.weights), inputs).numpy()).max()
+    assert np.abs(answers(written, inputs, tiny.config, exact=True) - torchs).max() < 0.5 * own_error
+    stored = {i.name: list(i.dims) for i in written.graph.initializer}
+    assert stored["backbone.layer4.1.body.0.weight"] == [256, 512, 3, 3]
+    assert stored["backbone.layer4.1.body.2.weight"] == [512, 256, 3, 3]
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from rover_lib.onboard.artifact import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop import run_report as report
@@ -47,6 +48,19 @@ class Page(HTMLParser):
         self.text += data
 
 
+def test_figures_of_another_artifact_are_no_verdict(run_dir, artifacts):
+    """`rover distill --name` leaves its student's in a run that is there, `rover quantize -o` what was asked for."""
+    shutil.copy(artifacts["static"], run_dir / "policy_static.pt")
+    (run_dir / "run.json").write_bytes(before := b"of before")
+    with pytest.raises(RoverError, match=r"policy_static\.pt: is not the artifact that this run made"):
+        report.write(run_dir)
+    assert (run_dir / "run.json").read_bytes() == before
+    stage = read_stage(run_dir / "quantize.json", "quantize")
+    stage["metrics"]["modes"]["static"]["content_hash"] = content_hash(artifacts["static"])
+    (run_dir / "quantize.json").write_text(json.dumps(stage))
+    report.write(run_dir)
+
+
 def test_leaves_the_same_verdict_as_json_page_and_words(run_dir):
     content = report.write(run_dir)
     assert read_stage(run_dir / "run.json", "run") == content
@@ -56,7 +70,8 @@ def test_leaves_the_same_verdict_as_json_page_and_words(run_dir):
     assert page.open == []
     commands = [step["command"] for step in judged["next"]]
     for sentence in (judged["headline"], *judged["why"], *judged["cautions"], *commands):
-        assert sentence in page.text and sentence in words
+        assert sentence.replace("`", "") in page.text and sentence in words
+    assert any("`" in sentence for sentence in judged["cautions"]) and ("code", {}) in page.tags
     assert "runs/mine/policy_static.pt" in commands[0]  # as one types it here
     for mode in judged["modes"]:
         assert f"{mode['size_mb']:.1f}" in page.text and f"{mode['size_mb']:.1f}" in words

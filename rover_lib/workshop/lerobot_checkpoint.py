@@ -1,0 +1,422 @@
+"""The folder that `lerobot-train` leaves: config.json, model.safetensors, and how each feature is normalised."""
+
+import json
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.stage import sha256_of
+from rover_lib.workshop.act import Affine
+from rover_lib.workshop.checkpoint_contents import (
+    COPY_AGAIN,
+    FLOATS,
+    LARGEST_SIDE_PX,
+    Contents,
+    config_from,
+    flag,
+    is_size,
+    named_weights,
+    one_observation,
+    positive,
+)
+from rover_lib.workshop.samples import camera_names
+from rover_lib.workshop.untrusted import listed, shown
+
+RATE_HZ = 30.0  # of a plan's steps, where nothing says it: the trainer's recordings
+
+# Bounds, each far above what a policy of full size has, and low enough to be read in a second.
+JSON_BYTES = 1_000_000  # LeRobot's config.json: 3 kB
+HEADER_BYTES = 1_000_000  # of model.safetensors: 100 bytes for each of some 300 tensors
+STATISTICS_BYTES = 16_000_000  # LeRobot's: a few kB
+
+# What LeRobot calls its files. By a processor's: where its statistics lay before 0.4, and the step that normalises.
+PRETRAINED = "pretrained_model"
+ORIGIN = "origin.json"  # which we leave in a folder of that format: its config.json refuses what it does not know
+ADAPTER = "adapter_config.json"
+PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
+STEPS = {
+    PREPROCESSOR: ("normalize_inputs.buffer_", "normalizer_processor"),
+    POSTPROCESSOR: ("unnormalize_outputs.buffer_", "unnormalizer_processor"),
+}
+BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+
+
+def lerobot_folder(path: Path) -> Path | None:
+    """The folder with a policy's config that `path` is or holds, as `lerobot-train` arranges them; None without one.
+
+    Raises CheckpointError for an output folder that has steps but none that is said to be the last.
+    """
+    for inner in ("", PRETRAINED, f"last/{PRETRAINED}", f"checkpoints/last/{PRETRAINED}"):
+        if any((path / inner / name).exists() for name in ("config.json", ADAPTER)):
+            return path / inner
+    for steps in (path / "checkpoints", path):
+        if found := sorted(p.parent.name for p in steps.glob(f"*/{PRETRAINED}")):
+            raise CheckpointError(
+                f"{steps}: which of its checkpoints is the last is not said",
+                found=listed(found),
+                remedy=f"give one of them, as in {steps / found[-1]}",
+            )
+    return None
+
+
+def _act_config(folder: Path) -> dict[str, Any]:
+    """config.json of a whole ACT policy. Raises CheckpointError for an adapter and for other policies."""
+    raw = {} if (folder / ADAPTER).exists() else _read_json(folder / "config.json")
+    if not raw or raw.get("use_peft"):
+        raise CheckpointError(
+            f"{folder}: a PEFT adapter, which holds changes to another policy's weights and no policy",
+            remedy="merge it into its policy (PEFT's merge_and_unload) and save that",
+        )
+    if raw.get("type") != "act":
+        raise CheckpointError(
+            f"{folder}/config.json: policy type is {shown(raw.get('type'))}",
+            remedy="only 'act' is known here"
+            if raw.get("type")
+            else "only 'act' is known here; if it is one from before 2025, convert it by LeRobot's "
+            "lerobot.processor.migrate_policy_normalization",
+        )
+    return raw
+
+
+def _picture_sizes(folder: Path, inputs: Mapping[str, tuple[str, list[int]]]) -> dict[str, tuple[int, int]]:
+    """(height, width) by camera. Raises CheckpointError for inputs that no camera car has."""
+    sizes: dict[str, tuple[int, int]] = {}
+    for name, (kind, shape) in inputs.items():
+        if kind == "VISUAL":
+            if len(shape) != 3 or shape[0] != 3 or max(shape) > LARGEST_SIDE_PX:
+                raise CheckpointError(
+                    f"{folder}: camera {shown(name)} has shape {shape[:4]}",
+                    remedy=f"only (3, height, width) works here, up to {LARGEST_SIDE_PX} pixels a side",
+                )
+            sizes[name] = (shape[1], shape[2])
+        elif kind == "ENV":
+            raise CheckpointError(
+                f"{folder}: input {shown(name)} is an environment state, which no camera car has",
+                remedy="train a policy without it",
+            )
+    if not sizes:
+        raise CheckpointError(
+            f"{folder}: the policy has no camera input (it has {listed(inputs) or 'none'})",
+            remedy="nothing to drive by",
+        )
+    return sizes
+
+
+def read_lerobot(folder: Path) -> Contents:
+    """Raises CheckpointError for what is missing or damaged, and for policies that this project cannot run."""
+    raw = _act_config(folder)
+    file = folder / "model.safetensors"
+    _refuse_shards(folder, file)
+    state = _read_safetensors(file)
+    buffers = {name: state.pop(name) for name in list(state) if name.startswith(BUFFERS)}
+    weights = named_weights(file, state, file.stat().st_size)
+    inputs, outputs = (_features(folder, raw, key) for key in ("input_features", "output_features"))
+    sizes = _picture_sizes(folder, inputs)
+    if "observation.state" not in inputs:
+        raise CheckpointError(
+            f"{folder}: the policy has no 'observation.state' input", remedy="LeRobot's forward needs one too"
+        )
+    if "action" not in outputs:
+        raise CheckpointError(
+            f"{folder}: the policy has no 'action' output",
+            found=listed(outputs) or "none",
+            remedy="train one that acts",
+        )
+    one_observation(folder, raw)
+    keys = ("chunk_size", "dim_model", "n_heads", "dim_feedforward", "n_encoder_layers", "n_decoder_layers")
+    chunk, dim, heads, feedforward, n_encoder, n_decoder = (positive(folder, raw, k) for k in keys)
+    asked = raw.get("normalization_mapping", dict.fromkeys(("VISUAL", "STATE", "ACTION"), "MEAN_STD"))
+    inner = Normaliser(folder, PREPROCESSOR, asked, buffers)
+    outer = Normaliser(folder, POSTPROCESSOR, asked, buffers)
+    states, actions = inputs["observation.state"][1], outputs["action"][1]
+    config = config_from(
+        folder,
+        weights,
+        cameras=tuple(camera_names(sizes)),
+        image_sizes=tuple(sizes.values()),
+        chunk=chunk,
+        dim=dim,
+        heads=heads,
+        feedforward=feedforward,
+        encoder_layers=n_encoder,
+        decoder_layers=n_decoder,
+        backbone=raw.get("vision_backbone"),
+        dilation=flag(folder, raw, "replace_final_stride_with_dilation"),
+        pre_norm=flag(folder, raw, "pre_norm"),
+        activation=raw.get("feedforward_activation", "relu"),
+        image_norm=tuple(inner.affine(c, "VISUAL", 3) or Affine((1.0,) * 3, (0.0,) * 3) for c in sizes),
+        state_norm=inner.affine("observation.state", "STATE", states[0]),
+        action_unnorm=outer.affine("action", "ACTION", actions[0], inverse=True),
+        rate_hz=_own_rate_hz(folder),
+    )
+    for name, shape, size in (
+        ("observation.state", states, len(config.state_names)),
+        ("action", actions, len(config.action_names)),
+    ):
+        if shape != [size]:
+            raise CheckpointError(
+                f"{folder}: config and weights do not agree ('{name}' has shape {shape}, the weights are for {size})",
+                remedy=COPY_AGAIN,
+            )
+    extra = {
+        "optimizer_mb": 0.0,
+        "normalisation_from": {"in": inner.source, "out": outer.source},
+        "written_here": (folder / ORIGIN).exists(),
+    }
+    return Contents("lerobot", config, weights, sha256_of(file), file.stat().st_size, extra)
+
+
+def read_origin(folder: Path) -> dict[str, Any]:
+    """What we noted in a folder of LeRobot's format that we wrote, {} in another's. Raises CheckpointError."""
+    return _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}
+
+
+def _own_rate_hz(folder: Path) -> float:
+    """Steps of a plan in a second: what we noted in a folder that we wrote, else the usual."""
+    rate_hz = read_origin(folder).get("rate_hz", RATE_HZ)
+    if isinstance(rate_hz, bool) or not isinstance(rate_hz, (int, float)) or not 0 < rate_hz <= 1000:
+        raise CheckpointError(
+            f"{folder / ORIGIN}: 'rate_hz' must be above 0 and at most 1000", found=shown(rate_hz), remedy=COPY_AGAIN
+        )
+    return float(rate_hz)
+
+
+def _features(folder: Path, raw: Mapping[str, Any], key: str) -> dict[str, tuple[str, list[int]]]:
+    """Type and shape of each of the config's features, by name."""
+    features = raw.get(key) or {}
+    if not isinstance(features, dict):
+        raise CheckpointError(f"{folder}/config.json: '{key}' is no object", found=shown(features), remedy=COPY_AGAIN)
+    checked = {}
+    for name, feature in features.items():
+        kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
+        if not isinstance(kind, str) or not isinstance(shape, list) or not shape or not all(map(is_size, shape)):
+            raise CheckpointError(
+                f"{folder}/config.json: feature {shown(name)} has no type and shape",
+                found=f"{shown(kind)} and {shown(shape)}",
+                remedy=COPY_AGAIN,
+            )
+        checked[name] = kind, shape
+    return checked
+
+
+def _refuse_shards(folder: Path, file: Path) -> None:
+    """Raise CheckpointError for weights in pieces: torch's distributed format (DCP), or an index of safetensors."""
+    if file.exists():
+        return
+    checkpoint = folder.parent if folder.name == PRETRAINED else folder
+    pieces = [
+        p for place in (folder, checkpoint) for pattern in ("*.distcp", "*/*.distcp") for p in place.glob(pattern)
+    ]
+    if pieces or file.with_suffix(".safetensors.index.json").exists():
+        what = "a sharded checkpoint (DCP)" if pieces else "weights in several files"
+        raise CheckpointError(
+            f"{folder}: {what}, and no model.safetensors",
+            remedy="merge them where it was trained, and save the policy by its save_pretrained",
+        )
+
+
+class Normaliser:
+    """What LeRobot does to each feature, in or out, as an Affine.
+
+    A processor file says it; before LeRobot 0.4 the config and buffers beside the weights did. A feature whose mode is
+    not IDENTITY and that has no statistics is refused: LeRobot 0.4 then normalised nothing, without a word, and what a
+    policy gives in standard deviations would have become a servo's pulse.
+
+    asked: the config's normalization_mapping. buffers: the weights' names that begin with BUFFERS.
+    """
+
+    def __init__(self, folder: Path, file: str, asked: Any, buffers: Mapping[str, Tensor]):
+        self.where = folder / file
+        self.modes, self.eps = asked, 1e-8
+        self.stats: dict[str, Tensor] = {}
+        self.features: list[str] | None = None  # those that the processor's step names; the others it leaves alone
+        prefix, step_name = STEPS[file]
+        self.old = not self.where.exists()
+        if self.old:
+            self.stats = {k.removeprefix(prefix): v for k, v in buffers.items() if k.startswith(prefix)}
+            self.where = folder / "config.json"
+        else:
+            self._read_steps(folder, step_name)
+        self.source = f"{file}, LeRobot's processor"
+        if self.old:
+            self.source = "the weights' file, as LeRobot did before 0.4" if self.stats else "config.json: IDENTITY"
+        texts = isinstance(self.modes, dict) and all(isinstance(v, str) for v in self.modes.values())
+        if not texts or not isinstance(self.eps, (int, float)) or not 0 <= self.eps <= 1:
+            raise CheckpointError(
+                f"{self.where}: a norm_map of texts and an eps from 0 to 1 are expected",
+                found=f"{shown(self.modes)} and {shown(self.eps)}",
+                remedy=COPY_AGAIN,
+            )
+
+    def _read_steps(self, folder: Path, step_name: str) -> None:
+        known = {"rename_observations_processor", "to_batch_processor", "device_processor", step_name}
+        count = 0
+        for step in self._steps():
+            config = step["config"]
+            if renames := config.get("rename_map"):
+                raise CheckpointError(
+                    f"{self.where}: renames observations ({shown(renames)})", remedy="rename the inputs instead"
+                )
+            if step["registry_name"] not in known:
+                raise CheckpointError(
+                    f"{self.where}: has a processor step that is not known here: {shown(step['registry_name'])}",
+                    remedy="train without it, or do in the recordings what it does",
+                )
+            if step["registry_name"] == step_name:
+                count += 1
+                self.modes, self.eps = config.get("norm_map", {}), config.get("eps", 1e-8)
+                features = config.get("features")
+                self.features = list(features) if isinstance(features, dict) else []
+                if config.get("normalize_observation_keys") is not None:
+                    raise CheckpointError(
+                        f"{self.where}: normalises some of the observations only (normalize_observation_keys)",
+                        remedy="give the others IDENTITY, or train without it",
+                    )
+                if state := step.get("state_file"):
+                    self.stats = self._read_statistics(folder, state)
+        if count > 1:
+            raise CheckpointError(f"{self.where}: normalises {count} times", remedy="train with one such step")
+
+    def _steps(self) -> list[dict[str, Any]]:
+        """The processor's steps, each with a name and a config."""
+        steps = _read_json(self.where).get("steps", [])
+        named = isinstance(steps, list) and all(
+            isinstance(s, dict) and isinstance(s.get("registry_name"), str) and isinstance(s.get("config") or {}, dict)
+            for s in steps
+        )
+        if not named:
+            raise CheckpointError(
+                f"{self.where}: its steps are no list of objects with a registry_name and a config", remedy=COPY_AGAIN
+            )
+        return [{**s, "config": s.get("config") or {}} for s in steps]
+
+    def _read_statistics(self, folder: Path, name: Any) -> dict[str, Tensor]:
+        if not isinstance(name, str) or Path(name).name != name or not name.isprintable():
+            raise CheckpointError(
+                f"{self.where}: its state file {shown(name)} is no file of the folder", remedy=COPY_AGAIN
+            )
+        return _read_safetensors(folder / name, STATISTICS_BYTES)
+
+    def affine(self, key: str, kind: str, size: int, inverse: bool = False) -> Affine | None:
+        """LeRobot's _apply_transform as scale and shift; None where it leaves the feature alone."""
+        mode = self.modes.get(kind)
+        if mode == "IDENTITY":
+            return None
+        name = key.replace(".", "_") if self.old else key
+        stats = {k.removeprefix(f"{name}."): v for k, v in self.stats.items() if k.startswith(f"{name}.")}
+        left_out = not inverse and self.features is not None and key not in self.features
+        if mode is None or not stats or left_out:
+            raise self._would_be_raw(key, kind, mode, stats)
+        pairs = {
+            "MEAN_STD": ("mean", "std"),
+            "MIN_MAX": ("min", "max"),
+            "QUANTILES": ("q01", "q99"),
+            "QUANTILE10": ("q10", "q90"),
+        }
+        if mode not in pairs:
+            raise CheckpointError(
+                f"{self.where}: normalisation mode {shown(mode)} of '{key}' is not known here",
+                remedy=f"known are IDENTITY, {', '.join(pairs)}",
+            )
+        if missing := [p for p in pairs[mode] if p not in stats]:
+            raise CheckpointError(
+                f"{self.where}: mode '{mode}' of '{key}' needs {missing}",
+                found=listed(sorted(stats)),
+                remedy="copy the whole folder again, or compute the statistics again",
+            )
+        if odd := [p for p in pairs[mode] if stats[p].dtype not in FLOATS]:
+            raise CheckpointError(
+                f"{self.where}: statistics of '{key}' are no floats ({odd})", remedy="compute them again"
+            )
+        a, b = (stats[p].double().flatten() for p in pairs[mode])
+        if len(a) != size or len(b) != size:
+            raise CheckpointError(
+                f"{self.where}: statistics of '{key}' have {len(a)} and {len(b)} values, the feature has {size}",
+                remedy=COPY_AGAIN,
+            )
+        if mode == "MEAN_STD":
+            scale, shift = (b, a) if inverse else (1 / (b + self.eps), -a / (b + self.eps))
+        else:
+            span = torch.where(a == b, torch.full_like(a, self.eps), b - a)
+            if self.old:
+                span = b - a if inverse else b - a + self.eps
+            # LeRobot makes -1 of a feature that never changed, by taking `a` away first. By scale and shift it is that
+            # only while a * scale is a float32 whose unit is far below 1: a larger scale gave anything within 16 of it.
+            most = torch.exp2((21 - a.abs().log2()).floor())
+            scale = most.minimum(2 / span)
+            scale, shift = (span / 2, a + span / 2) if inverse else (scale, -a * scale - 1)
+        if not (torch.isfinite(scale.float()).all() and torch.isfinite(shift.float()).all()):  # as they are used
+            raise CheckpointError(f"{self.where}: statistics of '{key}' are not finite", remedy="compute them again")
+        if (wrong := b < 0 if mode == "MEAN_STD" else b < a).any():
+            what = "a negative std" if mode == "MEAN_STD" else f"a {pairs[mode][0]} above its {pairs[mode][1]}"
+            raise CheckpointError(
+                f"{self.where}: statistics of '{key}' have {what}, which would turn it around",
+                found=f"{a[wrong].tolist()} and {b[wrong].tolist()}",
+                remedy="compute them again",
+            )
+        return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
+
+    def _would_be_raw(self, key: str, kind: str, mode: str | None, stats: Mapping[str, Tensor]) -> CheckpointError:
+        """What to say of a feature that LeRobot would leave as it is without having been told to."""
+        remedy = (
+            "copy the folder again from where it was trained, with all policy_preprocessor* and policy_postprocessor* "
+            "files, or say IDENTITY where it was trained on raw values"
+        )
+        if mode is None:
+            return CheckpointError(f"{self.where}: no normalisation mode for '{key}' ({kind})", remedy=remedy)
+        needs = f"no statistics of '{key}', whose mode is {shown(mode)}"
+        if stats:
+            needs = f"'{key}' is not among the features that it normalises, and its mode is {shown(mode)}"
+        beside = "no processor file beside it, and " if self.old and not self.stats else ""
+        return CheckpointError(f"{self.where}: {beside}{needs}", remedy=remedy)
+
+
+def _of_folder(path: Path, most_bytes: int | None = None) -> Path:
+    """The path of a file of a LeRobot folder, once it is known to be one, and not larger than it can sensibly be."""
+    try:
+        status = path.stat()
+    except OSError as e:
+        reason = "not found" if isinstance(e, FileNotFoundError) else f"cannot be read ({e.strerror})"
+        raise CheckpointError(
+            f"{path}: {reason}", remedy="a LeRobot folder has config.json and model.safetensors"
+        ) from None
+    if not stat.S_ISREG(status.st_mode):
+        raise CheckpointError(f"{path}: not a file", remedy="a LeRobot folder has config.json and model.safetensors")
+    if most_bytes is not None and status.st_size > most_bytes:
+        raise CheckpointError(
+            f"{path}: has {status.st_size / 1e6:.1f} MB, at most {most_bytes / 1e6:g} are read", remedy=COPY_AGAIN
+        )
+    return path
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(_of_folder(path, JSON_BYTES).read_bytes())
+    except (ValueError, OSError, RecursionError) as e:  # RecursionError: brackets nested without end
+        raise CheckpointError(f"{path}: not readable as JSON ({e})", remedy=COPY_AGAIN) from None
+    if not isinstance(content, dict):
+        raise CheckpointError(f"{path}: expected a JSON object", found=type(content).__name__, remedy=COPY_AGAIN)
+    return content
+
+
+def _read_safetensors(path: Path, most_bytes: int | None = None) -> dict[str, Tensor]:
+    try:
+        with _of_folder(path, most_bytes).open("rb") as f:
+            header_bytes = int.from_bytes(f.read(8), "little")
+        if header_bytes > HEADER_BYTES:
+            raise CheckpointError(
+                f"{path}: not readable as safetensors (its header claims {header_bytes / 1e6:.1f} MB, "
+                f"at most {HEADER_BYTES / 1e6:g} are read)",
+                remedy=COPY_AGAIN,
+            )
+        return load_file(path)
+    except CheckpointError:
+        raise
+    except Exception as e:  # whatever its Rust or torch says of a header that lies
+        raise CheckpointError(f"{path}: not readable as safetensors ({shown(str(e))})", remedy=COPY_AGAIN) from None
