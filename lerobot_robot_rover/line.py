@@ -49,7 +49,7 @@ class Line:
 
     @property
     def link(self) -> ServoLink:
-        """The open one. Raises LinkError if nobody has opened it."""
+        """The open link. Raises LinkError if nobody has opened it."""
         if self._link is None:
             raise LinkError(f"{self.port}: the link is not open", remedy="connect() first")
         return self._link
@@ -64,7 +64,8 @@ def line_to(port: str) -> Line:
     """The one of this process to a port, by whatever name, /dev/serial/by-id/... too."""
     key = os.path.realpath(port)  # not Path's: a name, which need not exist yet
     line = _lines.get(key)
-    if line is None:
+    # After plugging in anew, the port may have been given to another device than the line's own name leads to.
+    if line is None or os.path.realpath(line.port) != key:
         line = _lines[key] = Line(port)
     return line
 

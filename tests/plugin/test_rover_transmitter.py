@@ -165,6 +165,16 @@ def test_who_names_the_same_port_has_the_same_line(tmp_path):
     assert line_to(str(port)) is not line_to(str(tmp_path / "other"))
 
 
+def test_a_port_that_another_device_has_got_is_another_line(tmp_path):
+    port, by_id = tmp_path / "ttyACM0", tmp_path / "by-id"
+    port.touch()
+    by_id.symlink_to(port)
+    before = line_to(str(by_id))
+    by_id.unlink()  # it was unplugged, and what was plugged in then has its number
+    after = line_to(str(port))
+    assert after is not before and after.port == str(port) and line_to(str(port)) is after
+
+
 def test_the_last_closes_it():
     shared = line_to(PORT)
     with pytest.raises(LinkError, match="is not open"):
