@@ -226,7 +226,7 @@ def check_manifest(manifest: Any, where: str) -> None:
                 f"{where}: manifest camera {str(camera)[:80]!r} lacks name, height or width", remedy="quantize again"
             )
         sides = [camera["height"], camera["width"]]
-        if not _is_name(camera["name"]) or not all(isinstance(s, int) and _is_within(s, SIDE_PX) for s in sides):
+        if not is_name(camera["name"]) or not all(isinstance(s, int) and _is_within(s, SIDE_PX) for s in sides):
             raise ArtifactError(
                 f"{where}: manifest camera {str(camera)[:80]!r} is not a name and a size", remedy="quantize again"
             )
@@ -237,7 +237,7 @@ def check_manifest(manifest: Any, where: str) -> None:
             raise _out_of_range(where, manifest, key, limits)
     for key in ("state_names", "action_names", "cameras"):
         names = [c["name"] for c in manifest[key]] if key == "cameras" else manifest[key]
-        if not 1 <= len(names) <= MOST_NAMES or not all(map(_is_name, names)) or len(set(names)) != len(names):
+        if not 1 <= len(names) <= MOST_NAMES or not all(map(is_name, names)) or len(set(names)) != len(names):
             raise ArtifactError(
                 f"{where}: manifest {key} must be names, each once", found=repr(names)[:80], remedy="quantize again"
             )
@@ -277,7 +277,8 @@ def _is_within(value: Any, limits: tuple[float, float]) -> bool:
     return number and limits[0] <= value <= limits[1] and value != math.inf
 
 
-def _is_name(value: Any) -> bool:
+def is_name(value: Any) -> bool:
+    """Whether a manifest may name a camera, a state or an action so."""
     return isinstance(value, str) and 0 < len(value) <= NAME_LENGTH and "/" not in value
 
 

@@ -8,13 +8,15 @@ from pathlib import Path
 
 import torch
 
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.artifact import CHUNK, MOST_NAMES, NAME_LENGTH, RATE_HZ, SIDE_PX, is_name
+from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import Source
+from rover_lib.workshop.untrusted import shown
 
 SMALL_GMAC = 1.0  # below this a second thread costs more, on a busy machine, than it brings
 
@@ -41,7 +43,37 @@ def load(checkpoint: Path | str, episodes: Path | str | Source, progress: Progre
         source = replace(source, cameras=policy.config.cameras)
     recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
-    return Opened(policy.recorded_as(recordings.layout), recordings, parts)
+    recorded = policy.recorded_as(recordings.layout)
+    _check_limits(recorded)
+    return Opened(recorded, recordings, parts)
+
+
+def _check_limits(policy: Checkpoint) -> None:
+    """Raise CheckpointError for a policy that no artifact may hold: now, rather than after minutes of calibration."""
+    c, remedy = policy.config, "such a policy cannot be made into an artifact"
+    sides = [side for size in c.image_sizes for side in size]
+    for what, values, (least, most) in (
+        ("steps in a plan", [c.chunk], CHUNK),
+        ("steps of a plan in a second", [c.rate_hz], RATE_HZ),
+        ("pixels a side", sides, SIDE_PX),
+    ):
+        for value in values:
+            if not least <= value <= most:
+                raise CheckpointError(
+                    f"{policy.path}: {what} must be from {least:g} to {most:g}", found=f"{value:g}", remedy=remedy
+                )
+    for what, names in (("cameras", c.cameras), ("states", c.state_names), ("actions", c.action_names)):
+        if len(names) > MOST_NAMES:
+            raise CheckpointError(
+                f"{policy.path}: {what} must be at most {MOST_NAMES}", found=str(len(names)), remedy=remedy
+            )
+        for name in names:
+            if not is_name(name):
+                raise CheckpointError(
+                    f"{policy.path}: the names of {what} must have 1 to {NAME_LENGTH} characters and no '/'",
+                    found=shown(name),
+                    remedy="give them other names in the dataset's meta/info.json and the policy's config.json",
+                )
 
 
 def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:

@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 from recorded import record_drives
 
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import CheckpointError, RoverError
+from rover_lib.workshop import session
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint_files import write_lerobot
 from rover_lib.workshop.pipeline import write_load
@@ -47,3 +48,27 @@ def test_recordings_that_now_name_their_numbers_otherwise_are_refused(written, t
     (tmp_path / "load.json").write_text(json.dumps(stage))
     with pytest.raises(RoverError, match="says something else of its numbers"):
         opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        ({"chunk": 257}, "steps in a plan must be from 1 to 256, found 257"),
+        ({"rate_hz": 2.0}, "steps of a plan in a second must be from 5 to 120, found 2"),
+        ({"image_sizes": ((8, 16),)}, "pixels a side must be from 16 to 8192, found 8"),
+        ({"cameras": ("left/right",)}, "the names of cameras must have 1 to 64 characters and no '/', found"),
+        ({"action_names": ("steering", "t" * 65)}, "the names of actions must have 1 to 64 characters"),
+        ({"state_names": tuple(f"joint{i}" for i in range(65))}, "states must be at most 64, found 65"),
+    ],
+)
+def test_what_no_artifact_may_hold_is_refused(change, says, tiny):
+    policy = replace(tiny, config=replace(tiny.config, **change))
+    with pytest.raises(CheckpointError, match=says):
+        session._check_limits(policy)
+
+
+def test_that_is_refused_before_anything_is_calibrated(tiny, tmp_path, monkeypatch):
+    long = replace(tiny, config=replace(tiny.config, chunk=257))
+    monkeypatch.setattr(session, "load_checkpoint", lambda path: long)
+    with pytest.raises(CheckpointError, match="from 1 to 256, found 257"):
+        load(long.path, record_drives(tmp_path / "episodes", frames=300))
