@@ -273,11 +273,11 @@ def distill(
     """
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import read_stage
-    from rover_lib.workshop.distill import Recipe, summary
+    from rover_lib.workshop.distill import DistillRecipe, summary
     from rover_lib.workshop.distill import distill as teach
     from rover_lib.workshop.student import StudentShape
 
-    recipe = Recipe.of(params(), steps, samples, seed)
+    recipe = DistillRecipe.of(params(), steps, samples, seed)
     height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
     shape = StudentShape(height, width, **parts)
@@ -316,11 +316,11 @@ def finetune(
     """
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import read_stage
-    from rover_lib.workshop.finetune import Recipe
+    from rover_lib.workshop.finetune import FinetuneRecipe
     from rover_lib.workshop.finetune import finetune as learn_on
     from rover_lib.workshop.improved import summary
 
-    recipe = Recipe.of(params(), correction_weight=weight, samples=samples, seed=seed)
+    recipe = FinetuneRecipe.of(params(), correction_weight=weight, samples=samples, seed=seed)
     recipe = recipe.of_steps(steps) if steps else recipe
     folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal(), **options)
     content = read_stage(folder / "finetune.json", "finetune")

@@ -20,8 +20,7 @@ from typing import Any, Protocol
 
 from rover_lib.onboard.artifact import car_of, content_hash
 from rover_lib.onboard.camera import Camera, CameraError, path_of
-from rover_lib.onboard.car import Car as CarFile
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car import Car, this_car
 from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver, sentence_of
 from rover_lib.onboard.feed import Feed
 from rover_lib.onboard.host import default_log, default_view
@@ -52,7 +51,7 @@ REST_S = 1.0  # between plans that nobody drives by
 TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"
 
 
-class Car(Protocol):
+class OtherCar(Protocol):
     """A car to drive that is not the one at the options' camera and port."""
 
     camera: str
@@ -106,7 +105,7 @@ def check_no_film(camera: str) -> None:
 
 
 def drive_car(
-    options: DriveOptions, report: Report, car: Callable[[], AbstractContextManager[Car]] | None = None
+    options: DriveOptions, report: Report, car: Callable[[], AbstractContextManager[OtherCar]] | None = None
 ) -> None:
     """Drives as the options say, in this process's main thread; raises as loop.drive.
 
@@ -258,7 +257,7 @@ def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
             said = report.ended
 
 
-def another_car(manifest: dict[str, Any], this: CarFile) -> str:
+def another_car(manifest: dict[str, Any], this: Car) -> str:
     """A sentence where an artifact was calibrated for another car than this one, "" if not. It may be driven by.
 
     An artifact that names none is for the recordings' car.
@@ -451,7 +450,7 @@ def _flight_log(options: DriveOptions, settings: Settings, report: Report) -> It
     limits = params()["flight_log"]
     path = options.log_file or default_log()
     header: dict[str, Any] = {"artifact": str(options.artifact or options.replay), "hz": options.hz, **vars(settings)}
-    if not (car := this_car()).drives_like(CarFile()):
+    if not (car := this_car()).drives_like(Car()):
         header["car"] = car.description()
     with StatusLine(lambda: report.status, sys.stderr) as status:
         logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status.handler], force=True)

@@ -61,7 +61,7 @@ NOBODY_DROVE = "Judged on recordings alone: nobody drove."
 
 
 @dataclass(frozen=True)
-class Recipe:
+class DistillRecipe:
     """How a student is taught: params.yml's section `distill`.
 
     samples: asked about at most. rate: of the first two phases; the third has a tenth. to_teacher, to_recorded: weights
@@ -84,14 +84,14 @@ class Recipe:
     seed: int
 
     @classmethod
-    def of(cls, params: dict[str, Any], steps: int | None, samples: int | None, seed: int | None) -> "Recipe":
+    def of(cls, params: dict[str, Any], steps: int | None, samples: int | None, seed: int | None) -> "DistillRecipe":
         """That of params.yml, with what is not None in its place. steps: in all."""
         recipe = cls(**params["distill"])
         recipe = recipe.of_steps(steps) if steps else recipe
         given = {"samples": samples, "seed": seed}
         return replace(recipe, **{name: value for name, value in given.items() if value is not None})
 
-    def of_steps(self, steps: int) -> "Recipe":
+    def of_steps(self, steps: int) -> "DistillRecipe":
         """The same with that many steps in all, at least one in each phase."""
         names = ("backbone_steps", "transformer_steps", "together_steps", "qat_steps")
         planned = sum(getattr(self, name) for name in names)
@@ -105,7 +105,7 @@ def distill(
     shape: StudentShape,
     *,
     runs_dir: Path | str = "runs",
-    recipe: Recipe | None = None,
+    recipe: DistillRecipe | None = None,
     qat: bool = False,
     device: str | None = None,
     progress: Progress = silent,
@@ -120,7 +120,7 @@ def distill(
     no student; CheckpointError, EpisodeError, TrainingError; RoverError while another process makes a run of that name.
     """
     folder, where = run_folder(runs_dir, name, DistillError), training_device(device, DistillError)
-    recipe = recipe or Recipe(**params()["distill"])
+    recipe = recipe or DistillRecipe(**params()["distill"])
     if recipe.seed < 0:
         raise DistillError("a seed must be at least 0", found=recipe.seed)
     opened = load(checkpoint, episodes, progress)
@@ -169,7 +169,7 @@ class _Work:
     opened: Opened
     config: ActConfig
     share: float | None
-    recipe: Recipe
+    recipe: DistillRecipe
     qat: bool
     device: torch.device
     progress: Progress

@@ -66,7 +66,7 @@ DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonst
 
 
 @dataclass(frozen=True)
-class Recipe:
+class FinetuneRecipe:
     """How a policy learns on: params.yml's section `finetune`.
 
     samples: frames at most of each folder's demonstrations, and of its corrections. rate: of the first phase; the
@@ -103,11 +103,11 @@ class Recipe:
             raise FinetuneError("to_parent must be from 0 to 1, held_out_share from 0 to below 1", found=self)
 
     @classmethod
-    def of(cls, params: dict[str, Any], **given: Any) -> "Recipe":
+    def of(cls, params: dict[str, Any], **given: Any) -> "FinetuneRecipe":
         """That of params.yml, with what is not None in its place."""
         return cls(**params["finetune"] | {name: value for name, value in given.items() if value is not None})
 
-    def of_steps(self, steps: int) -> "Recipe":
+    def of_steps(self, steps: int) -> "FinetuneRecipe":
         """The same with that many steps in all, at least one in each phase."""
         planned = self.transformer_steps + self.together_steps
         transformer = max(1, round(steps * self.transformer_steps / max(planned, 1)))
@@ -120,7 +120,7 @@ def finetune(
     name: str,
     *,
     runs_dir: Path | str = "runs",
-    recipe: Recipe | None = None,
+    recipe: FinetuneRecipe | None = None,
     device: str | None = None,
     progress: Progress = silent,
 ) -> Path:
@@ -137,7 +137,7 @@ def finetune(
     folder, where = run_folder(runs_dir, name, FinetuneError), training_device(device, FinetuneError)
     if folder.exists():
         raise _is_there(folder)
-    recipe = recipe or Recipe.of(params())
+    recipe = recipe or FinetuneRecipe.of(params())
     parent, material = _opened(checkpoint, episodes, recipe, progress)
     work = _Work(parent, material, recipe, where, progress)
     with (
@@ -211,7 +211,7 @@ class _Material:
 
 
 def _opened(
-    checkpoint: Path | str, episodes: Sequence[Path | str | Source], recipe: Recipe, progress: Progress
+    checkpoint: Path | str, episodes: Sequence[Path | str | Source], recipe: FinetuneRecipe, progress: Progress
 ) -> tuple[Checkpoint, _Material]:
     """The checkpoint and what it learns from, in proof that they belong together."""
     if str(checkpoint).endswith((".pt", ".onnx.zip")):
@@ -242,7 +242,7 @@ def _opened(
     return policies[0], _parted(read, recipe)
 
 
-def _parted(read: Sequence[Recordings], recipe: Recipe) -> _Material:
+def _parted(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Material:
     """Old and new episodes, and of each what is learned from and what judges."""
     p = params()["calibration"]
     old = [e for e in read[0].episodes if not e.by_policy]
@@ -346,7 +346,7 @@ class _Work:
 
     parent: Checkpoint
     material: _Material
-    recipe: Recipe
+    recipe: FinetuneRecipe
     device: torch.device
     progress: Progress
 

@@ -184,11 +184,11 @@ class Notebooks:
     def _taught(self, job: Job, folder: Path) -> Path:
         """The student's checkpoint, in the run's own folder; what was begun goes on."""
         from rover_lib.onboard.params import params
-        from rover_lib.workshop.distill import Recipe, distill
+        from rover_lib.workshop.distill import DistillRecipe, distill
         from rover_lib.workshop.student import StudentShape
 
         options = dict(job.student)
-        recipe = Recipe.of(params(), **{key: options.pop(key, None) for key in ("steps", "samples", "seed")})
+        recipe = DistillRecipe.of(params(), **{key: options.pop(key, None) for key in ("steps", "samples", "seed")})
         width, _, height = str(options.pop("size", "x")).partition("x")
         qat = bool(options.pop("qat", False))
         try:

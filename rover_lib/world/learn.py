@@ -31,7 +31,7 @@ from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, w
 from rover_lib.workshop import pipeline
 from rover_lib.workshop.cells import Table
 from rover_lib.workshop.compare import gate
-from rover_lib.workshop.finetune import Recipe, finetune
+from rover_lib.workshop.finetune import FinetuneRecipe, finetune
 from rover_lib.workshop.pipeline import make_artifact
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.session import load
@@ -159,10 +159,10 @@ class Experiment:
         alone = Condition(self.latency_ms / 1e3, self.settings())
         return {PUSHED: replace(alone, pushes=self.pushes), ALONE: alone, DECOY: replace(alone, decoys=self.decoys)}
 
-    def recipe(self) -> Recipe:
+    def recipe(self) -> FinetuneRecipe:
         """For both arms, and all recordings of the rounds are learned from: worlds judge here."""
         alike = {"correction_weight": 1.0, "held_out_share": 0.0, "judged_frames": JUDGED_FRAMES}
-        recipe = Recipe.of(params(), samples=self.samples, **alike)
+        recipe = FinetuneRecipe.of(params(), samples=self.samples, **alike)
         return recipe.of_steps(self.steps) if self.steps else recipe
 
 

@@ -68,7 +68,7 @@ RESNET18_MACS = 37e3  # multiply-accumulates per pixel
 
 
 @dataclass(frozen=True)
-class Recipe:
+class TrainingRecipe:
     """How long and how fast each phase trains.
 
     samples: how many of the recordings' are used at most; feature_samples: of these, for the transformer. judged: how
@@ -90,7 +90,7 @@ class Recipe:
     at: tuple[int, int] | None = None
     carry_steps: int = 0
 
-    def of_steps(self, steps: int) -> "Recipe":
+    def of_steps(self, steps: int) -> "TrainingRecipe":
         """The same recipe with that many steps in all, at least one in each phase that it has."""
         names = "backbone_steps", "transformer_steps", "together_steps", "carry_steps"
         planned = {name: getattr(self, name) for name in names if getattr(self, name)}
@@ -111,8 +111,8 @@ SIZES = {
     ),
     "full": ActConfig(),
 }
-SMALL = Recipe(300, 900, 60, 16, 16, 16, samples=4000, feature_samples=4000, judged=500)
-FULL = Recipe(
+SMALL = TrainingRecipe(300, 900, 60, 16, 16, 16, samples=4000, feature_samples=4000, judged=500)
+FULL = TrainingRecipe(
     *(200, 250, 20),
     *(32, 32, 8),
     samples=100_000,
@@ -226,7 +226,7 @@ class _Training:
     size: ActConfig  # as trained first; the policy's own may be larger
     policy: "ACTPolicy"
     data: Frames
-    recipe: Recipe
+    recipe: TrainingRecipe
     loss_weights: Tensor  # (2,), on the device that is trained on
     rng: np.random.Generator
     saved: Resumable
@@ -252,7 +252,7 @@ class _Training:
 
 
 def _train(
-    episodes_dir: Path, size: ActConfig, recipe: Recipe, seed: int, device: torch.device, saved: Resumable
+    episodes_dir: Path, size: ActConfig, recipe: TrainingRecipe, seed: int, device: torch.device, saved: Resumable
 ) -> dict[str, Any]:
     """All of the checkpoint but its config."""
     p = params()["calibration"]
@@ -297,7 +297,9 @@ def _train(
     }
 
 
-def _plan(size: ActConfig, first: ActConfig, recipe: Recipe, frames: int, judges: int) -> dict[str, tuple[int, int]]:
+def _plan(
+    size: ActConfig, first: ActConfig, recipe: TrainingRecipe, frames: int, judges: int
+) -> dict[str, tuple[int, int]]:
     """Each phase's steps, and what one costs, in 10^9 multiply-accumulates: for the bar, so roughly."""
 
     def g(config: ActConfig, passes: int, batch: int, backbone: bool = True, transformer: bool = True) -> int:

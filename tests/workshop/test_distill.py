@@ -21,7 +21,7 @@ from rover_lib.workshop.act import ACT, Affine, inputs_of
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot
 from rover_lib.workshop.compare import LerobotEager
-from rover_lib.workshop.distill import Recipe, distill, summary
+from rover_lib.workshop.distill import DistillRecipe, distill, summary
 from rover_lib.workshop.student import StudentShape
 
 SHAPE = StudentShape(54, 96, decoder_layers=1, feedforward=64)
@@ -41,7 +41,7 @@ def teacher(tmp_path_factory):
 def recipe():
     few = {"samples": 20, "batch": 4, "unit_frames": 8, "judged_frames": 8, "rate": 1e-3}
     steps = {"backbone_steps": 3, "transformer_steps": 8, "together_steps": 3, "qat_steps": 3}
-    return Recipe(**{**params()["distill"], **steps, **few})
+    return DistillRecipe(**{**params()["distill"], **steps, **few})
 
 
 @pytest.fixture(autouse=True)
@@ -306,7 +306,10 @@ def test_a_policy_that_somebody_trained_is_not_replaced_by_a_student(teacher, ep
         ({"shape": StudentShape(54, 96), "device": "tpu"}, "device must be"),
         ({"shape": StudentShape(54, 96), "name": "../fast"}, "plain folder name"),
         ({"shape": StudentShape(54, 96), "name": ""}, "plain folder name"),
-        ({"shape": StudentShape(54, 96), "recipe": Recipe(**{**params()["distill"], "seed": -1})}, "seed must be"),
+        (
+            {"shape": StudentShape(54, 96), "recipe": DistillRecipe(**{**params()["distill"], "seed": -1})},
+            "seed must be",
+        ),
     ],
 )
 def test_what_cannot_be_taught_is_refused(teacher, episodes, tmp_path, options, says):

@@ -29,7 +29,7 @@ from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
 from rover_lib.workshop.episodes import load_recordings
-from rover_lib.workshop.finetune import Recipe, finetune, human_samples
+from rover_lib.workshop.finetune import FinetuneRecipe, finetune, human_samples
 from rover_lib.workshop.pipeline import make_artifact
 from rover_lib.workshop.samples import Episode, Sample
 from rover_lib.workshop.student import gmac
@@ -70,7 +70,7 @@ def checkpoint(tmp_path_factory):
 @pytest.fixture(scope="module")
 def recipe():
     few = {"samples": 20, "batch": 4, "judged_frames": 4, "rate": 1e-3}
-    return Recipe.of(params(), transformer_steps=6, together_steps=3, **few)
+    return FinetuneRecipe.of(params(), transformer_steps=6, together_steps=3, **few)
 
 
 @pytest.fixture(autouse=True)
