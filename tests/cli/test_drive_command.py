@@ -1,16 +1,18 @@
 """`rover drive` whole, as a user calls it: a car of its own process, a camera, a serial line, exit codes, files."""
 
+import contextlib
 import json
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from needs import until
+from needs import real_time, until
 
 from lab.driving.policy import make_artifact, pictures
 from rover_lib.cli import main
@@ -33,16 +35,26 @@ def artifact(tmp_path_factory):
     return path
 
 
+def fresh(folder):
+    """A folder of an attempt's own: see needs.real_time."""
+    return Path(tempfile.mkdtemp(dir=folder))
+
+
 @pytest.fixture(scope="module")
 def world_drive(demo_run, tmp_path_factory):
     """One drive in the balloon world, recorded."""
-    folder = tmp_path_factory.mktemp("drive")
-    options = ["--world", "--ticks", "60", "--latency-ms", "50", "--log", folder / "flight.log"]
-    options += ["--json", folder / "drive.json", "--record", folder / "episodes"]
-    policy = demo_run / "policy_static.pt"
-    done = subprocess.run([*ROVER, policy, *map(str, options)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return folder, done.stderr
+
+    @real_time
+    def drive():
+        folder = fresh(tmp_path_factory.mktemp("drive"))
+        options = ["--world", "--ticks", "60", "--latency-ms", "50", "--log", folder / "flight.log"]
+        options += ["--json", folder / "drive.json", "--record", folder / "episodes"]
+        policy = demo_run / "policy_static.pt"
+        done = subprocess.run([*ROVER, policy, *map(str, options)], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return folder, done.stderr
+
+    return drive()
 
 
 def test_a_drive_leaves_its_report(world_drive):
@@ -76,13 +88,14 @@ def test_a_recorded_drive_is_an_episode(world_drive):
     assert "takeover" not in data["metadata"]
 
 
+@real_time
 def test_its_replay_sends_the_same_pulses(world_drive, tmp_path):
-    episode = next((world_drive[0] / "episodes").iterdir())
-    options = ["--replay", episode, "--world", "--log", tmp_path / "flight.log", "--json", "-"]
+    episode, folder = next((world_drive[0] / "episodes").iterdir()), fresh(tmp_path)
+    options = ["--replay", episode, "--world", "--log", folder / "flight.log", "--json", "-"]
     done = subprocess.run([*ROVER, *map(str, options)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["ended"] == "done"
-    sent, recorded = read_log(tmp_path / "flight.log").ticks, read_controls(episode)
+    sent, recorded = read_log(folder / "flight.log").ticks, read_controls(episode)
     # At each tick the newest control that is due: of two that a busy machine recorded within one tick, one is left out.
     # The log's times have four decimals.
     since_s = sent["t_s"] - sent["t_s"][0] + SLACK_S
@@ -93,16 +106,11 @@ def test_its_replay_sends_the_same_pulses(world_drive, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@real_time
 def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number):
-    command = [
-        *ROVER,
-        str(demo_run / "policy_static.pt"),
-        "--world",
-        "--log",
-        str(tmp_path / "flight.log"),
-        "--json",
-        str(tmp_path / "drive"),
-    ]
+    folder = fresh(tmp_path)
+    options = ["--world", "--log", folder / "flight.log", "--json", folder / "drive"]
+    command = [*ROVER, str(demo_run / "policy_static.pt"), *map(str, options)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     for line in process.stderr:
         if line.strip() == "rover: armed":
@@ -112,23 +120,25 @@ def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number):
     _, stderr = process.communicate(timeout=20)
     assert process.returncode == 0, stderr
     assert f"{number.name}: stopping" in stderr
-    assert json.loads((tmp_path / "drive").read_text())["ended"] == "told to stop"
+    assert json.loads((folder / "drive").read_text())["ended"] == "told to stop"
 
 
-@pytest.fixture
-def watched(demo_run, tmp_path):
+@contextlib.contextmanager
+def watched(demo_run, folder):
     """A drive of 300 ticks in the world, its view's server, and an open page that shows it."""
     pytest.importorskip("aiohttp", reason="needs the extra view")
     from lab.driving.page import Page, ViewServer
 
-    options = ["--world", "--ticks", "300", "--view", tmp_path / "view", "--log", tmp_path / "flight.log"]
-    options += ["--json", tmp_path / "drive"]
-    with ViewServer(tmp_path / "view") as server, Page(server.url) as page:
+    options = ["--world", "--ticks", "300", "--view", folder / "view", "--log", folder / "flight.log"]
+    options += ["--json", folder / "drive"]
+    with ViewServer(folder / "view") as server, Page(server.url) as page:
         command = [*ROVER, str(demo_run / "policy_static.pt"), *map(str, options)]
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-            until(lambda: page.newest["phase"] == "driving", 120)
-            yield server, page, process
-            process.kill()
+            try:
+                until(lambda: page.newest["phase"] == "driving", 120)
+                yield server, page, process
+            finally:
+                process.kill()
 
 
 def ending(process, folder):
@@ -137,14 +147,16 @@ def ending(process, folder):
     return json.loads((folder / "drive").read_text())
 
 
-def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(watched, tmp_path):
-    _, page, process = watched
-    until(lambda: len(page.messages) > 20)
-    page.stop()
-    until(lambda: page.newest["phase"] == "ended")
-    assert page.newest["stopped"] and page.newest["pins"][1] == 120
-    assert ending(process, tmp_path)["ended"] == page.newest["text"] == "stopped from the view (127.0.0.1)"
-    flight = read_log(tmp_path / "flight.log")
+@real_time
+def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp_path):
+    folder = fresh(tmp_path)
+    with watched(demo_run, folder) as (_, page, process):
+        until(lambda: len(page.messages) > 20)
+        page.stop()
+        until(lambda: page.newest["phase"] == "ended")
+        assert page.newest["stopped"] and page.newest["pins"][1] == 120
+        assert ending(process, folder)["ended"] == page.newest["text"] == "stopped from the view (127.0.0.1)"
+    flight = read_log(folder / "flight.log")
     assert "ended: stopped from the view (127.0.0.1)" in [e.text for e in flight.events]
     shown = [m for m in page.messages if m["phase"] == "driving"]
     assert len(shown) > 15 and all(m["jpeg_bytes"] > 1000 and m["size"] == [640, 360] for m in shown)
@@ -157,25 +169,29 @@ def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(watched, tmp_
 
 
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
-def test_a_view_that_hangs_or_dies_takes_no_tick(watched, tmp_path, number):
-    server, _, process = watched
-    server.signal(number)
-    report = ending(process, tmp_path)
+@real_time
+def test_a_view_that_hangs_or_dies_takes_no_tick(demo_run, tmp_path, number):
+    folder = fresh(tmp_path)
+    with watched(demo_run, folder) as (server, _, process):
+        server.signal(number)
+        report = ending(process, folder)
     assert (report["ticks"], report["ended"]) == (300, "300 ticks")
 
 
-def test_a_flood_of_requests_takes_no_tick_and_writes_nothing(watched, tmp_path):
+@real_time
+def test_a_flood_of_requests_takes_no_tick_and_writes_nothing(demo_run, tmp_path):
     from lab.driving.page import flood
 
-    server, page, process = watched
-    before = {p.name for p in tmp_path.iterdir()}
-    page.close()  # in the middle
-    counts = flood(server.url, 3.0)
-    assert counts.get("403", 0) > 100 and set(counts) <= {"0", "200", "403"}
-    report = ending(process, tmp_path)
+    folder = fresh(tmp_path)
+    with watched(demo_run, folder) as (server, page, process):
+        before = {p.name for p in folder.iterdir()}
+        page.close()  # in the middle
+        counts = flood(server.url, 3.0)
+        assert counts.get("403", 0) > 100 and set(counts) <= {"0", "200", "403"}
+        report = ending(process, folder)
     assert (report["ticks"], report["ended"]) == (300, "300 ticks")
-    assert {p.name for p in tmp_path.iterdir()} - before <= {"drive"}
-    assert sum(e.text == "armed" for e in read_log(tmp_path / "flight.log").events) == 1
+    assert {p.name for p in folder.iterdir()} - before <= {"drive"}
+    assert sum(e.text == "armed" for e in read_log(folder / "flight.log").events) == 1
 
 
 def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
