@@ -4,10 +4,12 @@ Debian packages cannot come with pip; .ci/run installs them, so that none of the
 """
 
 import contextlib
+import fcntl
 import functools
 import os
 import shutil
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -99,6 +101,21 @@ class Heartbeat:
 
 
 @contextlib.contextmanager
+def in_turn():
+    """Inside, no other test in real time runs on this machine, of this suite or of another.
+
+    What runs at real-time priority keeps a processor for up to 100 ms from what else does, and an Arduino that waits as
+    long stops its car.
+    """
+    with open(Path(tempfile.gettempdir()) / f"rover-real-time-{os.getuid()}.lock", "w") as turn:
+        fcntl.flock(turn, fcntl.LOCK_EX)
+        try:
+            yield
+        finally:
+            fcntl.flock(turn, fcntl.LOCK_UN)  # a forked child may hold the file open
+
+
+@contextlib.contextmanager
 def boosted_priority():
     """Inside, this thread, and the threads and processes that it starts, go before ordinary ones, if this user may."""
     before = sys.getswitchinterval()
@@ -122,7 +139,7 @@ def real_time(test: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(test)
     def repeated(*args: object, **fixtures: object) -> None:
         for attempt in range(1, ATTEMPTS + 1):
-            with boosted_priority(), Heartbeat() as heartbeat:
+            with in_turn(), boosted_priority(), Heartbeat() as heartbeat:
                 try:
                     return test(*args, **fixtures)
                 except Exception as error:

@@ -1,5 +1,8 @@
 """The tests' own way with a busy machine: a test in real time is repeated while it is late, and never skipped."""
 
+import subprocess
+import sys
+import threading
 import time
 
 import needs
@@ -32,6 +35,27 @@ def test_it_fails_in_the_end_and_says_why():
         always_late()
     assert len(attempts) == needs.ATTEMPTS
     assert "this machine was too busy in 5 attempts" in failure.value.__notes__[0]
+
+
+def test_one_at_a_time(tmp_path, monkeypatch):
+    """Of all workers and suites of this machine; the one here is a process of its own."""
+    monkeypatch.setattr(needs.tempfile, "gettempdir", lambda: str(tmp_path))
+    program = f"""
+import sys, tempfile
+sys.path[:0] = {sys.path!r}
+tempfile.gettempdir = lambda: {str(tmp_path)!r}
+import needs
+needs.real_time(lambda: (print("in", flush=True), sys.stdin.readline()))()
+"""
+    with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"in\n"
+        began = threading.Event()
+        mine = threading.Thread(target=needs.real_time(began.set))
+        mine.start()
+        assert not began.wait(0.2)
+        other.stdin.close()
+        assert began.wait(20)
+        mine.join()
 
 
 def test_a_heartbeat_knows_that_nobody_had_a_turn():

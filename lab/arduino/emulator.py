@@ -99,6 +99,18 @@ def symbol(name: str) -> int:
     return int(line[1], 16)
 
 
+def _set_nice(pid: int, nice: int) -> None:
+    """A priority for a process that leads a session, as far as this user may.
+
+    Linux shares the processors among sessions first, and among the processes of each then, where autogroups are on: see
+    sched(7).
+    """
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, pid, nice)
+    with contextlib.suppress(OSError):
+        Path(f"/proc/{pid}/autogroup").write_text(f"{nice}\n")
+
+
 class EmulatedArduino:
     """The real firmware in simavr, in real time, as a process of its own that ends with this one.
 
@@ -139,8 +151,7 @@ class EmulatedArduino:
         self.pid = self._process.pid
         self._process.keep_unread(LOG_BYTES)
         try:
-            with contextlib.suppress(PermissionError):
-                os.setpriority(os.PRIO_PROCESS, self.pid, nice)
+            _set_nice(self.pid, nice)
             deadline = time.monotonic() + START_S
             while not os.path.lexists(self.port):  # Path.exists would follow the link
                 self._process.check()

@@ -196,6 +196,8 @@ class TestFirmware:
         nice = -10 if os.geteuid() == 0 else os.getpriority(os.PRIO_PROCESS, 0) + 1  # only root may raise it
         with EmulatedArduino(nice=nice) as board:
             assert os.getpriority(os.PRIO_PROCESS, board.pid) == nice
+            session = Path(f"/proc/{board.pid}/autogroup")
+            assert os.geteuid() != 0 or not session.exists() or session.read_text().split()[-1] == str(nice)
 
     def test_when_it_has_ended(self, emulated):
         os.kill(emulated.pid, signal.SIGKILL)
