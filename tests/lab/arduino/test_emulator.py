@@ -9,6 +9,7 @@ import termios
 import time
 from contextlib import suppress
 from itertools import pairwise
+from pathlib import Path
 
 import needs
 import pytest
