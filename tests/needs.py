@@ -107,7 +107,7 @@ def in_turn():
     What runs at real-time priority keeps a processor for up to 100 ms from what else does, and an Arduino that waits as
     long stops its car.
     """
-    with open(Path(tempfile.gettempdir()) / f"rover-real-time-{os.getuid()}.lock", "w") as turn:
+    with (Path(tempfile.gettempdir()) / f"rover-real-time-{os.getuid()}.lock").open("w") as turn:
         fcntl.flock(turn, fcntl.LOCK_EX)
         try:
             yield
@@ -117,11 +117,15 @@ def in_turn():
 
 @contextlib.contextmanager
 def boosted_priority():
-    """Inside, this thread, and the threads and processes that it starts, go before ordinary ones, if this user may."""
+    """Inside, this thread goes before ordinary ones, if this user may.
+
+    What it starts does not, unless it asks for that: a program that loads torch would keep every car of this machine
+    waiting.
+    """
     before = sys.getswitchinterval()
     sys.setswitchinterval(0.0005)
     with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
     try:
         yield
     finally:

@@ -164,18 +164,19 @@ class CameraFeed:
         self._pipe.close()
 
     def _run(self) -> None:
-        waiting: deque[tuple[float, bytes]] = deque()
+        waiting: deque[tuple[float, tuple[bytes, ...], bool]] = deque()
         due = time.monotonic()
         while not self._closing.wait(max(0.0, due - time.monotonic())):
             due = max(due + self._period_s, time.monotonic() - self._period_s)
             pictures = self._pictures
             if pictures and not self._paused:
-                self._next += not self._frozen
-                waiting.append((time.monotonic() + self.late_s, pictures[self._next % len(pictures)]))
+                waiting.append((time.monotonic() + self.late_s, pictures, not self._frozen))
             while waiting and waiting[0][0] <= time.monotonic():
-                jpeg = waiting.popleft()[1]
+                _, pictures, moves = waiting.popleft()
                 if self._pipe.read:
-                    if self._pipe.write(jpeg):
+                    # The next one when this one was taken: a slow reader would see the same few again and again.
+                    if self._pipe.write(pictures[(self._next + moves) % len(pictures)]):
+                        self._next += moves
                         self.written += 1
                     else:
                         self.dropped += 1

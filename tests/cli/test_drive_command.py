@@ -194,26 +194,19 @@ def test_a_flood_of_requests_takes_no_tick_and_writes_nothing(demo_run, tmp_path
     assert sum(e.text == "armed" for e in read_log(folder / "flight.log").events) == 1
 
 
+@real_time
 def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
     """A camera of some seconds, which torch may take to load, the car being another world's."""
-    (tmp_path / "short.mjpeg").write_bytes(b"".join(pictures(0) * 14))
+    folder = fresh(tmp_path)
+    (folder / "short.mjpeg").write_bytes(b"".join(pictures(0) * 14))
     with VirtualCar() as car:
-        options = [
-            "--film",
-            "--camera",
-            tmp_path / "short.mjpeg",
-            "--port",
-            car.port,
-            "--log",
-            tmp_path / "l",
-            "--json",
-            tmp_path / "j",
-        ]
+        options = ["--film", "--camera", folder / "short.mjpeg", "--port", car.port]
+        options += ["--log", folder / "l", "--json", folder / "j"]
         done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
     assert done.returncode == 3, done.stderr
     assert "is the camera unplugged?" in done.stderr
     assert "Traceback" not in done.stderr
-    assert "unplugged" in json.loads((tmp_path / "j").read_text())["ended"]
+    assert "unplugged" in json.loads((folder / "j").read_text())["ended"]
 
 
 def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
@@ -255,11 +248,13 @@ def test_what_cannot_begin(options, code, message, tmp_path):
     assert "Traceback" not in result.output
 
 
+@real_time
 def test_the_car_stands_after_it(artifact, tmp_path):
+    folder = fresh(tmp_path)
     with VirtualCar() as car:
-        (tmp_path / "drive.mjpeg").write_bytes(b"".join(pictures(0) * 50))
-        options = ["--film", "--camera", tmp_path / "drive.mjpeg", "--port", car.port, "--ticks", "20"]
-        options += ["--log", tmp_path / "l"]
+        (folder / "drive.mjpeg").write_bytes(b"".join(pictures(0) * 50))
+        options = ["--film", "--camera", folder / "drive.mjpeg", "--port", car.port, "--ticks", "20"]
+        options += ["--log", folder / "l"]
         done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         with ServoLink(car.port) as link:

@@ -338,3 +338,16 @@ def test_a_feed_that_nobody_reads_in_time(tmp_path):
         with (tmp_path / "camera").open("rb", buffering=0):
             until(lambda: feed.dropped > 5)
             assert feed.written == 1
+
+
+def test_a_slow_reader_misses_no_picture(tmp_path):
+    """Of two in turn, who takes every second frame would else see one of them alone, and call the camera frozen."""
+    seen = []
+    path = tmp_path / "camera"
+    with CameraFeed(path, RED, BLUE, rate_hz=100) as feed, path.open("rb", buffering=0) as pipe:
+        for count in range(1, 9):
+            until(lambda count=count: feed.written == count)
+            dropped = feed.dropped
+            until(lambda dropped=dropped: feed.dropped > dropped)
+            seen.append(cv2.imdecode(np.frombuffer(pipe.read(1 << 20), np.uint8), cv2.IMREAD_COLOR))
+    assert colours(seen) == ["r", "b"] * 4
