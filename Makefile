@@ -38,10 +38,13 @@ help:
 	@echo "                                            and the JSON behind them into results/, and the pages' tables from it"
 	@echo "make tables                                 the pages' tables alone"
 
+# ensurepip on its own says why it failed, which venv hides; where it cannot (a full disk, no bundled wheels), the pip of
+# $(PYTHON) fills the environment. An environment that was begun and has no pip gets one.
 # uv installs the CUDA build of torch, gigabytes that its wheel insists on, in a minute where pip takes several.
 $(READY): pyproject.toml lerobot_robot_rover/pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and f"Python 3.11 to 3.13 is needed, found {sys.version.split()[0]}: make PYTHON=python3.12")'
-	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
+	test -x $(VENV)/bin/python || $(PYTHON) -m venv --without-pip $(VENV)
+	$(VENV)/bin/python -m pip --version > /dev/null 2>&1 || $(VENV)/bin/python -m ensurepip --upgrade --default-pip > /dev/null || $(PYTHON) -m pip --python $(VENV)/bin/python install --quiet pip
 	$(VENV)/bin/python -m pip install --quiet 'uv>=0.5'
 	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,view,dev,docs]' -e ./lerobot_robot_rover
 	@touch $@
