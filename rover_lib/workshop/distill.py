@@ -25,7 +25,6 @@ import torch
 from torch import Tensor
 
 from rover_lib.onboard import preprocess
-from rover_lib.onboard.artifact import ONNX_SUFFIX
 from rover_lib.onboard.errors import CheckpointError, DistillError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, write_stage
@@ -49,6 +48,7 @@ from rover_lib.workshop.lessons import BatchedPolicy, Lessons, in_another_light,
 from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.quantize import QuantizedPolicy, quantize
+from rover_lib.workshop.run import files_of_a_run
 from rover_lib.workshop.run_folder import run_folder
 from rover_lib.workshop.samples import Source
 from rover_lib.workshop.scheme import Scheme
@@ -114,10 +114,10 @@ def distill(
 
     recipe: params.yml's if None. qat: quantization-aware training at the end; then the student may have its
     teacher's own shape, and that is all that is done. device: 'cpu', 'cuda' or None for the best there is.
-    Ended at any moment and started again with the same arguments, it goes on and gives the same student. What was
-    in the run's folder before stays until the new is whole.
-    Raises DistillError for a student, a device or recordings that cannot be, and for a run that has a policy which is
-    no student; CheckpointError, EpisodeError, TrainingError; RoverError while another process makes a run of that name.
+    Ended at any moment and started again with the same arguments, it goes on and gives the same student. An earlier
+    student in the run's folder stays until the new one is whole; then it goes, with all that a run has left of it.
+    Raises DistillError for a student, a device or recordings that cannot be, and for a run of a policy that is no
+    student; CheckpointError, EpisodeError, TrainingError; RoverError while another process makes a run of that name.
     """
     folder, where = run_folder(runs_dir, name, DistillError), training_device(device, DistillError)
     recipe = recipe or DistillRecipe(**params()["distill"])
@@ -138,7 +138,7 @@ def distill(
     ):
         taught = _taught(work)
         _leave(new, name, work, taught)
-    (folder / f"policy_static{ONNX_SUFFIX}").unlink(missing_ok=True)  # of the policy_static.pt that this one replaced
+        _remove_replaced(folder, new)
     shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
     return folder
 
@@ -148,9 +148,19 @@ def _refuse_another_policy(folder: Path, teacher: Checkpoint) -> None:
     remedy = "give another --name"
     if teacher.path.resolve().is_relative_to(folder):
         raise DistillError(f"{folder}: holds the teacher, which its student would replace", remedy=remedy)
-    for path in (folder / "best_model.pth", folder / "pretrained_model"):
-        if path.exists() and not _is_student(path):
+    policies = [path for path in (folder / "best_model.pth", folder / "pretrained_model") if path.exists()]
+    for path in policies:
+        if not _is_student(path):
             raise DistillError(f"{path}: is no student, and one would replace it", remedy=remedy)
+    if not policies and (artifact := folder / "policy_static.pt").exists():
+        raise DistillError(f"{artifact}: is of another run, and a student would replace it", remedy=remedy)
+
+
+def _remove_replaced(folder: Path, new: Path) -> None:
+    """Remove what is there of an earlier student and has no successor: its report would be read as the new one's."""
+    for path in [*files_of_a_run(folder), folder / "best_model.pth"]:
+        if not (new / path.name).exists():
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def _is_student(path: Path) -> bool:

@@ -88,7 +88,7 @@ def run(
     The new run is made beside the old one of that name, in .<name>.new, and takes its place when it is whole: stage by
     stage a run that fails at its third notebook would have cost the policies of the last good one, and left reports of
     two runs side by side. So for a while both are on the disk, about 570 MB each for a full-size policy. Only a run's
-    own files are replaced (`_own`); recordings, a checkpoint and benchmarks of other hosts in its folder stay.
+    own files (`files_of_a_run`) are replaced; recordings, a checkpoint and benchmarks of other hosts stay.
 
     Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C, the old run
     is as it was and nothing is left of the new one. RoverError while another process makes a run of that name.
@@ -124,7 +124,7 @@ def run(
     return folder
 
 
-def _own(folder: Path) -> list[Path]:
+def files_of_a_run(folder: Path) -> list[Path]:
     """What a run leaves in its folder, and what was made of its artifacts later: none of it is of another run's."""
     stages = ("load", "calibrate", "quantize", "compare", "run", "arm", "parts", "drive", "learn")
     names = [f"{stage}.json" for stage in (*stages, f"benchmark-{socket.gethostname()}")]
@@ -153,7 +153,7 @@ def _take_place(new: Path, folder: Path, old: Path) -> None:
     folder.mkdir(exist_ok=True)
     old.mkdir()
     made = [p.name for p in new.iterdir()]
-    replaced = {p.name for p in _own(folder)} | {name for name in made if (folder / name).exists()}
+    replaced = {p.name for p in files_of_a_run(folder)} | {name for name in made if (folder / name).exists()}
     try:
         for name in replaced:
             (folder / name).rename(old / name)

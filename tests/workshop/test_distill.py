@@ -240,7 +240,11 @@ def test_what_was_there_stays_until_the_new_is_whole(teacher, episodes, recipe, 
     (tmp_path / "fast" / "pretrained_model" / "origin.json").write_text('{"teacher_sha256": "old"}')
     (tmp_path / "fast" / "policy_static.pt").write_text("old")
     (tmp_path / "fast" / "policy_static.onnx.zip").write_text("the same, for ONNX Runtime")
-    (tmp_path / "fast" / "compare.json").write_text("of a run")
+    for name in ("compare.json", "report.html", "policy_mixed.pt"):
+        (tmp_path / "fast" / name).write_text("of the old student")
+    (tmp_path / "fast" / "figures").mkdir()
+    (tmp_path / "fast" / "notes.txt").write_text("the user's")
+    before = sorted(p.name for p in (tmp_path / "fast").iterdir())
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
         interrupt(patch, distill_module, "write_stage")
@@ -248,13 +252,12 @@ def test_what_was_there_stays_until_the_new_is_whole(teacher, episodes, recipe, 
             distill(teacher, episodes, "fast", SHAPE, **arguments)
     assert (tmp_path / "fast" / "pretrained_model" / "config.json").read_text() == "old"
     assert (tmp_path / "fast" / "policy_static.pt").read_text() == "old"
-    before = ["compare.json", "policy_static.onnx.zip", "policy_static.pt", "pretrained_model"]
     assert sorted(p.name for p in (tmp_path / "fast").iterdir()) == before
     distill(teacher, episodes, "fast", SHAPE, **arguments)
     assert load_checkpoint(tmp_path / "fast" / "pretrained_model").config.feedforward == 64
     assert load_policy(tmp_path / "fast" / "policy_static.pt").manifest["mode"] == "static"
-    assert (tmp_path / "fast" / "compare.json").read_text() == "of a run"
-    assert not (tmp_path / "fast" / "policy_static.onnx.zip").exists()  # it was of another policy
+    after = ["best_model.pth", "distill.json", "notes.txt", "policy_static.pt", "pretrained_model"]
+    assert sorted(p.name for p in (tmp_path / "fast").iterdir()) == after
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cache", "fast"]
 
 
@@ -297,6 +300,25 @@ def test_a_policy_that_somebody_trained_is_not_replaced_by_a_student(teacher, ep
     (own.parent / "pretrained_model").mkdir()
     with pytest.raises(DistillError, match="pretrained_model: is no student, and one would replace it"):
         distill(teacher, episodes, "full", SHAPE, runs_dir=tmp_path)
+
+
+def test_an_artifact_of_another_run_is_not_replaced_by_a_student(teacher, episodes, tmp_path):
+    """As in `rover run best_model.pth episodes`, then `rover distill ... --name mine`."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "policy_static.pt").write_text("the last good policy")
+    with pytest.raises(DistillError, match=r"policy_static\.pt: is of another run, and a student would replace it"):
+        distill(teacher, episodes, "mine", SHAPE, runs_dir=tmp_path)
+    assert (tmp_path / "mine" / "policy_static.pt").read_text() == "the last good policy"
+
+
+def test_an_old_students_checkpoint_goes_where_the_new_one_has_none(tmp_path):
+    """The trainer's format has no place for a policy of another rate: best_model.pth would be of the old one."""
+    folder, new = tmp_path / "fast", tmp_path / "new"
+    for path in (folder / "best_model.pth", new / "pretrained_model" / "config.json"):
+        path.parent.mkdir(parents=True)
+        path.touch()
+    distill_module._remove_replaced(folder, new)
+    assert not list(folder.iterdir())
 
 
 @pytest.mark.parametrize(
