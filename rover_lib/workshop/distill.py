@@ -152,8 +152,9 @@ def _refuse_another_policy(folder: Path, teacher: Checkpoint) -> None:
     for path in policies:
         if not _is_student(path):
             raise DistillError(f"{path}: is no student, and one would replace it", remedy=remedy)
-    if not policies and (artifact := folder / "policy_static.pt").exists():
-        raise DistillError(f"{artifact}: is of another run, and a student would replace it", remedy=remedy)
+    # Killed while a student takes an earlier one's place, there may be an artifact alone, but no run: that goes first.
+    if not policies and (folder / "quantize.json").exists():
+        raise DistillError(f"{folder}: holds the run of another policy, which a student would replace", remedy=remedy)
 
 
 def _remove_replaced(folder: Path, new: Path) -> None:

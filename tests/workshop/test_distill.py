@@ -306,9 +306,21 @@ def test_an_artifact_of_another_run_is_not_replaced_by_a_student(teacher, episod
     """As in `rover run best_model.pth episodes`, then `rover distill ... --name mine`."""
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "policy_static.pt").write_text("the last good policy")
-    with pytest.raises(DistillError, match=r"policy_static\.pt: is of another run, and a student would replace it"):
+    (tmp_path / "mine" / "quantize.json").write_text("{}")
+    with pytest.raises(DistillError, match="mine: holds the run of another policy, which a student would replace"):
         distill(teacher, episodes, "mine", SHAPE, runs_dir=tmp_path)
     assert (tmp_path / "mine" / "policy_static.pt").read_text() == "the last good policy"
+
+
+def test_a_kill_while_a_student_takes_an_earlier_ones_place_keeps_nobody_from_going_on(teacher, tmp_path):
+    for name in ("fast/pretrained_model", "fast/figures", "new/pretrained_model"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in ("fast/policy_static.pt", "fast/quantize.json", "new/policy_static.pt", "new/distill.json"):
+        (tmp_path / name).touch()
+    distill_module._remove_replaced(tmp_path / "fast", tmp_path / "new")
+    (tmp_path / "fast" / "pretrained_model").rename(tmp_path / "new" / "pretrained_model.old")
+    assert [p.name for p in (tmp_path / "fast").iterdir()] == ["policy_static.pt"]
+    distill_module._refuse_another_policy(tmp_path / "fast", load_checkpoint(teacher))
 
 
 def test_an_old_students_checkpoint_goes_where_the_new_one_has_none(tmp_path):
