@@ -361,7 +361,7 @@ class Pty:
         self.port = os.ttyname(slave)
         os.close(slave)
 
-    def read(self, wanted, within_s=2.0):
+    def read(self, wanted, within_s=20.0):
         data, end = b"", time.monotonic() + within_s
         while len(data) < wanted and select.select([self.master], [], [], max(0, end - time.monotonic()))[0]:
             try:
@@ -377,7 +377,7 @@ def ends():
     """The Arduino's end, the cable, and the host's, open."""
     board = Pty()
     cable = Cable(board.port)
-    host = serial.Serial(cable.port, 115200, timeout=1, write_timeout=0.01, exclusive=True)
+    host = serial.Serial(cable.port, 115200, timeout=20, write_timeout=20, exclusive=True)
     host.write(b"x")
     assert board.read(1) == b"x"
     yield board, cable, host
@@ -417,15 +417,16 @@ def test_only_the_drives_own_whole_lines_are_commands(ends):
     cable.not_ours.add(other[:-1])
     cable.to_arduino = lambda data: b""
     host.write(b">D 1 6 15" + good + other + good.replace(b"1500", b"1501") + b"AT\r\n")
-    time.sleep(0.1)
-    assert [c[1:] for c in cable.commands] == [(1500, 200)]
+    needs.until(lambda: cable.commands)
     assert board.read(1, 0.1) == b""
+    assert [c[1:] for c in cable.commands] == [(1500, 200)]
     cable.inject(good)
     assert board.read(len(good)) == good
 
 
 def test_a_stuck_cable_blocks_and_an_unplugged_one_fails(ends):
     _, cable, host = ends
+    host.write_timeout = 0.01
     cable.stick()
     with pytest.raises(serial.SerialTimeoutException):
         host.write(b"abc")
