@@ -76,6 +76,7 @@ def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
     metrics: dict[str, float | int] = {
         f"latency_{name}_ms": float(np.percentile(x, q)) for name, q in PERCENTILES.items()
     }
+    metrics["latency_min_ms"] = float(x.min())
     metrics["latency_mean_ms"] = float(x.mean())
     metrics["latency_max_ms"] = float(x.max())
     metrics["n"] = len(x)

@@ -110,6 +110,7 @@ def test_latency_metrics():
         "latency_p50_ms": pytest.approx(50.5),
         "latency_p95_ms": pytest.approx(95.05),
         "latency_p99_ms": pytest.approx(99.01),
+        "latency_min_ms": 1,
         "latency_mean_ms": pytest.approx(50.5),
         "latency_max_ms": 100,
         "n": 100,
