@@ -221,6 +221,7 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "drives": _drives,
     "students": partial(_students, "full"),
     "channels": partial(_students, "channels"),
+    "faster": partial(_students, "faster"),
     "learning": _learning,
     "parameters": _parameters,
 }
