@@ -369,7 +369,7 @@ def test_a_disk_that_hangs_holds_up_nothing(tmp_path, monkeypatch):
     for i in range(1000):
         recorder.control(time.monotonic(), i, 1500, 136, 21316, 1016)
     assert recorder.close() is None
-    assert time.monotonic() - start < 10  # and not the 20 s of the disk
+    assert time.monotonic() - start < 2
     assert "has not taken" in recorder.failure
     assert len(recorder._queue) <= 50
     hanging.set()

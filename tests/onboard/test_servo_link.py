@@ -282,7 +282,7 @@ def test_arming_without_an_answer():
         start = time.monotonic()
         with pytest.raises(LinkError, match="no answer to arming"):
             link.arm()
-        assert 0.4 < time.monotonic() - start < 5
+        assert 0.4 < time.monotonic() - start < 1.0
         assert len({b for b in board.heard if b.startswith(">A")}) >= 5  # again and again, each with its own number
 
 

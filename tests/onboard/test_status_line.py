@@ -84,8 +84,9 @@ def test_a_stuck_terminal_holds_up_nobody(terminal):
         start = time.monotonic()
         for _ in range(1000):
             status.say("camera unplugged")
+        assert time.monotonic() - start < 0.2
         status.close()
-        assert time.monotonic() - start < 5  # what waits for this terminal waits for ever
+        assert time.monotonic() - start < 1
 
 
 @pytest.mark.slow
@@ -96,7 +97,7 @@ def test_a_pipe_that_blocks_holds_up_nobody():
             until(lambda: not select.select([], [writing], [], 0)[1])
             start = time.monotonic()
             status.close()
-            assert time.monotonic() - start < 5
+            assert time.monotonic() - start < 1
         os.close(reading)  # lets go of the thread, with EPIPE
         status._thread.join(5)
         assert not status._thread.is_alive()

@@ -402,7 +402,7 @@ def test_a_stuck_disk_holds_up_neither_the_loop_nor_the_end(tmp_path, monkeypatc
         with FlightLog(tmp_path / "flight.log", header=HEADER, **LIMITS, flush_s=0.01) as log:
             for k in range(5000):
                 log.tick(tick(k))
-        assert time.monotonic() - start < 8  # and not the 10 s of the disk
+        assert time.monotonic() - start < 2
         assert len(log._ticks) <= telemetry.QUEUE_TICKS
     finally:
         go_on.set()
@@ -439,9 +439,10 @@ def test_a_logger_that_is_stuck_or_raises_does_not_matter(path, monkeypatch):
         start = time.monotonic()
         for _ in range(1000):
             log.event("two", level=logging.WARNING)
+        assert time.monotonic() - start < 0.5
         log.tick(tick(0))
         log.close()
-        assert time.monotonic() - start < 8  # and not the 10 s of one message
+        assert time.monotonic() - start < 2
         go_on.set()
     assert [e.text for e in read_log(path, 0).events] == ["one", "and another"]
     assert len(read_log(path).events) == telemetry.QUEUE_EVENTS
