@@ -13,6 +13,8 @@ How a recording becomes samples:
 - Controls that waited in the serial buffer arrive in one burst, with system times that say nothing. They are
   put where the Arduino's clock says, counted back from the first control that arrived live after them
   (backwards and from close by, because that clock drifts). Those that the clock cannot place are dropped.
+- Where the system's clock was set back in the middle of a drive (frames' numbers and the Arduino's clock go on), what
+  follows is left out: its times are those of other moments of the same drive, whose actions it would be given.
 - A frame's action is its control; its state is the previous frame's action; its chunk is its own action and
   the following frames' (LeRobot's delta indices range(chunk)), padded at the end with the last one and
   masked.
@@ -33,7 +35,7 @@ import stat
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -62,6 +64,7 @@ DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged, two in a row are a hole in time
 HOLE_S = 0.5  # and so is this, whatever is usual: no camera of a moving car is that slow
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
+Item = TypeVar("Item")
 DISAGREES = 1e-3  # recorded action against the one computed from its pulse; the recordings hold 5e-5
 
 
@@ -336,7 +339,8 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
             continue
         times_s = values["system_timestamp"], values["arduino_timestamp"] / 1000
         controls.append(_Control(*times_s, (steering, throttle), driver))
-    return _sorted_by_time(controls, [c.system_s for c in controls], path, "control", faults)
+    went_on = [arduino_step_s(a.arduino_s, b.arduino_s) > 0 for a, b in pairwise(controls)]
+    return _in_order([(c.system_s, c) for c in controls], went_on, path, "control", faults)
 
 
 def _read_action(
@@ -362,11 +366,26 @@ def _read_action(
     return action
 
 
-def _sorted_by_time(items: list, times_s: list[float], path: Path, what: str, faults: _Faults) -> list:
-    """The items by time, stable; the steps back are counted."""
-    back = sum(b < a for a, b in pairwise(times_s))
+def _in_order(
+    timed: list[tuple[float, Item]], went_on: list[bool], path: Path, what: str, faults: _Faults
+) -> list[Item]:
+    """The items by time, stable; the steps back are counted. What follows on a clock that was set back is left out.
+
+    timed: (time in seconds, item), as they lie in the file. went_on: whether each but the first was made after the one
+    before it, whatever their times say.
+    """
+    times_s = [time_s for time_s, _ in timed]
+    end = next((i for i in range(2, len(timed)) if went_on[i - 1] and _was_set_back(times_s, i)), len(timed))
+    note = f"the clock was set back at {what} {end}; from there on, times may be those of other moments"
+    faults.add(path, f"clock_set_back_at_{what}", note, len(timed) - end)
+    back = sum(b < a for a, b in pairwise(times_s[:end]))
     faults.add(path, f"unsorted_{what}_times", f"{what}s were put in order of time", back)
-    return [items[i] for i in sorted(range(len(items)), key=times_s.__getitem__)]
+    return [item for _, item in sorted(timed[:end], key=lambda pair: pair[0])]
+
+
+def _was_set_back(times_s: list[float], i: int) -> bool:
+    """Whether the two before `i` are both later than those at and after it: one wrong time alone is no clock's."""
+    return min(times_s[i - 2 : i]) > max(times_s[i : i + 2])
 
 
 def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list[_Control]:
@@ -436,7 +455,8 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
         picture = folder / name.replace("\\", "/")
         usable = _check_picture(folder, picture, name, path, faults)
         frames.append(_Frame(int(number), time_s, picture, usable))
-    frames = _sorted_by_time(frames, [f.time_s for f in frames], path, "frame", faults)
+    went_on = [b.number > a.number for a, b in pairwise(frames)]
+    frames = _in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
     kept = frames[:1]
     for frame in frames[1:]:
         if frame.time_s > kept[-1].time_s:

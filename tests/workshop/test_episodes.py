@@ -457,6 +457,38 @@ def test_unsorted_times(tmp_path):
     assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
 
 
+@pytest.mark.parametrize("back_s", [0.2, 0.5, 30])
+def test_what_follows_on_a_clock_that_was_set_back_is_left_out(tmp_path, back_s):
+    """Frames of two moments would have one time, and the actions of either."""
+    folder = record(tmp_path)
+    whole = {s.frame_name: s.chunk[0].tolist() for s in load(tmp_path).samples}
+
+    def change(content):
+        for i, frame in enumerate(content["frame_samples"]):
+            frame["timestamp"] -= back_s * (i >= 20)
+        set_s = content["frame_samples"][19]["timestamp"]
+        for control in content["control_samples"]:
+            control["system_timestamp"] -= back_s * (control["system_timestamp"] > set_s)
+
+    edit(folder, change)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"clock_set_back_at_frame": 20, "clock_set_back_at_control": 23}
+    assert {s.frame_name: s.chunk[0].tolist() for s in recordings.samples} == dict(list(whole.items())[:20])
+
+
+@pytest.mark.parametrize("wrong_s", [-60, 60])
+@pytest.mark.parametrize("row", [0, 7, 20])
+def test_one_wrong_time_is_no_clock_that_was_set(tmp_path, row, wrong_s):
+    def change(content):
+        content["frame_samples"][row]["timestamp"] += wrong_s
+        content["control_samples"][row]["system_timestamp"] += wrong_s
+
+    edit(record(tmp_path), change)
+    recordings = load(tmp_path)
+    assert not {kind for kind in kinds(recordings) if kind.startswith("clock_set_back")}
+    assert len(recordings.samples) > 20
+
+
 def test_no_overlap(tmp_path):
     def change(content):
         for frame in content["frame_samples"]:
