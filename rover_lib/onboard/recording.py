@@ -51,6 +51,7 @@ FRAME_FIELDS = ("frame_id", "timestamp", "image_path")
 POLICY, HUMAN, NOBODY = DRIVERS = ("policy", "human", "nobody")
 HIT, MISSED = OUTCOMES = ("hit", "missed")  # what a drive came to, as metadata.outcome
 
+DATA_BYTES = 200_000_000  # of a data file that is read at once: three hours of driving
 LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
 ARDUINO_WRAP_MS = 1 << 32  # its clock starts again after 49.7 days
 BURST_SHARE = 0.3  # arriving within this share of the usual interval means: both were waiting in a buffer
@@ -484,10 +485,11 @@ def _times(system_s: list[float], arduino_s: list[float]) -> np.ndarray:
 
 
 def _data_of(path: Path) -> bytes:
-    """A data file's bytes, none where it cannot be read."""
+    """A data file's bytes, none where it cannot be read, or is larger than any drive's."""
     try:
+        status = path.stat()
         # opening a pipe would wait for ever
-        return path.read_bytes() if stat.S_ISREG(path.stat().st_mode) else b""
+        return path.read_bytes() if stat.S_ISREG(status.st_mode) and status.st_size <= DATA_BYTES else b""
     except OSError:
         return b""
 

@@ -44,6 +44,7 @@ from rover_lib.onboard.pwm import NEUTRAL, PwmCalibration
 from rover_lib.onboard.recording import (
     BURST_MIN,
     CONTROL_FIELDS,
+    DATA_BYTES,
     FRAME_FIELDS,
     HUMAN,
     NOBODY,
@@ -254,12 +255,16 @@ def _read_tables(folder: Path, faults: _Faults) -> tuple[tuple[str, str | None],
 
 
 def _read_bytes(path: Path, faults: _Faults) -> bytes | None:
-    """A data file's bytes; None, counted, if it is absent, empty, unreadable, or a link that leaves its
+    """A data file's bytes; None, counted, if it is absent, empty, unreadable, too large, or a link that leaves its
     folder.
     """
     try:
-        if not stat.S_ISREG(path.stat().st_mode):
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
             faults.add(path, "unreadable", "not a file")
+            return None
+        if status.st_size > DATA_BYTES:
+            faults.add(path, "too_large", f"{status.st_size / 1e6:.0f} MB, at most {DATA_BYTES / 1e6:.0f} are read")
             return None
         if not _inside(path, path.parent):
             faults.add(path, "path_leaves_folder", "a link to somewhere else")

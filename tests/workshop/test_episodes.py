@@ -399,6 +399,16 @@ def test_without_json_and_csvs_the_folder_is_skipped(tmp_path, text):
         load(tmp_path)
 
 
+def test_files_larger_than_any_drives_are_not_read(tmp_path):
+    """Of a terabyte without a byte on the disk, no memory is left for the other episodes."""
+    record(tmp_path, "episode_20260101_120000")
+    other = record(tmp_path, "episode_20260102_120000")
+    for name in ("episode_data.json", "control_data.csv", "frame_data.csv"):
+        os.truncate(other / name, 1 << 40)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"too_large": 3, "nothing_usable": 1} and len(recordings.episodes) == 1
+
+
 def test_csv_faults(tmp_path):
     folder = record(tmp_path)
     (folder / "episode_data.json").unlink()
