@@ -23,6 +23,7 @@ from typing import Any, BinaryIO
 from rover_lib.onboard.errors import RoverError
 
 SCHEMA = 1
+PARTS = ("params", "metrics", "inputs", "env")
 
 
 @contextmanager
@@ -141,18 +142,22 @@ def write_stage(
     return content
 
 
-def read_stage(path: Path | str, stage: str) -> dict[str, Any]:
-    """Read what `write_stage` wrote. Raises RoverError if the file is missing, damaged or of another stage."""
+def read_stage(path: Path | str, stage: str | None) -> dict[str, Any]:
+    """Read what `write_stage` wrote. stage: None for any.
+
+    Raises RoverError if the file is missing, damaged, not whole or of another stage.
+    """
     path = Path(path)
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError:
         raise RoverError(f"{path}: not found", remedy=f"run the notebook of stage '{stage}' first") from None
-    except (ValueError, OSError) as e:
+    except (ValueError, OSError, RecursionError) as e:  # RecursionError: brackets nested without end
         raise RoverError(f"{path}: not readable as JSON ({e})", remedy="delete it and run its stage again") from None
     found = (content.get("schema"), content.get("stage")) if isinstance(content, dict) else type(content).__name__
-    if found != (SCHEMA, stage):
-        raise RoverError(
-            f"{path}: expected schema {SCHEMA} of stage '{stage}'", found=found, remedy="run the stage again"
-        )
+    if not isinstance(content, dict) or found != (SCHEMA, stage or content.get("stage")):
+        of_stage = f" of stage '{stage}'" if stage else ""
+        raise RoverError(f"{path}: expected schema {SCHEMA}{of_stage}", found=found, remedy="run the stage again")
+    if lacking := [part for part in PARTS if not isinstance(content.get(part), dict)]:
+        raise RoverError(f"{path}: has no {', '.join(lacking)}", remedy="run the stage again")
     return content

@@ -67,8 +67,7 @@ def _calibration(path: Path) -> dict[str, Any]:
 
 
 def _report(path: Path) -> dict[str, Any]:
-    content = json.loads(path.read_text())
-    content = read_stage(path, str(content.get("stage")))
+    content = read_stage(path, None)
     metrics = {key: _counted(value) for key, value in content["metrics"].items()}
     return {"stage": content["stage"], "env": content["env"], "params": content["params"], "metrics": metrics}
 

@@ -47,16 +47,23 @@ def write(run_dir: Path | str) -> dict[str, Any]:
     """Judge a run and leave run.json and report.html in its folder. Returns run.json's content.
 
     Made anew of what is there, so that `make arm` and `rover world students` count once they were made. Raises
-    RoverError where a stage is missing, and where an artifact is another one than was compared.
+    RoverError where a stage is missing or lacks what is to be judged, and where an artifact is another one than was
+    compared.
     """
     folder, p = Path(run_dir), params()
     files = _files(folder)
     contents = {stage: read_stage(path, stage) for stage, path in files.items()}
-    _refuse_other_artifacts(folder, contents["quantize"]["metrics"]["modes"])
-    given = contents["load"]["params"]
-    names = Names(*(_typed(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
-    judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names)
-    judged = {"headline": headline(judged), "host": contents["benchmark"]["env"]["host"], **judged}
+    try:
+        _refuse_other_artifacts(folder, contents["quantize"]["metrics"]["modes"])
+        given = contents["load"]["params"]
+        names = Names(*(_typed(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
+        judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names)
+        judged = {"headline": headline(judged), "host": contents["benchmark"]["env"]["host"], **judged}
+    except KeyError as missing:
+        raise RoverError(
+            f"{folder}: what its stages left has no {missing}",
+            remedy="was it made by another version? 'rover run' of its checkpoint makes it again",
+        ) from missing
     inputs = {path.name: sha256_of(path) for path in files.values()}
     content = write_stage(
         folder / "run.json", "run", params={"verdict": p["verdict"], "gates": p["gates"]}, metrics=judged, inputs=inputs

@@ -118,8 +118,8 @@ def test_the_table_says_how_hot_and_how_fast(folders):
         (lambda c: json.dumps({**c, "metrics": {**c["metrics"], "artifacts": {}}}), "no figures of a benchmark"),
         (lambda c: json.dumps({**c, "metrics": {**c["metrics"], "throttled": "hot"}}), "no figures of a benchmark"),
         (lambda c: json.dumps({**c, "metrics": {**c["metrics"], "series": [{"t_s": 1}]}}), "no figures of a benchmark"),
-        (lambda c: json.dumps({**c, "env": None}), "no figures of a benchmark"),
-        (lambda c: json.dumps({**c, "inputs": [1]}), "no figures of a benchmark"),
+        (lambda c: json.dumps({**c, "env": None}), "has no env"),
+        (lambda c: json.dumps({**c, "inputs": [1]}), "has no inputs"),
     ],
 )
 def test_a_damaged_or_foreign_file_is_counted_and_named(folders, spoil, words):

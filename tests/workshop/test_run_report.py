@@ -117,3 +117,14 @@ def test_a_run_that_is_not_whole_has_no_verdict(run_dir, tmp_path):
     with pytest.raises(RoverError, match=r"no verdict without compare.json, benchmark-<host>.json; rover run"):
         report.write(run_dir)
     assert not (run_dir / "run.json").exists() and not (run_dir / report.PAGE).exists()
+
+
+@pytest.mark.parametrize(("stage", "part"), [("quantize", "modes"), ("load", "checkpoint"), ("compare", "modes")])
+def test_a_run_of_another_version_is_a_sentence(run_dir, stage, part):
+    content = json.loads((run_dir / f"{stage}.json").read_text())
+    for has in (content["params"], content["metrics"]):
+        has.pop(part, None)
+    (run_dir / f"{stage}.json").write_text(json.dumps(content))
+    with pytest.raises(RoverError, match=f"left has no '{part}'; was it made by another version"):
+        report.write(run_dir)
+    assert not (run_dir / "run.json").exists()
