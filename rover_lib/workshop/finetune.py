@@ -55,7 +55,7 @@ from rover_lib.workshop.lessons import (
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run_folder import run_folder
 from rover_lib.workshop.samples import Episode, Recordings, Sample, Source, frame_rate_hz, is_another_rate
-from rover_lib.workshop.session import SMALL_GMAC, training_device
+from rover_lib.workshop.session import SMALL_GMAC, check_sizes, training_device
 from rover_lib.workshop.student import gmac, not_a_cars
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 
@@ -221,7 +221,7 @@ def _opened(
         )
     parent = load_checkpoint(checkpoint)
     _refuse_no_car(parent)
-    c = parent.config
+    check_sizes(parent)
     sources = [Source.of(each) for each in episodes]
     if not sources:
         raise FinetuneError("there are no recordings to learn from", remedy="give the old ones, then the new ones")
@@ -229,7 +229,7 @@ def _opened(
     if len(set(places)) < len(places):
         raise FinetuneError("the same recordings are given twice", found=", ".join(places), remedy="leave one out")
     p = params()["calibration"]
-    read = [load_recordings(source, c.chunk, p["sync_s"], progress) for source in sources]
+    read = [load_recordings(source, parent.config.chunk, p["sync_s"], progress) for source in sources]
     policies = [parent.recorded_as(recordings.layout) for recordings in read]
     if any(policy.config != policies[0].config for policy in policies):
         raise FinetuneError(

@@ -38,35 +38,23 @@ def load(checkpoint: Path | str, episodes: Path | str | Source, progress: Progre
     """
     p = params()["calibration"]
     policy = load_checkpoint(checkpoint)
+    check_sizes(policy)  # each sample has as many actions as a plan: of a million, a few frames fill the memory
     source = Source.of(episodes)
     if policy.format == "lerobot" and not source.cameras:  # the trainer's file does not say what its camera is called
         source = replace(source, cameras=policy.config.cameras)
     recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
     recorded = policy.recorded_as(recordings.layout)
-    _check_limits(recorded)
+    _check_limits(recorded)  # whose rate and names are the recordings'
     return Opened(recorded, recordings, parts)
 
 
 def _check_limits(policy: Checkpoint) -> None:
     """Raise CheckpointError for a policy that no artifact may hold: now, rather than after minutes of calibration."""
-    c, remedy = policy.config, "such a policy cannot be made into an artifact"
-    sides = [side for size in c.image_sizes for side in size]
-    for what, values, (least, most) in (
-        ("steps in a plan", [c.chunk], CHUNK),
-        ("steps of a plan in a second", [c.rate_hz], RATE_HZ),
-        ("pixels a side", sides, SIDE_PX),
-    ):
-        for value in values:
-            if not least <= value <= most:
-                raise CheckpointError(
-                    f"{policy.path}: {what} must be from {least:g} to {most:g}", found=f"{value:g}", remedy=remedy
-                )
+    check_sizes(policy)
+    c = policy.config
+    _within(policy, "steps of a plan in a second", c.rate_hz, RATE_HZ)
     for what, names in (("cameras", c.cameras), ("states", c.state_names), ("actions", c.action_names)):
-        if len(names) > MOST_NAMES:
-            raise CheckpointError(
-                f"{policy.path}: {what} must be at most {MOST_NAMES}", found=str(len(names)), remedy=remedy
-            )
         for name in names:
             if not is_name(name):
                 raise CheckpointError(
@@ -74,6 +62,26 @@ def _check_limits(policy: Checkpoint) -> None:
                     found=shown(name),
                     remedy="give them other names in the dataset's meta/info.json and the policy's config.json",
                 )
+
+
+def check_sizes(policy: Checkpoint) -> None:
+    """Raise CheckpointError for a plan, pictures or numbers that no artifact may have: before recordings are read."""
+    c = policy.config
+    _within(policy, "steps in a plan", c.chunk, CHUNK)
+    for side in (side for size in c.image_sizes for side in size):
+        _within(policy, "pixels a side", side, SIDE_PX)
+    for what, names in (("cameras", c.cameras), ("states", c.state_names), ("actions", c.action_names)):
+        _within(policy, what, len(names), (1, MOST_NAMES))
+
+
+def _within(policy: Checkpoint, what: str, value: float, limits: tuple[float, float]) -> None:
+    least, most = limits
+    if not least <= value <= most:
+        raise CheckpointError(
+            f"{policy.path}: {what} must be from {least:g} to {most:g}",
+            found=f"{value:g}",
+            remedy="such a policy cannot be made into an artifact",
+        )
 
 
 def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:

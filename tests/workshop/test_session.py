@@ -58,7 +58,7 @@ def test_recordings_that_now_name_their_numbers_otherwise_are_refused(written, t
         ({"image_sizes": ((8, 16),)}, "pixels a side must be from 16 to 8192, found 8"),
         ({"cameras": ("left/right",)}, "the names of cameras must have 1 to 64 characters and no '/', found"),
         ({"action_names": ("steering", "t" * 65)}, "the names of actions must have 1 to 64 characters"),
-        ({"state_names": tuple(f"joint{i}" for i in range(65))}, "states must be at most 64, found 65"),
+        ({"state_names": tuple(f"joint{i}" for i in range(65))}, "states must be from 1 to 64, found 65"),
     ],
 )
 def test_what_no_artifact_may_hold_is_refused(change, says, tiny):
@@ -67,8 +67,17 @@ def test_what_no_artifact_may_hold_is_refused(change, says, tiny):
         session._check_limits(policy)
 
 
-def test_that_is_refused_before_anything_is_calibrated(tiny, tmp_path, monkeypatch):
-    long = replace(tiny, config=replace(tiny.config, chunk=257))
+def test_sizes_are_refused_before_any_recording_is_read(tiny, monkeypatch):
+    """Plans of a million steps, in a file of a few megabytes, would fill the memory with the samples of a drive."""
+    long = replace(tiny, config=replace(tiny.config, chunk=1_000_000))
     monkeypatch.setattr(session, "load_checkpoint", lambda path: long)
-    with pytest.raises(CheckpointError, match="from 1 to 256, found 257"):
-        load(long.path, record_drives(tmp_path / "episodes", frames=300))
+    monkeypatch.setattr(session, "load_recordings", lambda *given: pytest.fail("they were read"))
+    with pytest.raises(CheckpointError, match=r"from 1 to 256, found 1e\+06"):
+        load(long.path, "episodes")
+
+
+def test_a_rate_of_the_recordings_is_refused_before_anything_is_calibrated(tiny, tmp_path, monkeypatch):
+    slow = replace(tiny, config=replace(tiny.config, rate_hz=2.0))
+    monkeypatch.setattr(session, "load_checkpoint", lambda path: slow)
+    with pytest.raises(CheckpointError, match="from 5 to 120, found 2"):
+        load(slow.path, record_drives(tmp_path / "episodes", frames=300))
