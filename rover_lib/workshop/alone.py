@@ -1,8 +1,7 @@
 """A hidden folder in which one process makes what will then take its place beside it.
 
-    with alone_in(folder.with_name(f".{folder.name}.new")) as new:
+    with made_beside(folder, files_of_a_run) as new:
         ...                                                     # fill it
-        new.rename(folder)
 
 Two commands with the same --name would each remove what the other had made, and the later would win.
 """
@@ -10,11 +9,13 @@ Two commands with the same --name would each remove what the other had made, and
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
+
+ADDED = ".added"  # in the folder of what was replaced: the names that replaced nothing, a line each
 
 
 @contextmanager
@@ -31,6 +32,58 @@ def alone_in(folder: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         os.close(held)
+
+
+@contextmanager
+def made_beside(folder: Path, replaced: Callable[[Path], Iterable[Path]] = lambda _: ()) -> Iterator[Path]:
+    """`.<name>.new` beside a folder, empty: what is in it when the block ends well takes its place there.
+
+    All of it does, or nothing; the hidden folder goes in any case.
+
+    replaced: what of the folder goes then, beside all that has a successor; the rest stays. Until the new is whole it
+    lies in `.<name>.old`, from where the next one puts it back if this process was killed meanwhile.
+    Raises RoverError while another process makes something for that folder.
+    """
+    old = folder.with_name(f".{folder.name}.old")
+    with alone_in(folder.with_name(f".{folder.name}.new")) as new:
+        if old.exists():  # the last one was killed while it took its place
+            _put_back(old, folder)
+        yield new
+        if folder.exists():
+            _take_place(new, folder, old, replaced(folder))
+        else:
+            new.rename(folder)
+
+
+def _take_place(new: Path, folder: Path, old: Path, replaced: Iterable[Path]) -> None:
+    made = {path.name for path in new.iterdir()}
+    goes = {path.name for path in replaced if path.exists()} | {name for name in made if (folder / name).exists()}
+    old.mkdir()
+    try:
+        (new / ADDED).write_text("\n".join(sorted(made - goes)))
+        (new / ADDED).rename(old / ADDED)
+        for name in goes:
+            (folder / name).rename(old / name)
+        for name in made:
+            (new / name).rename(folder / name)
+        old.rename(new / "replaced")  # done at once: a kill while it is removed must not leave a part to be put back
+    except BaseException:
+        if old.exists():
+            _put_back(old, folder)
+        raise
+
+
+def _put_back(old: Path, folder: Path) -> None:
+    """Move what was being replaced back into its folder, over what of its successor is there. May be killed, too."""
+    added = old / ADDED
+    if added.exists():
+        for name in added.read_text().splitlines():
+            _remove(folder / name)
+        added.unlink()
+    for path in old.iterdir():
+        _remove(folder / path.name)
+        path.rename(folder / path.name)
+    old.rmdir()
 
 
 def _taken(folder: Path) -> int:

@@ -4,9 +4,7 @@
 it also says how many steps of a plan make a second, for which neither format has a place.
 """
 
-import contextlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,6 @@ from torch import Tensor
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
-from rover_lib.workshop.alone import alone_in
 from rover_lib.workshop.lerobot_checkpoint import ORIGIN, RATE_HZ
 from rover_lib.workshop.training import trainer_config
 
@@ -116,35 +113,7 @@ def write_both(
     return {name: sha256_of(path) for name, path in files.items()}
 
 
-@contextlib.contextmanager
-def made_beside(folder: Path, last: str) -> Iterator[Path]:
-    """A hidden folder beside a run's, empty: what is in it when the block ends well moves into the run's folder, the
-    file `last` last. Nothing does otherwise, and the hidden one goes.
-
-    Raises RoverError while another process makes a run of that name.
-    """
-    # not `.new`, in which a run of that name may wait to go on
-    with alone_in(folder.with_name(f".{folder.name}.made")) as new:
-        yield new
-        _take_place(new, folder, last)
-
-
 def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
     """Mean and standard deviation whose normalisation, LeRobot's eps included, is x * scale + shift."""
     scale, shift = torch.tensor(norm.scale, dtype=torch.float64), torch.tensor(norm.shift, dtype=torch.float64)
     return {"mean": (-shift / scale).float().reshape(shape), "std": (1 / scale - EPS).float().reshape(shape)}
-
-
-def _take_place(new: Path, folder: Path, last: str) -> None:
-    """Move what is whole into a run's folder, the file `last` last; what was there goes when its successor is there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in sorted(new.iterdir(), key=lambda p: p.name == last):
-        place, old = folder / path.name, new / f"{path.name}.old"
-        try:
-            if place.is_dir() or (place.exists() and path.is_dir()):
-                place.rename(old)
-            path.rename(place)
-        except BaseException:
-            if old.exists() and not place.exists():
-                old.rename(place)
-            raise

@@ -33,10 +33,11 @@ from rover_lib.workshop import lessons as lessons_module
 from rover_lib.workshop import pipeline as quantization
 from rover_lib.workshop import student as student_module
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
+from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint_files import made_beside, write_both
+from rover_lib.workshop.checkpoint_files import write_both
 from rover_lib.workshop.choose import Chooser
 from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.episodes import Sample
@@ -125,7 +126,6 @@ def distill(
         raise DistillError("a seed must be at least 0", found=recipe.seed)
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint
-    _refuse_another_policy(folder, teacher)
     config = student_config(teacher, shape)
     share = None if shape.backbone_channels == 1 else shape.backbone_channels
     work = _Work(opened, config, share, recipe, qat, where, progress)
@@ -133,12 +133,12 @@ def distill(
         remedy = "give it a smaller picture, fewer layers or channels, or train it for INT8 with --qat"
         raise DistillError("this student would be its teacher", remedy=remedy)
     with (
-        made_beside(folder, "distill.json") as new,
+        made_beside(folder, _of_an_earlier_student) as new,
         threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()),
     ):
+        _refuse_another_policy(folder, teacher)
         taught = _taught(work)
         _leave(new, name, work, taught)
-        _remove_replaced(folder, new)
     shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
     return folder
 
@@ -152,16 +152,13 @@ def _refuse_another_policy(folder: Path, teacher: Checkpoint) -> None:
     for path in policies:
         if not _is_student(path):
             raise DistillError(f"{path}: is no student, and one would replace it", remedy=remedy)
-    # Killed while a student takes an earlier one's place, there may be an artifact alone, but no run: that goes first.
     if not policies and (folder / "quantize.json").exists():
         raise DistillError(f"{folder}: holds the run of another policy, which a student would replace", remedy=remedy)
 
 
-def _remove_replaced(folder: Path, new: Path) -> None:
-    """Remove what is there of an earlier student and has no successor: its report would be read as the new one's."""
-    for path in [*files_of_a_run(folder), folder / "best_model.pth"]:
-        if not (new / path.name).exists():
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+def _of_an_earlier_student(folder: Path) -> list[Path]:
+    """What goes even if it has no successor: its report would be read as the new one's, and so would its checkpoint."""
+    return [*files_of_a_run(folder), folder / "best_model.pth"]
 
 
 def _is_student(path: Path) -> bool:

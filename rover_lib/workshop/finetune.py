@@ -36,9 +36,10 @@ from rover_lib.onboard.recording import HUMAN, recorded_car
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import act, training
 from rover_lib.workshop import lessons as lessons_module
+from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint_files import made_beside, write_both
+from rover_lib.workshop.checkpoint_files import write_both
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.episodes import load_recordings, split
 from rover_lib.workshop.improved import Judged, verdict
@@ -141,7 +142,7 @@ def finetune(
     parent, material = _opened(checkpoint, episodes, recipe, progress)
     work = _Work(parent, material, recipe, where, progress)
     with (
-        made_beside(folder, "finetune.json") as new,
+        made_beside(folder) as new,
         threads(1 if gmac(parent.config) < SMALL_GMAC else torch.get_num_threads()),
     ):
         if folder.exists():  # by another process, just now

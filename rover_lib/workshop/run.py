@@ -25,7 +25,7 @@ from jupyter_client.manager import AsyncKernelManager
 from rover_lib.onboard.artifact import ONNX_SUFFIX
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.alone import alone_in
+from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
 from rover_lib.workshop.run_folder import run_folder
@@ -100,16 +100,9 @@ def run(
     known = set().union(*(parameters_of(s) for s in sources))
     if unknown := sorted(set(overrides) - known):
         raise NotebookError(f"no notebook has a parameter {unknown}", remedy=f"known are {sorted(known)}")
-    new, old = folder.with_name(f".{folder.name}.new"), folder.with_name(f".{folder.name}.old")
-    given = {
-        "run_dir": str(new),
-        "checkpoint": absolute(checkpoint),
-        "episodes": absolute(episodes),
-        **overrides,
-    }
-    with alone_in(new):
-        if old.exists():  # the last one was killed while it took its place
-            _put_back(old, folder)
+    given = {"checkpoint": absolute(checkpoint), "episodes": absolute(episodes), **overrides}
+    with made_beside(folder, files_of_a_run) as new:
+        given["run_dir"] = str(new)
         others = _benchmarks_of_other_hosts(folder)
         for path in others:  # notebook 05 shows them
             shutil.copy2(path, new)
@@ -120,7 +113,6 @@ def run(
         for path in others:
             (new / path.name).unlink()
         _say_final_paths(new, folder)
-        _take_place(new, folder, old)
     return folder
 
 
@@ -146,37 +138,6 @@ def _say_final_paths(new: Path, folder: Path) -> None:
         final = text.replace(str(new), str(folder)).replace(json.dumps(str(new))[1:-1], json.dumps(str(folder))[1:-1])
         if final != text:
             path.write_text(final)
-
-
-def _take_place(new: Path, folder: Path, old: Path) -> None:
-    """Move a whole run to its folder, and what was its predecessor's out of it. If that is interrupted, move back."""
-    folder.mkdir(exist_ok=True)
-    old.mkdir()
-    made = [p.name for p in new.iterdir()]
-    replaced = {p.name for p in files_of_a_run(folder)} | {name for name in made if (folder / name).exists()}
-    try:
-        for name in replaced:
-            (folder / name).rename(old / name)
-        for name in made:
-            (new / name).rename(folder / name)
-        old.rename(new / "replaced")  # done at once: a kill while it is removed must not leave a part to be put back
-    except BaseException:
-        if old.exists():
-            for name in made:
-                if not (new / name).exists():
-                    (folder / name).rename(new / name)
-            _put_back(old, folder)
-        raise
-
-
-def _put_back(old: Path, folder: Path) -> None:
-    """Move a run that was being replaced back into its folder, over what of the new one is there."""
-    for path in old.iterdir():
-        place = folder / path.name
-        if place.is_dir():
-            shutil.rmtree(place)
-        path.rename(place)
-    old.rmdir()
 
 
 def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:

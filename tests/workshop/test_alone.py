@@ -1,14 +1,15 @@
 """Two commands that make the same thing at once do not take it from each other."""
 
+import contextlib
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop import alone
-from rover_lib.workshop.alone import alone_in
-from rover_lib.workshop.checkpoint_files import made_beside
+from rover_lib.workshop.alone import alone_in, made_beside
 from rover_lib.workshop.run_folder import run_folder
 
 
@@ -67,38 +68,86 @@ def test_a_run_that_is_a_link_is_made_where_the_link_leads(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "mine").symlink_to("../disk/large")
     for _ in ("not there yet", "there"):
-        with made_beside(run_folder(tmp_path / "runs", "mine", RoverError), "last.json") as new:
+        with made_beside(run_folder(tmp_path / "runs", "mine", RoverError)) as new:
             assert new.parent == tmp_path / "disk"
             (new / "last.json").touch()
     assert [p.name for p in (tmp_path / "runs" / "mine").iterdir()] == ["last.json"]
 
 
-def test_what_is_moved_into_a_runs_folder_costs_nothing_where_it_ends_in_the_middle(tmp_path, monkeypatch):
-    """A file where a folder belongs is replaced; what was there is put back if its successor cannot come."""
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "pretrained_model").write_text("old")
-    (tmp_path / "mine" / "figures").mkdir()
-    (tmp_path / "mine" / "figures" / "one").write_text("old")
+# ---- taking the place of what was there ------------------------------------------------------------------------------
 
-    def make():
-        with made_beside(tmp_path / "mine", "last.json") as new:
-            for name in ("pretrained_model", "figures"):
-                (new / name).mkdir()
-                (new / name / "one").write_text("new")
-            (new / "last.json").write_text("new")
 
-    rename = type(tmp_path).rename
+def whole(folder):
+    return {str(p.relative_to(folder)): p.read_text() for p in folder.rglob("*") if p.is_file()}
 
-    def interrupted(path, target):
-        if path.name == "figures" and path.parent.name == ".mine.made":
+
+def write(folder, *names, text):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def make(folder):
+    """Folders and files in the place of each other, one that is new, and one whose predecessor goes without."""
+    with made_beside(folder, lambda folder: [folder / "report.html", folder / "figures"]) as new:
+        write(new, "figures/one", "pretrained_model/config.json", "policy_mixed.pt", "fast.json", text="new")
+
+
+NEW = dict.fromkeys(("figures/one", "pretrained_model/config.json", "policy_mixed.pt", "fast.json"), "new")
+NEW |= {"users/frame.jpg": "old"}
+
+
+@pytest.fixture
+def before(tmp_path):
+    write(
+        tmp_path / "mine",
+        *("figures/one", "figures/two", "pretrained_model", "report.html", "fast.json/one", "users/frame.jpg"),
+        text="old",
+    )
+    return whole(tmp_path / "mine")
+
+
+def test_what_is_made_beside_takes_its_place(tmp_path, before):
+    make(tmp_path / "mine")
+    assert whole(tmp_path / "mine") == NEW and [p.name for p in tmp_path.iterdir()] == ["mine"]
+
+
+@pytest.mark.parametrize("count", range(10))
+def test_an_interrupt_or_a_kill_while_it_takes_its_place_costs_nothing(tmp_path, before, monkeypatch, count):
+    """A student's files and its predecessor's lay among each other, and neither could be told from the other."""
+    rename, moved = Path.rename, []
+
+    def ends(path, target):
+        moved.append(path)
+        if len(moved) == count + 1:
             raise KeyboardInterrupt
         return rename(path, target)
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(type(tmp_path), "rename", interrupted)
-        make()
-    assert (tmp_path / "mine" / "figures" / "one").read_text() == "old"
-    make()
-    assert {p.name for p in (tmp_path / "mine").iterdir()} == {"pretrained_model", "figures", "last.json"}
-    assert (tmp_path / "mine" / "pretrained_model" / "one").read_text() == "new"
-    assert (tmp_path / "mine" / "figures" / "one").read_text() == "new"
+    as_it_was = {f"mine/{name}": text for name, text in before.items()}
+    for killed in (False, True):
+        moved.clear()
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(Path, "rename", ends)
+            if killed:  # who is killed puts nothing back
+                patch.setattr(alone, "_put_back", lambda *_: None)
+            make(tmp_path / "mine")
+        if killed:
+            with contextlib.suppress(RuntimeError), made_beside(tmp_path / "mine"):
+                raise RuntimeError  # the next one puts it back, whatever it comes to itself
+        assert whole(tmp_path) == as_it_was
+    make(tmp_path / "mine")
+    assert whole(tmp_path / "mine") == NEW
+
+
+def test_where_nothing_was_it_appears_at_once(tmp_path, monkeypatch):
+    """Interrupted between two files, it left a half that the next command took for the whole."""
+    rename, seen = Path.rename, []
+
+    def observed(path, target):
+        seen.append((tmp_path / "mine").exists())
+        rename(path, target)
+        seen.append(len(whole(tmp_path / "mine")))
+
+    monkeypatch.setattr(Path, "rename", observed)
+    make(tmp_path / "mine")
+    assert seen == [False, 4]

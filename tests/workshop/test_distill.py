@@ -312,25 +312,22 @@ def test_an_artifact_of_another_run_is_not_replaced_by_a_student(teacher, episod
     assert (tmp_path / "mine" / "policy_static.pt").read_text() == "the last good policy"
 
 
-def test_a_kill_while_a_student_takes_an_earlier_ones_place_keeps_nobody_from_going_on(teacher, tmp_path):
-    for name in ("fast/pretrained_model", "fast/figures", "new/pretrained_model"):
-        (tmp_path / name).mkdir(parents=True)
-    for name in ("fast/policy_static.pt", "fast/quantize.json", "new/policy_static.pt", "new/distill.json"):
+def test_what_was_killed_while_it_took_its_place_is_an_earlier_students_again(teacher, episodes, tmp_path, monkeypatch):
+    """Some of it had gone, and the run's report stayed: it looked like the run of another policy."""
+    monkeypatch.setattr(distill_module, "_is_student", lambda path: True)
+    monkeypatch.setattr(distill_module, "_taught", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
+    monkeypatch.setattr(distill_module, "_leave", lambda new, *_: (new / "distill.json").touch())
+    for name in ("fast/quantize.json", ".fast.old/best_model.pth"):
+        (tmp_path / name).parent.mkdir()
         (tmp_path / name).touch()
-    distill_module._remove_replaced(tmp_path / "fast", tmp_path / "new")
-    (tmp_path / "fast" / "pretrained_model").rename(tmp_path / "new" / "pretrained_model.old")
-    assert [p.name for p in (tmp_path / "fast").iterdir()] == ["policy_static.pt"]
-    distill_module._refuse_another_policy(tmp_path / "fast", load_checkpoint(teacher))
+    folder = distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path, device="cpu")
+    assert [p.name for p in tmp_path.iterdir()] == ["fast"]
+    assert [p.name for p in folder.iterdir()] == ["distill.json"]
 
 
 def test_an_old_students_checkpoint_goes_where_the_new_one_has_none(tmp_path):
     """The trainer's format has no place for a policy of another rate: best_model.pth would be of the old one."""
-    folder, new = tmp_path / "fast", tmp_path / "new"
-    for path in (folder / "best_model.pth", new / "pretrained_model" / "config.json"):
-        path.parent.mkdir(parents=True)
-        path.touch()
-    distill_module._remove_replaced(folder, new)
-    assert not list(folder.iterdir())
+    assert tmp_path / "best_model.pth" in distill_module._of_an_earlier_student(tmp_path)
 
 
 @pytest.mark.parametrize(
