@@ -233,7 +233,8 @@ def camera_names(keys: Iterable[str]) -> dict[str, str]:
     observation.image and observation.images.image.
     """
     keys = list(keys)
-    names = {key.removeprefix(CAMERA).removeprefix("observation."): key for key in keys}
+    # one of the two: a camera may itself be called observation.image, where we wrote the policy
+    names = {key.removeprefix(CAMERA if key.startswith(CAMERA) else "observation."): key for key in keys}
     return names if len(names) == len(keys) else {key: key for key in keys}
 
 

@@ -21,7 +21,7 @@ from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot
 from rover_lib.workshop.episodes import load_recordings, split
-from rover_lib.workshop.samples import Layout, Source
+from rover_lib.workshop.samples import CAMERA, Layout, Source, camera_names
 from rover_lib.workshop.session import load
 
 CHUNK, FPS, SIZE = 8, 20, (72, 128)
@@ -109,6 +109,15 @@ def test_no_camera_hides_another(tmp_path):
     assert "has 2 cameras, found observation.images.front, observation.front; say what" in refused(root)
     assert "has no camera 'front', found observation" in refused(Source.of(root, camera="front"))
     assert "has no meta/tasks.parquet" in refused(Source.of(root, camera="observation.front"))
+
+
+@pytest.mark.parametrize(
+    "keys", [("observation.images.image", "observation.image"), ("observation.images.front", "observation.left", "top")]
+)
+def test_cameras_keep_their_names_in_a_policy_that_we_write(keys):
+    """As write_lerobot calls them: else its own dataset has no such camera."""
+    names = list(camera_names(keys))
+    assert list(camera_names(f"{CAMERA}{name}" for name in names)) == names
 
 
 def test_our_own_recordings_say_their_names_themselves(tmp_path):
