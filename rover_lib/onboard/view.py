@@ -37,7 +37,7 @@ from aiohttp import WSMsgType, web
 from rover_lib.onboard.ahead import CarShape, from_now
 from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.host import throttled_means
+from rover_lib.onboard.host import is_listened_at, throttled_means
 from rover_lib.onboard.pwm import ARDUINO_STEP_US
 
 PORT = 8470
@@ -226,9 +226,8 @@ class View:
         wire = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
-            with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) as other:
-                if other.connect_ex(str(place)) == 0:
-                    raise ViewError(f"{place}: another view listens there", remedy="end that one first")
+            if is_listened_at(place):
+                raise ViewError(f"{place}: another view listens there", remedy="end that one first")
             if place.exists() and not place.is_socket():
                 raise ViewError(f"{place}: is there, and is no socket", remedy="name another with --feed")
             place.unlink(missing_ok=True)  # of one that was killed
