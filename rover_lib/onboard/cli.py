@@ -390,6 +390,7 @@ def calibrate(
 
     path = output or default_place()
     refuse_existing(path, force)
+    check_output(path, None)
     more: dict[str, Any] = {"name": name}
     if field_of_view_deg is not None:
         more["camera"] = {"field_of_view_deg": field_of_view_deg}
@@ -403,8 +404,8 @@ def calibrate(
             **more,
         )
         link.tell(car)  # and not the last one that was tried
+    click.echo(yaml_of(car), nl=False)  # first: should writing fail, it can be copied from here
     write_car(car, path)
-    click.echo(yaml_of(car), nl=False)
     click.echo(f"rover: written to {path}", err=True)
 
 
