@@ -225,7 +225,7 @@ class Rover(Robot):
             raise PolicyError("an action of the rover is steering and throttle", found=sorted(map(str, action)))
         try:
             values = np.array([[float(action[name]) for name in ACTIONS]])
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise PolicyError("an action must be of numbers", found=repr(action)[:80]) from None
         steering, throttle = Plan(0, 0.0, 0.0, values, self._link.car.limits).actions[0].tolist()
         return steering, throttle
