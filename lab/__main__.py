@@ -10,6 +10,7 @@ import click
 
 from rover_lib.onboard.cli import ARTIFACT, FILE, Rover, drive_options, run_drive, show
 from rover_lib.onboard.confine import AS_ROOT
+from rover_lib.onboard.kinds import Number
 from rover_lib.workshop.progress import terminal
 
 
@@ -22,7 +23,7 @@ def main(debug: bool) -> None:
 
 @main.command()
 @drive_options
-@click.option("--latency-ms", type=click.FloatRange(min=0), default=0, help="Time that a plan takes, at least.")
+@click.option("--latency-ms", type=Number(min=0), default=0, help="Time that a plan takes, at least.")
 @click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
 @click.pass_context
 def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> None:

@@ -26,7 +26,7 @@ from rover_lib.onboard.plan import Plan, Settings
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.pwm import NEUTRAL
 from rover_lib.onboard.servo_link import ServoLink
-from rover_lib.onboard.telemetry import FlightLog
+from rover_lib.onboard.telemetry import FlightLog, log_limits
 from rover_lib.onboard.watch import unfinished_drive
 
 ACTIONS = ("steering", "throttle")
@@ -195,11 +195,11 @@ class Rover(Robot):
             raise DeviceNotConnectedError(f"the rover at {self.config.port} is not connected: connect() first")
 
     def _flight_log(self) -> FlightLog:
-        limits, path, car = params()["flight_log"], self.config.log or default_log(), this_car()
+        (max_bytes, keep), path, car = log_limits(), self.config.log or default_log(), this_car()
         if unfinished := unfinished_drive(path):
             logging.getLogger("rover").warning(unfinished)
         header = {"artifact": "LeRobot", "hz": RATE_HZ, **vars(self.settings), "car": car.description()}
-        return FlightLog(path, header=header, max_bytes=int(limits["max_mb"] * 1e6), keep=limits["keep"])
+        return FlightLog(path, header=header, max_bytes=max_bytes, keep=keep)
 
     def _wait_for_human(self) -> None:
         """Until the car can be armed, unless it is driven."""
@@ -225,7 +225,7 @@ class Rover(Robot):
             raise PolicyError("an action of the rover is steering and throttle", found=sorted(map(str, action)))
         try:
             values = np.array([[float(action[name]) for name in ACTIONS]])
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise PolicyError("an action must be of numbers", found=repr(action)[:80]) from None
         steering, throttle = Plan(0, 0.0, 0.0, values, self._link.car.limits).actions[0].tolist()
         return steering, throttle

@@ -8,15 +8,13 @@ import click
 
 from rover_lib.onboard.cli import LOG_DRIVE, drive_options, open_view, run_drive, sum_up, view_options
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import Output, PathTo
+from rover_lib.onboard.kinds import Number, Output, PathTo
 
 
 @click.command(short_help="Drive a car, or the balloon world, by an artifact.")
 @drive_options
 @click.option("--world", "in_world", is_flag=True, help="The balloon world instead of a car, in real time.")
-@click.option(
-    "--latency-ms", type=click.FloatRange(min=0), default=0, help="With --world: how long a plan takes, at least."
-)
+@click.option("--latency-ms", type=Number(min=0), default=0, help="With --world: how long a plan takes, at least.")
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
@@ -67,9 +65,7 @@ def view(file: Path | None, drive: int, **options: Any) -> None:
 @click.option(
     "--pictures", type=PathTo("recordings"), help="The drive's episode [default: the one that the log names]."
 )
-@click.option(
-    "--video-hz", type=click.FloatRange(1, 60), default=30, show_default=True, help="Pictures a second of the film."
-)
+@click.option("--video-hz", type=Number(1, 60), default=30, show_default=True, help="Pictures a second of the film.")
 @click.option(
     "--video-width", type=click.IntRange(160, 1920), default=640, show_default=True, help="Width of the film in pixels."
 )

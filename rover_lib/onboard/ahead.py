@@ -12,6 +12,7 @@ from typing import Any
 from rover_lib.onboard.car import WIDTH_PX, Car, this_car
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.pwm import is_finite
 
 NEAR_M = 0.15  # before the camera; what is nearer is not on the picture
 
@@ -36,8 +37,7 @@ class CarShape:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or value <= 0:
+            if not is_finite(value) or value <= 0:
                 raise ParamsError(f"view: {name} must be a number above 0", found=repr(value), remedy="see params.yml")
 
     @classmethod

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from rover_lib.onboard.car import (
+    DEFAULT,
     FAST_PULSE_MAX_US,
     PERIOD_MIN_US,
     STEERING_THROW_US,
@@ -82,6 +83,7 @@ def measure(
     be measured here, `name`, `camera` and `wheelbase_m` as car.yml has them.
     Raises CarError with what was seen and what to do where that is no car, LinkError as the link does.
     """
+    Car.of({**DEFAULT, **more}, "what was given")  # what is wrong with it is said before a human's work, not after
     ask("Take the wheels off the ground and unplug the motor. Switch the transmitter on, and let go of both sticks.")
     _find(link, sleep)
     rest = _hold(link, "at rest", sleep)

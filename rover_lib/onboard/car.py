@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.errors import CarError, ParamsError
-from rover_lib.onboard.pwm import Channel, PwmCalibration
+from rover_lib.onboard.errors import CarError, ParamsError, PwmError
+from rover_lib.onboard.pwm import Channel, PwmCalibration, is_finite
 
 FILE_VARIABLE = "ROVER_CAR"  # names another file; what the programs that a command starts get too
 PLACES = (  # of car.yml, the first that exists counts
@@ -200,7 +200,7 @@ class Car:
                 cap_us=cap_us,
                 **measures,
             )
-        except CarError as error:
+        except (CarError, PwmError) as error:
             raise CarError(f"{where}: {error.what}", found=error.found, remedy=error.remedy) from None
         if car.description()["steering"] == DEFAULT["steering"] and (
             {**car.description()["throttle"], "cap_us": 0} == {**DEFAULT["throttle"], "cap_us": 0}
@@ -231,8 +231,8 @@ def _section(value: object, where: str, needed: set[str], optional: set[str]) ->
     return value
 
 
-def _number(value: object, what: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+def _number(value: Any, what: str) -> float:
+    if not is_finite(value):
         raise CarError(f"{what} must be a number", found=repr(value)[:80])
     return value
 
@@ -281,7 +281,7 @@ def read_car(path: Path | str) -> Car:
         raise CarError(f"{path}: not found", remedy="`rover calibrate` writes one")
     try:
         return Car.of(read_params(path), str(path))
-    except (ParamsError, OSError, UnicodeDecodeError) as error:
+    except (ParamsError, OSError) as error:
         raise CarError(f"{path}: cannot be read ({error})", remedy="`rover calibrate` writes a new one") from None
 
 

@@ -17,7 +17,7 @@ import click
 
 from rover_lib.onboard.columns import aligned, benchmark_rows, number
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import Output, PathTo, check_output
+from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
 
 FILE = click.Path(path_type=Path)
 ARTIFACT = PathTo("artifact")
@@ -34,7 +34,7 @@ LOG_DRIVE = click.option(
 )
 
 
-SECONDS = click.FloatRange(min=0, min_open=True)
+SECONDS = Number(min=0, min_open=True)
 
 WORKSTATION_COMMANDS = frozenset(
     {
@@ -193,15 +193,15 @@ DRIVE_OPTIONS = (
     click.argument("artifact", type=ARTIFACT, required=False),
     CAMERA,
     PORT,
-    click.option("--hz", type=click.FloatRange(10, 100), default=30.0, show_default=True, help="Commands a second."),
+    click.option("--hz", type=Number(10, 100), default=30.0, show_default=True, help="Commands a second."),
     click.option("--dry-run", is_flag=True, help="No Arduino, no motor: logs what would be sent."),
     click.option("--record", type=FILE, help="Write the drive as an episode into this folder."),
-    click.option("--record-mb", type=click.FloatRange(min=1), help="At most this many megabytes in that folder."),
+    click.option("--record-mb", type=Number(min=1), help="At most this many megabytes in that folder."),
     click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive."),
     click.option("--ticks", type=click.IntRange(min=1), help="End after this number of commands."),
     click.option(
         "--throttle-limit",
-        type=click.FloatRange(0, 1),
+        type=Number(0, 1),
         help="Most throttle [default: params.yml; with --replay: none].",
     ),
     click.option(
@@ -282,9 +282,7 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
 @click.argument("out_dir", type=FILE)
 @CAMERA
 @PORT
-@click.option(
-    "--hz", type=click.FloatRange(5, 50), default=30.0, show_default=True, help="Controls and frames a second."
-)
+@click.option("--hz", type=Number(5, 50), default=30.0, show_default=True, help="Controls and frames a second.")
 @click.option("--max-seconds", type=SECONDS, help="Longest duration of an episode.")
 @click.option("--label", default="", help='What is done in them, such as "hit red balloon".')
 @click.option(
@@ -331,7 +329,7 @@ def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
 @click.argument("artifact", type=ARTIFACT, required=False)
 @CAMERA
 @PORT
-@click.option("--hz", type=click.FloatRange(1, 120), default=30.0, show_default=True, help="Frames a second wanted.")
+@click.option("--hz", type=Number(1, 120), default=30.0, show_default=True, help="Frames a second wanted.")
 @click.option("--receiver", is_flag=True, help="Lead a human, with the transmitter in hand, through its receiver only.")
 @AS_JSON
 @click.pass_context
@@ -392,6 +390,7 @@ def calibrate(
 
     path = output or default_place()
     refuse_existing(path, force)
+    check_output(path, None)
     more: dict[str, Any] = {"name": name}
     if field_of_view_deg is not None:
         more["camera"] = {"field_of_view_deg": field_of_view_deg}
@@ -405,8 +404,8 @@ def calibrate(
             **more,
         )
         link.tell(car)  # and not the last one that was tried
+    click.echo(yaml_of(car), nl=False)  # first: should writing fail, it can be copied from here
     write_car(car, path)
-    click.echo(yaml_of(car), nl=False)
     click.echo(f"rover: written to {path}", err=True)
 
 
@@ -431,7 +430,7 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 @click.option("--warmup", type=click.IntRange(min=0), default=10, show_default=True)
 @click.option("--iterations", type=click.IntRange(min=1), default=100, show_default=True)
 @click.option("--threads", type=click.IntRange(min=0), default=0, show_default=True, help="0: all cores.")
-@click.option("--duration", type=float, help="Soak for this many seconds instead, with a time series.")
+@click.option("--duration", type=SECONDS, help="Soak for this many seconds instead, with a time series.")
 @click.option("--output", type=Output("stage"), help="Write benchmark JSON there, for notebook 05.")
 @click.option("--gates", is_flag=True, help="Hold the first artifact against the original's gates in params.yml.")
 @AS_JSON
@@ -497,7 +496,7 @@ def benchmark(
 @click.option("--heartbeat-s", type=SECONDS, help="End the drive when no `rover heartbeat` comes for this long.")
 @click.option(
     "--wait-s",
-    type=click.FloatRange(min=0),
+    type=Number(min=0),
     default=60,
     show_default=True,
     help="How long to wait for what arming needs of a human.",
@@ -533,7 +532,11 @@ def heartbeat() -> None:
 @click.option("--chunk", type=click.IntRange(min=1), default=32, show_default=True, help="Actions in a plan.")
 @click.option("--camera", default="cam_front", show_default=True, help="The policy's name for this rover's camera.")
 @click.option(
-    "--aspect", type=float, default=1.78, show_default=True, help="Width of its pictures divided by their height."
+    "--aspect",
+    type=Number(min=0, min_open=True),
+    default=1.78,
+    show_default=True,
+    help="Width of its pictures divided by their height.",
 )
 @click.option("--signers", type=FILE, help="Whose artifacts it takes [default: /etc/rover/allowed_signers].")
 @click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")

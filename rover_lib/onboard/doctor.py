@@ -33,6 +33,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import blank, frozen
 from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, ServoLink, Telemetry
+from rover_lib.onboard.telemetry import log_limits
 
 NAME_WIDTH = 15
 RATE_SHARE = 0.9  # of the wanted frame rate
@@ -527,8 +528,8 @@ def governor(sys_root: Path = Path("/sys")) -> Iterator[Check]:
 
 def disk(log_folder: Path, recordings: Path, usage: Callable[[Path], Any] = shutil.disk_usage) -> Iterator[Check]:
     """Room for flight logs and recordings."""
-    limits = params()["flight_log"]
-    log_mb = limits["max_mb"] * (limits["keep"] + 1)
+    max_bytes, keep = log_limits()
+    log_mb = max_bytes / 1e6 * (keep + 1)
     for what, folder, need_mb in (("flight logs", log_folder, log_mb), ("recordings", recordings, RECORDINGS_MB)):
         there = next(p for p in (folder, *folder.absolute().parents) if p.exists())
         free_mb = usage(there).free / 1e6

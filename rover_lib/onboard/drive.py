@@ -36,7 +36,7 @@ from rover_lib.onboard.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.status_line import StatusLine
 from rover_lib.onboard.takeover import TakeoverRecorder
-from rover_lib.onboard.telemetry import FlightLog
+from rover_lib.onboard.telemetry import FlightLog, log_limits
 from rover_lib.onboard.watch import (
     HealthWatch,
     MemoryWatch,
@@ -447,16 +447,14 @@ def _all_of(*sources: Warnings) -> Warnings:
 @contextlib.contextmanager
 def _flight_log(options: DriveOptions, settings: Settings, report: Report) -> Iterator[FlightLog]:
     """An open flight log whose events are also lines on the terminal, above the report's status."""
-    limits = params()["flight_log"]
-    path = options.log_file or default_log()
+    (max_bytes, keep), path = log_limits(), options.log_file or default_log()
     header: dict[str, Any] = {"artifact": str(options.artifact or options.replay), "hz": options.hz, **vars(settings)}
     if not (car := this_car()).drives_like(Car()):
         header["car"] = car.description()
     with StatusLine(lambda: report.status, sys.stderr) as status:
         logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status.handler], force=True)
         unfinished = unfinished_drive(path)
-        max_bytes = int(limits["max_mb"] * 1e6)
-        with FlightLog(path, header=header, max_bytes=max_bytes, keep=limits["keep"]) as log:
+        with FlightLog(path, header=header, max_bytes=max_bytes, keep=keep) as log:
             if unfinished:
                 log.event(unfinished, level=logging.WARNING)
             yield log

@@ -4,8 +4,10 @@ Read from /proc and /sys: psutil would be a compiled package to pin and hash on 
 process's peak memory on Linux nor what a Raspberry Pi's firmware throttles.
 """
 
+import errno
 import os
 import resource
+import socket
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -104,6 +106,12 @@ def default_log() -> Path:
     """Where a drive's flight log goes: systemd's state folder of the service, or the user's."""
     home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(os.environ.get("STATE_DIRECTORY") or Path(home) / "rover") / "flight.log"
+
+
+def is_listened_at(place: Path) -> bool:
+    """Whether a process listens at a Unix socket of whole messages; what it leaves there when it dies is not one."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) as asking:
+        return asking.connect_ex(str(place)) in (0, errno.EAGAIN)  # EAGAIN: it has no time to answer
 
 
 def default_view() -> Path:

@@ -8,6 +8,7 @@ left to the command, whose own error says what is wrong with it.
 """
 
 import json
+import math
 import os
 import stat
 import zipfile
@@ -114,6 +115,17 @@ class Output(click.Path):
         if not (ctx and ctx.resilient_parsing):
             check_output(path, self.kind, appended=self.appended)
         return path
+
+
+class Number(click.FloatRange):
+    """A command's option that is a number within limits, which click lets "nan" pass, as that is below and above none;
+    nor is infinity one."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
 
 
 class PathTo(click.Path):

@@ -32,13 +32,29 @@ def params() -> dict[str, Any]:
     return values
 
 
+class _EachKeyOnce(yaml.SafeLoader):
+    """YAML forbids a key that is there twice; PyYAML takes the last one, and nobody is told which value counts."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
+                if key.value in seen:
+                    raise yaml.composer.ComposerError(None, None, f"{key.value!r} is there twice", key.start_mark)
+                seen.add(key.value)
+        return node
+
+
 def read_params(path: Path | str) -> dict[str, Any]:
-    """The content of one file alone. Raises ParamsError if it is missing, or no YAML mapping."""
+    """The content of one file alone. Raises ParamsError if it is missing, or no YAML mapping; OSError."""
     try:
-        content = yaml.safe_load(Path(path).read_text())
+        content = yaml.load(Path(path).read_text(), _EachKeyOnce)
     except FileNotFoundError:
         raise ParamsError(f"{path}: not found", remedy="it came with this package: install that again") from None
-    except yaml.YAMLError as e:
+    except OSError:
+        raise
+    except Exception as e:  # PyYAML lets pass what Python says of a date, a number, a byte or a depth that is none
         raise ParamsError(f"{path}: not readable as YAML ({' '.join(str(e).split())})") from None
     if content is None:  # nothing but comments
         return {}

@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.pwm import is_finite
 
 STEERING, THROTTLE = 0, 1
 ROUNDING = 1e-6  # of times, in steps
 LIMITS = np.array([[-1.0, 0.0], [1.0, 1.0]])  # lowest and highest [steering, throttle]
 IN_FORCE_S = 0.15  # of a command: after that the Arduino stops a car that hears no other
+ENSEMBLE_MOST = 10.0  # 64 plans, and exp(709) is the last that a float holds
 OVERSHOOT = 0.25  # a learned action may be a little beyond an end, as a transmitter is: it is clipped
 
 
@@ -53,17 +55,18 @@ class Settings:
 
         for name in ("fade_s", "stop_s", "throttle_limit", "black_level", "flat_level"):
             value = getattr(self, name)
-            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            must(number, f"{name} must be a finite number, found {value!r}")
+            must(is_finite(value), f"{name} must be a finite number, found {value!r}")
         for name in ("blend_ticks", "frozen_frames", "black_frames"):
             value = getattr(self, name)
             must(type(value) is int and value >= 0, f"{name} must be a whole number from 0, found {value!r}")
         must(0 < self.fade_s <= self.stop_s, f"0 < fade_s <= stop_s must hold, found {self.fade_s} and {self.stop_s}")
         must(0 <= self.throttle_limit <= 1, f"throttle_limit must be in [0, 1], found {self.throttle_limit}")
         must(self.frozen_frames != 1 and self.black_frames != 1, "one frame alone is no fault: 0 (off) or from 2")
-        ensemble = self.ensemble
-        if ensemble is not None:
-            must(type(ensemble) in (int, float) and math.isfinite(ensemble), f"ensemble must be finite: {ensemble!r}")
+        must(type(self.compensate) is bool, f"compensate must be true or false, found {self.compensate!r}")
+        if self.ensemble is not None:
+            # Beyond it the weights of a few dozen plans overflow, and what they give is no number.
+            holds = is_finite(self.ensemble) and abs(self.ensemble) <= ENSEMBLE_MOST
+            must(holds, f"ensemble must be a number within {ENSEMBLE_MOST:g} of 0, found {self.ensemble!r}")
 
     @classmethod
     def of(cls, section: Mapping[str, Any], **overrides: Any) -> "Settings":

@@ -15,6 +15,14 @@ ARDUINO_STEP_US = 4  # resolution of micros() on a 16 MHz Arduino: no pulse is k
 NEUTRAL = (0.0, 0.0)  # (steering, throttle): straight and stopped
 
 
+def is_finite(value: object) -> bool:
+    """Whether it is a number, no boolean, that a float can hold; NaN and infinities are not."""
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # a whole number of 309 digits
+        return False
+
+
 def _finite(value: object, what: str) -> float:
     """`value` as a float. Raises PwmError for None, strings, booleans, NaN and infinities."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
@@ -52,6 +60,8 @@ class Channel:
     def __post_init__(self):
         for key in ("period_us", "neutral_pct", "span_pct", "low", "high"):
             _finite(getattr(self, key), f"{self.name} {key}")
+        if self.below_pct is not None:
+            _finite(self.below_pct, f"{self.name} below_pct")
         below = self._span_pct(-1.0)
         if self.period_us <= 0 or self.span_pct * below <= 0 or not self.low <= 0 <= self.high or self.low == self.high:
             raise PwmError(

@@ -46,6 +46,7 @@ from typing import TYPE_CHECKING, Any
 from systemd_watchdog import WatchDog
 
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.host import is_listened_at
 
 if TYPE_CHECKING:  # who asks for the service's state, as every playbook does, waits for neither numpy nor OpenCV
     from rover_lib.onboard.loop import Arm, Report
@@ -133,6 +134,9 @@ class Service:
         path = _socket_path()
         self._operators = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
+            if is_listened_at(path):  # taken from it, nobody could arm its car, and no heartbeat would reach a drive
+                self._operators.close()
+                raise ServiceError(f"{path}: another service listens there", remedy="end that one first")
             path.unlink(missing_ok=True)
             self._operators.bind(str(path))
             path.chmod(0o600)
@@ -240,7 +244,7 @@ class Service:
                 continue
             with (
                 connection,
-                contextlib.suppress(OSError, ValueError, TypeError, RecursionError),
+                contextlib.suppress(OSError, ValueError, TypeError, OverflowError, RecursionError),
             ):  # nonsense has no answer
                 connection.settimeout(1.0)
                 _, uid, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
@@ -257,6 +261,7 @@ class Service:
         if ask != "arm":
             return {"text": self._text, "missing": self._missing, "model": self._model, "ticket": self._ticket}
         now_s = self._clock()
+        asked_at_s = now_s if asked_s is None else min(float(asked_s), now_s)
         request = Request(**{name: None if value is None else float(value) for name, value in limits.items()})
         with self._turn:
             if not self._ticket:
@@ -265,7 +270,7 @@ class Service:
                 text = "the request names another model, or the service was started or tried again meanwhile: ask anew"
                 return {"armed": False, "text": text}
             self._ticket, self._request, self._asked, self._answer = "", request, True, None
-            self._asked_s = min(float(asked_s if asked_s is not None else now_s), now_s)
+            self._asked_s = asked_at_s
             self._turn.notify_all()
             while not self._done.is_set():
                 if self._turn.wait_for(lambda: self._answer, FEED_S):

@@ -38,6 +38,8 @@ import numpy as np
 
 from rover_lib.onboard.errors import ParamsError, RoverError
 from rover_lib.onboard.host import Host, throttled_means
+from rover_lib.onboard.params import params
+from rover_lib.onboard.pwm import is_finite
 from rover_lib.onboard.servo_link import State
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.stage import plain
@@ -126,6 +128,19 @@ def _event_line(event: Event) -> bytes:
         fields = {"cut": whole[:EVENT_CHARACTERS]}
     text = event.text[:EVENT_CHARACTERS]
     return _sealed({"kind": "event", "t_s": round(event.t_s, 4), "event": text, "fields": fields})
+
+
+def log_limits() -> tuple[int, int]:
+    """FlightLog's max_bytes and keep, by params.yml. Raises ParamsError for what is no size, and no count."""
+    section = params()["flight_log"]
+    max_mb, keep = section["max_mb"], section["keep"]
+    if not is_finite(max_mb) or type(keep) is not int:
+        raise ParamsError(
+            "flight_log: max_mb must be a number, and keep a whole one",
+            found=f"{max_mb!r} and {keep!r}",
+            remedy="see params.yml",
+        )
+    return int(max_mb * 1e6), keep
 
 
 class FlightLog:

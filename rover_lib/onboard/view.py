@@ -37,12 +37,13 @@ from aiohttp import WSMsgType, web
 from rover_lib.onboard.ahead import CarShape, from_now
 from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.host import throttled_means
+from rover_lib.onboard.host import is_listened_at, throttled_means
 from rover_lib.onboard.pwm import ARDUINO_STEP_US
 
 PORT = 8470
 MESSAGE_BYTES = 1 << 20  # more than a drive's socket takes
 PAGES = 32
+ACCEPT_AGAIN_S = 0.5
 BEAT_S = 5.0  # a page that does not answer for that long is gone
 GONE = "gone"
 PAGE = Path(__file__).with_name("view.html")
@@ -102,7 +103,7 @@ def new_token() -> str:
 def read_token(path: Path) -> str:
     """A file's. Raises ViewError for one that is not there, or that could be guessed."""
     try:
-        token = path.read_text().strip()
+        token = path.read_text(errors="replace").strip()
     except OSError as error:
         raise ViewError(f"{path}: the token cannot be read ({error.strerror})", remedy="provision the rover") from None
     if not re.fullmatch(r"[A-Za-z0-9_-]{16,128}", token, re.ASCII):
@@ -226,9 +227,8 @@ class View:
         wire = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
-            with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) as other:
-                if other.connect_ex(str(place)) == 0:
-                    raise ViewError(f"{place}: another view listens there", remedy="end that one first")
+            if is_listened_at(place):
+                raise ViewError(f"{place}: another view listens there", remedy="end that one first")
             if place.exists() and not place.is_socket():
                 raise ViewError(f"{place}: is there, and is no socket", remedy="name another with --feed")
             place.unlink(missing_ok=True)  # of one that was killed
@@ -246,7 +246,11 @@ class View:
     async def _accept(self, wire: socket.socket) -> None:
         loop, tasks = asyncio.get_running_loop(), set()
         while True:
-            drive, _ = await loop.sock_accept(wire)
+            try:
+                drive, _ = await loop.sock_accept(wire)
+            except OSError:  # no file is left, for as long as somebody opens one connection after the other
+                await asyncio.sleep(ACCEPT_AGAIN_S)
+                continue
             _, uid, _ = struct.unpack("3i", drive.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
             if uid not in self._users:
                 drive.close()
@@ -259,7 +263,7 @@ class View:
         self._drives.append(drive)
         phase = ""
         try:
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError, IndexError):  # nonsense ends it
+            with contextlib.suppress(Exception):  # whatever its nonsense breaks, it ends with that
                 while data := await _received(loop, drive):
                     line, _, picture = data.partition(b"\n")
                     head = json.loads(line)

@@ -19,7 +19,8 @@ from typing import Any
 from rover_lib.onboard.loop import Report
 from rover_lib.onboard.servo_link import LinkError, ServoLink, Telemetry
 from rover_lib.onboard.signal_event import SignalEvent
-from rover_lib.onboard.telemetry import FlightLog
+from rover_lib.onboard.stage import open_plain
+from rover_lib.onboard.telemetry import FlightLog, LogError
 
 SWITCH_S = 0.0005  # at the latest, other threads give the interpreter back to the loop; not Python's 5 ms
 PRIORITY = 2  # of real time: above what stands in for a car in the balloon world
@@ -138,10 +139,10 @@ def unfinished_drive(log: Path | str) -> str | None:
     A process that is killed, or has no power any more, cannot say so itself.
     """
     try:
-        with Path(log).open("rb") as file:
+        with open_plain(log, LogError(f"{log}: no plain file")) as file:  # a FIFO would be waited for
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
             lines = file.read().splitlines()
-    except OSError:
+    except (OSError, LogError):
         return None
     ticks = False
     for line in reversed(lines):

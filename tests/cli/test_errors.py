@@ -90,6 +90,11 @@ WRONG = [
     ("inspect nothing.pt", "nothing.pt: not found", "pretrained_model"),
     ("drive", "ARTIFACT", "--replay EPISODE"),
     ("drive policy_static.pt --latency-ms 100", "--latency-ms", "--world"),
+    # no number
+    ("drive policy_static.pt --max-seconds nan", "--max-seconds", "nan is not a finite number"),
+    ("drive policy_static.pt --record out --record-mb nan", "--record-mb", "nan is not a finite number"),
+    ("arm-car --max-seconds inf", "--max-seconds", "inf is not a finite number"),
+    ("arm-car --heartbeat-s nan", "--heartbeat-s", "nan is not a finite number"),
 ]
 
 

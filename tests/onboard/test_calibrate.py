@@ -4,6 +4,7 @@ from functools import partial
 
 import needs
 import pytest
+import yaml
 from click.testing import CliRunner
 
 from lab.arduino.native import NativeArduino
@@ -165,6 +166,31 @@ def test_it_replaces_nothing_without_force(run):
     assert read_car(path) == Car()
     assert run(Desk(CRAWLER), "--force")[0].exit_code == 0
     assert not read_car(path).is_default
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--wheelbase-m", "30"), "wheelbase_m must be from 0.03 to 3, found 30"),
+        (("--field-of-view-deg", "nan"), "field_of_view_deg must be a number"),
+        (("--name", "a\nb"), "name must be 1 to 60 characters"),
+        (("--output", f"{__file__}/car.yml"), "this is a file, not a folder"),
+    ],
+)
+def test_what_cannot_be_written_down_is_said_before_anybody_is_asked(run, options, sentence):
+    result, _ = run(desk := Desk(CRAWLER), *options)
+    assert result.exit_code == 1 and sentence in result.output
+    assert not desk.asked
+
+
+def test_what_was_measured_is_shown_although_it_cannot_be_written(run, monkeypatch):
+    def full(path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module, "atomic_path", full)
+    result, _ = run(Desk(CRAWLER), "--name", "crawler")
+    assert result.exit_code == 1 and "No space left on device" in result.output
+    assert Car.of(yaml.safe_load(result.stdout)).name == "crawler"
 
 
 @pytest.mark.parametrize("at", range(6))

@@ -131,6 +131,8 @@ def test_what_moves_a_car():
         ("throttle.cap_us", 0, "cap"),
         ("camera.field_of_view_deg", 200, "field_of_view_deg must be from 20 to 160"),
         ("wheelbase_m", float("nan"), "wheelbase_m must be a number"),
+        pytest.param("wheelbase_m", 10**400, "wheelbase_m must be a number", id="a number of 401 digits"),
+        ("steering.right_us", 0, "its ends must be inside a period"),
         ("name", "", "1 to 60 characters"),
     ],
 )
@@ -143,12 +145,19 @@ def test_what_is_no_car_is_said_in_a_sentence(where, value, sentence, tmp_path):
     assert str(error.value).startswith(f"{path}: ")
 
 
-@pytest.mark.parametrize("text", ["- a list", "a: [", "\x00", "just words"])
+@pytest.mark.parametrize("text", ["- a list", "a: [", "\x00", "just words", "wheelbase_m: 2026-13-45"])
 def test_a_file_that_is_no_mapping(tmp_path, text):
     path = tmp_path / "car.yml"
     path.write_text(text)
     with pytest.raises(CarError, match=r"car\.yml"):
         read_car(path)
+
+
+def test_a_value_that_is_there_twice(tmp_path):
+    text = yaml.safe_dump(CRAWLER) + "wheelbase_m: 0.5\n"
+    (tmp_path / "car.yml").write_text(text)
+    with pytest.raises(CarError, match="'wheelbase_m' is there twice"):
+        read_car(tmp_path / "car.yml")
 
 
 def test_an_empty_file(tmp_path):

@@ -713,6 +713,11 @@ def test_a_drive_before_that_has_no_end_is_noticed(tmp_path, lines, ended):
     assert unfinished_drive(tmp_path / "none.log") is None
 
 
+def test_a_log_that_is_a_fifo_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "flight.log")
+    assert unfinished_drive(tmp_path / "flight.log") is None
+
+
 def test_a_real_log_ends(tmp_path, link, clock):
     path = tmp_path / "flight.log"
     with FlightLog(path, header={}, max_bytes=100_000, keep=1) as log:

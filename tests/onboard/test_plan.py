@@ -208,6 +208,10 @@ def test_settings_of_params():
         {"throttle_limit": 1.1},
         {"frozen_frames": 1},
         {"ensemble": "a"},
+        {"ensemble": True},
+        {"ensemble": -20.0},  # whose weights overflow
+        {"fade_s": 10**400},
+        {"compensate": "false"},
         {"speed": 1},
     ],
 )

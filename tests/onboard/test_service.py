@@ -264,6 +264,30 @@ def test_nonsense_arms_nothing(systemd, tmp_path, nonsense):
     waits_unarmed(systemd, stop, talk)
 
 
+@pytest.mark.parametrize("limits", [{"max_seconds": 10**400}, {"asked_s": 10**400}, {"asked_s": "soon"}], ids=range(3))
+def test_a_request_with_a_number_that_is_none_is_no_attempt(systemd, limits):
+    """All else in it is right: the model, and the ticket, which stays good."""
+    stop = threading.Event()
+
+    def operator() -> None:
+        state = s.ask_service(ask="state")
+        with pytest.raises(s.ServiceError, match="gave no answer"):
+            s.ask_service(ask="arm", model=state["model"], ticket=state["ticket"], **limits)
+        assert s.ask_service(ask="state") == state
+        stop.set()
+
+    waits_unarmed(systemd, stop, operator)
+
+
+def test_a_second_service_leaves_the_first_its_operators(systemd):
+    with served() as first:
+        with pytest.raises(s.ServiceError, match="another service listens there; end that one first"), served():
+            pass
+        thread = beside(systemd, human)
+        assert first.wait_for_human(armed) == "telemetry"
+        thread.join()
+
+
 def test_says_what_is_missing_and_refuses_until_then(systemd):
     missing, answers, told = ["switch the transmitter on"], [], []
 

@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import errno
+import gc
 import json
 import os
 import socket
@@ -295,12 +297,16 @@ def test_a_second_click_hides_no_end(tmp_path):
 
 NONSENSE = [b"", b"\n", b"{}", b"[]\n", b"no json\n" + JPEG, b'{"phase": "driving", "plan": 3}\n', b"\xff\xfe\n",
             b"null\n", b'{"phase": "driving", "shape": [9, 9, 3]}\nshort', b'{"phase": "driving", "pins": "ab"}\n',
-            b'{"phase": "driving", "machine": {"throttled": "hot"}}\n']  # fmt: skip
+            b'{"phase": "driving", "machine": {"throttled": "hot"}}\n', b"[" * 100_000 + b"\n",
+            b'{"phase": "driving", "machine": [1]}\n', b'{"phase": "driving", "size": [640, 0], "sent_s": 0, '
+            b'"plan": {"captured_s": 0, "rate_hz": 30, "actions": [[0, 1]]}}\n']  # fmt: skip
 
 
 @pytest.mark.parametrize("said", NONSENSE[1:], ids=lambda m: repr(m[:30]))
 def test_a_drive_that_talks_nonsense_ends_nothing_but_its_own_line(tmp_path, said):
     async def scene():
+        unforeseen = []
+        asyncio.get_running_loop().set_exception_handler(lambda loop, context: unforeseen.append(context))
         async with Bench(tmp_path) as bench:
             mad = bench.drive()
             mad.wire.send(said)
@@ -314,6 +320,28 @@ def test_a_drive_that_talks_nonsense_ends_nothing_but_its_own_line(tmp_path, sai
                 raise AssertionError("the drive after it is not shown")
             await page.send_str("stop")
             assert await drive.asked() == b"stop 127.0.0.1"
+        gc.collect()  # a task that failed is told of when it goes
+        assert not unforeseen
+
+    asyncio.run(scene())
+
+
+def test_a_view_without_a_file_left_takes_drives_again_later(tmp_path, monkeypatch):
+    monkeypatch.setattr(v, "ACCEPT_AGAIN_S", 0.01)
+
+    async def scene():
+        loop = asyncio.get_running_loop()
+        accept, refused = loop.sock_accept, [OSError(errno.EMFILE, "Too many open files")] * 3
+
+        async def accept_later(wire):
+            if refused:
+                raise refused.pop()
+            return await accept(wire)
+
+        monkeypatch.setattr(loop, "sock_accept", accept_later)
+        async with Bench(tmp_path) as bench:
+            bench.drive().send(HEAD)
+            await driving(await bench.page())
 
     asyncio.run(scene())
 
@@ -442,9 +470,9 @@ def test_a_socket_that_a_killed_view_has_left_is_taken(tmp_path):
     asyncio.run(scene())
 
 
-@pytest.mark.parametrize("content", ["", "short", "with a blank in the middle", "ä" * 20])
+@pytest.mark.parametrize("content", ["", "short", "with a blank in the middle", "ä" * 20, b"\xff" * 20])
 def test_a_token_that_could_be_guessed_is_refused(tmp_path, content):
-    (tmp_path / "token").write_text(content)
+    (tmp_path / "token").write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(v.ViewError, match="no token of 16 letters"):
         v.read_token(tmp_path / "token")
 

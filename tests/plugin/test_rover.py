@@ -199,6 +199,7 @@ def test_a_throttle_above_the_limit_is_cut(make_rover, standin):
         ({"steering": 0.0, "throttle": 0.1, "gripper": 1.0}, "is steering and throttle"),
         ({"steering": "left", "throttle": 0.1}, "must be of numbers"),
         ({"steering": None, "throttle": 0.1}, "must be of numbers"),
+        ({"steering": 10**400, "throttle": 0.1}, "must be of numbers"),
     ],
 )
 def test_an_action_that_must_not_drive_a_car(rover, standin, action, sentence):
