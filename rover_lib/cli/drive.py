@@ -11,10 +11,10 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import Number, Output, PathTo
 
 
-@click.command(short_help="Drive a car, or the balloon world, by an artifact.")
+@click.command(short_help="Drive a car, or in the balloon world, with an artifact.")
 @drive_options
-@click.option("--world", "in_world", is_flag=True, help="The balloon world instead of a car, in real time.")
-@click.option("--latency-ms", type=Number(min=0), default=0, help="With --world: how long a plan takes, at least.")
+@click.option("--world", "in_world", is_flag=True, help="Drive in the balloon world instead of a car, in real time.")
+@click.option("--latency-ms", type=Number(min=0), default=0, help="With --world: minimum time of a plan.")
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
@@ -37,7 +37,7 @@ def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **op
     ctx.exit(run_drive(car=partial(VirtualCar, seed=seed) if in_world else None, latency_ms=latency_ms, **options))
 
 
-@click.command(short_help="Show a drive in the browser; it can be stopped there.")
+@click.command(short_help="Show a drive in the browser, with a stop button.")
 @click.argument("file", type=click.Path(path_type=Path, exists=True), required=False)
 @view_options
 @LOG_DRIVE
@@ -56,12 +56,12 @@ def view(file: Path | None, drive: int, **options: Any) -> None:
     watching.watch(file, drive, options)
 
 
-@click.command(short_help="Sum up a flight log, and draw it.")
+@click.command(short_help="Summarize a flight log, and draw it.")
 @click.argument("file", type=PathTo("flight log"))
 @click.option("-o", "--output", type=Output(), help="The figure to write [default: FILE.png].")
 @LOG_DRIVE
 @click.option("--video", type=Output(), help="A film of the drive: .mp4, or .webp for a page.")
-@click.option("--mcap", type=Output(), help="The drive for Foxglove or Rerun, with its pictures where there are some.")
+@click.option("--mcap", type=Output(), help="The drive for Foxglove or Rerun, with its pictures if it was recorded.")
 @click.option(
     "--pictures", type=PathTo("recordings"), help="The drive's episode [default: the one that the log names]."
 )
@@ -81,14 +81,14 @@ def log(
     video_width: int,
     as_json: bool,
 ) -> None:
-    """Sum up the flight log FILE of `rover drive`, and draw it.
+    """Summarize the flight log FILE of `rover drive`, and draw it.
 
-    With --video it makes a film of the drive instead, which needs the pictures that `rover drive --record` has kept:
-    where the car was led, what was commanded, and what its pins did. With --mcap it writes the log, and the pictures if
-    there are some, for viewers of such files.
+    The summary has missed ticks, jitter, ages and latencies of plans, who drove, temperature and events. Older parts
+    of the same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation, the summary does not.
 
-    Missed ticks, jitter, ages and latencies of plans, who drove, temperature, and what happened. Older parts of the
-    same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation, the summary does not.
+    --video makes a film of the drive instead: its pictures with the planned path, the commands and the servo pulses.
+    It needs the pictures that `rover drive --record` has kept. --mcap writes the log, with the pictures if there are
+    any, for viewers of MCAP files.
     """
     flight = sum_up(file, drive, as_json)
     if video:

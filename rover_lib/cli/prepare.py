@@ -1,4 +1,4 @@
-"""Commands that make artifacts of a checkpoint, and look at them."""
+"""Commands that make artifacts from a checkpoint and inspect them."""
 
 import functools
 import json
@@ -30,10 +30,10 @@ def _size(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int
 
 CHECKPOINT, EPISODES = PathTo("checkpoint"), PathTo("recordings")
 ACTION_NAMES = click.option(
-    "--action-names", default="", help="What a LeRobotDataset's actions are, in their order, if it does not say it."
+    "--action-names", default="", help="Names of a LeRobotDataset's actions in order, if it has none."
 )
 CAMERA = click.option(
-    "--camera", default="", help="Which of a LeRobotDataset's cameras the policy looks through; commas between several."
+    "--camera", default="", help="Which cameras of a LeRobotDataset the policy uses, separated by commas."
 )
 
 
@@ -51,7 +51,7 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
     return called
 
 
-@click.command(short_help="From a checkpoint to artifacts and a verdict.")
+@click.command(short_help="Turn a checkpoint into artifacts and a verdict.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES)
 @ACTION_NAMES
@@ -64,11 +64,11 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     """Load, calibrate, quantize, compare and benchmark CHECKPOINT with the recordings in EPISODES.
 
-    EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command; of the Hub, as
-    user/name@revision.
-    Executes the five notebooks; reports, artifacts, figures and the executed notebooks are left in the run's folder.
-    Ends with a verdict: which artifact to deploy, what failed and what to do about it, in words, as report.html and as
-    run.json.
+    EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command; give a dataset on the
+    Hub as user/name@revision.
+    Executes five notebooks and leaves reports, artifacts, figures and the executed notebooks in the run's folder. Ends
+    with a verdict, printed and written as report.html and run.json: which artifact to deploy, what failed, and what to
+    do about it.
     """
     from rover_lib.workshop.run import run as run_notebooks
 
@@ -77,13 +77,13 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     _judge(folder)
 
 
-@click.command(short_help="Judge a run again, from what is there.")
+@click.command(short_help="Judge an existing run again.")
 @click.argument("run_dir", type=PathTo("run"))
 @AS_JSON
 def report(run_dir: Path, as_json: bool) -> None:
-    """Judge the run in RUN_DIR again, from what is there, as `rover run` does at its end.
+    """Judge the existing run in RUN_DIR again, as `rover run` does at its end.
 
-    For when `make arm` has counted its instructions, `rover world students` its students, or params.yml has changed.
+    Use it after `make arm` has counted instructions, after `rover world students`, or when params.yml has changed.
     """
     _judge(run_dir, as_json)
 
@@ -128,18 +128,18 @@ def list_runs(runs_dir: Path, as_json: bool) -> None:
         click.echo(f"no run in {runs_dir}: make demo, or rover run, makes the first")
 
 
-@click.command(short_help="Many runs from one sheet, and which is best.")
+@click.command(short_help="Make many runs from one sheet, and compare them.")
 @click.argument("sheet", type=FILE)
 @click.option("--out", type=FILE, help="The sweep's folder [default: runs/<the sheet's name>].")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine [default: one for two cores].")
 @click.option("--scheduler", metavar="tcp://HOST:8786", help="A Dask cluster instead of this machine.")
 @AS_JSON
 def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | None, as_json: bool) -> None:
-    """Make each run that the file SHEET asks for, and say which are the best.
+    """Make all runs that the file SHEET asks for, and say which are the best.
 
-    SHEET names checkpoints, recordings, students to teach and settings to vary; every combination is a run, in a folder
-    of its own in the sweep's. What is there is not made again: after Ctrl-C, a power cut or another line in SHEET the
-    same command goes on. Runs that fail are named at the end, and the others are whole.
+    SHEET names checkpoints, recordings, students to teach and settings to vary. Every combination is a run with its own
+    folder inside the sweep's. Finished runs are not made again: after Ctrl-C, a power cut or a new line in SHEET, the
+    same command continues. Runs that fail are named at the end and do not harm the others.
     """
     from rover_lib.workshop import sweep as sweeping
 
@@ -160,7 +160,7 @@ def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | N
         raise click.exceptions.Exit(1)
 
 
-@click.command(short_help="Make one artifact of a checkpoint.")
+@click.command(short_help="Make one artifact from a checkpoint.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES)
 @click.option("-o", "--output", type=Output("artifact"), required=True, help="The artifact to write.")
@@ -175,7 +175,12 @@ def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | N
 @click.option(
     "--observer", type=click.Choice(["histogram", "minmax", "percentile"]), default="histogram", show_default=True
 )
-@click.option("--float-block", "float_blocks", multiple=True, help="A block to leave in float; makes static mixed.")
+@click.option(
+    "--float-block",
+    "float_blocks",
+    multiple=True,
+    help="A block to leave in float, which makes the mode mixed; may be repeated.",
+)
 @click.option("--samples", type=click.IntRange(min=1), help="Calibration samples [default: params.yml].")
 @with_source
 def quantize(checkpoint: Path, episodes: "Source", output: Path, mode: str, samples: int | None, **how: Any) -> None:
@@ -201,14 +206,14 @@ def quantize(checkpoint: Path, episodes: "Source", output: Path, mode: str, samp
 @click.command(short_help="Compare artifacts with FP32, on recorded frames.")
 @click.argument("reference", type=ARTIFACT)
 @click.argument("artifacts", type=ARTIFACT, nargs=-1, required=True)
-@click.option("--episodes", type=EPISODES, required=True, help="Recordings; their held-out part judges.")
+@click.option("--episodes", type=EPISODES, required=True, help="Recordings; their held-out part is used.")
 @AS_JSON
 @with_source
 def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as_json: bool) -> None:
     """Compare ARTIFACTS with REFERENCE (the FP32 artifact) on recorded frames.
 
-    Errors are shares of the recorded range and microseconds of servo pulse. A REFERENCE that copies its state and does
-    not look at its camera is warned of.
+    Errors are in percent of the recorded range and in microseconds of servo pulse. Warns if REFERENCE copies its state
+    and ignores its camera.
     """
     from rover_lib.onboard.artifact import distinct_names
     from rover_lib.onboard.params import params
@@ -240,18 +245,20 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
 @click.argument("episodes", type=EPISODES)
 @click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="The student's picture [default: its teacher's].")
 @click.option("--decoder-layers", type=int, metavar="N", help="Keep only the first N decoder layers [default: all].")
-@click.option("--feedforward", type=int, metavar="N", help="Keep the N best units of each feed-forward [default: all].")
+@click.option(
+    "--feedforward", type=int, metavar="N", help="Keep the N most important units of each feed-forward [default: all]."
+)
 @click.option(
     "--backbone-channels",
     type=float,
     metavar="SHARE",
-    help="Keep that share, say 0.5, of the channels inside the backbone's blocks [default: all].",
+    help="Keep this share, such as 0.5, of the channels inside the backbone's blocks [default: all].",
 )
 @click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
 @click.option("--samples", type=click.IntRange(min=1), help="Frames to learn from [default: params.yml].")
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of all phases [default: params.yml].")
-@click.option("--qat", is_flag=True, help="Train it for INT8 at the end. With no other shape: CHECKPOINT itself.")
+@click.option("--qat", is_flag=True, help="Train it for INT8 at the end; without a new shape, CHECKPOINT itself.")
 @click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]")
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
 @AS_JSON
@@ -286,13 +293,15 @@ def distill(
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
 
 
-@click.command(short_help="Let a policy learn on, from takeovers.")
+@click.command(short_help="Train a policy further, from takeovers.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES, nargs=-1, required=True)
 @click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
-@click.option("--weight", type=float, help="How many times a correction's frame counts [default: params.yml].")
-@click.option("--samples", type=click.IntRange(min=1), help="Frames of each kind, at most [default: params.yml].")
+@click.option("--weight", type=float, help="Weight of a frame of a correction [default: params.yml].")
+@click.option(
+    "--samples", type=click.IntRange(min=1), help="Maximum number of frames of each kind [default: params.yml]."
+)
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of both phases [default: params.yml].")
 @click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]")
 @click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
@@ -307,12 +316,12 @@ def finetune(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Let CHECKPOINT learn on, from what humans drove in EPISODES: first the old recordings, then the new ones.
+    """Train CHECKPOINT further on what humans drove in EPISODES: first the old recordings, then the new ones.
 
-    A human's frames of a drive in which the policy drove too are corrections, and count more; what a policy drove is
-    not imitated. Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and finetune.json in the run's
-    folder, and says on which held-out episodes it is nearer to the human than before. Ended at any moment and started
-    again, it goes on where it was.
+    A human's frames in a drive of the policy are corrections, and count more; the policy's own frames are not
+    imitated. Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and finetune.json in the run's
+    folder, and says on which held-out episodes it came closer to the human. If it is ended at any moment, the same
+    command continues where it was.
     """
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import read_stage
@@ -365,7 +374,7 @@ def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
 @click.command("export-dataset", short_help="Write recordings as a LeRobotDataset v3.")
 @click.argument("episodes", type=EPISODES)
 @click.argument("out", type=FILE)
-@click.option("--video", is_flag=True, help="AV1 video, far smaller and not equal to the last bit [default: images].")
+@click.option("--video", is_flag=True, help="Write AV1 video: far smaller than images, but lossy [default: images].")
 @click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="Size of the pictures [default: as recorded].")
 @AS_JSON
 def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> None:
@@ -384,13 +393,13 @@ def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> 
     show({"exported": report | {"report": str(out / REPORT)}}, as_json)
 
 
-@click.command(short_help="Collect all that a Pi without internet installs.")
+@click.command(short_help="Collect the packages for a Pi without internet.")
 @click.argument("folder", type=FILE, default="wheels")
 @click.option("--python", "pythons", multiple=True, help="A Pi's Python [default: 3.11 and 3.13].")
 @click.option("--only-rover", is_flag=True, help="Only rover_lib's own wheel: Pis with internet fetch the others.")
 @click.option("--engine", type=click.Choice(["torch", "onnxruntime"]), default="torch", show_default=True)
 def wheelhouse(folder: Path, pythons: tuple[str, ...], only_rover: bool, engine: str) -> None:
-    """Put all that a Pi installs into FOLDER, for a rover without internet (154 MB for each Python)."""
+    """Download all packages that a Pi installs into FOLDER, for a rover without internet (154 MB per Python)."""
     from rover_lib.workshop.wheelhouse import PYTHONS, make
 
     show(vars(make(folder, pythons=pythons or PYTHONS, only_rover=only_rover, engine=engine)), True)

@@ -20,7 +20,7 @@ def world() -> None:
 
 @world.command(short_help="Record drives of an expert.")
 @click.argument("out_dir", type=FILE)
-@click.option("--count", type=click.IntRange(min=1), default=80, show_default=True, help="Episodes.")
+@click.option("--count", type=click.IntRange(min=1), default=80, show_default=True, help="Number of episodes.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 def record(out_dir: Path, count: int, seed: int) -> None:
     """Record COUNT drives of the expert to OUT_DIR, in the format of the real car's recorder."""
@@ -33,7 +33,11 @@ def record(out_dir: Path, count: int, seed: int) -> None:
 @click.argument("episodes", type=PathTo("recordings"))
 @click.argument("output", type=Output("checkpoint"))
 @click.option(
-    "--size", type=click.Choice(["small", "full"]), default="small", show_default=True, help="full: the real car's."
+    "--size",
+    type=click.Choice(["small", "full"]),
+    default="small",
+    show_default=True,
+    help="full is the size of the real car's policy.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps [default: the recipe's].")
@@ -108,7 +112,11 @@ def _anew(file: Path) -> Iterator[None]:
 @click.argument("student_runs", type=PathTo("run"), nargs=-1, required=True)
 @click.option("--episodes", type=FILE, help="Recordings to judge with [default: those of TEACHER_RUN].")
 @click.option(
-    "--worlds", type=click.IntRange(min=0), default=200, show_default=True, help="0 for a real car's policy: no drives."
+    "--worlds",
+    type=click.IntRange(min=0),
+    default=200,
+    show_default=True,
+    help="Worlds to drive in; 0 for a real car's policy.",
 )
 @AS_JSON
 def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, **options: Any) -> None:
@@ -133,7 +141,7 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
 
 @world.command(short_help="Drive, correct, learn: does it drive better?")
 @click.argument("run_dir", type=PathTo("run"))
-@click.option("--out", type=FILE, help="For what it records and learns [default: <RUN_DIR>-learn].")
+@click.option("--out", type=FILE, help="Folder for recordings and policies [default: <RUN_DIR>-learn].")
 @click.option("--rounds", type=click.IntRange(min=1), default=3, show_default=True)
 @click.option("--drives", type=click.IntRange(min=1), default=20, show_default=True, help="Drives in each round.")
 @click.option(
@@ -141,9 +149,9 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
     type=click.IntRange(min=1),
     default=200,
     show_default=True,
-    help="Pushed worlds that judge, and half as many left alone.",
+    help="Worlds to judge in when pushed; half as many left alone.",
 )
-@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of each learning [default: params.yml].")
+@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps per training [default: params.yml].")
 @AS_JSON
 def learn(run_dir: Path, out: Path | None, worlds: int, as_json: bool, **options: Any) -> None:
     """Let the policy in RUN_DIR drive while an expert takes over where a human would, and learn on from that.

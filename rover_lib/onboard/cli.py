@@ -25,7 +25,7 @@ LONG_LIST = 12  # longer ones are for programs
 BUSY = 0.5  # load per core, of the last minute, beside which a time is no measurement
 # Of every command that works with the car:
 CAMERA = click.option(
-    "--camera", default="0", show_default=True, help="Number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
+    "--camera", default="0", show_default=True, help="A number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
 )
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's serial port.")
@@ -172,7 +172,7 @@ VERSION = click.option(
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
 @VERSION
 def main(debug: bool) -> None:
-    """Drive a car by a learned policy: what works on the rover. A workstation's `rover` knows more commands."""
+    """Drive a car with a learned policy. These commands work on the rover; on a workstation, `rover` has more."""
 
 
 def drive_options(command: Callable) -> Callable:
@@ -194,7 +194,7 @@ DRIVE_OPTIONS = (
     CAMERA,
     PORT,
     click.option("--hz", type=Number(10, 100), default=30.0, show_default=True, help="Commands a second."),
-    click.option("--dry-run", is_flag=True, help="No Arduino, no motor: logs what would be sent."),
+    click.option("--dry-run", is_flag=True, help="Use no Arduino; only log what would be sent."),
     click.option("--record", type=FILE, help="Write the drive as an episode into this folder."),
     click.option("--record-mb", type=Number(min=1), help="At most this many megabytes in that folder."),
     click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive."),
@@ -202,12 +202,12 @@ DRIVE_OPTIONS = (
     click.option(
         "--throttle-limit",
         type=Number(0, 1),
-        help="Most throttle [default: params.yml; with --replay: none].",
+        help="Largest throttle [default: params.yml; with --replay: none].",
     ),
     click.option(
         "--blend-ticks",
         type=click.IntRange(min=0),
-        help="Commands in which a fresh plan takes over [default: params.yml].",
+        help="Commands over which a new plan replaces the old one [default: params.yml].",
     ),
     click.option("--ensemble", type=float, help="LeRobot's temporal ensembling with this coefficient, such as 0.01."),
     click.option("--threads", type=click.IntRange(min=1), help="Threads of the policy [default: all cores but one]."),
@@ -222,16 +222,18 @@ DRIVE_OPTIONS = (
         "json_file",
         type=click.File("w", lazy=True),
         callback=_spares,
-        help="Write a summary of the drive there; - prints it.",
+        help="Write a summary of the drive to this file; - prints it.",
     ),
     click.option("--replay", type=PathTo("recordings"), help="Send this episode's pulses; no policy, no camera."),
     click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder, FIFO or .mjpeg."),
-    click.option("--view", type=FILE, help="Socket of the view that shows it [default: that of your `rover view`]."),
-    click.option("--service", is_flag=True, help="As a systemd service: disarmed until `rover arm-car`."),
+    click.option(
+        "--view", type=FILE, help="Socket of the view that shows the drive [default: that of your `rover view`]."
+    ),
+    click.option("--service", is_flag=True, help="Run as a systemd service, disarmed until `rover arm-car`."),
 )
 
 
-@main.command(short_help="Drive a car by an artifact.")
+@main.command(short_help="Drive a car with an artifact.")
 @drive_options
 @click.pass_context
 def drive(ctx: click.Context, **options: Any) -> None:
@@ -284,7 +286,7 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
 @PORT
 @click.option("--hz", type=Number(5, 50), default=30.0, show_default=True, help="Controls and frames a second.")
 @click.option("--max-seconds", type=SECONDS, help="Longest duration of an episode.")
-@click.option("--label", default="", help='What is done in them, such as "hit red balloon".')
+@click.option("--label", default="", help='What the episodes show, such as "hit red balloon".')
 @click.option(
     "--episodes",
     type=click.IntRange(min=1),
@@ -325,22 +327,21 @@ def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
     click.echo(f"{len(episodes)} labelled: {outcome}")
 
 
-@main.command(short_help="Look at all that driving needs; say what to do.")
+@main.command(short_help="Check all that driving needs; say what to do.")
 @click.argument("artifact", type=ARTIFACT, required=False)
 @CAMERA
 @PORT
-@click.option("--hz", type=Number(1, 120), default=30.0, show_default=True, help="Frames a second wanted.")
-@click.option("--receiver", is_flag=True, help="Lead a human, with the transmitter in hand, through its receiver only.")
+@click.option("--hz", type=Number(1, 120), default=30.0, show_default=True, help="Required frames per second.")
+@click.option("--receiver", is_flag=True, help="Only test the receiver, with a human at the transmitter.")
 @AS_JSON
 @click.pass_context
 def doctor(
     ctx: click.Context, artifact: Path | None, camera: str, port: str, hz: float, receiver: bool, as_json: bool
 ) -> None:
-    """Look at all that driving needs: camera, Arduino, ARTIFACT, power, disk. Say what to do.
+    """Check all that driving needs (camera, Arduino, ARTIFACT, power, disk), and say what to do.
 
-    Nothing is armed, and no servo is moved but by the transmitter. Exit code 1 if anything fails that driving cannot do
-    without; warnings do not count. With --receiver it asks for a stick to be moved and the transmitter to be switched
-    off: do that once.
+    Nothing is armed, and only the transmitter can move a servo. Exit code 1 if anything that driving needs fails;
+    warnings do not count. With --receiver it asks you to move a stick and to switch the transmitter off: do that once.
     """
     from rover_lib.onboard import doctor as checking
     from rover_lib.onboard.host import default_log
@@ -367,10 +368,10 @@ def doctor(
 @click.option("--output", type=FILE, help="The file [default: where the other commands look for car.yml].")
 @click.option("--name", default="my car", show_default=True, help="What to call the car.")
 @click.option(
-    "--field-of-view-deg", type=float, help="What the camera sees, from left to right [default: the balloon world's]."
+    "--field-of-view-deg", type=float, help="The camera's horizontal field of view [default: the balloon world's]."
 )
-@click.option("--wheelbase-m", type=float, help="From axle to axle [default: the balloon world's].")
-@click.option("--force", is_flag=True, help="Replace a file that is there.")
+@click.option("--wheelbase-m", type=float, help="Distance between the axles [default: the balloon world's].")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
 def calibrate(
     port: str,
     output: Path | None,
@@ -379,7 +380,7 @@ def calibrate(
     wheelbase_m: float | None,
     force: bool,
 ) -> None:
-    """Lead a human, with the transmitter in hand, through both sticks, and write what was measured as car.yml.
+    """Guide a human with the transmitter through both sticks, measure the pulses, and write them as car.yml.
 
     Recorder, drive, doctor and the balloon world read it from then on, and the Arduino is told it. Take the wheels off
     the ground and unplug the motor first. Ctrl-C leaves everything as it was.
@@ -425,14 +426,14 @@ def describe_artifact(file: Path) -> dict[str, Any]:
     return {"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}
 
 
-@main.command(short_help="Take the time of artifacts on this machine.")
+@main.command(short_help="Time artifacts on this machine.")
 @click.argument("artifacts", type=ARTIFACT, nargs=-1, required=True)
 @click.option("--warmup", type=click.IntRange(min=0), default=10, show_default=True)
 @click.option("--iterations", type=click.IntRange(min=1), default=100, show_default=True)
 @click.option("--threads", type=click.IntRange(min=0), default=0, show_default=True, help="0: all cores.")
 @click.option("--duration", type=SECONDS, help="Soak for this many seconds instead, with a time series.")
-@click.option("--output", type=Output("stage"), help="Write benchmark JSON there, for notebook 05.")
-@click.option("--gates", is_flag=True, help="Hold the first artifact against the original's gates in params.yml.")
+@click.option("--output", type=Output("stage"), help="Write the benchmark to this JSON file, for notebook 05.")
+@click.option("--gates", is_flag=True, help="Check the first artifact against the original limits in params.yml.")
 @AS_JSON
 def benchmark(
     artifacts: tuple[Path, ...],
@@ -487,10 +488,10 @@ def benchmark(
         click.echo(f"{row['gate']:<20} {found:>8}  promised {row['limit']}: {passed}")
 
 
-@main.command("arm-car", short_help="Arm the car: its service drives at once.")
-@click.option("--yes", is_flag=True, help="Do not ask.")
+@main.command("arm-car", short_help="Arm the car; its service then drives at once.")
+@click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @click.option(
-    "--model", default="", help="Content hash of the model that is meant; with another, the car is not armed."
+    "--model", default="", help="Content hash that the loaded model must have; otherwise the car is not armed."
 )
 @click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive [default: the service's].")
 @click.option("--heartbeat-s", type=SECONDS, help="End the drive when no `rover heartbeat` comes for this long.")
@@ -499,10 +500,10 @@ def benchmark(
     type=Number(min=0),
     default=60,
     show_default=True,
-    help="How long to wait for what arming needs of a human.",
+    help="How long to wait for the human's part of arming.",
 )
 def arm_car(yes: bool, model: str, max_seconds: float | None, heartbeat_s: float | None, wait_s: float) -> None:
-    """Arm the car whose service waits for it (rover-drive.service): it drives at once. Needs root.
+    """Arm the car, whose service (rover-drive.service) then drives at once. Needs root.
 
     Says what the Arduino still wants, and waits for it: the transmitter switched on, its throttle stick at rest, its
     steering stick just wiggled. Moving a stick takes the car back; `sudo systemctl restart rover-drive` disarms it.
@@ -527,7 +528,7 @@ def heartbeat() -> None:
     click.echo(ask_service(ask="heartbeat")["text"])
 
 
-@main.group(short_help="The models on a rover: stage, switch, roll back.")
+@main.group(short_help="Manage a rover's models: stage, switch, roll back.")
 @click.option("--models", type=FILE, default="/var/lib/rover/models", show_default=True, help="The rover's models.")
 @click.option("--chunk", type=click.IntRange(min=1), default=32, show_default=True, help="Actions in a plan.")
 @click.option("--camera", default="cam_front", show_default=True, help="The policy's name for this rover's camera.")
@@ -538,13 +539,13 @@ def heartbeat() -> None:
     show_default=True,
     help="Width of its pictures divided by their height.",
 )
-@click.option("--signers", type=FILE, help="Whose artifacts it takes [default: /etc/rover/allowed_signers].")
+@click.option("--signers", type=FILE, help="Keys whose artifacts are accepted [default: /etc/rover/allowed_signers].")
 @click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
 @click.pass_context
 def release(
     ctx: click.Context, models: Path, chunk: int, camera: str, aspect: float, signers: Path | None, sandboxed: bool
 ) -> None:
-    """Models on the rover: staged, proven, used; what is in use changes at once or not at all.
+    """Manage the rover's models: stage them, verify them, use them. A switch happens completely or not at all.
 
     `ansible-playbook ansible/deploy.yml` does all of it over a network.
     """
@@ -562,36 +563,38 @@ ALLOW = click.option(
 )
 
 
-@release.command(short_help="Cut an artifact into parts that travel one by one.")
+@release.command(short_help="Split an artifact into parts for the transfer.")
 @click.argument("artifact", type=ARTIFACT)
 @click.argument("folder", type=FILE)
 @click.option("--sign-key", type=FILE, help="The ssh key that logs in to the rover, to sign with.")
 @ALLOW
 @click.pass_obj
 def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, allow: tuple[str, ...]) -> None:
-    """Cut ARTIFACT into parts that travel one by one, in FOLDER. Refuses what the rover would refuse."""
+    """Split ARTIFACT into parts for the transfer, in FOLDER. Refuses what the rover would refuse."""
     from rover_lib.onboard.release import pack as pack_parts
 
     show(pack_parts(artifact, folder, releases.expected, allow, sign_key), True)
 
 
-@release.command(short_help="Make a release of an artifact; use stays as it is.")
+@release.command(short_help="Make a release of an artifact without using it.")
 @click.argument("source", type=FILE)
 @click.option("--sha256", help="The SHA-256 that the artifact must have.")
-@click.option("--unsigned", is_flag=True, help="Take it without the signature of a laptop that this rover knows.")
+@click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")
 @ALLOW
 @click.pass_obj
 def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow: tuple[str, ...]) -> None:
-    """Make a release of SOURCE, an artifact or what `pack` wrote. What is in use stays in use."""
+    """Make a release of SOURCE, an artifact or what `pack` wrote. The release in use stays in use."""
     show(vars(releases.stage(source, sha256=sha256, allow=allow, unsigned=unsigned)), True)
 
 
-@release.command(short_help="Prove that a release computes what it should.")
+@release.command(short_help="Verify that a release computes what it should.")
 @click.argument("name", default="current")
-@click.option("--confined", is_flag=True, help="Give up first what an inference does not need, as rover-check@ does.")
+@click.option(
+    "--confined", is_flag=True, help="First drop all rights that an inference does not need, as rover-check@ does."
+)
 @click.pass_obj
 def verify(releases: Any, name: str, confined: bool) -> None:
-    """Prove that a release is whole and computes here what it should: checksums and parity vectors."""
+    """Verify that a release is complete and computes here what it should, by checksums and parity vectors."""
     if confined and (path := releases.path_of(name)).exists():
         from rover_lib.onboard.confine import confine, memory_mb
         from rover_lib.onboard.policy import import_engine
@@ -607,31 +610,31 @@ def verify(releases: Any, name: str, confined: bool) -> None:
 @click.argument("name")
 @click.pass_obj
 def switch(releases: Any, name: str) -> None:
-    """Use the release NAME from now on: proven before and after, and back by itself if that fails."""
+    """Use the release NAME from now on. It is verified before and after; if that fails, the old one is used again."""
     show({"name": name, "changed": releases.switch(name)}, True)
 
 
-@release.command(short_help="Use the release before the one in use.")
+@release.command(short_help="Go back to the release before the one in use.")
 @click.pass_obj
 def rollback(releases: Any) -> None:
-    """Use the release before the one in use, the newest that can be proven."""
+    """Go back to the newest earlier release that can be verified."""
     show({"name": releases.rollback(), "changed": True}, True)
 
 
-@release.command(short_help="Remove all but the releases used last.")
+@release.command(short_help="Remove all but the latest releases.")
 @click.option("--keep", type=click.IntRange(min=1), default=3, show_default=True)
 @click.pass_obj
 def prune(releases: Any, keep: int) -> None:
-    """Remove all but the releases used last; never the one in use."""
+    """Remove all releases but those used last; never the one in use."""
     removed = releases.prune(keep)
     show({"removed": removed, "changed": bool(removed)}, True)
 
 
-@release.command(short_help="What is in use, and whether it is whole.")
+@release.command(short_help="Show the release in use, and whether it is intact.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, with the machine's and the service's state.")
 @click.pass_obj
 def status(releases: Any, as_json: bool) -> None:
-    """What is in use, whether it is whole, what else is there. Exit code 1 if what is in use is not whole."""
+    """Show the release in use, whether it is intact, and the others. Exit code 1 if the one in use is damaged."""
     report = releases.status()
     if as_json:
         import socket
@@ -666,16 +669,18 @@ VIEW_OPTIONS = (
     click.option(
         "--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="Port of the page; 0: any."
     ),
-    click.option("--interface", default="", help="A network that may open it too, such as wlan0 [default: none]."),
     click.option(
-        "--token-file", type=FILE, help="File with the token that the URL must have [default: a new one, printed]."
+        "--interface", default="", help="A network that may open the page too, such as wlan0 [default: none]."
+    ),
+    click.option(
+        "--token-file", type=FILE, help="File with the token that the URL must contain [default: a new token, printed]."
     ),
     click.option("--feed", type=FILE, help="Socket to which drives connect [default: that of your `rover drive`]."),
-    click.option("--drive-user", help="A user whose drives it shows, beside your own."),
+    click.option("--drive-user", help="Another user whose drives are shown, besides yours."),
 )
 
 
-@main.command(short_help="Show a drive in the browser; it can be stopped there.")
+@main.command(short_help="Show a drive in the browser, with a stop button.")
 @view_options
 def view(**options: Any) -> None:
     """Show the drive of this machine in a browser: its picture, its plan, what the pins do. A drive may come and go.
@@ -714,12 +719,12 @@ def open_view(
     asyncio.run(view.run(tell, replay))
 
 
-@main.command(short_help="Sum up a flight log.")
+@main.command(short_help="Summarize a flight log.")
 @click.argument("file", type=PathTo("flight log"))
 @LOG_DRIVE
 @AS_JSON
 def log(file: Path, drive: int, as_json: bool) -> None:
-    """Sum up the flight log FILE of `rover drive`. A workstation's `rover log` draws it too.
+    """Summarize the flight log FILE of `rover drive`. A workstation's `rover log` draws it too.
 
     Missed ticks, jitter, ages and latencies of plans, who drove, temperature, and what happened. Older parts of the
     same log (FILE.1, FILE.2, ...) are read with it.

@@ -25,8 +25,8 @@ LATER = ("arm", "distill")  # that `make arm` and `rover world students` add to 
 PAGE = "report.html"
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
-    "04_worst_frames": "The frames on which static INT8 is furthest from FP32",
-    "03_sensitivity": "Which block takes how much of the error",
+    "04_worst_frames": "The frames on which static INT8 differs most from FP32",
+    "03_sensitivity": "How much of the error each block causes",
     "04_hits": "Balloons hit, by mode",
     "05_latency": "How long a plan takes, by mode",
 }
@@ -130,7 +130,7 @@ def text(judged: Mapping[str, Any]) -> str:
         for row in judged["failed"]:
             lines += [f"  {against(row)}", *(f"    - {remedy}" for remedy in row["remedies"])]
     if judged["cautions"]:
-        lines += ["", "To know:", *(f"  {line}" for line in judged["cautions"])]
+        lines += ["", "Keep in mind:", *(f"  {line}" for line in judged["cautions"])]
     lines += ["", "Next:", *(f"  {step['command']}\n      {step['why']}" for step in judged["next"])]
     return "\n".join(lines)
 
@@ -174,18 +174,18 @@ def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) ->
     parts = [
         f"<h1>{escape(title)}</h1>",
         f'<div class="{kind}">{_paragraphs(judged["why"])}</div>',
-        "<h2>The modes beside each other</h2>",
+        "<h2>The modes compared</h2>",
         _html_table(judged),
         _list([f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]),
-        f"<small>Errors are mean differences to FP32, of the recorded range. Speed: {escape(judged['timing'])}, on "
-        f"{escape(judged['host'])}.</small>",
+        f"<small>Errors are mean differences from FP32, in percent of the recorded range. "
+        f"Speed: {escape(judged['timing'])}, on {escape(judged['host'])}.</small>",
     ]
     if judged["failed"]:
         parts.append("<h2>What failed, and what to do</h2>")
     for row in judged["failed"]:
         parts += [f"<p><b>{escape(against(row))}</b></p>", _list(row["remedies"])]
     if judged["cautions"]:
-        parts += ["<h2>To know</h2>", _list(judged["cautions"])]
+        parts += ["<h2>Keep in mind</h2>", _list(judged["cautions"])]
     steps = "".join(f"<li><code>{escape(s['command'])}</code><br>{escape(s['why'])}</li>" for s in judged["next"])
     parts += ["<h2>Next</h2>", f"<ol>{steps}</ol>"]
     for figure, caption in FIGURES.items():

@@ -1,10 +1,9 @@
-"""The pages' tables: of results, from the JSON in results/, and of the notebooks' parameters, from the notebooks. What
-is in them is written by this, and by nobody's hand.
+"""Writes the tables in the pages: results from the JSON in results/, parameters from the notebooks.
 
     python -m rover_lib.workshop.tables        # what `make tables` does
 
 A table stands in README.md or in a page of docs/ between `<!-- table NAME, by make tables -->` and `<!-- end -->`, each
-once. A field without its JSON is empty; a row of which nothing was measured, as a count that was not made, is left out.
+once. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is left out.
 """
 
 import re
@@ -83,20 +82,20 @@ def _demo(root: Path) -> list[Row]:
         return f"{steering} / {throttle}" if steering and throttle else None
 
     low, high = (f"{fp32['trials'] * fp32[f'hits_wilson_{end}']:.1f}".removesuffix(".0") for end in ("low", "high"))
-    of = f"of {fp32['trials']} (95 % interval of FP32's {low} to {high})"
+    worlds = f"in {fp32['trials']} worlds (95 % interval for FP32: {low} to {high})"
     rows = [
         row("artifact, MB", lambda mode: _of(modes[mode], "size_mb", ".1f")),
-        row(f"balloons hit, {of}", lambda mode: _of(modes[mode], "hits", "d")),
+        row(f"balloons hit {worlds}", lambda mode: _of(modes[mode], "hits", "d")),
         row("steering error, % of the recorded range", error("steering")),
         row("throttle error, % of the recorded range", error("throttle")),
-        row("the same in microseconds of pulse (an Arduino resolves 4)", microseconds),
-        row("times as fast as LeRobot's eager FP32, by p50", lambda mode: _of(timed[mode], "speedup", ".1f")),
+        row("both errors in microseconds of servo pulse (the Arduino resolves 4)", microseconds),
+        row("speed-up over LeRobot's eager FP32, by medians", lambda mode: _of(timed[mode], "speedup", ".1f")),
         row(
-            "instructions of an inference, 10^9, *counted on an emulated Cortex-A76* (`make arm NAME=demo`)",
+            "instructions per inference, 10^9, *counted on an emulated Cortex-A76* (`make arm NAME=demo`)",
             lambda mode: _of(counted.get(f"policy_{mode}", {}), "instructions_g", ".3f"),
         ),
         row(
-            "time that a Pi 5 cannot beat, ms, *computed*",
+            "lower bound for a plan on a Pi 5, ms, *computed*",
             lambda mode: _of(timed[mode], "floor_ms", ".1f") if mode in ("fp32", BEST) else None,
         ),
     ]
@@ -115,14 +114,17 @@ def _faults(root: Path) -> list[Row]:
     return [
         ("what", "figure"),
         (
-            "faults in a driving car that end in a stopped car, from the fault to throttle off",
+            "faults that must stop a driving car: stopped; time from the fault to throttle off",
             f"{right('stopped')}, at most {worst:.0f} ms",
         ),
-        ("faults that are ridden through, or until the plan's age stops the car", right("continues")),
-        ("faults from before the start, with which the car is never armed", right("refused")),
-        ("human takes over by a stick, until the pins are the human's", f"at most {takeover:.0f} ms, by design 46"),
-        ("pulses recorded, replayed and measured again", f"within {report['bytes']['worst_us']:.0f} us"),
-        ("drives with random faults in virtual time that broke a rule of safety", _random(root)),
+        ("faults that must not stop it before the plan is too old: handled", right("continues")),
+        ("faults before the start that must keep it from being armed: not armed", right("refused")),
+        ("human moves a stick: time until the pins follow the human", f"at most {takeover:.0f} ms; designed for 46"),
+        (
+            "pulses that were recorded, replayed and measured again: difference",
+            f"within {report['bytes']['worst_us']:.0f} us",
+        ),
+        ("drives with random faults in virtual time that broke a safety rule", _random(root)),
         *_view(root),
     ]
 
@@ -131,16 +133,16 @@ def _view(root: Path) -> list[Row]:
     """What a view does to a drive; `python -m lab view`."""
     report = _metrics(root / "results" / "lab", "view")
     stop, late = report["stop"], report["late_ms"]
-    cost = f"{late['with']['p99']:.2f} ms late at p99, {late['without']['p99']:.2f} without a view, in turns"
+    cost = f"{late['with']['p99']:.2f} ms at p99; {late['without']['p99']:.2f} without a view, measured in turns"
     picture = f"{report['pictures_hz']:.0f} a second, {report['delay_ms']['p95']:.0f} ms old at p95"
     return [
         (
-            "the car is stopped by the button of a page, from the click to throttle off",
+            "stop button of the view: drives stopped; time from the click to throttle off",
             f"{stop['stopped']} of {stop['stops']}, at most {stop['stop_ms']['max']:.0f} ms",
         ),
-        (f"the loop's commands while a view has {report['pages']} open pages", cost),
-        ("the view's pictures", picture),
-        ("the view's share of a core", f"{report['cpu_pct']:.1f} %"),
+        (f"lateness of the loop's commands while {report['pages']} pages of the view are open", cost),
+        ("pictures in the view", picture),
+        ("processor time of the view, share of one core", f"{report['cpu_pct']:.1f} %"),
     ]
 
 
@@ -188,22 +190,25 @@ def _students(run: str, root: Path) -> list[Row]:
         )
 
     counted = "10^9 instructions (SIMD), *counted*", "ms on a Pi 5, *computed*"
-    driven = "hits left alone", "pushed, and as late"
-    return [("", "MB", *counted, *driven, f"{' / '.join(actions)} error to the recordings, %"), *map(row, rows)]
+    driven = "balloons hit, left alone", "balloons hit, pushed, with its computed latency"
+    return [("", "MB", *counted, *driven, f"{' / '.join(actions)} error against the recordings, %"), *map(row, rows)]
 
 
 def _learning(root: Path) -> list[Row]:
     """The demo's policy before and after learning on, from corrections and from demonstrations."""
     policies = _metrics(root / "results" / "demo", "learn")["policies"]
     conditions = [key for key, value in policies[0].items() if isinstance(value, dict)]
-    words = {"alone": "left alone", "decoy": "beside a red thing that is no balloon"}
+    words = {"alone": "left alone", "decoy": "beside a red decoy"}
 
     def row(policy: Mapping[str, Any]) -> Row:
         name = policy["arm"] + (f", round {policy['round']}" if policy["round"] else "")
         hits = (f"{policy[how]['hits']} of {policy[how]['trials']}" for how in conditions)
         return (name, f"{policy['human_s']:.0f}", *hits)
 
-    return [("", "human seconds", *(words.get(how, how) for how in conditions)), *map(row, policies)]
+    return [
+        ("policy", "seconds of human driving", *(f"hits, {words.get(how, how)}" for how in conditions)),
+        *map(row, policies),
+    ]
 
 
 def _parameters(root: Path) -> list[Row]:
@@ -212,7 +217,7 @@ def _parameters(root: Path) -> list[Row]:
     for path in sorted((root / "notebooks").glob("*.ipynb")):
         for name, default, why in parameters_in(path):
             rows.append((f"[{path.stem}](../notebooks/{path.name})", f"`{name}`", f"`{default}`", why))
-    return [("notebook", "parameter", "if it is not given", "what it is"), *rows]
+    return [("notebook", "parameter", "default", "meaning"), *rows]
 
 
 TABLES: dict[str, Callable[[Path], list[Row]]] = {

@@ -245,8 +245,8 @@ def _failed(
     trained = gate("fp32 hits", hits, ">=", limits["fp32_hits"])
     if trained["passed"] is False:
         remedies = [
-            "No other format heals this: train longer, on more recordings.",
-            "Record drives in which the car is off its way and is steered back, so that it learns to.",
+            "No other format can fix this: train longer, on more recordings.",
+            "Record drives in which the car has left its way and is steered back, so that the policy learns it.",
         ]
         failed.append(_said(trained) | {"remedies": remedies})
     for row in rows[GATED]["missed_gates"] if GATED in rows else []:
@@ -255,7 +255,7 @@ def _failed(
     floor = gate(f"{GATED} floor_ms", rows.get(GATED, {}).get("floor_ms"), "<=", promised)
     if floor["passed"] is False:
         remedies = [
-            "Driving at 30 Hz does not need it, as one plan is a second of driving; no program can change it.",
+            "Driving at 30 Hz does not need it: one plan covers a second. No program can make this policy faster.",
             f"A smaller policy can: `{_smaller(stages, names)}`.",
         ]
         failed.append(_said(floor) | {"remedies": remedies})
@@ -271,7 +271,7 @@ def _remedies(
 ) -> list[str]:
     """What to do about a gate that static INT8 does not keep, the cheapest first."""
     if key in ("size_mb", "model_size_mb"):
-        return [f"INT8 has done what it can; a smaller policy is smaller: `{_smaller(stages, names)}`."]
+        return [f"INT8 cannot make it smaller; a smaller policy can: `{_smaller(stages, names)}`."]
     action = key.removesuffix("_mae_pct") if key.endswith("_mae_pct") else None
     remedies = [
         _of_mixed(params, rows),
@@ -281,11 +281,11 @@ def _remedies(
         remedies.append(f"Most of it comes from {block[0]}: {block[1]:.2f} % with that alone in INT8 (notebook 03).")
     if clipped := _clipped(stages["quantize"], params):
         remedies.append(
-            f"Calibration did not show {clipped} all that came later: record more of what calibration lacked, "
-            "other light, other places, sharper turns."
+            f"{clipped} met larger values than in calibration: record more of what was missing there, such as other "
+            "light, other places, sharper turns."
         )
     if action and (worst := _worst_episodes(stages["compare"], action)):
-        remedies.append(f"Record more drives like {worst}, on whose frames it is worst (notebook 04 shows them).")
+        remedies.append(f"Record more drives like {worst}, where the error is largest (notebook 04 shows the frames).")
     return remedies
 
 
@@ -293,12 +293,12 @@ def _of_mixed(params: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]]) 
     mixed = rows.get("mixed")
     if mixed is None or not mixed["float_blocks"]:
         most = params["quantization"]["mixed_max_cost_pct"]
-        return f"Mixed could leave no block in float for {most:g} % of cost: raise mixed_max_cost_pct in params.yml."
+        return f"Mixed can leave no block in float within a cost of {most:g} %: raise mixed_max_cost_pct in params.yml."
     blocks = ", ".join(mixed["float_blocks"])
     if mixed["missed_gates"]:
         missed = ", ".join(row["words"] for row in mixed["missed_gates"])
-        return f"Mixed does not heal it: it leaves {blocks} in float, and still misses: {missed}."
-    return f"Mixed heals it: it leaves {blocks} in float, and its error is {error_pct(mixed):.2f} % at most."
+        return f"Mixed does not fix it: it leaves {blocks} in float, and still misses: {missed}."
+    return f"Mixed fixes it: it leaves {blocks} in float, and its largest error is {error_pct(mixed):.2f} %."
 
 
 def _worst_block(sensitivity: Mapping[str, Mapping[str, float | None]], action: str) -> tuple[str, float] | None:
@@ -365,11 +365,11 @@ def _does_not_drive(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list
 def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
     """Why this one, each reason a sentence."""
     if best is fp32:
-        return ["No INT8 mode keeps every gate and is worth what it costs: FP32 is what was trained."]
+        return ["No INT8 mode keeps every gate and is worth its cost, so this is FP32, the policy as it was trained."]
     errors = [f"{action} {judge.shown_pct(e).strip()}" for action, e in best["errors_pct"].items()]
-    lines = [f"It keeps every gate: against FP32 it is off by {', '.join(errors)} of the recorded range."]
+    lines = [f"It keeps every gate: it differs from FP32 by {', '.join(errors)} of the recorded range."]
     if best["trials"]:
-        lines.append(f"It hits {best['hits']} of {best['trials']} balloons, FP32 {fp32['hits']}.")
+        lines.append(f"It hits {best['hits']} of {best['trials']} balloons; FP32 hits {fp32['hits']}.")
     size = f"It has {best['size_mb']:.1f} MB, {best['times_smaller']:.1f} times smaller than FP32"
     if best["instructions_g"] and fp32["instructions_g"]:
         counts = f"{best['instructions_g']:.3g} G instructions instead of {fp32['instructions_g']:.3g}"
@@ -394,7 +394,7 @@ def _because(
     if row["missed_gates"]:
         return "misses " + "; ".join(against(missed) for missed in row["missed_gates"])
     if row["mode"] == "mixed" and not row["float_blocks"]:
-        return "is static INT8 once more: no block had to stay in float"
+        return "is the same as static INT8: no block had to stay in float"
     key = _work_key([row, best])
     other = CALLED[best["mode"]]
     if key and row[key] > best[key] * (1 + limits["worth_pct"] / 100):
@@ -407,8 +407,8 @@ def _because(
         )
         return how.format(times, other) + larger + truer
     if error_pct(row) > error_pct(best) + limits["better_points"]:
-        return f"is no faster than {other}, and {error_pct(row):.2f} % off"
-    return f"is no better than {other}: as fast, as true and no smaller"
+        return f"is no faster than {other}, and its error is {error_pct(row):.2f} %"
+    return f"is no better than {other}: as fast, as accurate and no smaller"
 
 
 def against(row: Mapping[str, Any]) -> str:
@@ -427,30 +427,31 @@ def _cautions(
     lines = [f"Do not drive before this is clear: {warning.removesuffix('?')}." for warning in unfit]
     shared = set(split["held_out"]) & set(split["calibration"])
     if shared or len(split["held_out"]) < params["verdict"]["held_out_episodes"]:
-        alone = ", which calibrated too" if shared else ""
+        alone = ", which were also used to calibrate" if shared else ""
         lines.append(
             f"Judged on {compared['frames']} frames of {count(len(split['held_out']), 'episode')}{alone}: too few to "
             "be sure. Record some 20 drives more, in other light and places."
         )
     if not compared["fp32"]["trials"]:
         lines.append(
-            "Nobody drove: judged by errors on recordings alone. The first metres are the test; hold the stick."
+            "Nobody drove: only errors on recordings were judged. The first metres are the test, so hold the stick."
         )
     lines += [f"{warning}." for warning in (*compared.get("warnings", []), *stages["quantize"].get("warnings", []))]
     if _timing(rows) == "measured here":
         lines.append(
-            "The times are this machine's, and modes may stand in another order on a Pi: `ansible/benchmark.yml` takes "
-            "them there."
+            "The times are this machine's; on a Pi another mode may be fastest: `ansible/benchmark.yml` measures it."
         )
     if how := _busy(stages["benchmark"], params["verdict"]):
         least = _time_key(stages["benchmark"], params["verdict"]) == "latency_min_ms"
         judged = "the least time of each mode is compared, and " if least else ""
-        lines.append(f"This machine was busy when it took the times ({how}): {judged}a quiet one tells them better.")
+        lines.append(
+            f"This machine was busy when it took the times ({how}): {judged}a quiet machine gives better figures."
+        )
     if best["mode"] == "fp32" and best["floor_ms"]:
         lines.append(f"A plan in FP32 takes a Pi 5 at least {best['floor_ms']:.0f} ms (computed).")
     student = stages.get("distill", {}).get("recommendation", {}).get("name", "teacher")
     if student != "teacher":
-        lines.append(f"A smaller policy may take its place: {student}, by `rover world students`.")
+        lines.append(f"A smaller policy may replace this one: {student}, as `rover world students` found.")
     return lines
 
 
@@ -478,7 +479,7 @@ def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[
         commands.append((_shell("rover", "drive", artifact, "--world", "--max-seconds", "60"), "watch it drive"))
     if not any(row["gate"].startswith(GATED) and not row["gate"].endswith("floor_ms") for row in judged["failed"]):
         commands.append((f"{play}deploy.yml -e {_shell(f'rover_artifact={artifact}')}{allow}", "put it on the rover"))
-        commands.append((f"{play}benchmark.yml", "take its time there"))
+        commands.append((f"{play}benchmark.yml", "measure its time there"))
         commands.append((f"{play}drive.yml --limit rover1", "drive, transmitter in hand"))
     else:
         if deploy == "mixed":

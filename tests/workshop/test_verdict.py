@@ -75,10 +75,10 @@ def test_a_throttle_that_misses_its_gate_is_healed_by_mixed(demo):
     assert failed["words"] == "throttle error of static INT8, % of the recorded range"
     assert (failed["found"], failed["limit"]) == (2.8, 1.0)
     remedies = "\n".join(failed["remedies"])
-    assert "Mixed heals it: it leaves encoder.0.attention in float" in remedies
+    assert "Mixed fixes it: it leaves encoder.0.attention in float" in remedies
     assert "rover distill 'best model.pth' episodes --qat --name mine-qat" in remedies
     assert "Most of it comes from head: 2.50 %" in remedies
-    assert f"did not show {demo['quantize']['layers'][0]['name']}" in remedies
+    assert f"{demo['quantize']['layers'][0]['name']} met larger values" in remedies
     worst = [w["episode"] for w in demo["compare"]["worst"] if (w["mode"], w["action"]) == ("static", "throttle")]
     assert f"Record more drives like {worst[0]}" in remedies
     assert "throttle error" in row(judged, "static")["because"] and "mine-qat" in commands(judged)[2]
