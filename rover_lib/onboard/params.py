@@ -33,12 +33,16 @@ def params() -> dict[str, Any]:
 
 
 def read_params(path: Path | str) -> dict[str, Any]:
-    """The content of one file alone. Raises ParamsError if it is missing, or no YAML mapping."""
+    """The content of one file alone. Raises ParamsError if it is missing or unreadable, or no YAML mapping."""
     try:
         content = yaml.safe_load(Path(path).read_text())
     except FileNotFoundError:
         raise ParamsError(f"{path}: not found", remedy="it came with this package: install that again") from None
-    except yaml.YAMLError as e:
+    except OSError as e:
+        raise ParamsError(f"{path}: cannot be read ({e.strerror})") from None
+    except RecursionError:
+        raise ParamsError(f"{path}: not readable as YAML (it is nested too deeply)") from None
+    except (yaml.YAMLError, ValueError) as e:  # ValueError: other bytes than UTF-8, a date of a thirteenth month
         raise ParamsError(f"{path}: not readable as YAML ({' '.join(str(e).split())})") from None
     if content is None:  # nothing but comments
         return {}
