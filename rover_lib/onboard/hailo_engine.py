@@ -14,6 +14,7 @@ import hailo_platform
 import numpy as np
 
 from rover_lib.onboard.archive import HEF, ONNX, open_archive, read_record
+from rover_lib.onboard.engines import SessionEngine
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.host import usable_cores
 
@@ -21,7 +22,7 @@ TIMEOUT_MS = 1000  # for one inference: some thirty times what one should take
 LARGEST_SIDE = 8192  # of an output
 
 
-class HailoEngine:
+class HailoEngine(SessionEngine):
     """A network on the chip, and the rest of the policy on the processor. Use `load`.
 
     runs: the manifest's "hailo", see `_checked`.
@@ -71,23 +72,13 @@ class HailoEngine:
             raise RuntimeError(f"{type(e).__name__}: {e}") from None
         return y
 
-    def give_back(self) -> bool:
-        """As engines.Engine: nothing is held that could be."""
-        return False
-
-    @property
-    def threads(self) -> int:
-        """As engines.Engine, of what runs on the processor."""
-        return self._threads
-
-    def set_threads(self, threads: int) -> None:
-        """As engines.Engine: a session has its threads for life, so it is made anew. Raises ArtifactError."""
-        self._threads, self._rest = threads, None
+    def _make_session(self, threads: int) -> None:
         if self._rest_model is None:
+            self._rest = None
             return
         from rover_lib.onboard.onnx_engine import session_of  # here, because a whole network on the chip does without
 
-        self._rest = session_of(self._rest_model, threads)
+        self._rest = session_of(self._rest_model, threads, self._path)
 
     def _matched(self, model: Any, streams: list[Any], shapes: dict[str, list[int]]) -> dict[str, str]:
         """HailoRT's name of the stream for each of ours: by its size; where several have it, by the original name."""
