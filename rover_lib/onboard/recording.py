@@ -141,9 +141,15 @@ class EpisodeWriter:
                     f"{self.folder}: is being recorded, or was when its program was killed",
                     remedy=f"name another folder, or delete {temporary.name}",
                 ) from None
-            self._temporary = temporary
-            (temporary / "frames").mkdir()
-            self._rows = {name: (temporary / f"{name}.rows").open("ab", buffering=0) for name in ("control", "frame")}
+        self._temporary = temporary
+        try:
+            with self._disk():
+                (temporary / "frames").mkdir()
+                for name in ("control", "frame"):
+                    self._rows[name] = (temporary / f"{name}.rows").open("ab", buffering=0)
+        except BaseException:
+            self.discard()  # nobody finishes what was never open
+            raise
 
     def control(
         self,

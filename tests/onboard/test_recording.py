@@ -1,6 +1,7 @@
 """An episode's files: the user's format to the byte, whole or not at all, and the controls that come back."""
 
 import csv
+import errno
 import json
 import math
 import os
@@ -33,6 +34,16 @@ def write(folder, controls=3, frames=2, **options):
         for i in range(frames):
             writer.frame(100 + i / 30, FRAME)
     return folder
+
+
+def test_an_episode_that_cannot_be_begun_leaves_nothing(tmp_path, monkeypatch):
+    def full(path, *_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(EpisodeError, match="No space left"):
+        EpisodeWriter(tmp_path / NAME, About()).open()
+    assert not list(tmp_path.iterdir())
 
 
 def test_format_of_a_real_recording_to_the_byte(tmp_path):
