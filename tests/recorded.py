@@ -8,7 +8,7 @@ import pytest
 from policies import smooth_frame
 
 from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.onboard.recording import EpisodeWriter
+from rover_lib.onboard.recording import About, EpisodeWriter
 
 REPO = Path(__file__).resolve().parents[1]
 
@@ -26,7 +26,7 @@ def record_drives(root: Path, drives: int = 4, frames: int = 24) -> Path:
     """Drives whose steering and throttle change, and whose pictures do."""
     rng, pwm = np.random.default_rng(0), PwmCalibration()
     for drive in range(drives):
-        with EpisodeWriter(root / f"episode_{drive}", label="", resolution=(96, 54)) as writer:
+        with EpisodeWriter(root / f"episode_{drive}", About(""), resolution=(96, 54)) as writer:
             for i in range(frames + 6):
                 t_s = i / 30
                 pulses = pwm.pulses(0.5 * math.sin(4 * t_s + drive), 0.05 + 0.04 * math.cos(3 * t_s + drive))

@@ -281,7 +281,7 @@ def read_car(path: Path | str) -> Car:
         raise CarError(f"{path}: not found", remedy="`rover calibrate` writes one")
     try:
         return Car.of(read_params(path), str(path))
-    except (ParamsError, OSError) as error:
+    except ParamsError as error:
         raise CarError(f"{path}: cannot be read ({error})", remedy="`rover calibrate` writes a new one") from None
 
 

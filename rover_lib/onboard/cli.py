@@ -21,6 +21,7 @@ from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
 
 FILE = click.Path(path_type=Path)
 ARTIFACT = PathTo("artifact")
+MOST_THREADS = 256  # torch takes any number, and the process crashes where the system has no more
 LONG_LIST = 12  # longer ones are for programs
 BUSY = 0.5  # load per core, of the last minute, beside which a time is no measurement
 # Of every command that works with the car:
@@ -210,7 +211,9 @@ DRIVE_OPTIONS = (
         help="Commands over which a new plan replaces the old one [default: params.yml].",
     ),
     click.option("--ensemble", type=float, help="LeRobot's temporal ensembling with this coefficient, such as 0.01."),
-    click.option("--threads", type=click.IntRange(min=1), help="Threads of the policy [default: all cores but one]."),
+    click.option(
+        "--threads", type=click.IntRange(1, MOST_THREADS), help="Threads of the policy [default: all cores but one]."
+    ),
     click.option(
         "--log",
         "log_file",
@@ -430,7 +433,7 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 @click.argument("artifacts", type=ARTIFACT, nargs=-1, required=True)
 @click.option("--warmup", type=click.IntRange(min=0), default=10, show_default=True)
 @click.option("--iterations", type=click.IntRange(min=1), default=100, show_default=True)
-@click.option("--threads", type=click.IntRange(min=0), default=0, show_default=True, help="0: all cores.")
+@click.option("--threads", type=click.IntRange(0, MOST_THREADS), default=0, show_default=True, help="0: all cores.")
 @click.option("--duration", type=SECONDS, help="Soak for this many seconds instead, with a time series.")
 @click.option("--output", type=Output("stage"), help="Write the benchmark to this JSON file, for notebook 05.")
 @click.option("--gates", is_flag=True, help="Check the first artifact against the original limits in params.yml.")

@@ -30,7 +30,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Pilot, PolicyPilot, ReplayPilot
 from rover_lib.onboard.plan import Commanded, Settings
 from rover_lib.onboard.recorder import Recorder, room_for
-from rover_lib.onboard.recording import Controls, read_controls, recorded_car
+from rover_lib.onboard.recording import About, Controls, read_controls, recorded_car
 from rover_lib.onboard.service import CHECK_S, NotArmed, Service
 from rover_lib.onboard.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.signal_event import SignalEvent
@@ -417,16 +417,13 @@ class _Arming:
             self._log.event(f"the human is not recorded: {sentence_of(error)}", level=logging.ERROR)
 
     def _new_recorder(self, folder: Path) -> Recorder:
-        return Recorder(
-            folder,
-            self._camera,
-            label=f"driven by {self._mode}",
-            rate_hz=self._options.hz,
+        about = About(
+            f"driven by {self._mode}",
             arduino_port=self._link.port if self._link else "",
             source="rover drive",
             car=self._link.car if self._link else this_car(),
-            most_bytes=self._room,
         )
+        return Recorder(folder, self._camera, about, rate_hz=self._options.hz, most_bytes=self._room)
 
 
 def _first_of(*ends: Callable[[], str | None]) -> Callable[[], str | None]:

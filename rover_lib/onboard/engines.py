@@ -41,6 +41,30 @@ class Engine(Protocol):
         """Compute with that many threads from now on; torch's are those of the whole process."""
 
 
+class SessionEngine:
+    """What engines share whose threads are those of a session of ONNX Runtime, and which hold nothing to give back."""
+
+    _threads: int
+
+    def _make_session(self, threads: int) -> None:
+        """Make the session with that many threads. Raises ArtifactError, and leaves the one that is there then."""
+        raise NotImplementedError
+
+    def give_back(self) -> bool:
+        """As Engine: nothing is held that could be."""
+        return False
+
+    @property
+    def threads(self) -> int:
+        """As Engine, of what runs on the processor."""
+        return self._threads
+
+    def set_threads(self, threads: int) -> None:
+        """As Engine: a session has its threads for life, so it is made anew. Raises ArtifactError."""
+        self._make_session(threads)
+        self._threads = threads
+
+
 def module_of(name: str) -> Any:
     """The engine's module, imported now, which takes seconds: by who limits what may be opened or allocated later.
 

@@ -14,6 +14,7 @@ import hailo_platform
 import numpy as np
 
 from rover_lib.onboard.archive import HEF, ONNX, open_archive, read_record
+from rover_lib.onboard.engines import SessionEngine
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.host import usable_cores
 
@@ -21,7 +22,7 @@ TIMEOUT_MS = 1000  # for one inference: some thirty times what one should take
 LARGEST_SIDE = 8192  # of an output
 
 
-class HailoEngine:
+class HailoEngine(SessionEngine):
     """A network on the chip, and the rest of the policy on the processor. Use `load`.
 
     runs: the manifest's "hailo", see `_checked`.
@@ -71,23 +72,13 @@ class HailoEngine:
             raise RuntimeError(f"{type(e).__name__}: {e}") from None
         return y
 
-    def give_back(self) -> bool:
-        """As engines.Engine: nothing is held that could be."""
-        return False
-
-    @property
-    def threads(self) -> int:
-        """As engines.Engine, of what runs on the processor."""
-        return self._threads
-
-    def set_threads(self, threads: int) -> None:
-        """As engines.Engine: a session has its threads for life, so it is made anew. Raises ArtifactError."""
-        self._threads, self._rest = threads, None
+    def _make_session(self, threads: int) -> None:
         if self._rest_model is None:
+            self._rest = None
             return
         from rover_lib.onboard.onnx_engine import session_of  # here, because a whole network on the chip does without
 
-        self._rest = session_of(self._rest_model, threads)
+        self._rest = session_of(self._rest_model, threads, self._path)
 
     def _matched(self, model: Any, streams: list[Any], shapes: dict[str, list[int]]) -> dict[str, str]:
         """HailoRT's name of the stream for each of ours: by its size; where several have it, by the original name."""
@@ -127,22 +118,28 @@ def load(path: Path, manifest: dict[str, Any], threads: int | None) -> HailoEngi
 
 def _checked(manifest: dict[str, Any], path: Path) -> dict[str, Any]:
     """The manifest's "hailo": {network, outputs: {name: shape}, original_names, state, actions: scale and shift}."""
-    runs = manifest.get("hailo")
+    runs: Any = manifest.get("hailo")
     expected = {f"features_{c['name']}" for c in manifest["cameras"]}
     try:
-        assert isinstance(runs, dict) and runs["network"] in ("backbone", "whole")
-        assert runs["outputs"].keys() == ({"actions"} if runs["network"] == "whole" else expected)
+        _require(isinstance(runs, dict) and runs["network"] in ("backbone", "whole"))
+        _require(runs["outputs"].keys() == ({"actions"} if runs["network"] == "whole" else expected))
         for shape in runs["outputs"].values():
-            assert len(shape) == 3 and all(type(n) is int and 0 < n <= LARGEST_SIDE for n in shape)
-        assert all(isinstance(name, str) for name in runs["original_names"].values())
+            _require(len(shape) == 3 and all(type(n) is int and 0 < n <= LARGEST_SIDE for n in shape))
+        _require(all(isinstance(name, str) for name in runs["original_names"].values()))
         for affine, size in (("state", len(manifest["state_names"])), ("actions", len(manifest["action_names"]))):
             if runs[affine] is not None:
-                assert all(np.array(runs[affine][k], np.float32).shape == (size,) for k in ("scale", "shift"))
-    except (AssertionError, KeyError, TypeError, ValueError, AttributeError):
+                _require(all(np.array(runs[affine][k], np.float32).shape == (size,) for k in ("scale", "shift")))
+    except (KeyError, TypeError, ValueError, AttributeError):
         raise ArtifactError(
             f"{path}: its manifest does not say how its network runs", remedy="pack it again with the kit's compile.py"
         ) from None
     return runs
+
+
+def _require(fact: bool) -> None:
+    """No assert: Python leaves those out when it is told to optimise."""
+    if not fact:
+        raise ValueError
 
 
 def _affine(x: np.ndarray, by: dict[str, list[float]] | None) -> np.ndarray:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from rover_lib.onboard.archive import ONNX, open_archive, read_record
+from rover_lib.onboard.archive import ONNX, nothing_unknown, open_archive, read_record
+from rover_lib.onboard.engines import SessionEngine
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.host import usable_cores
 
@@ -15,8 +16,8 @@ onnxruntime.disable_telemetry_events()  # nobody was asked
 ERRORS_ONLY = 3  # of ONNX Runtime's log, which warns of what a machine without a graphics card lacks
 
 
-def session_of(model: bytes, threads: int) -> onnxruntime.InferenceSession:
-    """A model of ours in ONNX Runtime, on the processor. Raises one of its dozen exceptions if it cannot load it."""
+def session_of(model: bytes, threads: int, path: Path | str = "the model") -> onnxruntime.InferenceSession:
+    """A model of ours in ONNX Runtime, on the processor. path: where it is from. Raises ArtifactError."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = ERRORS_ONLY
@@ -25,13 +26,17 @@ def session_of(model: bytes, threads: int) -> onnxruntime.InferenceSession:
     # Else kernels for x86 without VNNI clip sums of two products to 16 bits, and the error is twice as large. ARM has
     # no such kernels.
     options.add_session_config_entry("session.x64quantprecision", "1")
-    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    try:
+        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as e:  # it has a dozen types
+        why = " ".join(str(e).split())[:200]
+        raise ArtifactError(f"{path}: ONNX Runtime cannot load it ({why})", remedy="quantize again") from None
     # It keeps the bytes, beside the weights that it has packed, for making itself anew with other providers: 68 MB.
     session._model_bytes = None
     return session
 
 
-class OnnxEngine:
+class OnnxEngine(SessionEngine):
     """The model of an ONNX artifact. Use `load`."""
 
     def __init__(self, path: Path, threads: int):
@@ -47,26 +52,10 @@ class OnnxEngine:
             raise RuntimeError(str(e)) from None
         return y
 
-    def give_back(self) -> bool:
-        """As engines.Engine: nothing is held that could be."""
-        return False
-
-    @property
-    def threads(self) -> int:
-        """As engines.Engine."""
-        return self._threads
-
-    def set_threads(self, threads: int) -> None:
-        """As engines.Engine: a session has its threads for life, so it is made anew. Raises ArtifactError."""
-        try:
-            with open_archive(self._path) as z:
-                self._session = session_of(read_record(z, ONNX), threads)
-        except ArtifactError:
-            raise
-        except Exception as e:
-            why = " ".join(str(e).split())[:200]
-            raise ArtifactError(f"{self._path}: ONNX Runtime cannot load it ({why})", remedy="quantize again") from None
-        self._threads, self._names = threads, [i.name for i in self._session.get_inputs()]
+    def _make_session(self, threads: int) -> None:
+        with open_archive(self._path) as z, nothing_unknown(self._path, "model"):
+            self._session = session_of(read_record(z, ONNX), threads, self._path)
+        self._names = [i.name for i in self._session.get_inputs()]
 
 
 def load(path: Path, manifest: dict[str, Any], threads: int | None) -> OnnxEngine:

@@ -16,6 +16,7 @@ from pathlib import Path
 from rover_lib.onboard.archive import ONNX, Unknown, nothing_unknown, read_record
 
 OPSET, NODES, NAME_BYTES = 17, 5000, 200
+FIELDS, MOST_DIMENSIONS = 100_000, 8  # of a whole model; of a tensor
 LARGEST_NUMBER = 10_000_000  # of an attribute
 OPERATORS = frozenset({
     "Add", "Cast", "Concat", "Conv", "DequantizeLinear", "Div", "Erf", "Identity", "LayerNormalization", "MatMul",
@@ -44,100 +45,104 @@ def check_model(z: zipfile.ZipFile, path: Path | str) -> None:
     z: from open_archive(). Nothing in it is run, and no tensor is made.
     """
     with nothing_unknown(path, "model"):
-        _check_model(memoryview(read_record(z, ONNX)))
+        _Model(memoryview(read_record(z, ONNX)))
 
 
-def _check_model(model: memoryview) -> None:
-    graphs, opsets = 0, []
-    for field, value in _fields(model, MODEL, "a model"):
-        if field == "graph":
-            graphs += 1
-            _check_graph(_bytes(value))
-        elif field == "opset_import":
-            known = dict(_fields(_bytes(value), OPSET_IMPORT, "an opset"))
-            opsets.append((_text(known.get("domain", memoryview(b""))), known.get("version")))
-    if graphs != 1:
-        raise Unknown(f"{graphs} graphs")
-    if opsets != [("", OPSET)]:
-        raise Unknown(f"the operator sets {opsets}"[:80])
+class _Model:
+    """A model's protobuf. Raises Unknown if it is not of the one form that artifacts have."""
 
+    def __init__(self, model: memoryview):
+        self._left = FIELDS
+        graphs, opsets = 0, []
+        for field, value in self._fields(model, MODEL, "a model"):
+            if field == "graph":
+                graphs += 1
+                self._check_graph(_bytes(value))
+            elif field == "opset_import":
+                known = dict(self._fields(_bytes(value), OPSET_IMPORT, "an opset"))
+                opsets.append((_text(known.get("domain", memoryview(b""))), known.get("version")))
+        if graphs != 1:
+            raise Unknown(f"{graphs} graphs")
+        if opsets != [("", OPSET)]:
+            raise Unknown(f"the operator sets {opsets}"[:80])
 
-def _check_graph(graph: memoryview) -> None:
-    nodes = 0
-    for field, value in _fields(graph, GRAPH, "a graph"):
-        if field == "node":
-            nodes += 1
-            _check_node(_bytes(value))
-        elif field == "initializer":
-            _check_tensor(_bytes(value))
-    if nodes > NODES:
-        raise Unknown(f"{nodes} nodes")
+    def _check_graph(self, graph: memoryview) -> None:
+        nodes = 0
+        for field, value in self._fields(graph, GRAPH, "a graph"):
+            if field == "node":
+                nodes += 1
+                self._check_node(_bytes(value))
+            elif field == "initializer":
+                self._check_tensor(_bytes(value))
+        if nodes > NODES:
+            raise Unknown(f"{nodes} nodes")
 
+    def _check_node(self, node: memoryview) -> None:
+        kind = ""
+        for field, value in self._fields(node, NODE, "a node"):
+            text = "" if field == "attribute" else _text(value)
+            if field == "op_type":
+                kind = text
+            elif field == "attribute":
+                self._check_attribute(_bytes(value))
+        if kind not in OPERATORS:
+            raise Unknown(f"the operator {kind!r}"[:80])
 
-def _check_node(node: memoryview) -> None:
-    kind = ""
-    for field, value in _fields(node, NODE, "a node"):
-        text = "" if field == "attribute" else _text(value)
-        if field == "op_type":
-            kind = text
-        elif field == "attribute":
-            _check_attribute(_bytes(value))
-    if kind not in OPERATORS:
-        raise Unknown(f"the operator {kind!r}"[:80])
+    def _check_attribute(self, attribute: memoryview) -> None:
+        for field, value in self._fields(attribute, ATTRIBUTE, "an attribute"):
+            if field == "name" and (name := _text(value)) not in ATTRIBUTES:
+                raise Unknown(f"the attribute {name!r}"[:80])
+            if field in ("i", "ints"):
+                number = value if isinstance(value, int) else LARGEST_NUMBER + 1
+                number -= (number >> 63) << 64  # two's complement
+                if abs(number) > LARGEST_NUMBER:
+                    raise Unknown(f"the number {number}")
 
+    def _check_tensor(self, tensor: memoryview) -> None:
+        sizes, kind, stored = [], 0, 0
+        for field, value in self._fields(tensor, TENSOR, "a tensor"):
+            if field == "name":
+                _text(value)
+            elif field == "raw_data":
+                stored += len(_bytes(value))
+            elif not isinstance(value, int):
+                raise Unknown(f"a tensor whose {field} is no number")
+            elif field == "dims":
+                sizes.append(value)
+                if len(sizes) > MOST_DIMENSIONS:  # a product of a hundred thousand numbers takes minutes
+                    raise Unknown(f"a tensor of more than {MOST_DIMENSIONS} dimensions")
+            else:
+                kind = value
+        if kind not in ITEM_BYTES:
+            raise Unknown(f"a tensor of type {kind}")
+        if math.prod(sizes) * ITEM_BYTES[kind] != stored:
+            raise Unknown(f"a tensor of {sizes} in {stored} bytes"[:80])
 
-def _check_attribute(attribute: memoryview) -> None:
-    for field, value in _fields(attribute, ATTRIBUTE, "an attribute"):
-        if field == "name" and (name := _text(value)) not in ATTRIBUTES:
-            raise Unknown(f"the attribute {name!r}"[:80])
-        if field in ("i", "ints"):
-            number = value if isinstance(value, int) else LARGEST_NUMBER + 1
-            number -= (number >> 63) << 64  # two's complement
-            if abs(number) > LARGEST_NUMBER:
-                raise Unknown(f"the number {number}")
-
-
-def _check_tensor(tensor: memoryview) -> None:
-    sizes, kind, stored = [], 0, 0
-    for field, value in _fields(tensor, TENSOR, "a tensor"):
-        if field == "name":
-            _text(value)
-        elif field == "raw_data":
-            stored += len(_bytes(value))
-        elif not isinstance(value, int):
-            raise Unknown(f"a tensor whose {field} is no number")
-        elif field == "dims":
-            sizes.append(value)
-        else:
-            kind = value
-    if kind not in ITEM_BYTES:
-        raise Unknown(f"a tensor of type {kind}")
-    if math.prod(sizes) * ITEM_BYTES[kind] != stored:
-        raise Unknown(f"a tensor of {sizes} in {stored} bytes"[:80])
-
-
-def _fields(message: memoryview, known: dict[int, str], what: str) -> Iterator[tuple[str, Value]]:
-    """(field, value) of a protobuf message: a number, or the bytes. Raises Unknown for a field that is not known."""
-    at, end = 0, len(message)
-    while at < end:
-        key, at = _varint(message, at)
-        number, wire = key >> 3, key & 7
-        if number not in known:
-            raise Unknown(f"{what} with field {number}")
-        if wire == VARINT:
-            value, at = _varint(message, at)
-            yield known[number], value
-            continue
-        if wire == BYTES:
-            size, at = _varint(message, at)
-        elif wire in (EIGHT_BYTES, FOUR_BYTES):
-            size = 8 if wire == EIGHT_BYTES else 4
-        else:
-            raise Unknown(f"{what} of wire type {wire}")
-        if size > end - at:
-            raise Unknown(f"{what} that is cut short")
-        yield known[number], message[at : at + size]
-        at += size
+    def _fields(self, message: memoryview, known: dict[int, str], what: str) -> Iterator[tuple[str, Value]]:
+        """(field, value) of a protobuf message: a number, or the bytes. Raises Unknown for another field."""
+        at, end = 0, len(message)
+        while at < end:
+            self._left -= 1
+            if self._left < 0:
+                raise Unknown(f"more than {FIELDS} fields")
+            key, at = _varint(message, at)
+            number, wire = key >> 3, key & 7
+            if number not in known:
+                raise Unknown(f"{what} with field {number}")
+            if wire == VARINT:
+                value, at = _varint(message, at)
+                yield known[number], value
+                continue
+            if wire == BYTES:
+                size, at = _varint(message, at)
+            elif wire in (EIGHT_BYTES, FOUR_BYTES):
+                size = 8 if wire == EIGHT_BYTES else 4
+            else:
+                raise Unknown(f"{what} of wire type {wire}")
+            if size > end - at:
+                raise Unknown(f"{what} that is cut short")
+            yield known[number], message[at : at + size]
+            at += size
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:

@@ -47,13 +47,13 @@ class _EachKeyOnce(yaml.SafeLoader):
 
 
 def read_params(path: Path | str) -> dict[str, Any]:
-    """The content of one file alone. Raises ParamsError if it is missing, or no YAML mapping; OSError."""
+    """The content of one file alone. Raises ParamsError if it is missing or unreadable, or no YAML mapping."""
     try:
         content = yaml.load(Path(path).read_text(), _EachKeyOnce)
     except FileNotFoundError:
         raise ParamsError(f"{path}: not found", remedy="it came with this package: install that again") from None
-    except OSError:
-        raise
+    except OSError as e:
+        raise ParamsError(f"{path}: cannot be read ({e.strerror})") from None
     except Exception as e:  # PyYAML lets pass what Python says of a date, a number, a byte or a depth that is none
         raise ParamsError(f"{path}: not readable as YAML ({' '.join(str(e).split())})") from None
     if content is None:  # nothing but comments

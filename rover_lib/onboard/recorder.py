@@ -13,14 +13,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
 
 from rover_lib.onboard.camera import Camera
-from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
-from rover_lib.onboard.recording import EpisodeExists, EpisodeWriter
+from rover_lib.onboard.recording import About, EpisodeExists, EpisodeWriter
 from rover_lib.onboard.servo_link import ServoLink
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.status_line import StatusLine
@@ -41,9 +40,8 @@ class Recorder:
     """An episode beside a running loop: controls are handed over, frames are taken from the camera in its own thread.
 
     folder: in which the episode appears on close(), as episode_YYYYMMDD_HHMMSS of the start in local time (a second
-    later if that is taken). label: what was done. rate_hz: frames a second at most. source, arduino_port: who drove and
-    through what, for the metadata. car: see EpisodeWriter. most_bytes: limit of the episode, see room_for(); None: what
-    the disk has.
+    later if that is taken). about: its fps is found here. rate_hz: frames a second at most. most_bytes: limit of the
+    episode, see room_for(); None: what the disk has.
     Raises EpisodeError if there is no room to record; later faults are in `failure`.
     """
 
@@ -51,13 +49,10 @@ class Recorder:
         self,
         folder: Path | str,
         camera: Camera,
+        about: About,
         *,
-        label: str = "",
         rate_hz: float = 30.0,
-        arduino_port: str = "",
-        source: str = "",
         most_bytes: int | None = None,
-        car: Car | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
         self._camera, self._clock, self._most_bytes = camera, clock, most_bytes
@@ -67,14 +62,8 @@ class Recorder:
         self._writer = _new_episode(
             Path(folder),
             self.start_s + self._to_system_s,
-            label=label,
-            fps=min(rate_hz, camera.wanted_hz),
-            resolution=None,
-            arduino_port=arduino_port,
-            flags=True,
-            car=car,
+            replace(about, fps=min(rate_hz, camera.wanted_hz)),
         )
-        self._writer.metadata["source"] = source
         self.folder = self._writer.folder
         self.path: Path | None = None  # the episode's, once it is there
         self.failure: str | None = None
@@ -238,10 +227,11 @@ def room_for(folder: Path | str, most_mb: float) -> int:
     return int(min(most_mb * 1e6 - taken, disk.f_bavail * disk.f_frsize / 2))
 
 
-def _new_episode(folder: Path, start_s: float, **options: Any) -> EpisodeWriter:
+def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
     """An open episode in `folder`, named by its start, or the next second that is free."""
     while True:
-        writer = EpisodeWriter(folder / time.strftime("episode_%Y%m%d_%H%M%S", time.localtime(start_s)), **options)
+        name = time.strftime("episode_%Y%m%d_%H%M%S", time.localtime(start_s))
+        writer = EpisodeWriter(folder / name, about, resolution=None, flags=True)
         try:
             writer.open()
             return writer
@@ -292,18 +282,8 @@ def record(
     stop = stop or threading.Event()
     lost = [0, 0]
     with contextlib.ExitStack() as stack:
-        recorder = stack.enter_context(
-            Recorder(
-                folder,
-                camera,
-                label=label,
-                rate_hz=rate_hz,
-                arduino_port=link.port,
-                source="human",
-                car=link.car,
-                clock=clock,
-            )
-        )
+        about = About(label, arduino_port=link.port, source="human", car=link.car)
+        recorder = stack.enter_context(Recorder(folder, camera, about, rate_hz=rate_hz, clock=clock))
         start = heard_s = recorder.start_s  # a status from before is not of this episode
         if status:
             line = stack.enter_context(

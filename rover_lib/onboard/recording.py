@@ -63,17 +63,32 @@ class EpisodeExists(EpisodeError):
     """A folder of this name is there, or is being recorded."""
 
 
+@dataclass(frozen=True)
+class About:
+    """What a recording says of itself.
+
+    label: what was done, e.g. "hit red balloon". fps: the camera's rate. start_time_s, end_time_s: system time of the
+    recording's ends; the first and last sample's when None. arduino_port: through what. source: who drove, None: not
+    noted. car: whose pulses they are, None: the first recordings'; another one's description is in the metadata.
+    """
+
+    label: str = ""
+    fps: float = 30
+    start_time_s: float | None = None
+    end_time_s: float | None = None
+    arduino_port: str = ""
+    source: str | None = None
+    car: Car | None = None
+
+
 class EpisodeWriter:
     """Collect one episode; the folder appears, complete, when the `with` block ends well, and not otherwise.
 
     Until then all is in a hidden folder beside it, on the disk and not in memory.
 
     folder: Path to make, e.g. episodes/episode_20251007_144013; its name is the episode's id. Must not exist.
-    label: what was done, e.g. "hit red balloon". fps: the camera's rate. resolution: (width, height); None for that of
-    the first frame. start_time_s, end_time_s: system time of the recording's ends; the first and last sample's when
-    left out.
-    flags: write the two columns that say what was measured (see above). car: whose pulses they are, None: the first
-    recordings'; another one's description is in the metadata.
+    resolution: (width, height); None for that of the first frame. flags: write the two columns that say what was
+    measured (see above).
     Raises EpisodeError for an existing folder, frames of another size, times or pulses that are no finite
     numbers, an episode without a frame or a control, or a disk that takes no more.
     """
@@ -81,28 +96,22 @@ class EpisodeWriter:
     def __init__(
         self,
         folder: Path | str,
+        about: About,
         *,
-        label: str,
-        fps: float = 30,
         resolution: tuple[int, int] | None = (640, 360),
-        start_time_s: float | None = None,
-        end_time_s: float | None = None,
-        arduino_port: str = "",
         jpeg_quality: int = 95,
         flags: bool = False,
-        car: Car | None = None,
     ):
-        self.folder = Path(folder)
-        self.label, self.fps = str(label), fps
+        self.folder, self.about = Path(folder), about
         self.resolution = resolution and (int(resolution[0]), int(resolution[1]))
-        self.start_time_s, self.end_time_s = start_time_s, end_time_s
-        self.arduino_port, self.jpeg_quality = arduino_port, jpeg_quality
-        car = car or Car()
+        self.jpeg_quality, self.flags = jpeg_quality, flags
+        car = about.car or Car()
         self.pwm = car.pwm
-        self.flags = flags
         self.metadata: dict[str, Any] = {}  # what else is to be noted of this episode
         if not car.drives_like(Car()):
             self.metadata["car"] = car.description()
+        if about.source is not None:
+            self.metadata["source"] = about.source
         self.controls = self.frames = self.picture_bytes = 0
         self._extra: dict[str, None] = {}  # names of further columns, in order
         self._first_s, self._last_s = math.inf, -math.inf
@@ -133,9 +142,15 @@ class EpisodeWriter:
                     f"{self.folder}: is being recorded, or was when its program was killed",
                     remedy=f"name another folder, or delete {temporary.name}",
                 ) from None
-            self._temporary = temporary
-            (temporary / "frames").mkdir()
-            self._rows = {name: (temporary / f"{name}.rows").open("ab", buffering=0) for name in ("control", "frame")}
+        self._temporary = temporary
+        try:
+            with self._disk():
+                (temporary / "frames").mkdir()
+                for name in ("control", "frame"):
+                    self._rows[name] = (temporary / f"{name}.rows").open("ab", buffering=0)
+        except BaseException:
+            self.discard()  # nobody finishes what was never open
+            raise
 
     def control(
         self,
@@ -291,19 +306,20 @@ class EpisodeWriter:
             )
         for file in self._rows.values():
             file.close()
-        start_s = self._first_s if self.start_time_s is None else self._time(self.start_time_s)
-        end_s = self._last_s if self.end_time_s is None else self._time(self.end_time_s)
+        about = self.about
+        start_s = self._first_s if about.start_time_s is None else self._time(about.start_time_s)
+        end_s = self._last_s if about.end_time_s is None else self._time(about.end_time_s)
         duration_s = end_s - start_s
         head = {
             "episode_id": self.folder.name,
-            "action_label": self.label,
+            "action_label": about.label,
             "start_time": start_s,
             "end_time": end_s,
             "duration": duration_s,
             "metadata": {
-                "camera_fps": self.fps,
+                "camera_fps": about.fps,
                 "camera_resolution": list(self.resolution or ()),
-                "arduino_port": self.arduino_port,
+                "arduino_port": about.arduino_port,
                 "total_control_samples": self.controls,
                 "total_frames": self.frames,
                 "avg_control_rate": self.controls / duration_s if duration_s > 0 else 0,

@@ -12,7 +12,7 @@
 
 A power cut may come between any two system calls, and takes with it what was not synced. So all that a release holds is
 synced before its folder gets its name, and all of that before `current` is renamed. What an interrupted command left
-(names that begin with a dot) the next one removes. No decision depends on the clock.
+(.new, .gone-... and .new-...) the next one removes. No decision depends on the clock.
 """
 
 import contextlib
@@ -147,15 +147,19 @@ def pack(
     for old in _packed_before(artifact, folder):
         old.unlink()
     folder.mkdir(parents=True, exist_ok=True)
-    count = 0
-    with artifact.open("rb") as f:
-        while part := f.read(PART_BYTES):
-            (folder / f"part-{count:04d}").write_bytes(part)
-            count += 1
-    if signature:
-        (folder / SIGNATURE).write_bytes(signature)
-    about = {**_about(artifact, manifest), "parts": count}
-    (folder / ORIGIN).write_text(json.dumps(about, indent=1, sort_keys=True) + "\n")
+    about = {**_about(artifact, manifest), "parts": 0}
+    try:
+        with artifact.open("rb") as f:
+            while part := f.read(PART_BYTES):
+                (folder / f"part-{about['parts']:04d}").write_bytes(part)
+                about["parts"] += 1
+        if signature:
+            (folder / SIGNATURE).write_bytes(signature)
+        (folder / ORIGIN).write_text(json.dumps(about, indent=1, sort_keys=True) + "\n")
+    except BaseException:
+        for half in _packed_before(artifact, folder):  # a disk that is full has room again
+            half.unlink()
+        raise
     return about
 
 
@@ -516,7 +520,8 @@ class Releases:
         raise ReleaseError(f"{self.models}: another deployment is at work", remedy="wait for it (status says at_work)")
 
     def _tidy(self) -> None:
-        for left in (*self.releases.glob(".*"), *self.models.glob(".new-*")):
+        ours = (*self.releases.glob(".new"), *self.releases.glob(".gone-*"), *self.models.glob(".new-*"))
+        for left in ours:  # a .git, or whatever else is somebody's, stays
             shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
         history = self._history()
         if (current := self.current) in self._by_use() and history[-1:] != [current]:

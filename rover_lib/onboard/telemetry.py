@@ -42,7 +42,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.pwm import is_finite
 from rover_lib.onboard.servo_link import State
 from rover_lib.onboard.signal_event import SignalEvent
-from rover_lib.onboard.stage import plain
+from rover_lib.onboard.stage import open_plain, plain
 
 SCHEMA = 1
 QUEUE_TICKS = 2048  # a minute at 30 Hz that a disk may do without; 1 MB
@@ -55,6 +55,7 @@ MIN_BYTES = 20_000
 EVENT_CHARACTERS = 800
 RECENT = 8
 ARMED = "armed"  # the loop's event, with which a drive begins
+NAME_A_LOG = "name a file that rover drive wrote"
 MISSING = "ticks are missing before this one"
 BACK_S = 1.0  # a tick that is so much older than the one before it belongs to another drive
 
@@ -522,15 +523,13 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     """Read a flight log, with the older files path.1, path.2, ... that belong to it.
 
     drive: which of the drives in these files, as an index: -1 is the last one, 0 the first. Raises LogError if the
-    file is not there, holds no line of a flight log, has no such drive, or is of another version.
+    file is not there or none, holds no line of a flight log, has no such drive, or is of another version.
     """
     path = Path(path)
     try:
-        files = [p.read_bytes() for p in (*_older(path), path)]
+        files = [_bytes_of(p) for p in (*_older(path), path)]
     except OSError as error:
-        raise LogError(
-            f"{path}: cannot be read ({error.strerror})", remedy="name a file that rover drive wrote"
-        ) from error
+        raise LogError(f"{path}: cannot be read ({error.strerror})", remedy=NAME_A_LOG) from error
     drives: list[_Drive] = []
     damaged = 0
     for line in (line for data in files for line in data.split(b"\n") if line):
@@ -554,7 +553,7 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     if not drives:
         raise LogError(
             f"{path}: no line of a flight log in it, {damaged} of something else",
-            remedy="name a file that rover drive wrote",
+            remedy=NAME_A_LOG,
         )
     if not -len(drives) <= drive < len(drives):
         raise LogError(
@@ -580,6 +579,11 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     )
 
 
+def _bytes_of(path: Path) -> bytes:
+    with open_plain(path, LogError(f"{path}: cannot be read (not a file)", remedy=NAME_A_LOG)) as file:
+        return file.read()
+
+
 def _row(line: bytes) -> list[Any] | Event | dict[str, Any] | None:
     """What a line says: the values of a tick, an event, or a header's or the machine's members; None if damaged."""
     try:
@@ -587,17 +591,42 @@ def _row(line: bytes) -> list[Any] | Event | dict[str, Any] | None:
             body, _, crc = line.rpartition(b',"crc":"')
             if crc != b'%04X"}' % binascii.crc_hqx(body, 0):
                 return None
-            row = json.loads(body + b"}")
-            if row["kind"] != "event":
-                return row
-            return Event(row["t_s"], row["event"], row["fields"])
+            return _json_row(json.loads(body + b"}"))
         body, _, crc = line.rpartition(b",")
         if crc != b"%04X" % binascii.crc_hqx(body, 0):
             return None
-        texts = body.decode().split(",")
-        return [
-            text if name in _TEXTS else float(text) if text else np.nan
-            for name, text in zip(Tick._fields, texts, strict=True)
-        ]
-    except (ValueError, KeyError):
+        texts = dict(zip(Tick._fields, body.decode().split(","), strict=True))
+        _time_of({"t_s": float(texts["t_s"])})
+        return [text if name in _TEXTS else _number_of(text) for name, text in texts.items()]
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
+
+
+def _number_of(text: str) -> float:
+    """Of a tick's column; NaN for "not known"."""
+    value = float(text) if text else math.nan
+    return value if math.isfinite(value) else math.nan
+
+
+def _time_of(row: dict[str, Any]) -> float:
+    t_s = row["t_s"]
+    if not isinstance(t_s, (int, float)) or not math.isfinite(t_s):
+        raise ValueError("no time")
+    return float(t_s)
+
+
+def _json_row(row: dict[str, Any]) -> Event | dict[str, Any]:
+    """A line of JSON whose checksum is right. Raises as _row() expects if it is no line of a log."""
+    match row["kind"], row:
+        case "event", {"event": str(text), "fields": dict(fields)}:
+            if text == MISSING and not isinstance(fields.get("ticks"), int):
+                raise ValueError("no count")
+            return Event(_time_of(row), text, fields)
+        case "machine", {"temperature_c": int() | float() | None as temperature_c, "throttled": str() | None}:
+            known = {} if temperature_c is None else {"temperature_c": float(temperature_c)}
+            return {**row, "t_s": _time_of(row), **known}
+        case "header", _ if isinstance(row.get("drive", {}), dict):
+            return row
+        case "event" | "machine" | "header", _:
+            raise ValueError("its members are others")
+    return row  # of a kind that a later version may write

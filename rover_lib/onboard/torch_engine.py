@@ -57,6 +57,10 @@ def load(path: Path, manifest: dict[str, Any], threads: int | None) -> TorchEngi
     if threads:
         torch.set_num_threads(threads)
     try:
+        str(path).encode()  # torch opens no other names
+    except UnicodeEncodeError:
+        raise ArtifactError(f"{path}: its name is no text that torch can read", remedy="rename it") from None
+    try:
         module = torch.jit.load(str(path), map_location="cpu").eval()
     except RuntimeError as e:
         raise ArtifactError(

@@ -16,15 +16,17 @@ import math
 import pickle
 import pickletools
 import re
+import reprlib
 import zipfile
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.archive import Unknown, nothing_unknown, read_record
+from rover_lib.onboard.archive import DEBUG_BYTES, Unknown, nothing_unknown, read_record
 
 LARGEST_NUMBER = 10_000_000  # of a size or an index in the program
 PARSED = 5  # times, of a program that Python fails to parse by a fault of its own
 TO_THE_END = 2**63 - 1  # of a slice
+MOST_DIMENSIONS = 8  # of a tensor
 
 OPERATORS = frozenset({
     "torch._convolution", "torch._make_per_tensor_quantized_tensor", "torch.add", "torch.addcmul", "torch.as_strided",
@@ -47,6 +49,9 @@ OPCODES = frozenset({
     "EMPTY_LIST", "APPEND", "APPENDS", "EMPTY_DICT", "SETITEM", "SETITEMS", "BINPUT", "LONG_BINPUT", "BINGET",
     "LONG_BINGET",
 })  # fmt: skip
+# A value that holds another one twice, which holds another one twice and so on, is small to store, but never done with
+# by who writes it as text or looks it up as a key. So the module holds nothing twice, and the constants have no keys.
+TWICE, KEYS = frozenset({"BINGET", "LONG_BINGET"}), frozenset({"SETITEM", "SETITEMS"})
 ITEM_BYTES = {
     "torch.FloatStorage": 4, "torch.DoubleStorage": 8, "torch.LongStorage": 8, "torch.IntStorage": 4,
     "torch.ShortStorage": 2, "torch.ByteStorage": 1, "torch.CharStorage": 1, "torch.BoolStorage": 1,
@@ -69,9 +74,11 @@ def check_program(z: zipfile.ZipFile, path: Path | str) -> None:
             raise Unknown(f"{len(programs)} programs")
         name = _Program(read_record(z, f"archive/{programs[0]}")).name
         module = programs[0].removeprefix("code/").removesuffix(".py").replace("/", ".")
-        for record in sizes:
-            if record.endswith(".debug_pkl"):
-                _check_opcodes(read_record(z, f"archive/{record}"), {"torch.jit._pickle.build_intlist"})
+        positions = [n for n in sizes if n.endswith(".debug_pkl")]
+        if (total := sum(sizes[n] for n in positions)) > DEBUG_BYTES:  # each may be that large, and reading takes time
+            raise Unknown(f"{total} bytes of source positions")
+        for record in positions:
+            _check_opcodes(read_record(z, f"archive/{record}"), OPCODES, {"torch.jit._pickle.build_intlist"})
         attributes = _read_pickle(read_record(z, "archive/data.pkl"), {}, f"{module}.{name}")
         if not isinstance(attributes, _Module):
             raise Unknown("a module that is none")
@@ -185,12 +192,12 @@ class _Program:
 # Its constants
 
 
-def _check_opcodes(raw: bytes, names: set[str] | None = None) -> None:
-    """Raise Unknown for an opcode that is not needed, or for a global that is not among names."""
+def _check_opcodes(raw: bytes, opcodes: frozenset[str], names: set[str] | None = None) -> None:
+    """Raise Unknown for an opcode that is not among opcodes, or for a global that is not among names."""
     count = 0
     try:
         for count, (opcode, argument, _) in enumerate(pickletools.genops(raw)):
-            if opcode.name not in OPCODES:
+            if opcode.name not in opcodes:
                 raise Unknown(f"a pickle with {opcode.name}")
             if opcode.name == "GLOBAL" and names is not None and (name := str(argument).replace(" ", ".")) not in names:
                 raise Unknown(f"a pickle with {name[:80]}")
@@ -202,8 +209,11 @@ def _check_opcodes(raw: bytes, names: set[str] | None = None) -> None:
 
 
 def _read_pickle(raw: bytes, storages: dict[str, int], module: str = "") -> Any:
-    """What a pickle of the archive describes; nothing that it names is called. storages: bytes by name of record."""
-    _check_opcodes(raw)
+    """What a pickle of the archive describes; nothing that it names is called. storages: bytes by name of record.
+
+    module: its name, if the pickle describes the module and not its constants.
+    """
+    _check_opcodes(raw, OPCODES - (TWICE if module else KEYS))
     try:
         return _Reader(raw, storages, module).load()
     except Unknown:
@@ -260,7 +270,7 @@ class _Reader(pickle.Unpickler):
             "torch._utils._rebuild_qtensor": self._quantized,
             "torch.jit._pickle.build_tensorlist": self._list,
             "torch.jit._pickle.restore_type_tag": self._list,
-            "collections.OrderedDict": lambda: {},
+            "collections.OrderedDict": self._hooks,
             "torch.per_channel_affine": "per_channel_affine",
             "torch.per_tensor_affine": "per_tensor_affine",
             "__torch__.torch.classes.quantized.Conv2dPackedParamsBase": _Conv2d,
@@ -279,10 +289,16 @@ class _Reader(pickle.Unpickler):
             case ("storage", str(kind), str(key), "cpu", int(items)) if kind in ITEM_BYTES:
                 if self._storages.get(key) == items * ITEM_BYTES[kind]:
                     return _Storage((ITEM_BYTES[kind], items))
-        raise Unknown(f"a tensor without its bytes, {str(pid)[:80]}")
+        raise Unknown(f"a tensor without its bytes, {reprlib.repr(pid)[:80]}")
 
-    @staticmethod
-    def _tensor(storage: Any, offset: Any, sizes: Any, strides: Any, needs_gradient: Any, hooks: Any) -> _Tensor:
+    # Methods all, of which a pickle cannot set a default or anything else, as it can of functions.
+
+    def _hooks(self) -> dict[str, Any]:
+        return {}
+
+    def _tensor(self, storage: Any, offset: Any, sizes: Any, strides: Any, needs_gradient: Any, hooks: Any) -> _Tensor:
+        if len(sizes) > MOST_DIMENSIONS:  # a product of a hundred thousand numbers takes minutes
+            raise Unknown(f"a tensor of {len(sizes)} dimensions")
         numbers = (offset, *sizes, *strides)
         if not isinstance(storage, _Storage) or not all(type(n) is int and n >= 0 for n in numbers):
             raise Unknown("a tensor of another form")
@@ -305,8 +321,7 @@ class _Reader(pickle.Unpickler):
                 raise Unknown("a quantized tensor of another form")
         return self._tensor(storage, offset, sizes, strides, needs_gradient, hooks)
 
-    @staticmethod
-    def _list(values: Any, kind: Any = "List[Optional[Tensor]]") -> list:
+    def _list(self, values: Any, kind: Any = "List[Optional[Tensor]]") -> list:
         if not isinstance(values, list) or kind != "List[Optional[Tensor]]":
-            raise Unknown(f"a list of {str(kind)[:80]}")
+            raise Unknown(f"a list of {kind[:80] if isinstance(kind, str) else reprlib.repr(kind)[:80]}")
         return values

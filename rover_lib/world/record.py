@@ -18,7 +18,7 @@ from rover_lib.onboard import recording
 from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.pwm import ARDUINO_STEP_US
-from rover_lib.onboard.recording import EpisodeWriter
+from rover_lib.onboard.recording import About, EpisodeWriter
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.world import world as world_module
@@ -124,13 +124,9 @@ class WorldEpisode:
         self._periods = [_measured_us(c.period_us) for c in (self._pwm.steering, self._pwm.throttle)]
         self.writer = EpisodeWriter(
             folder / episode_name(start),
-            label=LABEL,
-            fps=RATE_HZ,
+            About(LABEL, fps=RATE_HZ, start_time_s=self._start_s, arduino_port="playground", car=car),
             resolution=(FRAME_WIDTH, FRAME_HEIGHT),
-            start_time_s=self._start_s,
-            arduino_port="playground",
             jpeg_quality=JPEG_QUALITY,
-            car=car,
         )
 
     def __enter__(self) -> "WorldEpisode":

@@ -19,6 +19,13 @@ def rover(*args):
     return CliRunner().invoke(main, [str(a) for a in args])
 
 
+@pytest.mark.parametrize("command", ["benchmark", "drive"])
+def test_more_threads_than_any_machine_has_are_refused(command, artifacts):
+    """torch would take the number, and crash."""
+    result = rover(command, artifacts["static"], "--threads", 100_000)
+    assert result.exit_code == 2 and "100000 is not in the range" in result.output
+
+
 @pytest.mark.parametrize(
     "command",
     [

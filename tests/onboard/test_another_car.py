@@ -19,7 +19,7 @@ from rover_lib.onboard.errors import ArtifactError, CarError
 from rover_lib.onboard.pilot import ReplayPilot
 from rover_lib.onboard.plan import Follower, Plan, Settings
 from rover_lib.onboard.policy import action_limits
-from rover_lib.onboard.recording import Controls, EpisodeWriter, read_controls, recorded_car
+from rover_lib.onboard.recording import About, Controls, EpisodeWriter, read_controls, recorded_car
 from rover_lib.workshop.episodes import load_recordings
 
 CRAWLER = Car.of(
@@ -32,7 +32,7 @@ CRAWLER = Car.of(
 
 
 def episode(folder, car, name="episode_20260101_000000"):
-    with EpisodeWriter(folder / name, label="back and forth", resolution=(64, 36), car=car) as writer:
+    with EpisodeWriter(folder / name, About("back and forth", car=car), resolution=(64, 36)) as writer:
         for n in range(60):
             throttle = 0.1 if n < 30 or not car.reverses else -0.1
             pulses = car.pwm.pulses(0.5, throttle)

@@ -211,6 +211,12 @@ def reference(artifacts):
     return load_policy(artifacts["static"]).predict_chunk(FRAME, STATE)
 
 
+def test_refuses_a_name_that_torch_cannot_open(artifacts, tmp_path):
+    path = shutil.copy(artifacts["static"], tmp_path / "\udcff.pt")
+    with pytest.raises(ArtifactError, match="no text that torch can read; rename it"):
+        load_policy(path)
+
+
 def test_refuses_files_without_manifest_or_vectors(artifacts, tmp_path):
     gone = lambda raw: None  # noqa: E731
     assert "manifest.json" in refused(rewritten(artifacts["fp32"], tmp_path / "a.pt", {"manifest.json": gone}))

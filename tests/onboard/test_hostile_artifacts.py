@@ -205,6 +205,23 @@ def swap(old: bytes, new: bytes) -> Edit:
     return edit
 
 
+# Each step holds the one before it twice, through the memo: as text, it is a million times as long as here, and more.
+DOUBLED = b"K\0" + b"".join(b"q%ch%c\x86" % (i, i) for i in range(40))
+
+
+def sizes_without_end(raw: bytes) -> bytes:
+    """A first tensor of a hundred thousand sizes, and as many strides, each the largest number that a pickle holds."""
+    number = b"\x8a\xff" + b"\xff" * 254 + b"\x7f"
+    many = b"(" + number + b"q\1" + b"h\1" * 100_000 + b"t"
+    hooks = b"ccollections\nOrderedDict\n)R"
+    return raw[: raw.index(b"Q") + 1] + b"K\0" + many + many + b"\x89" + hooks + b"tRt."
+
+
+def an_altered_reader(raw: bytes) -> bytes:
+    """Gives what is called for a tensor a value of its own for each argument that is left out."""
+    return b"\x80\2c" + NAME[1:] + b"(N}X\x0c\0\0\0__defaults__(K\1K\2tstb."
+
+
 NAME, CLASS = b"ctorch._utils\n_rebuild_tensor_v2\n", b"c__torch__.rover_lib.workshop.act"
 PICKLES = {  # by record
     "a command in data.pkl": ("/data.pkl", lambda raw: pickle.dumps(Harmful(), 2), "found posix.system"),
@@ -221,6 +238,25 @@ PICKLES = {  # by record
     "another device": ("constants.pkl", swap(b"\3\0\0\0cpu", b"\4\0\0\0cuda"), "a tensor without its bytes"),
     "items of another size": ("constants.pkl", swap(b"FloatStorage", b"DoubleStorage"), "without its bytes"),
     "room for two billion": ("constants.pkl", swap(NAME + b"q\0", NAME + b"r\0\0\0\x7f"), "LONG_BINPUT"),
+    "bytes that are twice and twice again what they were": (
+        "constants.pkl",
+        lambda raw: b"\x80\2" + DOUBLED + b"Q.",
+        "a tensor without its bytes",
+    ),
+    "a list of twice and twice again": (
+        "constants.pkl",
+        lambda raw: b"\x80\2ctorch.jit._pickle\nrestore_type_tag\n(]" + DOUBLED + b"tR.",
+        "a list of (((((",
+    ),
+    "a key that is never done with": ("/data.pkl", lambda raw: b"\x80\2}" + DOUBLED + b"K\1s.", "BINGET"),
+    "a state that is never done with": (
+        "/data.pkl",
+        lambda raw: raw[: raw.index(b"}")] + DOUBLED + b"\x85b.",
+        "BINGET",
+    ),
+    "keys among the constants": ("constants.pkl", lambda raw: b"\x80\2}K\1K\1s.", "a pickle with SETITEM"),
+    "sizes without end": ("constants.pkl", sizes_without_end, "a tensor of 100001 dimensions"),
+    "another reader": ("/data.pkl", an_altered_reader, "cannot be read"),
     "an end before the end": ("constants.pkl", lambda raw: raw[: len(raw) // 2], "cannot be read"),
     "no pickle": ("constants.pkl", lambda raw: b"", "cannot be read"),
 }
@@ -230,6 +266,13 @@ PICKLES = {  # by record
 def test_no_pickle_of_another_form_is_read(artifacts, tmp_path, what):
     record, edit, message = PICKLES[what]
     refused(hostile(artifacts, tmp_path, {record: edit}), tmp_path, message)
+
+
+def test_source_positions_without_end_are_not_read(artifacts, tmp_path):
+    """Each record of them could be that large, and there could be five thousand: an hour of reading."""
+    idle = b"\x80\2" + b"N" * 600_000 + b"."
+    more = {f"archive/code/__torch__/torch/more{i}.py.debug_pkl": idle for i in range(60)}
+    refused(hostile(artifacts, tmp_path, {}, more), tmp_path, "bytes of source positions")
 
 
 @pytest.mark.parametrize(

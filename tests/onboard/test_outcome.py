@@ -14,14 +14,14 @@ from rover_lib.cli import main
 from rover_lib.onboard import outcome as module
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.outcome import label, labelled
-from rover_lib.onboard.recording import EpisodeWriter
+from rover_lib.onboard.recording import About, EpisodeWriter
 from rover_lib.workshop.episodes import load_recordings
 
 FRAME = np.full((18, 32, 3), (30, 90, 200), np.uint8)
 
 
 def recorded(folder):
-    with EpisodeWriter(folder, label="hit red balloon", resolution=(32, 18)) as writer:
+    with EpisodeWriter(folder, About("hit red balloon"), resolution=(32, 18)) as writer:
         writer.metadata["source"] = "rover drive"
         for i in range(10):
             writer.control(1000 + i / 30, 33 * i, 1500, 150, 21316, 1016)

@@ -38,6 +38,15 @@ def test_what_is_no_params_file(tmp_path, monkeypatch, text, says):
         p.params()
 
 
+@pytest.mark.parametrize("raw", [b"\xff\xfe", b"a: 2001-99-99", b"[" * 3000])
+def test_what_cannot_be_read_is_said(tmp_path, raw):
+    (tmp_path / "params.yml").write_bytes(raw)
+    with pytest.raises(ParamsError, match="not readable as YAML"):
+        p.read_params(tmp_path / "params.yml")
+    with pytest.raises(ParamsError, match="cannot be read"):
+        p.read_params(tmp_path)
+
+
 def test_each_parameter_stands_in_one_file():
     user, rover, lab = (p.read_params(p.PLACES[0]), p.read_params(p.DEFAULTS), lab_params())
     assert set(user) & set(rover) == {"gates"} and not set(user["gates"]) & set(rover["gates"])

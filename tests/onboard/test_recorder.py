@@ -25,7 +25,7 @@ from rover_lib.onboard.camera import Camera, CameraError, Frame
 from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recorder import Recorder, record
-from rover_lib.onboard.recording import EpisodeWriter, read_controls
+from rover_lib.onboard.recording import About, EpisodeWriter, read_controls
 from rover_lib.onboard.servo_link import LinkError, ServoLink, State, Telemetry, frame
 from rover_lib.workshop.episodes import load_recordings
 
@@ -142,8 +142,8 @@ def test_an_episode_beside_a_loop(tmp_path):
     virtual = Stepped()
     virtual.camera.push()
     before_s = time.time()
-    about = {"label": "driven", "rate_hz": 50, "arduino_port": "/dev/x", "source": "rover drive"}
-    recorder = Recorder(tmp_path / "new", virtual.camera, **about, clock=lambda: virtual.now_s)
+    about = About("driven", arduino_port="/dev/x", source="rover drive")
+    recorder = Recorder(tmp_path / "new", virtual.camera, about, rate_hz=50, clock=lambda: virtual.now_s)
     for i in range(5):
         virtual.wait(0.025)
         age_ms = None if i < 2 else 80.5
@@ -184,7 +184,7 @@ def test_an_episode_beside_a_loop(tmp_path):
 
 def test_a_faster_camera_is_thinned(tmp_path):
     virtual = Stepped()
-    with Recorder(tmp_path, virtual.camera, rate_hz=20, clock=lambda: virtual.now_s) as recorder:
+    with Recorder(tmp_path, virtual.camera, About(), rate_hz=20, clock=lambda: virtual.now_s) as recorder:
         recorder.control(virtual.now_s, 0, 1500, 136, 21316, 1016)
         for _ in range(60):
             virtual.wait(0.01)
@@ -195,7 +195,7 @@ def test_a_faster_camera_is_thinned(tmp_path):
 def test_a_clock_that_is_set_meanwhile_changes_nothing(tmp_path, monkeypatch):
     camera = FakeCamera()
     now = time.time()
-    with Recorder(tmp_path, camera) as recorder:
+    with Recorder(tmp_path, camera, About()) as recorder:
         for hours in (0, 1, -1):
             monkeypatch.setattr(time, "time", lambda h=hours: now + 3600 * h)
             recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
@@ -211,12 +211,15 @@ def test_a_clock_that_is_set_meanwhile_changes_nothing(tmp_path, monkeypatch):
 def test_two_in_one_second(tmp_path, monkeypatch):
     monkeypatch.setattr(time, "time", lambda: 1_760_000_000.0)
     camera = FakeCamera()
-    with Recorder(tmp_path, camera) as a, Recorder(tmp_path, camera) as b:  # the second while the first is recording
+    with (
+        Recorder(tmp_path, camera, About()) as a,
+        Recorder(tmp_path, camera, About()) as b,
+    ):  # the second while the first is recording
         for r in (a, b):
             r.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
         camera.push()
         until(lambda: a.frames and b.frames)
-    with Recorder(tmp_path, camera) as c:  # and after both are done
+    with Recorder(tmp_path, camera, About()) as c:  # and after both are done
         c.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
         camera.push()
         until(lambda: c.frames)
@@ -227,7 +230,7 @@ def test_two_in_one_second(tmp_path, monkeypatch):
 @pytest.mark.parametrize("recorded", [True, False])
 def test_an_unplugged_camera_keeps_what_there_is(tmp_path, recorded, caplog):
     camera = FakeCamera()
-    recorder = Recorder(tmp_path, camera)
+    recorder = Recorder(tmp_path, camera, About())
     if recorded:
         recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
         camera.push()
@@ -248,7 +251,7 @@ def test_an_unplugged_camera_keeps_what_there_is(tmp_path, recorded, caplog):
 
 def test_a_camera_that_hangs_ends_it(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "SILENT_S", 0.15)
-    recorder = Recorder(tmp_path, FakeCamera())
+    recorder = Recorder(tmp_path, FakeCamera(), About())
     until(lambda: recorder.failure)
     assert "no frame" in recorder.failure
     assert recorder.close() is None
@@ -256,7 +259,7 @@ def test_a_camera_that_hangs_ends_it(tmp_path, monkeypatch):
 
 def test_an_exception_of_the_loop_keeps_what_there_is(tmp_path):
     camera = FakeCamera()
-    with pytest.raises(ZeroDivisionError), Recorder(tmp_path, camera) as recorder:
+    with pytest.raises(ZeroDivisionError), Recorder(tmp_path, camera, About()) as recorder:
         recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
         camera.push()
         until(lambda: recorder.frames)
@@ -266,7 +269,7 @@ def test_an_exception_of_the_loop_keeps_what_there_is(tmp_path):
 
 def test_what_cannot_be_written_stops_the_recording_only(tmp_path):
     camera = FakeCamera()
-    recorder = Recorder(tmp_path, camera)
+    recorder = Recorder(tmp_path, camera, About())
     recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
     camera.push()
     until(lambda: recorder.frames)
@@ -284,10 +287,10 @@ def test_a_full_disk_is_seen_before_it_is_full(tmp_path, monkeypatch):
     camera = FakeCamera()
     monkeypatch.setattr(os, "statvfs", disk_with(1_000_000))
     with pytest.raises(EpisodeError, match=r"full.*1\.0 MB free"):
-        Recorder(tmp_path, camera)
+        Recorder(tmp_path, camera, About())
     assert left_in(tmp_path) == []
     monkeypatch.setattr(os, "statvfs", disk_with(1e9))
-    recorder = Recorder(tmp_path, camera)
+    recorder = Recorder(tmp_path, camera, About())
     recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
     camera.push()
     until(lambda: recorder.frames)
@@ -308,7 +311,7 @@ def test_episodes_take_no_more_than_they_may(tmp_path):
     (tmp_path / "episode_before" / "frames" / "frame_000001.jpg").write_bytes(bytes(2_000_000))
     room = module.room_for(tmp_path, 6.0)
     assert 3_900_000 < room <= 4_000_000
-    recorder = Recorder(tmp_path, camera, most_bytes=room)
+    recorder = Recorder(tmp_path, camera, About(), most_bytes=room)
     recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
     for _ in range(20):
         camera.push(picture)
@@ -320,7 +323,7 @@ def test_episodes_take_no_more_than_they_may(tmp_path):
     assert 1_500_000 < taken < 4_000_000 and recorder.frames < 20
     assert content_of(folder)["metadata"]["fault"] == recorder.failure
     with pytest.raises(EpisodeError, match="or delete some"):
-        Recorder(tmp_path, camera, most_bytes=module.room_for(tmp_path, 6.0))
+        Recorder(tmp_path, camera, About(), most_bytes=module.room_for(tmp_path, 6.0))
     assert left_in(tmp_path) == [folder.name, "episode_before"]
 
 
@@ -332,7 +335,7 @@ def test_an_episode_leaves_room_to_be_packed(tmp_path, monkeypatch):
 
 def test_a_car_that_was_not_armed_leaves_no_episode(tmp_path, caplog):
     camera = FakeCamera()
-    with camera.filming(), pytest.raises(LinkError), Recorder(tmp_path, camera) as recorder:
+    with camera.filming(), pytest.raises(LinkError), Recorder(tmp_path, camera, About()) as recorder:
         until(lambda: recorder.frames)
         raise LinkError("arming was refused")
     assert left_in(tmp_path) == [] and (recorder.path, recorder.failure) == (None, None) and not caplog.records
@@ -343,7 +346,7 @@ def test_a_disk_that_takes_nothing_leaves_nothing(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     camera = FakeCamera()
-    recorder = Recorder(tmp_path, camera)
+    recorder = Recorder(tmp_path, camera, About())
     recorder.control(time.monotonic(), 0, 1500, 136, 21316, 1016)
     camera.push()
     until(lambda: recorder.frames)
@@ -362,7 +365,7 @@ def test_a_disk_that_hangs_holds_up_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "QUEUE_MOST", 50)
     monkeypatch.setattr(module, "CLOSE_S", 0.1)
     camera = FakeCamera()
-    recorder = Recorder(tmp_path, camera)
+    recorder = Recorder(tmp_path, camera, About())
     camera.push()
     time.sleep(0.05)
     start = time.monotonic()

@@ -1,6 +1,7 @@
 """An episode's files: the user's format to the byte, whole or not at all, and the controls that come back."""
 
 import csv
+import errno
 import json
 import math
 import os
@@ -19,7 +20,7 @@ from recorded import real_episode
 
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.pwm import ARDUINO_STEP_US, PwmCalibration
-from rover_lib.onboard.recording import CONTROL_FIELDS, FLAG_FIELDS, FRAME_FIELDS, EpisodeWriter, read_controls
+from rover_lib.onboard.recording import CONTROL_FIELDS, FLAG_FIELDS, FRAME_FIELDS, About, EpisodeWriter, read_controls
 from rover_lib.workshop.episodes import load_recordings
 
 NAME = "episode_20260101_120000"
@@ -27,12 +28,22 @@ FRAME = np.full((36, 64, 3), (30, 90, 200), np.uint8)
 
 
 def write(folder, controls=3, frames=2, **options):
-    with EpisodeWriter(folder, label="hit red balloon", resolution=(64, 36), **options) as writer:
+    with EpisodeWriter(folder, About("hit red balloon"), resolution=(64, 36), **options) as writer:
         for i in range(controls):
             writer.control(100 + i / 30, 33 * i, 1500, 136, 21308, 1016)
         for i in range(frames):
             writer.frame(100 + i / 30, FRAME)
     return folder
+
+
+def test_an_episode_that_cannot_be_begun_leaves_nothing(tmp_path, monkeypatch):
+    def full(path, *_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(EpisodeError, match="No space left"):
+        EpisodeWriter(tmp_path / NAME, About()).open()
+    assert not list(tmp_path.iterdir())
 
 
 def test_format_of_a_real_recording_to_the_byte(tmp_path):
@@ -43,12 +54,14 @@ def test_format_of_a_real_recording_to_the_byte(tmp_path):
     frame = np.zeros((height, width, 3), np.uint8)
     with EpisodeWriter(
         tmp_path / sample_episode.name,
-        label=real["action_label"],
-        fps=real["metadata"]["camera_fps"],
+        About(
+            real["action_label"],
+            fps=real["metadata"]["camera_fps"],
+            start_time_s=real["start_time"],
+            end_time_s=real["end_time"],
+            arduino_port=real["metadata"]["arduino_port"],
+        ),
         resolution=(width, height),
-        start_time_s=real["start_time"],
-        end_time_s=real["end_time"],
-        arduino_port=real["metadata"]["arduino_port"],
     ) as writer:
         for c in real["control_samples"]:
             writer.control(
@@ -116,7 +129,7 @@ def test_folder_and_files(tmp_path):
 
 
 def test_normalised_values_have_four_decimals_and_the_firmwares_zero(tmp_path):
-    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+    with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
         writer.control(1.1, 33, 1500, 0, 21308, 0)
         writer.control(1.2, 66, np.int64(1456), 120, 21316, 1016)
@@ -133,7 +146,7 @@ def test_normalised_values_have_four_decimals_and_the_firmwares_zero(tmp_path):
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
 def test_an_exception_leaves_nothing(tmp_path, error):
-    with pytest.raises(error), EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+    with pytest.raises(error), EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
         writer.frame(1.0, FRAME)
         raise error
@@ -159,7 +172,7 @@ def test_an_existing_folder_is_refused_and_kept(tmp_path):
 def test_a_folder_that_appears_meanwhile_is_not_replaced(tmp_path):
     with (
         pytest.raises(EpisodeError, match="exists already"),
-        EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer,
+        EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer,
     ):
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
         writer.frame(1.0, FRAME)
@@ -172,7 +185,7 @@ def test_a_folder_that_appears_meanwhile_is_not_replaced(tmp_path):
 def test_controls_must_be_whole_numbers(tmp_path, bad):
     with (
         pytest.raises(EpisodeError, match="throttle_raw_us"),
-        EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer,
+        EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer,
     ):
         writer.control(1.0, 0, 1500, bad, 21308, 1016)
     assert list(tmp_path.iterdir()) == []
@@ -180,7 +193,7 @@ def test_controls_must_be_whole_numbers(tmp_path, bad):
 
 @pytest.mark.parametrize("bad", [None, "soon", math.nan, math.inf, 10**400])
 def test_times_must_be_finite(tmp_path, bad):
-    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+    with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         with pytest.raises(EpisodeError, match="finite"):
             writer.control(bad, 0, 1500, 136, 21308, 1016)
         with pytest.raises(EpisodeError, match="finite"):
@@ -196,13 +209,13 @@ def test_times_must_be_finite(tmp_path, bad):
 def test_frames_must_be_pictures_of_the_right_size(tmp_path, bad):
     with (
         pytest.raises(EpisodeError, match="frames must be uint8"),
-        EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer,
+        EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer,
     ):
         writer.frame(1.0, bad)
 
 
 def test_a_closed_writer_says_so(tmp_path):
-    writer = EpisodeWriter(tmp_path / NAME, label="x")
+    writer = EpisodeWriter(tmp_path / NAME, About("x"))
     with pytest.raises(EpisodeError, match="not open"):
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
 
@@ -222,7 +235,7 @@ def test_what_is_written_a_row_at_a_time_is_json_as_a_whole(tmp_path):
 
 
 def flagged(folder):
-    with EpisodeWriter(folder, label="x", resolution=None, flags=True) as writer:
+    with EpisodeWriter(folder, About("x"), resolution=None, flags=True) as writer:
         writer.metadata |= {"source": "human", "at": np.float32(0.5)}
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
         writer.control(1.02, 20, 1500, None, 21308, None, mode="static")
@@ -254,7 +267,7 @@ def test_no_pulse_is_a_flag_and_no_value(tmp_path):
 
 
 def test_further_columns_must_be_new_and_plain(tmp_path):
-    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+    with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         for extra in ({"steering_measured": 1}, {"arduino_timestamp": 1}):
             with pytest.raises(EpisodeError, match="no further column"):
                 writer.control(1.0, 0, 1500, 136, 21308, 1016, **extra)
@@ -269,7 +282,7 @@ def test_further_columns_must_be_new_and_plain(tmp_path):
 
 
 def test_one_name_is_recorded_once(tmp_path):
-    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+    with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         with pytest.raises(EpisodeError, match="is being recorded"):
             write(tmp_path / NAME)
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
@@ -297,7 +310,7 @@ def test_half_a_row_of_a_full_disk_is_taken_back(tmp_path):
         def write(self, data):
             return self.file.write(data[:10] if self.full else data)
 
-    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+    with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         file = writer._rows["control"] = Full(writer._rows["control"])
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
         file.full = True
@@ -317,7 +330,7 @@ def test_half_a_picture_of_a_full_disk_is_taken_back(tmp_path, monkeypatch):
         whole(path, bytes(data)[:50])
         raise OSError(28, "No space left on device")
 
-    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36)) as writer:
+    with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
         writer.frame(1.0, FRAME)
         with monkeypatch.context() as m:
@@ -328,7 +341,7 @@ def test_half_a_picture_of_a_full_disk_is_taken_back(tmp_path, monkeypatch):
 
 
 def test_a_long_drive_stays_out_of_memory(tmp_path):
-    with EpisodeWriter(tmp_path / NAME, label="x", resolution=(64, 36), flags=True) as writer:
+    with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36), flags=True) as writer:
         writer.frame(1.0, FRAME)
         tracemalloc.start()
         for i in range(3000):
@@ -370,7 +383,7 @@ def test_pulses_come_back(tmp_path_factory, pulses, first, steps):
     folder = tmp_path_factory.mktemp("round") / NAME
     pulses = [first, *pulses]
     times = [1.76e9 + sum(steps[:i]) / 1000 for i in range(len(pulses))]
-    with EpisodeWriter(folder, label="x", resolution=(64, 36), flags=True) as writer:
+    with EpisodeWriter(folder, About("x"), resolution=(64, 36), flags=True) as writer:
         for i, (t_s, found) in enumerate(zip(times, pulses, strict=True)):
             steering, throttle = found or (1500, None)
             writer.control(t_s, sum(steps[:i]), steering, throttle, 21316, 1016 if throttle else None)

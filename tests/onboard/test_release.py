@@ -312,6 +312,19 @@ def test_packing_again_changes_nothing(packed, two, keys):
     assert content() == before
 
 
+def test_a_disk_that_fills_while_packing_is_left_without_halves(two, tmp_path, monkeypatch):
+    write = Path.write_bytes
+
+    def full(path, content):
+        write(path, content[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        pack(two[1], tmp_path / "packed")
+    assert not list((tmp_path / "packed").iterdir())
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
@@ -732,6 +745,13 @@ def test_one_that_is_refused_does_not_tidy_up_after_the_other(releases, two):
         assert half.exists()
     releases.prune(3)
     assert not half.exists()
+
+
+def test_what_is_somebody_elses_among_the_releases_stays(releases):
+    theirs = releases.releases / ".git"
+    theirs.mkdir()
+    releases.prune(3)
+    assert theirs.exists()
 
 
 def test_a_rover_without_anything(tmp_path):

@@ -1,7 +1,9 @@
 """The flight log on good and bad disks, and what is read back from whole and damaged files."""
 
+import binascii
 import json
 import logging
+import math
 import os
 import resource
 import signal
@@ -295,6 +297,47 @@ def test_what_is_no_log(tmp_path):
     other.write_bytes(telemetry._sealed({"schema": 2, "kind": "header", "start": "x"}))
     with pytest.raises(LogError, match="of version 2, this program reads 1"):
         read_log(other)
+
+
+ROWS = {  # with a right checksum, and no lines of a flight log all the same
+    "no kind": {},
+    "a machine without a time": {"kind": "machine"},
+    "a temperature in words": {"kind": "machine", "t_s": 1, "temperature_c": "hot", "throttled": None},
+    "a temperature beyond all": {"kind": "machine", "t_s": 1, "temperature_c": 10**400, "throttled": None},
+    "an event at no time": {"kind": "event", "t_s": "x", "event": "a", "fields": {}},
+    "an event at the end of time": {"kind": "event", "t_s": 10**400, "event": "a", "fields": {}},
+    "an event without fields": {"kind": "event", "t_s": 1, "event": "a", "fields": []},
+    "a gap of no size": {"kind": "event", "t_s": 1, "event": telemetry.MISSING, "fields": {"ticks": "many"}},
+    "a header of no drive": {"kind": "header", "drive": [1]},
+}
+
+
+@pytest.mark.parametrize("what", ROWS)
+def test_a_line_of_another_form_is_skipped(tmp_path, good, what):
+    flight = read_bytes(good + telemetry._sealed(ROWS[what]), tmp_path)
+    assert flight.damaged == 1 and flight.summary()["ticks"] == 40
+
+
+def sealed(body):
+    return b'%s,"crc":"%04X"}\n' % (body, binascii.crc_hqx(body, 0))
+
+
+def test_a_line_that_is_nested_without_end_is_skipped(tmp_path, good):
+    assert read_bytes(good + sealed(b'{"kind":"x","y":' + b"[" * 5000 + b"]" * 5000), tmp_path).damaged == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "damaged"), [({"t_s": math.nan}, 1), ({"t_s": math.inf}, 1), ({"late_ms": math.inf}, 0)]
+)
+def test_a_tick_that_is_not_finite(tmp_path, good, change, damaged):
+    flight = read_bytes(good + telemetry._tick_line(tick(40, **change)), tmp_path)
+    assert flight.damaged == damaged and flight.summary()["jitter_max_ms"] == 0.25
+
+
+def test_a_pipe_is_not_waited_for(path):
+    os.mkfifo(path)
+    with pytest.raises(LogError, match="not a file"):
+        read_log(path)
 
 
 # ---- bad disks

@@ -17,7 +17,7 @@ from recorded import real_episode
 
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.onboard.recording import CONTROL_FIELDS, FRAME_FIELDS, EpisodeWriter
+from rover_lib.onboard.recording import CONTROL_FIELDS, FRAME_FIELDS, About, EpisodeWriter
 from rover_lib.workshop.episodes import choose_calibration, load_recordings, split
 
 CHUNK = 8
@@ -36,7 +36,7 @@ def throttle_at(t_s):
 def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0):
     """A faultless drive: controls every 33 ms from 0.1 s before the frames to 0.1 s after them."""
     folder = root / name
-    with EpisodeWriter(folder, label="hit red balloon", resolution=(32, 18)) as writer:
+    with EpisodeWriter(folder, About("hit red balloon"), resolution=(32, 18)) as writer:
         for i in range(round((frames / 30 + 0.2) / 0.033)):
             t_s = i * 0.033
             pulses = PWM.pulses(steering_at(t_s), throttle_at(t_s))
@@ -248,7 +248,7 @@ def test_throttle_without_a_measured_pulse_is_missing_not_zero(tmp_path, period)
 
 
 def test_a_channel_that_is_flagged_is_missing(tmp_path):
-    flagged = EpisodeWriter(tmp_path / "episode_20260101_120000", label="x", resolution=(32, 18), flags=True)
+    flagged = EpisodeWriter(tmp_path / "episode_20260101_120000", About("x"), resolution=(32, 18), flags=True)
     with flagged as writer:
         for i in range(40):
             t_s, lost = 1000 + 0.033 * i, 10 <= i < 20

@@ -20,7 +20,7 @@ from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY, EpisodeWriter
+from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY, About, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import finetune as finetune_module
 from rover_lib.workshop import pipeline, session
@@ -42,7 +42,7 @@ def record(root, drives=4, drivers=(HUMAN,) * FRAMES, size=(96, 54), offset=0, c
     """Drives whose steering and throttle change, and whose pictures do; with who drove at each frame."""
     rng, pwm = np.random.default_rng(offset), PwmCalibration()
     for drive in range(drives):
-        with EpisodeWriter(root / f"episode_{offset + drive}", label="", resolution=size, car=car) as writer:
+        with EpisodeWriter(root / f"episode_{offset + drive}", About("", car=car), resolution=size) as writer:
             for i, driver in enumerate(drivers):
                 t_s = i / rate_hz
                 pulses = pwm.pulses(0.5 * math.sin(4 * t_s + drive), 0.05 + 0.04 * math.cos(3 * t_s + drive))
