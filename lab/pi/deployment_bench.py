@@ -30,7 +30,7 @@ from lab.pi.playbooks import Play
 from rover_lib.onboard.release import POLICY, Releases, pack
 from rover_lib.workshop.cache import cached_folder, key_of
 
-STATE = "var/lib/rover"  # on the rover; models/ and incoming/ are in it
+STATE = "var/lib/rover"  # on the rover; models/ is in it, and incoming/ in that
 ROVER = "/opt/rover/venv/bin/rover"
 CHECK = "rover-check@{}.service"
 LOOK_S = 0.001  # between looks at the disk
@@ -68,8 +68,8 @@ class Disk:
 
     @classmethod
     def seen(cls, state: Path, about: Mapping[str, Any]) -> "Disk":
-        """state: the folder of models/ and incoming/. about: what pack() returned."""
-        models, incoming = state / "models", state / "incoming" / about["sha256"]
+        """state: the folder of models/. about: what pack() returned."""
+        models, incoming = state / "models", state / "models" / "incoming" / about["sha256"]
         ready, arrived, staging, current, last = False, (), {}, "", ""
         with contextlib.suppress(OSError):
             arrived = tuple(sorted(p.name for p in incoming.iterdir() if not p.name.startswith(".")))
@@ -200,7 +200,7 @@ class DeploymentBench:
 
     @property
     def state(self) -> Path:
-        """The rover's folder of models/ and incoming/; what is mounted there as long as it is on."""
+        """The rover's folder of models/; what is mounted there as long as it is on."""
         if self.pi.on:
             return Path(f"/proc/{self.pi.leader}/root/{STATE}")
         return self.pi.root / STATE
@@ -221,7 +221,7 @@ class DeploymentBench:
 
     @property
     def incoming(self) -> Path:
-        return self.state / "incoming" / self.about["sha256"]
+        return self.state / "models" / "incoming" / self.about["sha256"]
 
     @property
     def released(self) -> Path:

@@ -361,7 +361,7 @@ def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
             click.echo(f"{path}: {path.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
     if kit is None:
         return
-    from rover_lib.workshop.hailo import write_kit
+    from rover_lib.workshop.hailo.kit import write_kit
     from rover_lib.workshop.session import opened
 
     report = write_kit(opened(run_dir, terminal()), kit, samples=samples, progress=terminal())

@@ -134,13 +134,16 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     checkpoint, parts = again.checkpoint, again.parts
     samples = thinned(parts.choosing or parts.calibration, CHOOSING_FRAMES)
     exporter = Exporter(checkpoint, samples, Recipe.of(params()).parity)
-    calibration = Calibration.load(run_dir / "calibration.pt")
+    static = requantized(run_dir, checkpoint)  # before anything is written: it refuses a run whose files do not fit
+    made = {
+        "fp32": (ACT(checkpoint.config, checkpoint.weights), None),
+        "static": (static, Calibration.load(run_dir / "calibration.pt")),
+    }
     hashes = {}
-    for name in progress(("fp32", "static"), desc="for ONNX Runtime", total=2):
-        forget_graphs()
-        policy = ACT(checkpoint.config, checkpoint.weights) if name == "fp32" else requantized(run_dir, checkpoint)
+    for name, (policy, calibration) in progress(made.items(), desc="for ONNX Runtime", total=len(made)):
         path = run_dir / f"policy_{name}{ONNX_SUFFIX}"
-        hashes[path.name] = exporter.export(policy, path, None if name == "fp32" else calibration)
+        hashes[path.name] = exporter.export(policy, path, calibration)
+        forget_graphs()
     return hashes
 
 

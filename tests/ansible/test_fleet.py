@@ -153,7 +153,7 @@ def test_deployed_to_all_and_told_by_status(fleet, artifacts):
     for name in ("canary", "third"):
         status = fleet.releases(name).status()
         assert status["healthy"] and status["current"] == good and status["releases"][0]["signed"]
-        assert not (fleet.folder / name / "incoming").exists()
+        assert not (fleet.folder / name / "models" / "incoming").exists()
     policy = fleet.releases("third").policy
     policy.write_bytes(policy.read_bytes()[:-1] + b"x")
     fleet.lines["fourth"] = f"fourth rover_models={fleet.folder}/fourth/models"
@@ -176,7 +176,7 @@ def test_three_rovers_a_second_time_and_back(fleet, artifacts):
     for name in NAMES:
         assert fleet.releases(name).status()["current"] == second
         assert f"{name}: deployed" in done.stdout
-        assert not (fleet.folder / name / "incoming").exists()
+        assert not (fleet.folder / name / "models" / "incoming").exists()
     again = fleet.deploy(artifacts["mixed"])
     assert again.returncode == 0 and "canary: had it already" in again.stdout, again.stdout
     assert {name: row["changed"] for name, row in recap(again).items()} == dict.fromkeys(NAMES, 0)
@@ -248,7 +248,7 @@ def test_a_service_that_does_not_get_ready_with_it_has_the_model_before(fleet, a
 @pytest.mark.release
 def test_parts_that_were_damaged_on_the_way_are_sent_again(fleet, artifacts):
     packed = pack(artifacts["static"], fleet.folder / "packed")
-    incoming = fleet.folder / "third" / "incoming" / packed["sha256"]
+    incoming = fleet.folder / "third" / "models" / "incoming" / packed["sha256"]
     incoming.mkdir(parents=True)
     for part in (fleet.folder / "packed").glob("part-*"):
         (incoming / part.name).write_bytes(part.read_bytes()[:-1] + b"?")  # flipped on the way

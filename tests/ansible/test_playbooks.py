@@ -188,6 +188,33 @@ def test_whether_the_car_drives_is_asked_of_systemd_and_no_release_is_opened(tmp
     assert ("localhost is driving: wait until it is disarmed" in " ".join(done.stdout.split())) == refused
 
 
+def stand_in(tmp_path: Path, rover: str) -> Path:
+    """A systemctl that says what is in tmp_path/text of an active service and notes its calls in the file returned; and
+    a rover command with this body.
+    """
+    (tmp_path / "text").write_text("disarmed: waiting for a human to arm it")
+    programs = {
+        tmp_path / "bin" / "systemctl": f'echo "$@" >> {tmp_path}/calls\n'
+        f"printf 'LoadState=loaded\\nActiveState=active\\nStatusText='; cat {tmp_path}/text",
+        tmp_path / "home" / "venv" / "bin" / "rover": rover,
+    }
+    for path, body in programs.items():
+        path.parent.mkdir(parents=True)
+        path.write_text(f"#!/bin/sh\n{body}\n")
+        path.chmod(0o755)
+    return tmp_path / "calls"
+
+
+@pytest.mark.parametrize("asked_for, restarted", [("refuse", False), ("stop", True)])
+def test_a_car_that_is_armed_while_the_model_before_is_proven_is_not_stopped(tmp_path, asked_for, restarted):
+    calls = stand_in(tmp_path, f"printf driving > {tmp_path}/text")
+    given = {"rover_home": str(tmp_path / "home"), "rover_while_driving": asked_for, "rover_ready_s": 2}
+    done = play(tmp_path, [entry("rollback")], **given)
+    assert done.returncode == (0 if restarted else 2), done.stdout
+    assert ("localhost is driving: wait until it is disarmed" in " ".join(done.stdout.split())) is not restarted
+    assert ("restart rover-drive.service" in calls.read_text()) is restarted
+
+
 VAR_TMP = Path("/var/tmp")
 
 
@@ -214,6 +241,23 @@ def test_an_episode_comes_home_and_leaves_the_rover(tmp_path, name):
     assert [p.name for p in home.iterdir()] == [name]
     assert (home / name / "frames" / "frame_000001.jpg").read_bytes() == b"a picture"
     assert not list((tmp_path / "rover").iterdir()) and not left_in_var_tmp(before)
+
+
+def test_an_episode_at_home_is_not_lost_to_another_of_its_name(tmp_path):
+    """A Pi without internet and battery may live through the same second twice."""
+    name = "episode_20251007_144013"
+    rover, home = (tmp_path / place / name / "frame.jpg" for place in ("rover", "home/localhost/episodes"))
+    for path, content in ((rover, b"of today"), (home, b"of yesterday")):
+        path.parent.mkdir(parents=True)
+        path.write_bytes(content)
+    given = {"rover_episode": str(rover.parent), "rover_fetched": str(tmp_path / "home")}
+    found = play(tmp_path, [entry("episode")], **given)
+    assert found.returncode == 2 and f"{name} is here already, with other content" in found.stdout, found.stdout
+    assert (rover.read_bytes(), home.read_bytes()) == (b"of today", b"of yesterday")
+    home.write_bytes(b"of today")  # a run that was cut off before it removed what it had fetched
+    found = play(tmp_path, [entry("episode")], **given)
+    assert found.returncode == 0, found.stdout
+    assert not rover.parent.exists() and [p.name for p in home.parents[1].iterdir()] == [name]
 
 
 def test_an_episode_that_does_not_come_home_stays(tmp_path):
@@ -498,6 +542,15 @@ def unquoted(word: str) -> str:
         ("service", {"rover_home": "opt"}),
         ("service", {"rover_hz": "30\nUser=root"}),
         ("service", {"rover_memory_mb": "1500M\nUser=root"}),
+        ("service", {"rover_memory_mb": 0}),  # systemd ignores such a limit: there would be none
+        ("service", {"rover_ready_s": 0}),  # and takes this for no limit
+        ("service", {"rover_hz": "nan"}),
+        ("service", {"rover_seconds": -600}),
+        ("service", {"rover_threads": -1}),
+        ("view", {"rover_view_port": 65536}),
+        ("system", {"rover_journal_mb": 0}),
+        ("deploy", {"rover_keep": 0}),
+        ("deploy", {"rover_models": ""}),
         ("system", {"rover_port": '/dev/rover-arduino", RUN+="/bin/true'}),
         ("system", {"rover_usb_ids": ['2341:0043", RUN+="/bin/true']}),
     ],

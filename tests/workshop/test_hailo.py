@@ -14,9 +14,12 @@ from hailo_kit import FRAMES, normalised, opened
 from policies import TINY, lerobot_policy, memory_samples, smooth_frame
 
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.workshop import hailo
 from rover_lib.workshop.act import ACT, ActConfig, Affine, imagenet, inputs_of
-from rover_lib.workshop.hailo import CHIPS, estimate, networks, write_kit
+from rover_lib.workshop.hailo import stand_in
+from rover_lib.workshop.hailo.chips import CHIPS, estimate
+from rover_lib.workshop.hailo.description import files
+from rover_lib.workshop.hailo.kit import write_kit
+from rover_lib.workshop.hailo.networks import networks
 
 DOCS = Path(__file__).parents[2] / "docs" / "hailo.md"
 
@@ -134,7 +137,7 @@ def test_networks_have_fixed_shapes_of_few_ranks_and_known_operators(checkpoint)
 
 def test_kit_has_every_file_that_it_lists_and_that_the_docs_name(kit, checkpoint):
     made = {p.name for p in kit.iterdir()}
-    assert made == set(hailo.files(checkpoint.config))
+    assert made == set(files(checkpoint.config))
     assert all(name in (kit / "KIT.md").read_text() for name in made)
     patterns = re.findall(r"`([\w<>.]+\.(?:onnx|alls|sh|py|npy|npz|md|json))`", DOCS.read_text())
     assert len(patterns) > 10
@@ -208,7 +211,7 @@ def test_a_failure_on_the_way_leaves_nothing(checkpoint, tmp_path, monkeypatch):
     def fails(*_, **__):
         raise QuantizeError("no")
 
-    monkeypatch.setattr(hailo, "int8", fails)
+    monkeypatch.setattr(stand_in, "int8", fails)
     with pytest.raises(QuantizeError):
         write_kit(opened(checkpoint), tmp_path / "kit", samples=FRAMES)
     assert not list(tmp_path.iterdir())

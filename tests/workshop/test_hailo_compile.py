@@ -11,7 +11,7 @@ import hailo_standin
 import numpy as np
 import pytest
 
-from rover_lib.workshop import hailo_compile
+from rover_lib.workshop.hailo import compile as hailo_compile
 
 
 @pytest.fixture
@@ -69,3 +69,11 @@ def test_the_script_of_a_chip_runs_in_a_kit_alone(kit):
     shell = ["env", "-i", f"PATH={sys.exec_prefix}/bin:/usr/bin:/bin", "sh", "compile_hailo10h.sh", "whole"]
     done = subprocess.run(shell, cwd=kit, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1 and "Dataflow Compiler is not installed" in done.stderr
+
+
+def test_a_hef_that_is_not_there_costs_no_artifact(kit):
+    (kit / "policy_whole_hailo8.hailo.zip").write_bytes(b"of yesterday")
+    program = [sys.executable, "compile.py", "hailo8", "whole", "--hef", "nowhere.hef"]
+    done = subprocess.run(program, cwd=kit, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (1, "nowhere.hef: no such file\n")
+    assert (kit / "policy_whole_hailo8.hailo.zip").read_bytes() == b"of yesterday"

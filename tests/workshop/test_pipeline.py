@@ -7,9 +7,11 @@ import pytest
 from policies import memory_samples
 
 from rover_lib.onboard.artifact import content_hash, read_manifest
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
+from rover_lib.workshop import pipeline
 from rover_lib.workshop.observe import calibrate
-from rover_lib.workshop.pipeline import Recipe, export_policies, make_artifact
+from rover_lib.workshop.pipeline import Recipe, export_onnx, export_policies, make_artifact, write_quantize
 from rover_lib.workshop.quantize import quantize
 from rover_lib.workshop.session import Opened
 
@@ -48,3 +50,15 @@ def test_fp32_needs_no_calibration(loaded, tmp_path):
     manifest = read_manifest(tmp_path / "fp32.pt")
     assert (manifest["mode"], manifest["calibration"], warnings) == ("fp32", None, [])
     assert digest == content_hash(tmp_path / "fp32.pt")
+
+
+def test_a_run_whose_files_do_not_fit_each_other_gets_no_onnx_at_all(loaded, calibration, tmp_path, monkeypatch):
+    """Not even the FP32 one, which would lie there beside a static policy that is another."""
+    monkeypatch.setattr(pipeline, "opened", lambda *_: loaded)
+    calibration.save(tmp_path / "calibration.pt")
+    (tmp_path / "policy_static.pt").write_bytes(b"of another run")
+    write_quantize(tmp_path, loaded.checkpoint, {"modes": {"static": {"content_hash": "of this run"}}})
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(RoverError):
+        export_onnx(tmp_path)
+    assert sorted(tmp_path.iterdir()) == before

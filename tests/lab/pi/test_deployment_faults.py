@@ -38,7 +38,8 @@ def test_every_fault_has_its_own_name_and_there_are_enough():
 
 
 def test_how_far_a_deployment_has_come_is_on_the_disk(tmp_path):
-    incoming, releases = tmp_path / "incoming" / ABOUT["sha256"], tmp_path / "models" / "releases"
+    models = tmp_path / "models"
+    incoming, releases = models / "incoming" / ABOUT["sha256"], models / "releases"
     assert Disk.seen(tmp_path, ABOUT) == Disk()
     incoming.mkdir(parents=True)
     assert Disk.seen(tmp_path, ABOUT) == Disk(ready=True)

@@ -29,6 +29,8 @@ def main() -> None:
     parser.add_argument("--hef", type=Path, help="do not compile: pack this one")
     given = parser.parse_args()
     kit = Path(__file__).resolve().parent
+    if given.hef and not given.hef.is_file():
+        raise SystemExit(f"{given.hef}: no such file")
     hef = given.hef or compile_network(kit, given.chip, given.network)
     print(f"{pack(kit, given.chip, given.network, hef)}: take it to the rover, and run `rover doctor` there")
 
@@ -74,13 +76,14 @@ def pack(kit: Path, chip: str, name: str, hef: Path) -> Path:
         "weights_mb": network["weights_mb"],
     }
     path = kit / f"policy_{name}_{chip}.hailo.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as z:
+    new = path.with_name(f".{path.name}.new")  # so that what is there stays until this is whole
+    with zipfile.ZipFile(new, "w", zipfile.ZIP_STORED) as z:
         z.writestr("archive/extra/manifest.json", json.dumps(manifest, sort_keys=True, indent=1))
         z.write(kit / "parity.npz", "archive/extra/parity.npz")
         z.write(hef, "archive/network.hef")
         if network["cpu"]:
             z.write(kit / network["cpu"], "archive/model.onnx")
-    return path
+    return new.replace(path)
 
 
 def _check_compiler(major: str) -> None:
