@@ -29,6 +29,7 @@ from rover_lib.onboard.policy import Policy
 from rover_lib.onboard.recording import HUMAN, POLICY
 from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, write_stage
 from rover_lib.workshop import pipeline
+from rover_lib.workshop.cache import car_in_key
 from rover_lib.workshop.cells import Table
 from rover_lib.workshop.compare import gate
 from rover_lib.workshop.finetune import FinetuneRecipe, finetune
@@ -184,9 +185,8 @@ def measured(
         if not (run_dir / name).exists():
             raise WorldError(f"{run_dir / name}: not there", remedy="`make demo` makes it")
     inputs = {CHECKPOINT: sha256_of(run_dir / CHECKPOINT), ARTIFACT: content_hash(run_dir / ARTIFACT)}
-    given = plain(
-        asdict(experiment) | {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED}
-    )
+    how = {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED, **car_in_key()}
+    given = plain(asdict(experiment) | how)
     with suppress(RoverError):
         there = read_stage(path, "learn")
         if (there["params"], there["inputs"]) == (given, inputs):

@@ -27,7 +27,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.policy import Policy, load_policy
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
-from rover_lib.workshop.cache import cache_root, key_of
+from rover_lib.workshop.cache import cache_root, car_in_key, key_of
 from rover_lib.workshop.compare import GATED, thinned
 from rover_lib.workshop.distill import errors_of
 from rover_lib.workshop.episodes import load_recordings, split
@@ -260,7 +260,8 @@ def _errors(
 def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progress) -> np.ndarray:
     """(n, C, A) float32 of what an artifact plans on the samples. Kept in the cache."""
     frames = [(str(s.frame_path), s.frame_path.stat().st_size, s.frame_name, s.state.tolist()) for s in samples]
-    key = key_of({"artifact": content_hash(artifact), "frames": frames, "torch": torch.__version__}, preprocess)
+    planned_by = {"artifact": content_hash(artifact), "torch": torch.__version__, **car_in_key()}
+    key = key_of(planned_by | {"frames": frames}, preprocess)
     path = cache_root() / f"plans-{key}.npy"
     if not path.exists():
         every = everywhere(artifact, range(len(samples)), lambda policy, i: _plan(policy, samples[i]))
@@ -297,7 +298,8 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
             condition = Condition(pushed_ms / 1e3, Settings.of(how), PUSHES)
             asked["pushed_"] = partial(_pushed, condition=condition)
     sources = [world, trial, latency, loop, pilot, plan, preprocess]
-    alike = {"artifact": content_hash(run.artifact), "torch": torch.__version__, "drive": how, "pushes": PUSHES}
+    driven_by = {"artifact": content_hash(run.artifact), "torch": torch.__version__, **car_in_key()}
+    alike = driven_by | {"drive": how, "pushes": PUSHES}
     files = {}
     for name in asked:
         key = key_of(alike | {"how": name, "latency_ms": pushed_ms if name else None}, *sources)
