@@ -4,9 +4,8 @@
 it also says how many steps of a plan make a second, for which neither format has a place.
 """
 
-import contextlib
 import json
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -116,17 +115,10 @@ def write_both(
     return {name: sha256_of(path) for name, path in files.items()}
 
 
-@contextlib.contextmanager
-def made_beside(folder: Path, last: str) -> Iterator[Path]:
-    """A hidden folder beside a run's, empty: what is in it when the block ends well moves into the run's folder, the
-    file `last` last. Nothing does otherwise, and the hidden one goes.
-
-    Raises RoverError while another process makes a run of that name.
-    """
+def made_beside(folder: Path) -> AbstractContextManager[Path]:
+    """A hidden folder beside a run's, empty, in which a policy of that name is made; see `alone_in`."""
     # not `.new`, in which a run of that name may wait to go on
-    with alone_in(folder.with_name(f".{folder.name}.made")) as new:
-        yield new
-        _take_place(new, folder, last)
+    return alone_in(folder.with_name(f".{folder.name}.made"))
 
 
 def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
@@ -135,7 +127,7 @@ def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
     return {"mean": (-shift / scale).float().reshape(shape), "std": (1 / scale - EPS).float().reshape(shape)}
 
 
-def _take_place(new: Path, folder: Path, last: str) -> None:
+def take_place(new: Path, folder: Path, last: str) -> None:
     """Move what is whole into a run's folder, the file `last` last; what was there goes when its successor is there."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in sorted(new.iterdir(), key=lambda p: p.name == last):

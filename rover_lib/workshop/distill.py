@@ -36,7 +36,7 @@ from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint_files import made_beside, write_both
+from rover_lib.workshop.checkpoint_files import made_beside, take_place, write_both
 from rover_lib.workshop.choose import Chooser
 from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.episodes import Sample
@@ -133,12 +133,13 @@ def distill(
         remedy = "give it a smaller picture, fewer layers or channels, or train it for INT8 with --qat"
         raise DistillError("this student would be its teacher", remedy=remedy)
     with (
-        made_beside(folder, "distill.json") as new,
+        made_beside(folder) as new,
         threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()),
     ):
         taught = _taught(work)
         _leave(new, name, work, taught)
         _remove_replaced(folder, new)
+        take_place(new, folder, last="distill.json")
     shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
     return folder
 

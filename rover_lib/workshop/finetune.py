@@ -141,13 +141,16 @@ def finetune(
     parent, material = _opened(checkpoint, episodes, recipe, progress)
     work = _Work(parent, material, recipe, where, progress)
     with (
-        made_beside(folder, "finetune.json") as new,
+        made_beside(folder) as new,
         threads(1 if gmac(parent.config) < SMALL_GMAC else torch.get_num_threads()),
     ):
         if folder.exists():  # by another process, just now
             raise _is_there(folder)
         taught = _taught(work)
         _leave(new, name, work, taught)
+        if folder.exists():  # by another command meanwhile; what was learned is kept for another name
+            raise _is_there(folder)
+        new.rename(folder)  # at once: of a part of it, this command could not go on
     shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
     return folder
 

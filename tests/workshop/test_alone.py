@@ -8,7 +8,7 @@ import pytest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop import alone
 from rover_lib.workshop.alone import alone_in
-from rover_lib.workshop.checkpoint_files import made_beside
+from rover_lib.workshop.checkpoint_files import made_beside, take_place
 from rover_lib.workshop.run_folder import run_folder
 
 
@@ -67,9 +67,11 @@ def test_a_run_that_is_a_link_is_made_where_the_link_leads(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "mine").symlink_to("../disk/large")
     for _ in ("not there yet", "there"):
-        with made_beside(run_folder(tmp_path / "runs", "mine", RoverError), "last.json") as new:
+        folder = run_folder(tmp_path / "runs", "mine", RoverError)
+        with made_beside(folder) as new:
             assert new.parent == tmp_path / "disk"
             (new / "last.json").touch()
+            take_place(new, folder, last="last.json")
     assert [p.name for p in (tmp_path / "runs" / "mine").iterdir()] == ["last.json"]
 
 
@@ -81,11 +83,12 @@ def test_what_is_moved_into_a_runs_folder_costs_nothing_where_it_ends_in_the_mid
     (tmp_path / "mine" / "figures" / "one").write_text("old")
 
     def make():
-        with made_beside(tmp_path / "mine", "last.json") as new:
+        with made_beside(tmp_path / "mine") as new:
             for name in ("pretrained_model", "figures"):
                 (new / name).mkdir()
                 (new / name / "one").write_text("new")
             (new / "last.json").write_text("new")
+            take_place(new, tmp_path / "mine", last="last.json")
 
     rename = type(tmp_path).rename
 
