@@ -115,6 +115,12 @@ def write_both(
     return {name: sha256_of(path) for name, path in files.items()}
 
 
+def written_in(folder: Path) -> Path:
+    """What `write_both` left there for `load_checkpoint`: the trainer's file where there is one."""
+    trainers = folder / "best_model.pth"
+    return trainers if trainers.is_file() else folder / "pretrained_model"
+
+
 def made_beside(folder: Path) -> AbstractContextManager[Path]:
     """A hidden folder beside a run's, empty, in which a policy of that name is made; see `alone_in`."""
     # not `.new`, in which a run of that name may wait to go on

@@ -36,7 +36,7 @@ from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint_files import made_beside, take_place, write_both
+from rover_lib.workshop.checkpoint_files import made_beside, take_place, write_both, written_in
 from rover_lib.workshop.choose import Chooser
 from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.episodes import Sample
@@ -555,7 +555,7 @@ def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
         "seed": work.recipe.seed,
     }
     hashes = write_both(new, work.config, taught.weights, loss, origin, **settings)
-    student = load_checkpoint(new / ("best_model.pth" if "best_model.pth" in hashes else "pretrained_model"))
+    student = load_checkpoint(written_in(new))
     samples, parity = thinned(parts.choosing, quantization.CHOOSING_FRAMES), quantization.Recipe.of(params()).parity
     export(rounded, student, new / "policy_static.pt", samples, calibration, parity)
     write_stage(

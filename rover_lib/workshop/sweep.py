@@ -184,6 +184,7 @@ class Notebooks:
     def _taught(self, job: Job, folder: Path) -> Path:
         """The student's checkpoint, in the run's own folder; what was begun goes on."""
         from rover_lib.onboard.params import params
+        from rover_lib.workshop.checkpoint_files import written_in
         from rover_lib.workshop.distill import DistillRecipe, distill
         from rover_lib.workshop.student import StudentShape
 
@@ -198,7 +199,7 @@ class Notebooks:
         made = distill(
             job.checkpoint, job.episodes, job.name, shape, runs_dir=folder, recipe=recipe, qat=qat, device="cpu"
         )
-        return made / "best_model.pth"
+        return written_in(made)
 
 
 @contextmanager

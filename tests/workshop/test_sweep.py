@@ -176,6 +176,19 @@ def test_a_student_is_taught_into_its_runs_folder(tmp_path, monkeypatch):
         sweeping.Notebooks().prepare(replace(job, student={"size": "96 by 54"}), tmp_path)
 
 
+def test_a_student_that_only_lerobots_folder_can_hold_is_run_from_there(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("rover_lib.workshop.run.run", lambda checkpoint, *_, **__: asked.append(checkpoint))
+
+    def leave(*_, **__):
+        (tmp_path / "taught" / "pretrained_model").mkdir(parents=True)
+        return tmp_path / "taught"
+
+    monkeypatch.setattr("rover_lib.workshop.distill.distill", leave)
+    sweeping.Notebooks().prepare(Job("pretrained_model", "episodes", {"decoder_layers": 1}, {}, {}), tmp_path)
+    assert asked == [tmp_path / "taught" / "pretrained_model"]
+
+
 @pytest.mark.slow
 def test_a_cluster_without_a_worker_that_times_is_refused():
     from distributed import LocalCluster
