@@ -332,7 +332,7 @@ class _Lab:
         return range(SEED, SEED + (self.experiment.worlds if how == PUSHED else self.experiment.other_worlds))
 
     def outcomes(self, name: str) -> dict[str, dict[int, str]]:
-        """Of a policy, by condition and seed; those of worlds that an experiment with more of them drove are left out."""
+        """Of a policy, by condition and seed, in the worlds that judge; more of them may have been driven before."""
         found: dict[str, dict[int, str]] = {how: {} for how in self.experiment.judged_in()}
         for row in _rows(self.folder / f"{name}.jsonl"):
             if row["seed"] in self.seeds(row["how"]):

@@ -33,6 +33,7 @@ from rover_lib.workshop.distill import errors_of
 from rover_lib.workshop.episodes import load_recordings, split
 from rover_lib.workshop.judge import not_judged
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.run_folder import says_how_it_was_taught
 from rover_lib.workshop.samples import Recordings, Sample, Source
 from rover_lib.world import latency, trial, world
 from rover_lib.world.frontier import DRIVES, NOBODY_DROVE, recommendation
@@ -137,7 +138,7 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
     if not names or len({*names, TEACHER}) <= len(names):
         raise DistillError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
     taught = [_distilled(student) for student in students]
-    if (own := folder / "distill.json").is_file() and "losses" in read_stage(own, "distill")["metrics"]:
+    if (own := folder / "distill.json").is_file() and says_how_it_was_taught(own):
         raise DistillError(
             f"{folder}: was distilled itself, and its distill.json would be lost", remedy="begin with its own teacher"
         )
@@ -166,12 +167,12 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
 
 def _distilled(student: Path) -> dict[str, Any]:
     """The distill.json that `rover distill` left."""
-    if not (student / "distill.json").is_file():
+    path = student / "distill.json"
+    if not path.is_file():
         raise DistillError(f"{student}: no distill.json in it", remedy="'rover distill' makes a student")
-    content = read_stage(student / "distill.json", "distill")
-    if "losses" not in content["metrics"]:
+    if not says_how_it_was_taught(path):
         raise DistillError(f"{student}: is a teacher's run, not a student's", remedy="give the teacher first")
-    return content
+    return read_stage(path, "distill")
 
 
 def _artifact_of(run_dir: Path) -> Path:
