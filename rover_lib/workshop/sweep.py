@@ -396,7 +396,7 @@ def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> l
         if "benchmark" not in parts_done(job, Path(folder), marks[job.name]):
             continue
         compared = read_stage(run / "compare.json", "compare")["metrics"]
-        timed = next(read_stage(p, "benchmark") for p in sorted(run.glob("benchmark-*.json")))
+        timed = _timed(run)
         mode = compared["modes"][MODE]
         ours = [mode[f"{action}_mae_pct"] for action in compared["action_range"]]
         recorded = [mode.get(f"{action}_vs_recorded_pct") for action in compared["action_range"]]
@@ -416,6 +416,17 @@ def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> l
     for row in found:
         row["best"] = not any(_beats(other, row) for other in found)
     return found
+
+
+def _timed(run: Path) -> dict[str, Any]:
+    """The benchmark of the run's artifacts. One of another host may lie beside it, of what the run was before."""
+    artifact = f"policy_{MODE}.pt"
+    made = read_stage(run / "quantize.json", "quantize")["metrics"]["modes"][MODE]["content_hash"]
+    for path in sorted(run.glob("benchmark-*.json")):
+        content = read_stage(path, "benchmark")
+        if content["inputs"].get(artifact) == made:
+            return content
+    raise SweepError(f"{run}: no benchmark of its {artifact}", remedy="remove that folder, and sweep again")
 
 
 def _beats(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

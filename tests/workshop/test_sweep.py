@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -129,6 +130,21 @@ def test_the_best_are_those_that_no_other_beats():
     assert sweeping._beats(row, {**row, "size_mb": 13.0})
     assert not sweeping._beats({**row, "latency_p50_ms": 11.0}, {**row, "size_mb": 13.0})
     assert not sweeping._beats(row, {**row, "to_recorded_pct": None})
+
+
+def test_times_are_of_the_artifact_that_is_there(tmp_path, sheet, monkeypatch):
+    """A run that is made again keeps the benchmarks of other hosts, which are of what it was before."""
+    job = Sheet.read(sheet()).jobs()[0]
+    stub, mark = Stub(tmp_path / "log"), sweeping.fingerprints([job])[job.name]
+    worker = SimpleNamespace(state=SimpleNamespace(total_resources={"timing": 1}))
+    monkeypatch.setattr("distributed.get_worker", lambda: worker)
+    for part in ("prepare", "benchmark"):
+        sweeping.do(part, stub, job, tmp_path, mark)
+    timed = json.loads((tmp_path / job.name / "benchmark-here.json").read_text())
+    timed["inputs"], timed["metrics"] = {"policy_static.pt": "another"}, {"artifacts": {"static": {"latency_p50_ms": 99}}}
+    (tmp_path / job.name / "benchmark-a-host.json").write_text(json.dumps(timed))
+    (row,) = sweeping.rows([job], tmp_path, {job.name: mark})
+    assert row["latency_p50_ms"] == 10
 
 
 @pytest.mark.slow
