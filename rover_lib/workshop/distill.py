@@ -11,6 +11,7 @@ The run's folder gets best_model.pth, pretrained_model/, policy_static.pt and di
 Letters: n samples, B batch, C chunk, A actions.
 """
 
+import math
 import shutil
 import sys
 import zlib
@@ -55,6 +56,7 @@ from rover_lib.workshop.scheme import Scheme
 from rover_lib.workshop.session import SMALL_GMAC, Opened, load, training_device
 from rover_lib.workshop.student import StudentShape, gmac, initial_weights, student_config
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
+from rover_lib.workshop.untrusted import numbers
 
 Notes = dict[str, list[dict[str, Any]]]  # of what a student does without, by part
 NOBODY_DROVE = "Judged on recordings alone: nobody drove."
@@ -83,18 +85,34 @@ class DistillRecipe:
     judged_frames: int
     seed: int
 
+    def __post_init__(self):
+        counts = self.samples, self.batch, self.unit_frames, self.judged_frames
+        steps = self.backbone_steps, self.transformer_steps, self.together_steps, self.qat_steps
+        if min(counts) < 1 or min(*steps, self.seed) < 0:
+            raise DistillError("samples, batch and frames must be at least 1, steps and seed at least 0", found=self)
+        rates, weights = (self.rate, self.qat_rate), (self.to_teacher, self.to_recorded)
+        if not (all(map(math.isfinite, (*rates, *weights))) and min(rates) > 0 and min(weights) >= 0 < max(weights)):
+            raise DistillError(
+                "rates must be finite and above 0, to_teacher and to_recorded at least 0, and not both 0", found=self
+            )
+
     @classmethod
-    def of(cls, params: dict[str, Any], steps: int | None, samples: int | None, seed: int | None) -> "DistillRecipe":
-        """That of params.yml, with what is not None in its place. steps: in all."""
-        recipe = cls(**params["distill"])
-        recipe = recipe.of_steps(steps) if steps else recipe
+    def of(
+        cls, params: dict[str, Any], steps: int | None = None, samples: int | None = None, seed: int | None = None
+    ) -> "DistillRecipe":
+        """That of params.yml, with what is not None in its place. steps: in all. Raises DistillError."""
+        recipe = numbers(cls, params["distill"], "params.yml: distill", DistillError)
+        if steps is not None:
+            recipe = recipe.of_steps(steps)
         given = {"samples": samples, "seed": seed}
         return replace(recipe, **{name: value for name, value in given.items() if value is not None})
 
     def of_steps(self, steps: int) -> "DistillRecipe":
         """The same with that many steps in all, at least one in each phase."""
+        if steps < 1:
+            raise DistillError("a student needs at least 1 step", found=steps)
         names = ("backbone_steps", "transformer_steps", "together_steps", "qat_steps")
-        planned = sum(getattr(self, name) for name in names)
+        planned = max(sum(getattr(self, name) for name in names), 1)
         return replace(self, **{name: max(1, round(steps * getattr(self, name) / planned)) for name in names})
 
 
@@ -120,9 +138,7 @@ def distill(
     student; CheckpointError, EpisodeError, TrainingError; RoverError while another process makes a run of that name.
     """
     folder, where = run_folder(runs_dir, name, DistillError), training_device(device, DistillError)
-    recipe = recipe or DistillRecipe(**params()["distill"])
-    if recipe.seed < 0:
-        raise DistillError("a seed must be at least 0", found=recipe.seed)
+    recipe = recipe or DistillRecipe.of(params())
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint
     _refuse_another_policy(folder, teacher)
@@ -364,7 +380,7 @@ def _kept(path: Path) -> Any:
 def _train_transformer(room: _Room, policy: BatchedPolicy, saved: Resumable) -> None:
     """Phase two: all but the backbone, on the tokens that it gave."""
     recipe, lessons = room.work.recipe, room.lessons
-    optimizer, scheduler = optimiser(policy.model.parameters(), recipe.rate, recipe.transformer_steps)
+    optimizer, scheduler = optimiser(policy.model.parameters(), recipe.rate, max(recipe.transformer_steps, 1))
     rng = room.work.rng("transformer")
     steps, model = recipe.transformer_steps, policy.model
     for _ in saved.steps("transformer", steps, rng, model=model, optimizer=optimizer, scheduler=scheduler):
@@ -377,7 +393,7 @@ def _train_transformer(room: _Room, policy: BatchedPolicy, saved: Resumable) -> 
 def _train_together(room: _Room, policy: BatchedPolicy, saved: Resumable) -> None:
     """Phase three: all parameters at a tenth of the rate, on pictures in any light."""
     recipe = room.work.recipe
-    optimizer, scheduler = optimiser(policy.parameters(), recipe.rate / 10, recipe.together_steps)
+    optimizer, scheduler = optimiser(policy.parameters(), recipe.rate / 10, max(recipe.together_steps, 1))
     rng = room.work.rng("together")
     steps = recipe.together_steps
     for _ in saved.steps("together", steps, rng, policy=policy, optimizer=optimizer, scheduler=scheduler):
@@ -400,7 +416,7 @@ def _train_rounded(room: _Room, policy: BatchedPolicy, saved: Resumable, folder:
     kept = _kept(path)
     rounded = RoundedPolicy(student, Scheme(**kept["scheme"]), Calibration(**kept["calibration"])).to(work.device)
     exact = BatchedPolicy(work.config, student.weights).to(work.device)
-    optimizer, scheduler = optimiser(policy.parameters(), recipe.qat_rate, recipe.qat_steps)
+    optimizer, scheduler = optimiser(policy.parameters(), recipe.qat_rate, max(recipe.qat_steps, 1))
     rng, steps = work.rng("qat"), recipe.qat_steps
     for _ in saved.steps("qat", steps, rng, policy=policy, optimizer=optimizer, scheduler=scheduler):
         rows, views = room.draw(rng)

@@ -113,6 +113,8 @@ class Sheet:
             raise SweepError(f"{path}: students must be a list of mappings", found=students)
         if unknown := sorted(set().union(*students) - set(STUDENT_OPTIONS)):
             raise SweepError(f"{path}: no student has {unknown[0]!r}", remedy=f"known are {', '.join(STUDENT_OPTIONS)}")
+        for student in students:
+            _check_student(student)
         of_params = _lists(content.get("params"), f"{path}: params")
         if wrong := [key for key in of_params if "." not in key]:
             raise SweepError(f"{path}: params are named by their place, say calibration.seed", found=wrong[0])
@@ -132,6 +134,21 @@ class Sheet:
         if twice := {name for name in names if names.count(name) > 1}:
             raise SweepError("a run stands in the sheet twice", found=sorted(twice)[0])
         return jobs
+
+
+def _check_student(student: Mapping[str, Any]) -> None:
+    """Raise SweepError for what `rover distill` would not take as that option, rather than to teach another student."""
+    for key, value in student.items():
+        if key == "size":
+            right, what = isinstance(value, str) and re.fullmatch(r"\d+x\d+", value), "WIDTHxHEIGHT"
+        elif key == "qat":
+            right, what = isinstance(value, bool), "true or false"
+        elif key == "backbone_channels":
+            right, what = type(value) in (int, float), "a number"
+        else:
+            right, what = type(value) is int, "a whole number"
+        if not right:
+            raise SweepError(f"a student's {key} is {what}", found=value)
 
 
 def _lists(values: Any, where: str) -> dict[str, list[Any]]:
@@ -190,12 +207,10 @@ class Notebooks:
 
         options = dict(job.student)
         recipe = DistillRecipe.of(params(), **{key: options.pop(key, None) for key in ("steps", "samples", "seed")})
-        width, _, height = str(options.pop("size", "x")).partition("x")
-        qat = bool(options.pop("qat", False))
-        try:
-            shape = StudentShape(int(height) if height else None, int(width) if width else None, **options)
-        except ValueError:
-            raise SweepError("a student's size is WIDTHxHEIGHT", found=job.student["size"]) from None
+        _check_student(job.student)
+        width, _, height = options.pop("size", "x").partition("x")
+        qat = options.pop("qat", False)
+        shape = StudentShape(int(height) if height else None, int(width) if width else None, **options)
         made = distill(
             job.checkpoint, job.episodes, job.name, shape, runs_dir=folder, recipe=recipe, qat=qat, device="cpu"
         )

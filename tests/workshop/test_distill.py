@@ -1,6 +1,7 @@
 """A student is taught on recordings alone, whatever interrupts it."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
@@ -340,16 +341,48 @@ def test_an_old_students_checkpoint_goes_where_the_new_one_has_none(tmp_path):
         ({"shape": StudentShape(54, 96), "device": "tpu"}, "device must be"),
         ({"shape": StudentShape(54, 96), "name": "../fast"}, "plain folder name"),
         ({"shape": StudentShape(54, 96), "name": ""}, "plain folder name"),
-        (
-            {"shape": StudentShape(54, 96), "recipe": DistillRecipe(**{**params()["distill"], "seed": -1})},
-            "seed must be",
-        ),
     ],
 )
 def test_what_cannot_be_taught_is_refused(teacher, episodes, tmp_path, options, says):
     with pytest.raises(DistillError, match=says):
         distill(teacher, episodes, **{"name": "fast", "runs_dir": tmp_path, **options})
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"seed": -1}, "steps and seed at least 0"),
+        ({"batch": 0}, "at least 1"),
+        ({"judged_frames": 0}, "at least 1"),
+        ({"qat_steps": -1}, "steps and seed at least 0"),
+        ({"rate": 0.0}, "above 0"),
+        ({"rate": math.nan}, "finite"),
+        ({"to_teacher": 0.0, "to_recorded": 0.0}, "not both 0"),
+        ({"rate": "2e-4"}, "rate must be a number, found '2e-4'"),  # as YAML reads it
+        ({"samples": 10.5}, "samples must be a whole number"),
+        ({"lessons": 3}, "there is no 'lessons'"),
+    ],
+)
+def test_a_recipe_that_cannot_be_is_refused(values, says):
+    with pytest.raises(DistillError, match=says):
+        DistillRecipe.of({"distill": {**params()["distill"], **values}})
+
+
+def test_of_no_steps_there_is_no_recipe():
+    with pytest.raises(DistillError, match="at least 1 step"):
+        DistillRecipe.of(params(), steps=0)
+
+
+def test_a_phase_may_be_left_out(recipe):
+    """Its optimiser is made all the same."""
+    work = SimpleNamespace(recipe=replace(recipe, transformer_steps=0, together_steps=0), rng=np.random.default_rng)
+    room, policy = SimpleNamespace(work=work, lessons=None), torch.nn.Linear(1, 1)
+    policy.model = torch.nn.Linear(1, 1)
+    saved = SimpleNamespace(steps=lambda phase, steps, *_, **__: range(steps))
+    work.rng = lambda phase: np.random.default_rng(0)
+    distill_module._train_transformer(room, policy, saved)
+    distill_module._train_together(room, policy, saved)
 
 
 @pytest.mark.parametrize("steps", [1, 10, 1000])

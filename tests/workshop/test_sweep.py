@@ -66,6 +66,9 @@ def test_names_stay_while_the_sheet_grows(sheet):
         ({"params": {"seed": 1}}, "named by their place"),
         ({"students": {"size": "1x1"}}, "students must be a list of mappings"),
         ({"students": [{"layers": 1}]}, "no student has 'layers'"),
+        ({"students": [{"size": 320}]}, "a student's size is WIDTHxHEIGHT"),
+        ({"students": [{"qat": "no"}]}, "qat is true or false"),
+        ({"students": [{"steps": "few"}]}, "steps is a whole number"),
     ],
 )
 def test_a_wrong_sheet_is_a_sentence(sheet, changes, said):
@@ -141,7 +144,10 @@ def test_times_are_of_the_artifact_that_is_there(tmp_path, sheet, monkeypatch):
     for part in ("prepare", "benchmark"):
         sweeping.do(part, stub, job, tmp_path, mark)
     timed = json.loads((tmp_path / job.name / "benchmark-here.json").read_text())
-    timed["inputs"], timed["metrics"] = {"policy_static.pt": "another"}, {"artifacts": {"static": {"latency_p50_ms": 99}}}
+    timed["inputs"], timed["metrics"] = (
+        {"policy_static.pt": "another"},
+        {"artifacts": {"static": {"latency_p50_ms": 99}}},
+    )
     (tmp_path / job.name / "benchmark-a-host.json").write_text(json.dumps(timed))
     (row,) = sweeping.rows([job], tmp_path, {job.name: mark})
     assert row["latency_p50_ms"] == 10
