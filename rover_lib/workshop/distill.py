@@ -239,23 +239,12 @@ class _Taught:
 
 def _taught(work: _Work) -> _Taught:
     """All phases. What depends on teacher, picture and samples alone stays in the cache, for its next student."""
-    recipe, progress = work.recipe, work.progress
-    samples = thinned(work.opened.parts.calibration, recipe.samples)
-    sees = {
-        "teacher": work.teacher.identity,
-        "size": work.config.image_sizes,
-        "pictures": [(s.episode, s.frame_path.name, s.frame_path.stat().st_size) for s in samples],
-        "rows": [s.row for s in samples],  # a dataset's pictures are many in one file
-        "states": zlib.crc32(np.stack([s.state for s in samples]).tobytes()),
-        "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
-        "recipe": [recipe.batch, recipe.backbone_steps, recipe.rate],
-        "at": [work.device.type, recipe.seed],
-        "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
-    }
+    progress = work.progress
+    samples = thinned(work.opened.parts.calibration, work.recipe.samples)
+    sees = _sees(work, samples)
     sources = [sys.modules[__name__], lessons_module, student_module, channels, refit, training, preprocess, act]
     folder = cache_root() / f"lessons-{key_of(sees, *sources)}"
-    whole = sees | {"student": asdict(work.config), "share": work.share, "whole": asdict(recipe), "qat": work.qat}
-    own = cache_root() / f"student-{key_of(whole, *sources)}"
+    own = cache_root() / f"student-{key_of(sees | _learns(work, samples), *sources)}"
     depth = work.teacher.weights["encoder_img_feat_input_proj.weight"].shape[1]
     with Resumable(folder, progress) as saved:
         lessons = Lessons.open(folder, samples, work.config, depth, work.rng("states"))
@@ -280,6 +269,36 @@ def _taught(work: _Work) -> _Taught:
             _train_rounded(room, policy, saved, own)
         losses |= saved.losses
     return _Taught(policy.weights(), losses, notes, unrounded, own)
+
+
+def _sees(work: _Work, samples: Sequence[Sample]) -> dict[str, Any]:
+    """What lessons and a backbone depend on."""
+    recipe = work.recipe
+    return {
+        "teacher": work.teacher.identity,
+        "size": work.config.image_sizes,
+        "pictures": [(s.episode, s.frame_path.name, s.frame_path.stat().st_size) for s in samples],
+        "rows": [s.row for s in samples],  # a dataset's pictures are many in one file
+        "states": zlib.crc32(np.stack([s.state for s in samples]).tobytes()),
+        "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
+        "recipe": [recipe.batch, recipe.backbone_steps, recipe.rate],
+        "at": [work.device.type, recipe.seed],
+        "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
+    }
+
+
+def _learns(work: _Work, samples: Sequence[Sample]) -> dict[str, Any]:
+    """What a student depends on besides: its losses' units too, and what its ranges are read off if it is rounded."""
+    p, choosing = params(), work.opened.parts.choosing
+    rounded = [p["calibration"], p["quantization"], [(s.episode, s.row) for s in choosing]]
+    return {
+        "student": asdict(work.config),
+        "share": work.share,
+        "whole": asdict(work.recipe),
+        "pads": zlib.crc32(np.stack([s.is_pad for s in samples]).tobytes()),
+        "units": work.ranges().tolist(),
+        "rounded": rounded if work.qat else None,
+    }
 
 
 class _Room:

@@ -140,7 +140,7 @@ def _check_student(student: Mapping[str, Any]) -> None:
     """Raise SweepError for what `rover distill` would not take as that option, rather than to teach another student."""
     for key, value in student.items():
         if key == "size":
-            right, what = isinstance(value, str) and re.fullmatch(r"\d+x\d+", value), "WIDTHxHEIGHT"
+            right, what = re.fullmatch(r"\d+x\d+", str(value)) is not None, "WIDTHxHEIGHT"
         elif key == "qat":
             right, what = isinstance(value, bool), "true or false"
         elif key == "backbone_channels":

@@ -23,7 +23,9 @@ from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot
 from rover_lib.workshop.compare import LerobotEager
 from rover_lib.workshop.distill import DistillRecipe, distill, summary
-from rover_lib.workshop.student import StudentShape
+from rover_lib.workshop.progress import silent
+from rover_lib.workshop.session import load
+from rover_lib.workshop.student import StudentShape, student_config
 
 SHAPE = StudentShape(54, 96, decoder_layers=1, feedforward=64)
 
@@ -93,6 +95,35 @@ def test_distill_json_judges_it_on_held_out_episodes(taught):
     assert "nobody drove" in content["metrics"]["note"]
     assert "nobody drove" in summary(content) and "96x54, 1 decoder layer" in summary(content)
     assert len(content["inputs"]) > 4 * 24
+
+
+def test_what_was_begun_with_other_settings_is_not_gone_on_with(teacher, episodes, recipe, tmp_path, monkeypatch):
+    """Rounded by ranges of another calibration it would learn what its export does not round."""
+    opened, places = load(teacher, episodes), []
+
+    class Elsewhere(distill_module.Resumable):
+        def __enter__(self):
+            places.append(self.folder.name)
+            if len(places) % 2 == 0:
+                raise KeyboardInterrupt
+            return super().__enter__()
+
+    monkeypatch.setattr(distill_module, "Resumable", Elsewhere)
+    monkeypatch.setattr(distill_module, "_train_backbone", lambda *_: {})
+    monkeypatch.setattr(distill_module, "_refuse_strangers", lambda room: None)
+    monkeypatch.setattr(distill_module.Lessons, "ask", lambda *_: None)
+    (tmp_path / "other.yml").write_text("quantization: {smooth: 0.3}")
+    config = student_config(opened.checkpoint, SHAPE)
+    cpu = torch.device("cpu")
+    for qat in (True, False):
+        work = distill_module._Work(opened, config, None, recipe, qat, cpu, silent)
+        for settings in ("", str(tmp_path / "other.yml")):
+            monkeypatch.setenv("ROVER_PARAMS", settings)
+            with pytest.raises(KeyboardInterrupt):
+                distill_module._taught(work)
+    lessons, students = places[::2], places[1::2]
+    assert len(set(lessons)) == 1
+    assert students[0] != students[1] and students[2] == students[3]  # of QAT alone it matters
 
 
 @pytest.mark.slow
