@@ -11,8 +11,8 @@ from rover_lib.workshop.sweep import Job
 ENV = {"host": "here", "machine": "x", "torch": "2.8", "commit": ""}
 
 
-def _stage(folder: Path, name: str, stage: str, metrics: dict) -> None:
-    content = {"schema": 1, "stage": stage, "params": {}, "metrics": metrics, "inputs": {}, "env": ENV}
+def _stage(folder: Path, name: str, stage: str, metrics: dict, **inputs: str) -> None:
+    content = {"schema": 1, "stage": stage, "params": {}, "metrics": metrics, "inputs": inputs, "env": ENV}
     (folder / name).write_text(json.dumps(content))
 
 
@@ -40,6 +40,8 @@ class Stub:
         mode |= {"throttle_vs_recorded_pct": 1.0, "hits": 3, "trials": 4, "size_mb": 12.0}
         ranges = {"steering": [-1, 1], "throttle": [0, 1]}
         _stage(folder / job.name, "compare.json", "compare", {"modes": {"static": mode}, "action_range": ranges})
+        made = {"modes": {"static": {"content_hash": job.name}}}
+        _stage(folder / job.name, "quantize.json", "quantize", made)
         self._say("prepared", job.name)
 
     def benchmark(self, job: Job, folder: Path) -> None:
@@ -47,5 +49,5 @@ class Stub:
 
         assert get_worker().state.total_resources == {"timing": 1}
         timed = {"artifacts": {"static": {"latency_p50_ms": 10.0 - job.params["calibration.seed"]}}}
-        _stage(folder / job.name, "benchmark-here.json", "benchmark", timed)
+        _stage(folder / job.name, "benchmark-here.json", "benchmark", timed, **{"policy_static.pt": job.name})
         self._say("timed", job.name)

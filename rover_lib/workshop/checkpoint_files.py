@@ -113,6 +113,12 @@ def write_both(
     return {name: sha256_of(path) for name, path in files.items()}
 
 
+def written_in(folder: Path) -> Path:
+    """What `write_both` left there for `load_checkpoint`: the trainer's file where there is one."""
+    trainers = folder / "best_model.pth"
+    return trainers if trainers.is_file() else folder / "pretrained_model"
+
+
 def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
     """Mean and standard deviation whose normalisation, LeRobot's eps included, is x * scale + shift."""
     scale, shift = torch.tensor(norm.scale, dtype=torch.float64), torch.tensor(norm.shift, dtype=torch.float64)

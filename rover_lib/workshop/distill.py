@@ -11,6 +11,7 @@ The run's folder gets best_model.pth, pretrained_model/, policy_static.pt and di
 Letters: n samples, B batch, C chunk, A actions.
 """
 
+import math
 import shutil
 import sys
 import zlib
@@ -37,7 +38,7 @@ from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint_files import write_both
+from rover_lib.workshop.checkpoint_files import write_both, written_in
 from rover_lib.workshop.choose import Chooser
 from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.episodes import Sample
@@ -56,6 +57,7 @@ from rover_lib.workshop.scheme import Scheme
 from rover_lib.workshop.session import SMALL_GMAC, Opened, load, training_device
 from rover_lib.workshop.student import StudentShape, gmac, initial_weights, student_config
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
+from rover_lib.workshop.untrusted import numbers
 
 Notes = dict[str, list[dict[str, Any]]]  # of what a student does without, by part
 NOBODY_DROVE = "Judged on recordings alone: nobody drove."
@@ -84,18 +86,34 @@ class DistillRecipe:
     judged_frames: int
     seed: int
 
+    def __post_init__(self):
+        counts = self.samples, self.batch, self.unit_frames, self.judged_frames
+        steps = self.backbone_steps, self.transformer_steps, self.together_steps, self.qat_steps
+        if min(counts) < 1 or min(*steps, self.seed) < 0:
+            raise DistillError("samples, batch and frames must be at least 1, steps and seed at least 0", found=self)
+        rates, weights = (self.rate, self.qat_rate), (self.to_teacher, self.to_recorded)
+        if not (all(map(math.isfinite, (*rates, *weights))) and min(rates) > 0 and min(weights) >= 0 < max(weights)):
+            raise DistillError(
+                "rates must be finite and above 0, to_teacher and to_recorded at least 0, and not both 0", found=self
+            )
+
     @classmethod
-    def of(cls, params: dict[str, Any], steps: int | None, samples: int | None, seed: int | None) -> "DistillRecipe":
-        """That of params.yml, with what is not None in its place. steps: in all."""
-        recipe = cls(**params["distill"])
-        recipe = recipe.of_steps(steps) if steps else recipe
+    def of(
+        cls, params: dict[str, Any], steps: int | None = None, samples: int | None = None, seed: int | None = None
+    ) -> "DistillRecipe":
+        """That of params.yml, with what is not None in its place. steps: in all. Raises DistillError."""
+        recipe = numbers(cls, params["distill"], "params.yml: distill", DistillError)
+        if steps is not None:
+            recipe = recipe.of_steps(steps)
         given = {"samples": samples, "seed": seed}
         return replace(recipe, **{name: value for name, value in given.items() if value is not None})
 
     def of_steps(self, steps: int) -> "DistillRecipe":
         """The same with that many steps in all, at least one in each phase."""
+        if steps < 1:
+            raise DistillError("a student needs at least 1 step", found=steps)
         names = ("backbone_steps", "transformer_steps", "together_steps", "qat_steps")
-        planned = sum(getattr(self, name) for name in names)
+        planned = max(sum(getattr(self, name) for name in names), 1)
         return replace(self, **{name: max(1, round(steps * getattr(self, name) / planned)) for name in names})
 
 
@@ -121,9 +139,7 @@ def distill(
     student; CheckpointError, EpisodeError, TrainingError; RoverError while another process makes a run of that name.
     """
     folder, where = run_folder(runs_dir, name, DistillError), training_device(device, DistillError)
-    recipe = recipe or DistillRecipe(**params()["distill"])
-    if recipe.seed < 0:
-        raise DistillError("a seed must be at least 0", found=recipe.seed)
+    recipe = recipe or DistillRecipe.of(params())
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint
     config = student_config(teacher, shape)
@@ -219,23 +235,12 @@ class _Taught:
 
 def _taught(work: _Work) -> _Taught:
     """All phases. What depends on teacher, picture and samples alone stays in the cache, for its next student."""
-    recipe, progress = work.recipe, work.progress
-    samples = thinned(work.opened.parts.calibration, recipe.samples)
-    sees = {
-        "teacher": work.teacher.identity,
-        "size": work.config.image_sizes,
-        "pictures": [(s.episode, s.frame_path.name, s.frame_path.stat().st_size) for s in samples],
-        "rows": [s.row for s in samples],  # a dataset's pictures are many in one file
-        "states": zlib.crc32(np.stack([s.state for s in samples]).tobytes()),
-        "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
-        "recipe": [recipe.batch, recipe.backbone_steps, recipe.rate],
-        "at": [work.device.type, recipe.seed],
-        "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
-    }
+    progress = work.progress
+    samples = thinned(work.opened.parts.calibration, work.recipe.samples)
+    sees = _sees(work, samples)
     sources = [sys.modules[__name__], lessons_module, student_module, channels, refit, training, preprocess, act]
     folder = cache_root() / f"lessons-{key_of(sees, *sources)}"
-    whole = sees | {"student": asdict(work.config), "share": work.share, "whole": asdict(recipe), "qat": work.qat}
-    own = cache_root() / f"student-{key_of(whole, *sources)}"
+    own = cache_root() / f"student-{key_of(sees | _learns(work, samples), *sources)}"
     depth = work.teacher.weights["encoder_img_feat_input_proj.weight"].shape[1]
     with Resumable(folder, progress) as saved:
         lessons = Lessons.open(folder, samples, work.config, depth, work.rng("states"))
@@ -260,6 +265,36 @@ def _taught(work: _Work) -> _Taught:
             _train_rounded(room, policy, saved, own)
         losses |= saved.losses
     return _Taught(policy.weights(), losses, notes, unrounded, own)
+
+
+def _sees(work: _Work, samples: Sequence[Sample]) -> dict[str, Any]:
+    """What lessons and a backbone depend on."""
+    recipe = work.recipe
+    return {
+        "teacher": work.teacher.identity,
+        "size": work.config.image_sizes,
+        "pictures": [(s.episode, s.frame_path.name, s.frame_path.stat().st_size) for s in samples],
+        "rows": [s.row for s in samples],  # a dataset's pictures are many in one file
+        "states": zlib.crc32(np.stack([s.state for s in samples]).tobytes()),
+        "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
+        "recipe": [recipe.batch, recipe.backbone_steps, recipe.rate],
+        "at": [work.device.type, recipe.seed],
+        "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
+    }
+
+
+def _learns(work: _Work, samples: Sequence[Sample]) -> dict[str, Any]:
+    """What a student depends on besides: its losses' units too, and what its ranges are read off if it is rounded."""
+    p, choosing = params(), work.opened.parts.choosing
+    rounded = [p["calibration"], p["quantization"], [(s.episode, s.row) for s in choosing]]
+    return {
+        "student": asdict(work.config),
+        "share": work.share,
+        "whole": asdict(work.recipe),
+        "pads": zlib.crc32(np.stack([s.is_pad for s in samples]).tobytes()),
+        "units": work.ranges().tolist(),
+        "rounded": rounded if work.qat else None,
+    }
 
 
 class _Room:
@@ -360,7 +395,7 @@ def _kept(path: Path) -> Any:
 def _train_transformer(room: _Room, policy: BatchedPolicy, saved: Resumable) -> None:
     """Phase two: all but the backbone, on the tokens that it gave."""
     recipe, lessons = room.work.recipe, room.lessons
-    optimizer, scheduler = optimiser(policy.model.parameters(), recipe.rate, recipe.transformer_steps)
+    optimizer, scheduler = optimiser(policy.model.parameters(), recipe.rate, max(recipe.transformer_steps, 1))
     rng = room.work.rng("transformer")
     steps, model = recipe.transformer_steps, policy.model
     for _ in saved.steps("transformer", steps, rng, model=model, optimizer=optimizer, scheduler=scheduler):
@@ -373,7 +408,7 @@ def _train_transformer(room: _Room, policy: BatchedPolicy, saved: Resumable) -> 
 def _train_together(room: _Room, policy: BatchedPolicy, saved: Resumable) -> None:
     """Phase three: all parameters at a tenth of the rate, on pictures in any light."""
     recipe = room.work.recipe
-    optimizer, scheduler = optimiser(policy.parameters(), recipe.rate / 10, recipe.together_steps)
+    optimizer, scheduler = optimiser(policy.parameters(), recipe.rate / 10, max(recipe.together_steps, 1))
     rng = room.work.rng("together")
     steps = recipe.together_steps
     for _ in saved.steps("together", steps, rng, policy=policy, optimizer=optimizer, scheduler=scheduler):
@@ -396,7 +431,7 @@ def _train_rounded(room: _Room, policy: BatchedPolicy, saved: Resumable, folder:
     kept = _kept(path)
     rounded = RoundedPolicy(student, Scheme(**kept["scheme"]), Calibration(**kept["calibration"])).to(work.device)
     exact = BatchedPolicy(work.config, student.weights).to(work.device)
-    optimizer, scheduler = optimiser(policy.parameters(), recipe.qat_rate, recipe.qat_steps)
+    optimizer, scheduler = optimiser(policy.parameters(), recipe.qat_rate, max(recipe.qat_steps, 1))
     rng, steps = work.rng("qat"), recipe.qat_steps
     for _ in saved.steps("qat", steps, rng, policy=policy, optimizer=optimizer, scheduler=scheduler):
         rows, views = room.draw(rng)
@@ -551,7 +586,7 @@ def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
         "seed": work.recipe.seed,
     }
     hashes = write_both(new, work.config, taught.weights, loss, origin, **settings)
-    student = load_checkpoint(new / ("best_model.pth" if "best_model.pth" in hashes else "pretrained_model"))
+    student = load_checkpoint(written_in(new))
     samples, parity = thinned(parts.choosing, quantization.CHOOSING_FRAMES), quantization.Recipe.of(params()).parity
     export(rounded, student, new / "policy_static.pt", samples, calibration, parity)
     write_stage(

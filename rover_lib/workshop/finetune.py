@@ -59,6 +59,7 @@ from rover_lib.workshop.samples import Episode, Recordings, Sample, Source, fram
 from rover_lib.workshop.session import SMALL_GMAC, check_sizes, training_device
 from rover_lib.workshop.student import gmac, not_a_cars
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
+from rover_lib.workshop.untrusted import numbers
 
 OLD, NEW = "old", "new"
 TOGETHER_SLOWER = 50  # times the first phase's rate: a backbone that sees is not to be unlearned
@@ -105,8 +106,9 @@ class FinetuneRecipe:
 
     @classmethod
     def of(cls, params: dict[str, Any], **given: Any) -> "FinetuneRecipe":
-        """That of params.yml, with what is not None in its place."""
-        return cls(**params["finetune"] | {name: value for name, value in given.items() if value is not None})
+        """That of params.yml, with what is not None in its place. Raises FinetuneError."""
+        values = params["finetune"] | {name: value for name, value in given.items() if value is not None}
+        return numbers(cls, values, "params.yml: finetune", FinetuneError)
 
     def of_steps(self, steps: int) -> "FinetuneRecipe":
         """The same with that many steps in all, at least one in each phase."""
@@ -149,6 +151,9 @@ def finetune(
             raise _is_there(folder)
         taught = _taught(work)
         _leave(new, name, work, taught)
+        if folder.exists():  # by another command meanwhile; what was learned is kept for another name
+            raise _is_there(folder)
+        new.rename(folder)  # at once: of a part of it, this command could not go on
     shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
     return folder
 

@@ -52,14 +52,18 @@ class Judged:
 
 
 def chance_of(changes: Sequence[float]) -> float:
-    """How often differences of random sign have a mean at least as far from 0, two-sided. 1 for none."""
+    """How often differences of random sign have a mean at least as far from 0, two-sided. 1 for none.
+
+    Of ways that are drawn, the one that was found is one more: chance is never 0.
+    """
     found = np.asarray(changes, float)
     if not len(found):
         return 1.0
     if len(found) <= EXACT:
         signs = np.array(list(product((-1.0, 1.0), repeat=len(found))))
     else:
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (DRAWN, len(found)))
+        drawn = np.random.default_rng(0).choice([-1.0, 1.0], (DRAWN, len(found)))
+        signs = np.vstack([np.ones(len(found)), drawn])
     least = abs(found.sum()) * (1 - 1e-9)  # sums differ in their last bit by the order in which they are made
     return float((np.abs(signs @ found) >= least).mean())
 

@@ -19,8 +19,9 @@ from typing import Any
 import nbformat
 from PIL import Image
 
-from rover_lib.onboard.stage import atomic_path, read_stage
+from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.run import NAMES, NOTEBOOKS, NotebookError
+from rover_lib.workshop.run_folder import says_how_it_was_taught
 
 RESULTS_OF = {  # stages that a notebook leaves
     "01_load": "load",
@@ -96,9 +97,8 @@ def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEB
 
 
 def students(runs_dir: Path) -> list[Path]:
-    """What `rover distill` left of each student. A teacher's distill.json has no losses, but rows of its students."""
-    every = sorted(runs_dir.glob("*/distill.json"))
-    return [path for path in every if "losses" in read_stage(path, "distill")["metrics"]]
+    """What `rover distill` left of each student."""
+    return [path for path in sorted(runs_dir.glob("*/distill.json")) if says_how_it_was_taught(path)]
 
 
 def _write(texts: dict[Path, str]) -> list[Path]:

@@ -14,7 +14,7 @@ import shutil
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
-from rover_lib.workshop.run_folder import run_folder
+from rover_lib.workshop.run_folder import run_folder, says_how_it_was_taught
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
@@ -121,8 +121,9 @@ def files_of_a_run(folder: Path) -> list[Path]:
     stages = ("load", "calibrate", "quantize", "compare", "run", "arm", "parts", "drive", "learn")
     names = [f"{stage}.json" for stage in (*stages, f"benchmark-{socket.gethostname()}")]
     names += [*(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures", "report.html"]
-    if (folder / "08_distill.ipynb").exists():  # a teacher's; a student's distill.json is of what its run begins with
-        names.append("distill.json")
+    with suppress(RoverError):  # one that is damaged, or not there, is nobody's
+        if not says_how_it_was_taught(folder / "distill.json"):
+            names.append("distill.json")
     own = [folder / n for n in names] + [p for pattern in OWN_FILES for p in folder.glob(pattern)]
     return [path for path in own if path.exists()]
 

@@ -18,6 +18,7 @@ from rover_lib.onboard.columns import aligned, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+from rover_lib.workshop.run_folder import says_how_it_was_taught
 from rover_lib.workshop.verdict import CALLED, Names, against, count, error_pct, verdict
 
 STAGES = ("load", "quantize", "compare", "benchmark")  # without which there is nothing to judge
@@ -86,8 +87,8 @@ def _files(folder: Path) -> dict[str, Path]:
             f"{folder}: no verdict without {', '.join(missing)}", remedy="rover run makes them, of a checkpoint"
         )
     files = {stage: path for stage, path in files.items() if path.is_file()}
-    if "distill" in files and "recommendation" not in read_stage(files["distill"], "distill")["metrics"]:
-        del files["distill"]  # how this policy itself was taught
+    if "distill" in files and says_how_it_was_taught(files["distill"]):
+        del files["distill"]
     return files
 
 

@@ -113,6 +113,8 @@ class Sheet:
             raise SweepError(f"{path}: students must be a list of mappings", found=students)
         if unknown := sorted(set().union(*students) - set(STUDENT_OPTIONS)):
             raise SweepError(f"{path}: no student has {unknown[0]!r}", remedy=f"known are {', '.join(STUDENT_OPTIONS)}")
+        for student in students:
+            _check_student(student)
         of_params = _lists(content.get("params"), f"{path}: params")
         if wrong := [key for key in of_params if "." not in key]:
             raise SweepError(f"{path}: params are named by their place, say calibration.seed", found=wrong[0])
@@ -132,6 +134,21 @@ class Sheet:
         if twice := {name for name in names if names.count(name) > 1}:
             raise SweepError("a run stands in the sheet twice", found=sorted(twice)[0])
         return jobs
+
+
+def _check_student(student: Mapping[str, Any]) -> None:
+    """Raise SweepError for what `rover distill` would not take as that option, rather than to teach another student."""
+    for key, value in student.items():
+        if key == "size":
+            right, what = re.fullmatch(r"\d+x\d+", str(value)) is not None, "WIDTHxHEIGHT"
+        elif key == "qat":
+            right, what = isinstance(value, bool), "true or false"
+        elif key == "backbone_channels":
+            right, what = type(value) in (int, float), "a number"
+        else:
+            right, what = type(value) is int, "a whole number"
+        if not right:
+            raise SweepError(f"a student's {key} is {what}", found=value)
 
 
 def _lists(values: Any, where: str) -> dict[str, list[Any]]:
@@ -184,21 +201,20 @@ class Notebooks:
     def _taught(self, job: Job, folder: Path) -> Path:
         """The student's checkpoint, in the run's own folder; what was begun goes on."""
         from rover_lib.onboard.params import params
+        from rover_lib.workshop.checkpoint_files import written_in
         from rover_lib.workshop.distill import DistillRecipe, distill
         from rover_lib.workshop.student import StudentShape
 
         options = dict(job.student)
         recipe = DistillRecipe.of(params(), **{key: options.pop(key, None) for key in ("steps", "samples", "seed")})
-        width, _, height = str(options.pop("size", "x")).partition("x")
-        qat = bool(options.pop("qat", False))
-        try:
-            shape = StudentShape(int(height) if height else None, int(width) if width else None, **options)
-        except ValueError:
-            raise SweepError("a student's size is WIDTHxHEIGHT", found=job.student["size"]) from None
+        _check_student(job.student)
+        width, _, height = options.pop("size", "x").partition("x")
+        qat = options.pop("qat", False)
+        shape = StudentShape(int(height) if height else None, int(width) if width else None, **options)
         made = distill(
             job.checkpoint, job.episodes, job.name, shape, runs_dir=folder, recipe=recipe, qat=qat, device="cpu"
         )
-        return made / "best_model.pth"
+        return written_in(made)
 
 
 @contextmanager
@@ -395,7 +411,7 @@ def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> l
         if "benchmark" not in parts_done(job, Path(folder), marks[job.name]):
             continue
         compared = read_stage(run / "compare.json", "compare")["metrics"]
-        timed = next(read_stage(p, "benchmark") for p in sorted(run.glob("benchmark-*.json")))
+        timed = _timed(run)
         mode = compared["modes"][MODE]
         ours = [mode[f"{action}_mae_pct"] for action in compared["action_range"]]
         recorded = [mode.get(f"{action}_vs_recorded_pct") for action in compared["action_range"]]
@@ -415,6 +431,17 @@ def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> l
     for row in found:
         row["best"] = not any(_beats(other, row) for other in found)
     return found
+
+
+def _timed(run: Path) -> dict[str, Any]:
+    """The benchmark of the run's artifacts. One of another host may lie beside it, of what the run was before."""
+    artifact = f"policy_{MODE}.pt"
+    made = read_stage(run / "quantize.json", "quantize")["metrics"]["modes"][MODE]["content_hash"]
+    for path in sorted(run.glob("benchmark-*.json")):
+        content = read_stage(path, "benchmark")
+        if content["inputs"].get(artifact) == made:
+            return content
+    raise SweepError(f"{run}: no benchmark of its {artifact}", remedy="remove that folder, and sweep again")
 
 
 def _beats(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

@@ -463,7 +463,9 @@ def count(number: int, what: str) -> str:
 def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[str, str]]:
     """The next three commands to type, with the reason for each."""
     deploy, drove = judged["deploy"], bool(stages["compare"]["fp32"]["trials"])
-    run = _shell("rover", "run", f"runs/{names.name}-qat/best_model.pth", names.episodes, "--name", f"{names.name}-qat")
+    student = f"{names.name}-qat"
+    left = "pretrained_model" if stages["load"]["checkpoint"].get("format") == "lerobot" else "best_model.pth"
+    run = _shell("rover", "run", f"runs/{student}/{left}", names.episodes, "--name", student)
     if deploy is None:
         commands = [
             (f"make lab NAME={_shell(names.name)}", "look at notebook 01, what the car saw, and 04, what it plans"),

@@ -29,6 +29,7 @@ from rover_lib.onboard.policy import Policy
 from rover_lib.onboard.recording import HUMAN, POLICY
 from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, write_stage
 from rover_lib.workshop import pipeline
+from rover_lib.workshop.cache import car_in_key
 from rover_lib.workshop.cells import Table
 from rover_lib.workshop.compare import gate
 from rover_lib.workshop.finetune import FinetuneRecipe, finetune
@@ -184,9 +185,8 @@ def measured(
         if not (run_dir / name).exists():
             raise WorldError(f"{run_dir / name}: not there", remedy="`make demo` makes it")
     inputs = {CHECKPOINT: sha256_of(run_dir / CHECKPOINT), ARTIFACT: content_hash(run_dir / ARTIFACT)}
-    given = plain(
-        asdict(experiment) | {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED}
-    )
+    how = {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED, **car_in_key()}
+    given = plain(asdict(experiment) | how)
     with suppress(RoverError):
         there = read_stage(path, "learn")
         if (there["params"], there["inputs"]) == (given, inputs):
@@ -332,10 +332,11 @@ class _Lab:
         return range(SEED, SEED + (self.experiment.worlds if how == PUSHED else self.experiment.other_worlds))
 
     def outcomes(self, name: str) -> dict[str, dict[int, str]]:
-        """Of a policy, by condition and seed."""
+        """Of a policy, by condition and seed, in the worlds that judge; more of them may have been driven before."""
         found: dict[str, dict[int, str]] = {how: {} for how in self.experiment.judged_in()}
         for row in _rows(self.folder / f"{name}.jsonl"):
-            found[row["how"]][row["seed"]] = row["outcome"]
+            if row["seed"] in self.seeds(row["how"]):
+                found[row["how"]][row["seed"]] = row["outcome"]
         return found
 
 

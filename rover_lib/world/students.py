@@ -27,12 +27,13 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.policy import Policy, load_policy
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
-from rover_lib.workshop.cache import cache_root, key_of
+from rover_lib.workshop.cache import cache_root, car_in_key, key_of
 from rover_lib.workshop.compare import GATED, thinned
 from rover_lib.workshop.distill import errors_of
 from rover_lib.workshop.episodes import load_recordings, split
 from rover_lib.workshop.judge import not_judged
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.run_folder import says_how_it_was_taught
 from rover_lib.workshop.samples import Recordings, Sample, Source
 from rover_lib.world import latency, trial, world
 from rover_lib.world.frontier import DRIVES, NOBODY_DROVE, recommendation
@@ -137,7 +138,7 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
     if not names or len({*names, TEACHER}) <= len(names):
         raise DistillError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
     taught = [_distilled(student) for student in students]
-    if (own := folder / "distill.json").is_file() and "losses" in read_stage(own, "distill")["metrics"]:
+    if (own := folder / "distill.json").is_file() and says_how_it_was_taught(own):
         raise DistillError(
             f"{folder}: was distilled itself, and its distill.json would be lost", remedy="begin with its own teacher"
         )
@@ -166,12 +167,12 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
 
 def _distilled(student: Path) -> dict[str, Any]:
     """The distill.json that `rover distill` left."""
-    if not (student / "distill.json").is_file():
+    path = student / "distill.json"
+    if not path.is_file():
         raise DistillError(f"{student}: no distill.json in it", remedy="'rover distill' makes a student")
-    content = read_stage(student / "distill.json", "distill")
-    if "losses" not in content["metrics"]:
+    if not says_how_it_was_taught(path):
         raise DistillError(f"{student}: is a teacher's run, not a student's", remedy="give the teacher first")
-    return content
+    return read_stage(path, "distill")
 
 
 def _artifact_of(run_dir: Path) -> Path:
@@ -260,7 +261,8 @@ def _errors(
 def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progress) -> np.ndarray:
     """(n, C, A) float32 of what an artifact plans on the samples. Kept in the cache."""
     frames = [(str(s.frame_path), s.frame_path.stat().st_size, s.frame_name, s.state.tolist()) for s in samples]
-    key = key_of({"artifact": content_hash(artifact), "frames": frames, "torch": torch.__version__}, preprocess)
+    planned_by = {"artifact": content_hash(artifact), "torch": torch.__version__, **car_in_key()}
+    key = key_of(planned_by | {"frames": frames}, preprocess)
     path = cache_root() / f"plans-{key}.npy"
     if not path.exists():
         every = everywhere(artifact, range(len(samples)), lambda policy, i: _plan(policy, samples[i]))
@@ -297,7 +299,8 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
             condition = Condition(pushed_ms / 1e3, Settings.of(how), PUSHES)
             asked["pushed_"] = partial(_pushed, condition=condition)
     sources = [world, trial, latency, loop, pilot, plan, preprocess]
-    alike = {"artifact": content_hash(run.artifact), "torch": torch.__version__, "drive": how, "pushes": PUSHES}
+    driven_by = {"artifact": content_hash(run.artifact), "torch": torch.__version__, **car_in_key()}
+    alike = driven_by | {"drive": how, "pushes": PUSHES}
     files = {}
     for name in asked:
         key = key_of(alike | {"how": name, "latency_ms": pushed_ms if name else None}, *sources)

@@ -1,6 +1,7 @@
 """A student is taught on recordings alone, whatever interrupts it."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
@@ -22,7 +23,9 @@ from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot
 from rover_lib.workshop.compare import LerobotEager
 from rover_lib.workshop.distill import DistillRecipe, distill, summary
-from rover_lib.workshop.student import StudentShape
+from rover_lib.workshop.progress import silent
+from rover_lib.workshop.session import load
+from rover_lib.workshop.student import StudentShape, student_config
 
 SHAPE = StudentShape(54, 96, decoder_layers=1, feedforward=64)
 
@@ -92,6 +95,35 @@ def test_distill_json_judges_it_on_held_out_episodes(taught):
     assert "nobody drove" in content["metrics"]["note"]
     assert "nobody drove" in summary(content) and "96x54, 1 decoder layer" in summary(content)
     assert len(content["inputs"]) > 4 * 24
+
+
+def test_what_was_begun_with_other_settings_is_not_gone_on_with(teacher, episodes, recipe, tmp_path, monkeypatch):
+    """Rounded by ranges of another calibration it would learn what its export does not round."""
+    opened, places = load(teacher, episodes), []
+
+    class Elsewhere(distill_module.Resumable):
+        def __enter__(self):
+            places.append(self.folder.name)
+            if len(places) % 2 == 0:
+                raise KeyboardInterrupt
+            return super().__enter__()
+
+    monkeypatch.setattr(distill_module, "Resumable", Elsewhere)
+    monkeypatch.setattr(distill_module, "_train_backbone", lambda *_: {})
+    monkeypatch.setattr(distill_module, "_refuse_strangers", lambda room: None)
+    monkeypatch.setattr(distill_module.Lessons, "ask", lambda *_: None)
+    (tmp_path / "other.yml").write_text("quantization: {smooth: 0.3}")
+    config = student_config(opened.checkpoint, SHAPE)
+    cpu = torch.device("cpu")
+    for qat in (True, False):
+        work = distill_module._Work(opened, config, None, recipe, qat, cpu, silent)
+        for settings in ("", str(tmp_path / "other.yml")):
+            monkeypatch.setenv("ROVER_PARAMS", settings)
+            with pytest.raises(KeyboardInterrupt):
+                distill_module._taught(work)
+    lessons, students = places[::2], places[1::2]
+    assert len(set(lessons)) == 1
+    assert students[0] != students[1] and students[2] == students[3]  # of QAT alone it matters
 
 
 @pytest.mark.slow
@@ -337,16 +369,48 @@ def test_an_old_students_checkpoint_goes_where_the_new_one_has_none(tmp_path):
         ({"shape": StudentShape(54, 96), "device": "tpu"}, "device must be"),
         ({"shape": StudentShape(54, 96), "name": "../fast"}, "plain folder name"),
         ({"shape": StudentShape(54, 96), "name": ""}, "plain folder name"),
-        (
-            {"shape": StudentShape(54, 96), "recipe": DistillRecipe(**{**params()["distill"], "seed": -1})},
-            "seed must be",
-        ),
     ],
 )
 def test_what_cannot_be_taught_is_refused(teacher, episodes, tmp_path, options, says):
     with pytest.raises(DistillError, match=says):
         distill(teacher, episodes, **{"name": "fast", "runs_dir": tmp_path, **options})
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"seed": -1}, "steps and seed at least 0"),
+        ({"batch": 0}, "at least 1"),
+        ({"judged_frames": 0}, "at least 1"),
+        ({"qat_steps": -1}, "steps and seed at least 0"),
+        ({"rate": 0.0}, "above 0"),
+        ({"rate": math.nan}, "finite"),
+        ({"to_teacher": 0.0, "to_recorded": 0.0}, "not both 0"),
+        ({"rate": "2e-4"}, "rate must be a number, found '2e-4'"),  # as YAML reads it
+        ({"samples": 10.5}, "samples must be a whole number"),
+        ({"lessons": 3}, "there is no 'lessons'"),
+    ],
+)
+def test_a_recipe_that_cannot_be_is_refused(values, says):
+    with pytest.raises(DistillError, match=says):
+        DistillRecipe.of({"distill": {**params()["distill"], **values}})
+
+
+def test_of_no_steps_there_is_no_recipe():
+    with pytest.raises(DistillError, match="at least 1 step"):
+        DistillRecipe.of(params(), steps=0)
+
+
+def test_a_phase_may_be_left_out(recipe):
+    """Its optimiser is made all the same."""
+    work = SimpleNamespace(recipe=replace(recipe, transformer_steps=0, together_steps=0), rng=np.random.default_rng)
+    room, policy = SimpleNamespace(work=work, lessons=None), torch.nn.Linear(1, 1)
+    policy.model = torch.nn.Linear(1, 1)
+    saved = SimpleNamespace(steps=lambda phase, steps, *_, **__: range(steps))
+    work.rng = lambda phase: np.random.default_rng(0)
+    distill_module._train_transformer(room, policy, saved)
+    distill_module._train_together(room, policy, saved)
 
 
 @pytest.mark.parametrize("steps", [1, 10, 1000])

@@ -1,8 +1,10 @@
 """A policy learns on from what humans drove, and from nothing else, whatever interrupts it."""
 
+import contextlib
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -359,6 +361,25 @@ def test_a_run_that_another_process_made_meanwhile_is_not_overwritten(checkpoint
     with pytest.raises(FinetuneError, match="is there already"):
         finetune(checkpoint, [old, new], "better", runs_dir=tmp_path / "runs", device="cpu")
     assert [p.name for p in (tmp_path / "runs").iterdir()] == ["better"]
+
+
+def test_ended_while_the_run_takes_its_place_it_goes_on(checkpoint, old, new, tmp_path, monkeypatch):
+    """A folder that has only some of its files would keep the same command from going on."""
+    taught = SimpleNamespace(folder=tmp_path / "phases")
+    monkeypatch.setattr(finetune_module, "_taught", lambda work: taught)
+
+    def leave(folder, *_):
+        for name in ("best_model.pth", "finetune.json"):
+            (folder / name).touch()
+
+    monkeypatch.setattr(finetune_module, "_leave", leave)
+    for at in (1, 2, 3):
+        with monkeypatch.context() as patch:
+            interrupt(patch, Path, "rename", at)
+            with contextlib.suppress(KeyboardInterrupt):
+                finetune(checkpoint, [old, new], f"better-{at}", runs_dir=tmp_path, device="cpu")
+        folder = tmp_path / f"better-{at}"
+        assert not folder.exists() or (folder / "finetune.json").exists()
 
 
 def test_without_a_new_episode_there_is_nothing_to_learn(checkpoint, old, tmp_path):

@@ -28,6 +28,7 @@ def test_chance_of_many_is_drawn_and_near_the_normal():
     z = abs(changes.sum()) / math.sqrt((changes**2).sum())
     assert chance_of(changes) == pytest.approx(math.erfc(z / math.sqrt(2)), abs=4 / math.sqrt(DRAWN))
     assert chance_of(changes) == chance_of(changes)
+    assert 0 < chance_of([-1.0] * 40) <= 1 / DRAWN  # nothing is impossible by chance
 
 
 @given(st.lists(st.floats(-100, 100), max_size=14), st.floats(0.1, 10))

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -65,6 +66,9 @@ def test_names_stay_while_the_sheet_grows(sheet):
         ({"params": {"seed": 1}}, "named by their place"),
         ({"students": {"size": "1x1"}}, "students must be a list of mappings"),
         ({"students": [{"layers": 1}]}, "no student has 'layers'"),
+        ({"students": [{"size": 320}]}, "a student's size is WIDTHxHEIGHT"),
+        ({"students": [{"qat": "no"}]}, "qat is true or false"),
+        ({"students": [{"steps": "few"}]}, "steps is a whole number"),
     ],
 )
 def test_a_wrong_sheet_is_a_sentence(sheet, changes, said):
@@ -131,6 +135,24 @@ def test_the_best_are_those_that_no_other_beats():
     assert not sweeping._beats(row, {**row, "to_recorded_pct": None})
 
 
+def test_times_are_of_the_artifact_that_is_there(tmp_path, sheet, monkeypatch):
+    """A run that is made again keeps the benchmarks of other hosts, which are of what it was before."""
+    job = Sheet.read(sheet()).jobs()[0]
+    stub, mark = Stub(tmp_path / "log"), sweeping.fingerprints([job])[job.name]
+    worker = SimpleNamespace(state=SimpleNamespace(total_resources={"timing": 1}))
+    monkeypatch.setattr("distributed.get_worker", lambda: worker)
+    for part in ("prepare", "benchmark"):
+        sweeping.do(part, stub, job, tmp_path, mark)
+    timed = json.loads((tmp_path / job.name / "benchmark-here.json").read_text())
+    timed["inputs"], timed["metrics"] = (
+        {"policy_static.pt": "another"},
+        {"artifacts": {"static": {"latency_p50_ms": 99}}},
+    )
+    (tmp_path / job.name / "benchmark-a-host.json").write_text(json.dumps(timed))
+    (row,) = sweeping.rows([job], tmp_path, {job.name: mark})
+    assert row["latency_p50_ms"] == 10
+
+
 @pytest.mark.slow
 def test_twelve_runs_on_two_workers_of_which_one_dies(tmp_path, sheet):
     """All twelve are there, none was made twice; the one that failed is named, and made once it can be."""
@@ -174,6 +196,19 @@ def test_a_student_is_taught_into_its_runs_folder(tmp_path, monkeypatch):
     assert asked == [((student_file, job.episodes, job.name), {"runs_dir": tmp_path, "timed": False, "worlds": 0})]
     with pytest.raises(SweepError, match="WIDTHxHEIGHT"):
         sweeping.Notebooks().prepare(replace(job, student={"size": "96 by 54"}), tmp_path)
+
+
+def test_a_student_that_only_lerobots_folder_can_hold_is_run_from_there(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("rover_lib.workshop.run.run", lambda checkpoint, *_, **__: asked.append(checkpoint))
+
+    def leave(*_, **__):
+        (tmp_path / "taught" / "pretrained_model").mkdir(parents=True)
+        return tmp_path / "taught"
+
+    monkeypatch.setattr("rover_lib.workshop.distill.distill", leave)
+    sweeping.Notebooks().prepare(Job("pretrained_model", "episodes", {"decoder_layers": 1}, {}, {}), tmp_path)
+    assert asked == [tmp_path / "taught" / "pretrained_model"]
 
 
 @pytest.mark.slow

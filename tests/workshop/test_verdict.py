@@ -208,3 +208,11 @@ def test_the_real_sample_is_too_little_to_be_sure(demo, tmp_path):
     demo["load"] |= {"recordings": recordings.summary(), "split": split(recordings).episodes}
     caution = judge(demo)["cautions"][0]
     assert "of 1 episode, which calibrated too: too few" in caution and "Record some 20 drives more" in caution
+
+
+def test_what_is_typed_next_is_the_student_that_will_be_there(demo):
+    """The trainer's format has no place for what LeRobot normalises: of such a policy only LeRobot's folder is left."""
+    for mode in ("static", "mixed"):
+        miss(demo, mode, 2.8)
+    demo["load"]["checkpoint"]["format"] = "lerobot"
+    assert "rover run runs/mine-qat/pretrained_model episodes --name mine-qat" in commands(judge(demo))

@@ -256,3 +256,17 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "mine").write_text("")
     with pytest.raises(WorldError, match="exists and is not of this"):
         learn._begin(tmp_path, {})
+
+
+def test_worlds_that_were_driven_before_and_do_not_judge_now_are_no_misses(tmp_path):
+    fewer = learn._Lab(replace(FEW, rounds=1, worlds=3, other_worlds=2), tmp_path, tmp_path, None)
+    lines = "".join(
+        f'{{"how": "{how}", "seed": {learn.SEED + i}, "outcome": "left"}}\n' for how in learn.HOW for i in range(1, 9)
+    )
+    hits = "".join(f'{{"how": "{how}", "seed": {learn.SEED}, "outcome": "hit"}}\n' for how in learn.HOW)
+    for name in fewer.policies():
+        (tmp_path / f"{name}.jsonl").write_text(lines + hits)
+    rounds = [{"round": 1, "human_s": 1.0, "takeovers": 1, "drives": 2, "missed": 0}]
+    for row in learn._metrics(fewer, rounds)["policies"]:
+        assert (row["pushed"]["hits"], row["pushed"]["trials"]) == (1, 3)
+        assert row["alone"]["missed"] == [learn.SEED + 1]

@@ -1,6 +1,7 @@
 """A teacher and its students side by side: rows, what is kept, and what is refused."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
+from rover_lib.onboard.car import FILE_VARIABLE, Car, yaml_of
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import plots
@@ -158,6 +160,16 @@ def test_what_was_driven_once_is_kept(made):
     artifact(made.student / "policy_static.pt", "student's", off=0.004)
     measured(made.teacher, [made.student], worlds=3)
     assert len(made.driven) == 6 and {off for off, *_ in made.driven} == {0.004}
+
+
+def test_what_another_car_drove_is_not_taken_for_this_ones(made, monkeypatch, tmp_path):
+    measured(made.teacher, [made.student], worlds=1)
+    made.driven.clear()
+    path = tmp_path / "car.yml"
+    path.write_text(yaml_of(replace(Car(), wheelbase_m=0.5)))
+    monkeypatch.setenv(FILE_VARIABLE, str(path))
+    measured(made.teacher, [made.student], worlds=1)
+    assert len(made.driven) == 4
 
 
 def test_a_kill_costs_the_drives_that_had_not_ended(made, monkeypatch):
