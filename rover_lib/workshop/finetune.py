@@ -153,7 +153,6 @@ def finetune(
         _leave(new, name, work, taught)
         if folder.exists():  # by another command meanwhile; what was learned is kept for another name
             raise _is_there(folder)
-        new.rename(folder)  # at once: of a part of it, this command could not go on
     shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
     return folder
 
