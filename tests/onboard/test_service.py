@@ -563,12 +563,18 @@ class Policy:
         return np.tile(np.float32([0.1, 0.05]), (32, 1))
 
 
+def write_film(path):
+    """As long as the slowest of these tests may take on a busy machine, four minutes: a film that ends is a fault."""
+    frames = pictures(0)
+    path.write_bytes(b"".join(frames * (4 * 60 * 30 // len(frames) + 1)))
+
+
 @pytest.mark.slow
 def test_after_a_takeover_the_same_process_waits_for_another_request(systemd, tmp_path, monkeypatch):
     """The port stays open: opened again, it might reset the Arduino, and the human would lose the car."""
     for name, fake in {"ServoLink": Link, "PolicyProcess": Policy, "content_hash": lambda path: "ab12"}.items():
         monkeypatch.setattr(f"rover_lib.onboard.drive.{name}", fake)
-    (tmp_path / "film.mjpeg").write_bytes(b"".join(pictures(0) * 40))
+    write_film(tmp_path / "film.mjpeg")
     answers = []
     monkeypatch.setattr(Link, "missing", "w")
 
@@ -639,7 +645,7 @@ def test_a_takeover_is_recorded_and_then_the_service_waits_disarmed(systemd, tmp
         monkeypatch.setattr(DrivenLink, name, 0)
     for name in ("arms", "sent_later"):
         monkeypatch.setattr(DrivenLink, name, [])
-    (tmp_path / "film.mjpeg").write_bytes(b"".join(pictures(0) * 20))
+    write_film(tmp_path / "film.mjpeg")
     answers = []
 
     def operator() -> None:

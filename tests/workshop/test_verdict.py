@@ -207,7 +207,10 @@ def test_the_real_sample_is_too_little_to_be_sure(demo, tmp_path):
     recordings = load_recordings(tmp_path, chunk=8)
     demo["load"] |= {"recordings": recordings.summary(), "split": split(recordings).episodes}
     caution = judge(demo)["cautions"][0]
-    assert "of 1 episode, which were also used to calibrate: too few" in caution and "Record some 20 drives more" in caution
+    assert (
+        "of 1 episode, which were also used to calibrate: too few" in caution
+        and "Record some 20 drives more" in caution
+    )
 
 
 def test_what_is_typed_next_is_the_student_that_will_be_there(demo):
