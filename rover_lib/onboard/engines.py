@@ -8,6 +8,7 @@ that raises ArtifactError if it cannot run the artifact here. threads: None leav
 """
 
 import importlib
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -41,14 +42,14 @@ class Engine(Protocol):
         """Compute with that many threads from now on; torch's are those of the whole process."""
 
 
-class SessionEngine:
+class SessionEngine(ABC):
     """What engines share whose threads are those of a session of ONNX Runtime, and which hold nothing to give back."""
 
     _threads: int
 
+    @abstractmethod
     def _make_session(self, threads: int) -> None:
         """Make the session with that many threads. Raises ArtifactError, and leaves the one that is there then."""
-        raise NotImplementedError
 
     def give_back(self) -> bool:
         """As Engine: nothing is held that could be."""
