@@ -45,7 +45,7 @@ RITUAL_S = 30.0  # for a human to do what is asked
 SAME_US = 16  # pulses of a stick that nobody touches
 REST_US = 32  # the firmware arms with the throttle stick so near to neutral
 HOT_C = 75.0  # a Pi 5 slows down from 80
-MEMORY_MB = 700  # the real policy has 358 resident while predicting, 426 while it is loaded; the loop's process 100
+MEMORY_MB = 700  # the real policy has 358 resident while predicting, 424 while it is loaded; the loop's process 100
 RECORDINGS_MB = 1000  # a quarter of an hour at 30 Hz
 EARLIEST_S = 1_735_689_600  # 2025: a Pi without a network starts in its past
 

@@ -24,7 +24,7 @@ import yaml
 
 from rover_lib.onboard.columns import aligned, number
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.params import FOR_THIS_RUN, read_params
+from rover_lib.onboard.params import FOR_THIS_RUN, params, read_params
 from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
 from rover_lib.workshop import judge
 from rover_lib.workshop.hub import absolute
@@ -47,6 +47,7 @@ STUDENT_OPTIONS = (  # as of `rover distill`
 )
 OF_A_RUN = ("run_dir", "checkpoint", "episodes")  # parameters that the sweep itself sets
 MODE = "static"  # the artifact that a run is judged by
+A_SHEET = "docs/sweep.md has a sheet to begin with"
 
 
 class SweepError(RoverError):
@@ -95,13 +96,18 @@ class Sheet:
         """Paths in the file are taken from where the command is typed. Raises SweepError, ParamsError."""
         from rover_lib.workshop.run import NAMES, NOTEBOOKS, parameters_of
 
+        if not Path(path).exists():
+            raise SweepError(f"{path}: not found", remedy=A_SHEET)
         content = read_params(path)
-        if unknown := sorted(set(content) - set(cls.__dataclass_fields__)):
+        if unknown := sorted(map(str, set(content) - set(cls.__dataclass_fields__))):
             raise SweepError(f"{path}: {unknown[0]!r} is nothing that a sheet has",
                              remedy=f"known are {', '.join(cls.__dataclass_fields__)}")  # fmt: skip
         for key in ("checkpoints", "episodes"):
             if not content.get(key):
-                raise SweepError(f"{path}: no {key!r} in it", remedy="docs/sweep.md has a sheet to begin with")
+                raise SweepError(f"{path}: no {key!r} in it", remedy=A_SHEET)
+        checkpoints = content["checkpoints"] if isinstance(content["checkpoints"], list) else [content["checkpoints"]]
+        if not all(isinstance(checkpoint, str) for checkpoint in checkpoints):
+            raise SweepError(f"{path}: checkpoints must be paths", found=checkpoints)
         if not isinstance(content["episodes"], str):
             raise SweepError(f"{path}: episodes must be one folder", found=content["episodes"])
         of_notebooks = _lists(content.get("notebooks"), f"{path}: notebooks")
@@ -111,14 +117,17 @@ class Sheet:
         students = content.get("students") or [{}]
         if not isinstance(students, list) or not all(isinstance(s, dict) for s in students):
             raise SweepError(f"{path}: students must be a list of mappings", found=students)
-        if unknown := sorted(set().union(*students) - set(STUDENT_OPTIONS)):
+        if unknown := sorted(map(str, set().union(*students) - set(STUDENT_OPTIONS))):
             raise SweepError(f"{path}: no student has {unknown[0]!r}", remedy=f"known are {', '.join(STUDENT_OPTIONS)}")
         for student in students:
             _check_student(student)
         of_params = _lists(content.get("params"), f"{path}: params")
         if wrong := [key for key in of_params if "." not in key]:
             raise SweepError(f"{path}: params are named by their place, say calibration.seed", found=wrong[0])
-        checkpoints = content["checkpoints"] if isinstance(content["checkpoints"], list) else [content["checkpoints"]]
+        here = params()
+        if unknown := [place for place in of_params if not _has(here, place)]:
+            # Runs that differ in a misspelt value alone would be the same run under several names.
+            raise SweepError(f"{path}: params.yml has no {unknown[0]!r}", remedy="look at params.yml for its name")
         return cls([absolute(c) for c in checkpoints], absolute(content["episodes"]), students, of_notebooks, of_params)
 
     def jobs(self) -> list[Job]:
@@ -161,6 +170,15 @@ def _lists(values: Any, where: str) -> dict[str, list[Any]]:
     return lists
 
 
+def _has(values: Any, place: str) -> bool:
+    """Whether there is a value at that place, say "calibration.seed"."""
+    for name in place.split("."):
+        if not isinstance(values, Mapping) or name not in values:
+            return False
+        values = values[name]
+    return True
+
+
 def _combinations(values: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
     for chosen in itertools.product(*values.values()):
         yield dict(zip(values, chosen, strict=True))
@@ -200,7 +218,6 @@ class Notebooks:
 
     def _taught(self, job: Job, folder: Path) -> Path:
         """The student's checkpoint, in the run's own folder; what was begun goes on."""
-        from rover_lib.onboard.params import params
         from rover_lib.workshop.checkpoint_files import written_in
         from rover_lib.workshop.distill import DistillRecipe, distill
         from rover_lib.workshop.student import StudentShape

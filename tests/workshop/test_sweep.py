@@ -64,6 +64,12 @@ def test_names_stay_while_the_sheet_grows(sheet):
         ({"notebooks": [1]}, "notebooks must be a mapping"),
         ({"notebooks": {"samples": []}}, "samples has no value"),
         ({"params": {"seed": 1}}, "named by their place"),
+        ({"params": {"calibration.sed": [0, 1, 2]}}, "params.yml has no 'calibration.sed'"),
+        ({"params": {"calibration.seed.first": 1}}, "params.yml has no 'calibration.seed.first'"),
+        ({"params": {"no_section.seed": 1}}, "params.yml has no 'no_section.seed'"),
+        ({"checkpoints": 5}, "checkpoints must be paths"),
+        ({"checkpoints": ["a.pth", {"b": 1}]}, "checkpoints must be paths"),
+        ({"students": [{1: 2, "layers": 3}]}, "no student has '1'"),
         ({"students": {"size": "1x1"}}, "students must be a list of mappings"),
         ({"students": [{"layers": 1}]}, "no student has 'layers'"),
         ({"students": [{"size": 320}]}, "a student's size is WIDTHxHEIGHT"),
@@ -74,6 +80,17 @@ def test_names_stay_while_the_sheet_grows(sheet):
 def test_a_wrong_sheet_is_a_sentence(sheet, changes, said):
     with pytest.raises(SweepError, match=said):
         Sheet.read(sheet(**changes))
+
+
+def test_a_key_that_is_no_text_is_a_sentence(tmp_path):
+    (tmp_path / "sheet.yml").write_text("1: 2\nfoo: 3\n")
+    with pytest.raises(SweepError, match="'1' is nothing that a sheet has"):
+        Sheet.read(tmp_path / "sheet.yml")
+
+
+def test_a_sheet_that_is_not_there_is_the_users_to_write(tmp_path):
+    with pytest.raises(SweepError, match=r"not found; docs/sweep\.md has a sheet"):
+        Sheet.read(tmp_path / "sheet.yml")
 
 
 def test_a_run_twice_is_refused(sheet):
