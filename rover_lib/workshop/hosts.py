@@ -15,7 +15,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.cells import Table
 
-THIS = "this machine"  # so that a committed figure does not name it
+THIS = "this machine"  # instead of the host's name, which a committed figure need not show
 NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
 NO_SOAK = "none of the rovers was soaked; -e rover_soak_minutes=30 shows temperature, clock and throttling over time"
 
