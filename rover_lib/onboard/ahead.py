@@ -1,7 +1,7 @@
 """Where a plan leads, drawn into the camera's picture: the car's geometry, on a flat floor.
 
-A car of two axles, whose speed follows the throttle, and a camera that looks straight ahead and level. For people to
-look at, and for nothing else: no command depends on it.
+It assumes a car with two axles whose speed is proportional to the throttle, and a level camera that looks straight
+ahead. The drawing is only for people to look at: no command depends on it.
 """
 
 import math
@@ -14,17 +14,17 @@ from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pwm import is_finite
 
-NEAR_M = 0.15  # before the camera; what is nearer is not on the picture
+NEAR_M = 0.15  # in front of the camera; the picture does not show what is nearer
 
 
 @dataclass(frozen=True)
 class CarShape:
-    """A car's wheelbase and camera, by its car.yml, and the section `view` of params.yml.
+    """A car's wheelbase and camera, from its car.yml and the section `view` of params.yml.
 
-    Lengths in metres; what is of the picture, as a share of it.
+    Lengths are in metres; positions in the picture are fractions of its width or height.
 
-    wheel_angle_rad: of the front wheels at full steering. speed_mps: at throttle 1. focal: of the picture's width.
-    horizon: its row, of the picture's height from the top.
+    wheel_angle_rad: angle of the front wheels at full steering. speed_mps: at throttle 1. focal: focal length, as a
+    fraction of the picture's width. horizon: row of the horizon from the top, as a fraction of the picture's height.
     """
 
     wheelbase_m: float
@@ -42,8 +42,10 @@ class CarShape:
 
     @classmethod
     def of(cls, car: Car | None = None) -> "CarShape":
-        """The shape of this machine's car, or of another. Raises ParamsError for numbers that no car has, CarError as
-        this_car()."""
+        """The shape of `car`, or of this machine's car.
+
+        Raises ParamsError for values that no car can have, CarError as this_car().
+        """
         car = car or this_car()
         section: dict[str, Any] = params()["view"]
         measured = {"wheelbase_m": car.wheelbase_m, "focal": car.focal_px / WIDTH_PX}
@@ -53,7 +55,9 @@ class CarShape:
         return cls(**section, **measured)
 
     def track(self, actions: Iterable[Sequence[float]], step_s: float) -> list[tuple[float, float, float]]:
-        """(ahead, left, heading) in metres and radians from here on, a point before each action and one at the end.
+        """The car's path from here on as (ahead, left, heading) in metres and radians.
+
+        It has one point before each action and one at the end.
 
         actions: [steering, throttle] each, for step_s seconds; steering is positive to the left.
         """
@@ -71,9 +75,10 @@ class CarShape:
     def ribbon(
         self, actions: Iterable[Sequence[float]], step_s: float, aspect: float
     ) -> list[tuple[float, float, float, float]]:
-        """The way of both wheels, as shares of the picture: (x, y) of the left one, then of the right one.
+        """The path of both wheels in the picture: (x, y) of the left wheel, then of the right one.
 
-        aspect: of the picture, width to height. Only points before the camera; empty for a car that stands.
+        x and y are fractions of the picture's width and height. aspect: the picture's width divided by its height.
+        Points behind the camera are left out; the list is empty for a car that does not move.
         """
         ribbon = []
         for x, y, heading in self.track(actions, step_s):
@@ -90,6 +95,9 @@ class CarShape:
 
 
 def from_now(plan: dict[str, Any], now_s: float, seconds: float = 1.0) -> list[list[float]]:
-    """A plan's actions from now on, for that long at most. plan: actions, rate_hz, captured_s, as feed.py has it."""
+    """A plan's actions from now on, for at most `seconds`.
+
+    plan: has actions, rate_hz and captured_s, as in a message of feed.py.
+    """
     first = max(0, round((now_s - plan["captured_s"]) * plan["rate_hz"]))
     return plan["actions"][first : first + round(seconds * plan["rate_hz"])]

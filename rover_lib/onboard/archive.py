@@ -1,13 +1,13 @@
-"""The archive around an artifact: one zip, whose records are few, of known names and of bounded sizes.
+"""The zip file around an artifact: a limited number of records, each with a known name and a bounded size.
 
     with open_archive("policy_static.pt") as z:
         manifest = read_record(z, MANIFEST)
 
 It holds a program for torch (TorchScript's own records), for ONNX Runtime (one record, an ordinary .onnx with its
-weights inside), or for a Hailo chip (a compiled network, and an .onnx of what follows it on the processor), and beside
-it the manifest and the parity vectors. ONNX could keep those two as properties and tensors of its own file; a zip
-around it has what that lacks: checksums of every byte, and readers that all engines share and that need neither onnx
-nor protobuf.
+weights inside), or for a Hailo chip (a compiled network, and an .onnx for the part that runs on the processor after
+it). The manifest and the parity vectors lie beside the program. ONNX could store these two in its own file, as
+properties and tensors. A zip is better for two reasons: it has checksums of every byte, and all engines can share one
+reader that needs neither onnx nor protobuf.
 """
 
 import contextlib
@@ -50,9 +50,9 @@ KNOWN_RECORDS = tuple((re.compile(pattern, re.ASCII), limit) for pattern, limit 
 
 
 def open_archive(path: Path | str) -> zipfile.ZipFile:
-    """An artifact whose records are few, of known names and of bounded sizes, by its headers alone.
+    """Open an artifact, after checking in its headers that the number, names and sizes of its records are allowed.
 
-    Raises ArtifactError.
+    No record is unpacked. Raises ArtifactError.
     """
     try:
         with open_plain(path, ArtifactError(f"{path}: not a file", remedy="give a policy_*.pt")) as file:
@@ -72,14 +72,14 @@ def open_archive(path: Path | str) -> zipfile.ZipFile:
 
 
 class Unknown(Exception):
-    """Something that the programs and models of artifacts do not have; its text names it."""
+    """Something that no program or model of an artifact contains; the text names it."""
 
 
 @contextlib.contextmanager
 def nothing_unknown(path: Path | str, what: str) -> Iterator[None]:
-    """Of an archive's records while they are checked: raises ArtifactError for Unknown, and for what cannot be read.
+    """While an archive's records are checked, turn Unknown and errors of reading into an ArtifactError.
 
-    what: that is checked, in a word.
+    what: one word for the part that is checked, such as "program".
     """
     try:
         yield
@@ -92,21 +92,21 @@ def nothing_unknown(path: Path | str, what: str) -> Iterator[None]:
 
 
 def read_record(z: zipfile.ZipFile, name: str) -> bytes:
-    """A record, of which no more is unpacked than its header says. Raises as zipfile does."""
+    """A record's bytes; never unpacks more than its header announces. Raises as zipfile does."""
     with z.open(name) as record:
         return record.read(z.getinfo(name).file_size)
 
 
 def kind_of(records: list[zipfile.ZipInfo]) -> str:
-    """What an archive holds a policy for: torch, onnxruntime or hailo."""
+    """The engine that an archive's policy is for: torch, onnxruntime or hailo."""
     names = {record.filename for record in records}
     return "hailo" if HEF in names else "onnxruntime" if ONNX in names else "torch"
 
 
 def _check_directory(file: BinaryIO, path: Path | str) -> None:
-    """One zip archive from the file's first byte to its last, with a directory that may be read into memory.
+    """Check that the file is one zip archive from first byte to last, and its directory small enough for memory.
 
-    Two readers that look at different places for it would see two archives.
+    Otherwise two readers that look for the directory in different places could see two different archives.
     """
     if file.read(4) != b"PK\3\4":
         raise zipfile.BadZipFile("it does not begin as an archive")

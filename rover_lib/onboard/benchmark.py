@@ -1,11 +1,10 @@
-"""Time policies on the machine that runs them: a distribution, the host's state, and the floor of a Pi 5
-beside it.
+"""Measure the latency of policies on this machine: its distribution, the host's state, and a Pi 5's lower bound.
 
     metrics = benchmark({"static": static, "fp32": fp32}, frames, state, BenchmarkOptions(iterations=1000))
 
-All policies are timed interleaved in one run, one inference of each per round and another one first in every
-round: a machine that heats up or is shared slows all of them alike. What a host cannot tell (no thermal
-zone, no vcgencmd) is None, not 0. MB are 10**6 bytes.
+All policies are timed in one run. Each round has one inference of every policy, and starts with a different one. So a
+machine that heats up or is shared slows all of them alike. A value that the host does not report (no thermal zone, no
+vcgencmd) is None, not 0. MB are 10**6 bytes.
 """
 
 import itertools
@@ -27,15 +26,14 @@ from rover_lib.onboard.host import Host, throttled_means, usable_cores
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
-LEAST_ROUNDS = 20  # below it a 95th percentile is the slowest round
+LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
 
 
 def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeout_s: float = 300) -> float | None:
-    """Peak resident memory of a fresh process that loads one artifact and predicts three times; None if it
-    has no reading.
+    """Peak resident memory of a fresh process that loads one artifact and predicts three times.
 
-    The calling process holds every policy that is compared, so that its own peak says nothing about one of
-    them. Raises PolicyError if the artifact does not load or predict there.
+    A fresh one, because the calling process holds all compared policies, so that its own peak says nothing about one of
+    them. None if the machine does not report it. Raises PolicyError if the artifact does not load or predict there.
     """
     code = (
         "import sys, numpy as np\n"
@@ -67,10 +65,10 @@ def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeou
 
 
 def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
-    """The distribution of one policy's latencies, and the rates that follow.
+    """The distribution of one policy's latencies, and the rates that follow from it.
 
-    throughput_fps: inferences per second, one after the other (1000 / mean). control_rate_hz: the highest
-    rate at which 95 % of the inferences end within their period (1000 / p95).
+    throughput_fps: inferences per second without pauses (1000 / mean). control_rate_hz: the highest rate at which 95 %
+    of the inferences end within their period (1000 / p95).
     """
     x = np.asarray(latencies_ms, float)
     metrics: dict[str, float | int] = {
@@ -92,14 +90,14 @@ def _silent(items: Iterable, **_: object) -> Iterable:
 
 @dataclass(frozen=True)
 class BenchmarkOptions:
-    """How to time policies. Raises ParamsError for what makes no sense.
+    """How to time policies. Raises ParamsError for impossible values.
 
-    warmup: inferences of each policy that do not count. iterations: rounds; with duration_s, a soak, rounds until that
-    time is over, with a time series. at_most_s: fewer rounds, LEAST_ROUNDS at least, where slow policies would take
-    longer. threads: the engines', 0 for all cores, None as they are. rate_hz: at most this many inferences per second,
-    on absolute deadlines, as a drive makes them; None: as fast as it can. main: the policy whose figures stand at the
-    top level (None: the first). reference: the policy whose p50 the others are compared with.
-    memory_alone: measure each artifact's memory in a process of its own (seconds each).
+    warmup: inferences of each policy that are not counted. iterations: number of rounds. duration_s: instead, a soak
+    test: rounds until this time is over, with a time series. at_most_s: limits the time by doing fewer rounds, but at
+    least LEAST_ROUNDS. threads: of the engines; 0: all cores, None: as they are. rate_hz: at most so many inferences
+    per second, on absolute deadlines, as in a drive; None: as fast as possible. main: the policy whose figures are at
+    the top level (None: the first). reference: the policy with whose p50 the others are compared. memory_alone: measure
+    each artifact's memory in a process of its own, which takes seconds each.
     """
 
     warmup: int = 10
@@ -129,7 +127,7 @@ class BenchmarkOptions:
 
 @dataclass(frozen=True)
 class Clocks:
-    """Time as a benchmark sees it, all in seconds: what has passed, what the processor worked, and waiting."""
+    """The clocks of a benchmark, all in seconds: elapsed time, processor time, and a function that waits."""
 
     wall: Callable[[], float] = time.perf_counter
     cpu: Callable[[], float] = time.process_time
@@ -152,14 +150,15 @@ def benchmark(
 ) -> dict[str, Any]:
     """Time every policy's predict_chunk(frame, state), interleaved, and return the metrics of benchmark-<host>.json.
 
-    policies: name -> anything with predict_chunk; `.manifest` ("mode", "gmac"), `.path` and `.threads` with
-    `set_threads` are used where there are any. frames: taken in turn. progress: called like
+    policies: name -> an object with predict_chunk; its `.manifest` ("mode", "gmac"), `.path`, and `.threads` with
+    `set_threads` are used if it has them. frames: used in turn. progress: called like
     tqdm.tqdm(iterable, desc=, total=).
 
-    At the top level cpu_pct is this process's time over the whole run, as a share of all cores it may use; per
-    artifact, of its own inferences. temperature_c is the highest and clock_mhz the lowest reading. peak_memory_mb is
-    the artifact's alone where measured, else None there and this process's at the top level. Raises ParamsError without
-    policies, without frames, or if main or reference is no policy; what a policy raises goes through.
+    cpu_pct is processor time as a share of all cores that this process may use: at the top level over the whole run,
+    and per artifact over its own inferences. temperature_c is the highest and clock_mhz the lowest reading.
+    peak_memory_mb is that of the artifact alone if it was measured; otherwise it is None for the artifact, and this
+    process's at the top level. Raises ParamsError without policies or frames, or if main or reference is not among the
+    policies; errors of a policy are passed on.
     """
     names = list(policies)
     if not names or not len(frames):
@@ -240,7 +239,7 @@ class _Run:
         self.per_core_pct: list[float] | None = None
 
     def measure(self, options: BenchmarkOptions, progress: Progress) -> None:
-        """Fill the lists: `iterations` rounds, or as many as begin within duration_s."""
+        """Time `iterations` rounds, or as many as begin within duration_s, and fill the lists."""
         duration_s, rate_hz = options.duration_s, options.rate_hz
         if duration_s is None:
             rounds = progress(range(options.iterations), desc="timing", total=options.iterations)
@@ -276,7 +275,7 @@ class _Run:
             self.per_core_pct = [100 * busy / total if total > 0 else 0.0 for busy, total in spans]
 
     def metrics_of(self, name: str, cores: int) -> dict[str, Any]:
-        """What was measured of one policy, and what is known about it."""
+        """The figures of one policy: those measured, and those known from its manifest and file."""
         policy, times_ms = self.policies[name], self.latencies_ms[name]
         manifest = getattr(policy, "manifest", None) or {}
         path = getattr(policy, "path", None)
@@ -292,7 +291,7 @@ class _Run:
         }
 
     def speedup(self, name: str, reference: str) -> dict[str, float | None]:
-        """How many times as fast as the reference: by p50, and from 5 to 95 % of the rounds."""
+        """How many times as fast as the reference: by p50, and the range over 5 to 95 % of the rounds."""
         times_ms, reference_ms = self.latencies_ms[name], self.latencies_ms[reference]
         p50_ms, reference_p50_ms = (float(np.percentile(x, 50)) for x in (times_ms, reference_ms))
         paired = np.asarray(reference_ms) / np.maximum(times_ms, 1e-9)
@@ -304,7 +303,7 @@ class _Run:
         }
 
     def host_metrics(self) -> dict[str, Any]:
-        """The machine during the run: the highest temperature, the lowest clock, and the last throttled word."""
+        """The machine during the run: the highest temperature, the lowest clock, and the last throttling flags."""
         temperatures_c = [r["temperature_c"] for r in self.readings if r["temperature_c"] is not None]
         clocks_mhz = [r["clock_mhz"] for r in self.readings if r["clock_mhz"] is not None]
         throttled = self.readings[-1]["throttled"]
@@ -325,7 +324,7 @@ class _Run:
         self.cpu_s[name] += cpu_end_s - cpu_start_s
 
     def _wait(self, due_s: float, period_s: float) -> float:
-        """Wait for a deadline and return the next one; one that is over is counted and not made up for."""
+        """Wait for a deadline and return the next one. A deadline that has passed is counted and skipped."""
         now_s = self.clocks.wall()
         if now_s < due_s:
             self.clocks.sleep(due_s - now_s)
@@ -334,7 +333,7 @@ class _Run:
         return due_s + (behind + 1) * period_s
 
     def _note(self, t_s: float, seen: dict[str, int]) -> None:
-        """One point of the soak's series: the latencies since the last one, and the host's state."""
+        """Add one point to the time series: the latencies since the last point, and the host's state."""
         reading = self.host.reading()
         self.readings.append(reading)
         point: dict[str, Any] = {

@@ -1,10 +1,10 @@
-"""Measures another car's transmitter, through the Arduino's receiver pins: what `rover calibrate` writes into car.yml.
+"""Measure another car's transmitter through the Arduino's receiver pins, for `rover calibrate`, which writes car.yml.
 
     with ServoLink(port) as link:
         car = measure(link, ask=input)
 
-Nothing is armed. But the human's pulses go through to the servo and the speed controller, and while the Arduino is told
-one kind of car after the other, they get the neutral of each: so the wheels are off the ground, the motor unplugged.
+The car is not armed. But the human's pulses go through to the servo and the speed controller. And while several kinds
+of car are tried, these get the neutral of each. So the wheels must be off the ground and the motor unplugged.
 """
 
 import statistics
@@ -26,26 +26,26 @@ from rover_lib.onboard.errors import CarError
 from rover_lib.onboard.servo_link import Telemetry
 from rover_lib.onboard.stage import atomic_path
 
-LOOK_S = 0.5  # for both signals, as one kind of car; two pulses of 25 ms, or eight, are there long before
+LOOK_S = 0.5  # time for both signals to appear with one kind of car; two pulses of 25 ms, or eight, take far less
 MEASURE_S = 1.0
 STEP_S = 0.02  # of the Arduino's statuses
-STEADY_US = 24  # a stick that is held; the recordings' resting sticks stay within 16
-RETURNS_US = 40  # throttle that does not move back so far has no reverse
+STEADY_US = 24  # a stick held still stays within this; resting sticks in the recordings stay within 16
+RETURNS_US = 40  # if the throttle moves back less than this, the car has no reverse
 NAMES = ("steering", "throttle")
 
 
 class Link(Protocol):
-    """What this needs of a ServoLink."""
+    """The part of a ServoLink that is needed here."""
 
     def tell(self, car: Car) -> None:
-        """Make the Arduino's pins that car's from now on."""
+        """From now on the Arduino uses its pins as for that car."""
 
     def latest(self) -> Telemetry | None:
         """The newest status."""
 
 
 def _slow(steering_us: int, throttle_us: int) -> Car:
-    """A servo and a speed controller with periods around these; only to see pulses with."""
+    """A car with about these periods, used only to receive pulses."""
     return Car.of(
         {
             "name": "any car",
@@ -55,7 +55,7 @@ def _slow(steering_us: int, throttle_us: int) -> Car:
     )
 
 
-# A pulse counts whose period is within a quarter of the car's: these have all from 3 to 25 ms, likely ones first.
+# The Arduino accepts periods within a quarter of the car's. Together these cover 3 to 25 ms, the likely ones first.
 PERIODS_US = (20000, 12500, 7900, 5000, 3200)
 KINDS = (Car(), *(_slow(us, us) for us in PERIODS_US), *(_slow(a, b) for a in PERIODS_US for b in PERIODS_US if a != b))
 
@@ -77,13 +77,13 @@ def measure(
     sleep: Callable[[float], None] = time.sleep,
     **more: Any,
 ) -> Car:
-    """Leads a human through both sticks' ends and centres; the car that they make.
+    """Lead a human through the ends and centres of both sticks; return the measured car.
 
-    ask: tells the human what to do, and returns when it is done. notify: is told what was measured. more: what cannot
-    be measured here, `name`, `camera` and `wheelbase_m` as car.yml has them.
-    Raises CarError with what was seen and what to do where that is no car, LinkError as the link does.
+    ask: tells the human what to do, and returns when it is done. notify: is told what was measured. more: entries of
+    car.yml that cannot be measured, `name`, `camera` and `wheelbase_m`.
+    Raises CarError, with what was measured and what to do, if the values do not make a car; LinkError as the link does.
     """
-    Car.of({**DEFAULT, **more}, "what was given")  # what is wrong with it is said before a human's work, not after
+    Car.of({**DEFAULT, **more}, "what was given")  # so that mistakes in it are reported before the human does anything
     ask("Take the wheels off the ground and unplug the motor. Switch the transmitter on, and let go of both sticks.")
     _find(link, sleep)
     rest = _hold(link, "at rest", sleep)
@@ -123,9 +123,9 @@ def measure(
 
 
 def _check_throws(rest: Held, ends: Mapping[str, int]) -> None:
-    """Raises CarError for a stick that hardly moved, and for steering that went the same way twice.
+    """Raise CarError if a stick hardly moved, or if steering moved the same way for left and right.
 
-    ends: microseconds of the stick's channel by where it was held, "left", "right", "forward" and "back".
+    ends: the stick's pulse in microseconds where it was held: "left", "right", "forward" and "back".
     """
     for name, ways, neutral_us, least_us in (
         ("steering", ("left", "right"), rest.steering_us, STEERING_THROW_US),
@@ -147,7 +147,7 @@ def _check_throws(rest: Held, ends: Mapping[str, int]) -> None:
 
 
 def _goes_back(rest: Held, ends: Mapping[str, int]) -> bool:
-    """Whether the throttle has a reverse. Raises CarError where it went the same way backwards as forwards."""
+    """Whether the throttle has a reverse. Raises CarError if it moved the same way backwards as forwards."""
     backwards_us = (rest.throttle_us - ends["back"]) * (1 if ends["forward"] > rest.throttle_us else -1)
     if backwards_us < -RETURNS_US:
         raise CarError(
@@ -159,7 +159,7 @@ def _goes_back(rest: Held, ends: Mapping[str, int]) -> bool:
 
 
 def _find(link: Link, sleep: Callable[[float], None]) -> None:
-    """Tells the Arduino one kind of car after the other until both signals are there."""
+    """Try one kind of car after the other until the Arduino receives both signals."""
     seen: dict[str, int] = {}
     for kind in KINDS:
         link.tell(kind)
@@ -182,7 +182,7 @@ def _pulses(status: Telemetry | None) -> tuple[int | None, int | None]:
 
 
 def _hold(link: Link, where: str, sleep: Callable[[float], None]) -> Held:
-    """What both channels do for MEASURE_S. Raises CarError where a signal fails, or a stick moves."""
+    """Measure both channels for MEASURE_S. Raises CarError if a signal is lost or a stick moves."""
     rows: list[tuple[int, ...]] = []
     for _ in range(round(MEASURE_S / STEP_S)):
         sleep(STEP_S)
@@ -209,13 +209,13 @@ def _hold(link: Link, where: str, sleep: Callable[[float], None]) -> Held:
 
 
 def refuse_existing(path: Path, force: bool) -> None:
-    """Raises CarError for a car.yml that is there, unless it may be replaced."""
+    """Raise CarError if the car.yml exists, unless it may be replaced (force)."""
     if path.exists() and not force:
         raise CarError(f"{path}: exists already", remedy="--force replaces it")
 
 
 def write_car(car: Car, path: Path) -> None:
-    """All of it or nothing. Raises CarError where it cannot be written."""
+    """Write car.yml atomically. Raises CarError if it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:

@@ -1,11 +1,11 @@
-"""The newest frame of a camera: a thread reads all of them, because no backend of OpenCV can be told to keep only one.
+"""The newest frame of a camera. A thread reads all frames, because no backend of OpenCV can keep only the newest.
 
     with Camera(0) as camera:
         frame = camera.wait(after=0, timeout_s=1)
 
-The same reader also takes what stands in for a camera: a folder of frames, a file of JPEGs, or JPEGs through a FIFO.
-What a camera gives is no frame just because it came: it must be all of a picture, and of now. Some that are not are
-left out, a few in a row are a camera that failed.
+The same reader accepts substitutes for a camera: a folder of frames, a file of JPEGs, or JPEGs through a FIFO.
+A picture from a camera counts as a frame only if it is complete and new. Single bad pictures are left out; a few bad
+ones in a row mean that the camera has failed.
 """
 
 import contextlib
@@ -31,31 +31,31 @@ CLOSE_S = 1.0
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"  # FF D9 is not in the data of a JPEG: there FF is followed by 00
 PICTURES = (".jpg", ".jpeg")
 MJPG = cv2.VideoWriter.fourcc(*"MJPG")
-MONOTONIC, WALL, NO_CLOCK = "monotonic", "wall", "no"  # clocks that time stamps are of
-REFUSED_MOST = 4  # pictures in a row that are none; 0.13 s
-SAME = 0.9  # of a picture's blocks; a sensor's noise alone leaves at most 0.37 of them as they were
-REMEMBERED = 32  # pictures: no driver has more buffers that it could give again and again (VIDEO_MAX_FRAME)
-DECIDING = 5  # frames that show which clock a camera's time stamps are of
+MONOTONIC, WALL, NO_CLOCK = "monotonic", "wall", "no"  # the clock that time stamps come from
+REFUSED_MOST = 4  # bad pictures in a row; 0.13 s
+SAME = 0.9  # of a picture's blocks; the sensor's noise alone leaves at most 0.37 of them unchanged
+REMEMBERED = 32  # pictures: a driver has at most so many buffers that it could repeat (VIDEO_MAX_FRAME)
+DECIDING = 5  # frames after which it is decided which clock the time stamps come from
 OLD_S = 0.5  # age at which a plan's throttle begins to fade; a frame needs a plan first
 AHEAD_S = 0.01  # a time stamp may be rounded
-NEAR_S = 600.0  # a time stamp that is further from a clock than this is not of that clock
+NEAR_S = 600.0  # a time stamp further from a clock than this does not come from that clock
 
 Read = tuple[bytes | np.ndarray, float | None]  # a JPEG or a picture, and when it was captured if the camera says so
 Reader = Generator[Read, None, None]
 
 
 class CameraError(RoverError):
-    """A camera that is not there, stopped, or delivers something else than before."""
+    """A camera that is missing, has stopped, or delivers something different than before."""
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One picture. Nobody writes into it.
+    """One picture. Nobody may write into it.
 
-    image: (h, w, 3) uint8 BGR. captured_s: time.monotonic() (or the camera's clock) at which it was captured, or
-    arrived where the camera does not say. number: 1, 2, ... of this camera. repeats: of how many frames in a row, this
-    one the last, nearly all had been in one of the 32 before them, byte for byte; a sensor's noise makes that 0.
-    mean: of its pixels, 0 to 255. contrast: as picture.brightness(). jpeg: as it came; None of a camera of raw ones.
+    image: (h, w, 3) uint8 BGR. captured_s: when it was captured, in time.monotonic() (or the clock given to Camera);
+    when it arrived, if the camera does not say. number: 1, 2, ... of this camera. repeats: how many frames in a row, up
+    to this one, repeat nearly all of one of the 32 pictures before them, byte for byte; with a sensor's noise this is
+    0. mean: of its pixels, 0 to 255. contrast: as picture.brightness(). jpeg: as it arrived; None if the camera is raw.
     """
 
     image: np.ndarray
@@ -68,11 +68,12 @@ class Frame:
 
 
 class Camera:
-    """A source of frames, from entering the context until leaving it; a thread keeps only the newest.
+    """A source of frames, open inside its context; a thread reads it and keeps only the newest frame.
 
-    source: a number or /dev/videoN (V4L2), a folder of JPEGs (or an episode's), or a FIFO or .mjpeg file of JPEGs one
-    after another. size: (width, height) to ask a V4L2 camera for. rate_hz: to ask it for, and of sources without a rate
-    of their own. clock, wall_clock: the two that a camera's time stamps may be of. Any thread may call any method.
+    source: a number or /dev/videoN (V4L2), a folder of JPEGs (or of an episode), or a FIFO or .mjpeg file of JPEGs one
+    after another. size: (width, height) to request from a V4L2 camera. rate_hz: frames per second to request, and the
+    rate of sources without one of their own. clock, wall_clock: the two clocks that a camera's time stamps may come
+    from. Any thread may call any method.
     """
 
     def __init__(
@@ -85,12 +86,12 @@ class Camera:
         wall_clock: Callable[[], float] = time.time,
         held: bool = False,
     ):
-        """held: a folder or a file of pictures is shown again and again until begin(), and once from there on."""
+        """held: a folder or a file of pictures is repeated until begin() is called, and from then on shown once."""
         self.source = str(source)
         self.size, self.wanted_hz = size, rate_hz
         self._stamps = _Stamps(clock, wall_clock)
         self._shown = np.zeros((REMEMBERED, 0), np.uint64)  # the newest pictures' blocks, as block_sums()
-        self._remembered = 0  # how many there have been, of which it has the last
+        self._remembered = 0  # how many pictures have been stored there in all
         self._refusal: PictureError | None = None
         self._closing, self._begun = threading.Event(), threading.Event()
         self._held = held
@@ -128,7 +129,7 @@ class Camera:
         return self
 
     def begin(self) -> None:
-        """Shows held pictures from the first on. Nothing to a camera, which shows what is there."""
+        """Start held pictures from the first one, see __init__. Has no effect on a camera."""
         self._begun.set()
 
     def close(self) -> None:
@@ -221,7 +222,7 @@ class Camera:
         shown, number = block_sums(image), self.frames + 1
         if before is None:
             self._shown = np.zeros((REMEMBERED, len(shown)), np.uint64)
-        if self._held and self._begun.is_set():  # a film begins: what it showed until now may come again
+        if self._held and self._begun.is_set():  # a film starts: it may show the earlier pictures again
             self._held, self._remembered = False, 0
         same = (self._shown[: self._remembered] == shown).mean(axis=1).max(initial=0.0)
         self._shown[self._remembered % REMEMBERED] = shown
@@ -235,22 +236,23 @@ class Camera:
 
 
 class _Stamps:
-    """When frames were captured, by the time stamps that their camera gives.
+    """Finds out when frames were captured, from the time stamps that the camera gives.
 
-    Which clock those are of is decided once, by the first frames; from then on one that is old, ahead or standing still
-    is a fault of the camera. kind: "monotonic", "wall", or "no" if they are of neither; "" before the decision.
+    The first frames decide which clock the time stamps come from. After that, a time stamp that is old, in the future
+    or does not change is a fault of the camera. kind: "monotonic" or "wall" clock, "no" for neither; "" before the
+    decision.
     """
 
     def __init__(self, clock: Callable[[], float], wall_clock: Callable[[], float]):
         self._clock, self._wall_clock = clock, wall_clock
         self.kind = ""
         self._last_s = -math.inf
-        self._first: deque[tuple[float, float, float]] = deque(maxlen=DECIDING)  # stamp, and age by either clock
+        self._first: deque[tuple[float, float, float]] = deque(maxlen=DECIDING)  # time stamp, age by either clock
 
     def captured_s(self, stamp_s: float | None) -> float | None:
-        """When a frame that has just come was taken, seconds by the clock; None before the decision.
+        """When a frame that has just arrived was captured, seconds by the clock; None before the decision.
 
-        A frame without a stamp was taken when it arrived.
+        A frame without a time stamp counts as captured when it arrived.
 
         Raises PictureError for a stamp that cannot be right.
         """
@@ -273,7 +275,7 @@ class _Stamps:
         return now_s - max(0.0, age_s)
 
     def _decided(self) -> str:
-        """By most of the first frames: one of them may have come late."""
+        """Decide by the majority of the first frames, because one of them may have come late."""
         stamps, *ages = np.array(self._first).T
         stands = float(np.median(np.diff(stamps))) <= 0
         monotonic_s, wall_s = (float(np.median(age)) for age in ages)
@@ -364,7 +366,7 @@ def _contents(path: Path, piece: int = 1 << 20) -> Iterator[bytes]:
 def _paced(
     pictures: Callable[[], Iterable[bytes]], rate_hz: float, closing: threading.Event, begun: threading.Event
 ) -> Reader:
-    """Pictures that are all there, at a camera's rate: again and again until `begun`, and then once."""
+    """Stored pictures at a camera's rate: again and again until `begun`, and then once."""
     last = False
     while not last:
         last, start, count = begun.is_set(), time.monotonic(), 0
@@ -379,7 +381,7 @@ def _paced(
 
 
 def _fifo(path: Path, closing: threading.Event) -> Reader:
-    """JPEGs from a FIFO, the last of those that are there; its end is the end of the camera."""
+    """JPEGs from a FIFO; of those waiting, only the last. The end of the FIFO is the end of the camera."""
     for jpeg in _split(_pieces(path, closing), newest=True):
         yield jpeg, None
 
@@ -407,7 +409,7 @@ def _pieces(path: Path, closing: threading.Event) -> Iterator[bytes]:
 
 
 def _split(pieces: Iterator[bytes], newest: bool = False) -> Iterator[bytes]:
-    """Whole JPEGs out of a stream; newest: of several that came together only the last."""
+    """Complete JPEGs out of a stream. newest: of several that arrive together, only the last."""
     pending = bytearray()
     for piece in pieces:
         searched = max(0, len(pending) - 1)  # where an end marker may have been cut in two

@@ -1,11 +1,11 @@
-"""The car: its servo pulses, the most throttle that a host gets, its camera and its wheels. All from one file, car.yml.
+"""The car: its servo pulses, the host's throttle limit, its camera and its wheelbase, all read from one file, car.yml.
 
     with ServoLink("/dev/ttyUSB0", this_car()) as link:
         link.send_action(steering=0.2, throttle=0.1)
 
-Where there is no car.yml it is the car that the recordings are of, with the constants that were checked on them. The
-Arduino is told the same numbers, and takes none beyond the limits that its firmware was compiled with; they stand here
-too (firmware/rover/vehicle.h), so that a file which it would refuse is refused before.
+Without a car.yml, it is the car of the original recordings, with the constants that were checked on them. The Arduino
+is told the same numbers, and refuses any beyond the limits that its firmware was compiled with. This module has the
+same limits (firmware/rover/vehicle.h), so that a file which the Arduino would refuse is refused when it is read.
 """
 
 import math
@@ -22,8 +22,8 @@ import numpy as np
 from rover_lib.onboard.errors import CarError, ParamsError, PwmError
 from rover_lib.onboard.pwm import Channel, PwmCalibration, is_finite
 
-FILE_VARIABLE = "ROVER_CAR"  # names another file; what the programs that a command starts get too
-PLACES = (  # of car.yml, the first that exists counts
+FILE_VARIABLE = "ROVER_CAR"  # environment variable that names another file; inherited by started programs
+PLACES = (  # where car.yml may be; the first one that exists is used
     Path(__file__).parents[2] / "car.yml",  # a checkout's
     Path("/etc/rover/car.yml"),  # an installed rover's
 )
@@ -34,7 +34,7 @@ FAST_PERIOD_MIN_US, FAST_PERIOD_MAX_US = 1000, 1020  # of a throttle like the us
 PULSE_MIN_US, PULSE_MAX_US = 800, 2200
 STEERING_NEUTRAL_MIN_US, THROTTLE_NEUTRAL_MIN_US, NEUTRAL_MAX_US = 1300, 900, 1700
 FAST_NEUTRAL_MIN_US, FAST_NEUTRAL_MAX_US, FAST_PULSE_MAX_US = 80, 160, 711
-STEERING_THROW_US = 250  # to either side at least: the gesture before arming moves the stick by 200
+STEERING_THROW_US = 250  # at least, to either side: the gesture before arming moves the stick by 200
 THROTTLE_THROW_US = 100  # forward at least
 CAP_MAX_US = 118  # from neutral, either way: a fifth of the user's car's throttle
 
@@ -44,10 +44,10 @@ WIDTH_PX = 640  # of the pictures that the balloon world draws
 
 @dataclass(frozen=True)
 class Car:
-    """One car. A car that exists is one that the Arduino takes: CarError says what is not.
+    """One car. Only a car that the Arduino accepts can be made: otherwise CarError says what is wrong.
 
-    pwm: its two channels. cap_us: the furthest from neutral that a host gets the throttle's pulse, either way.
-    field_of_view_deg: of the camera, from the left edge to the right. wheelbase_m: from axle to axle.
+    pwm: its two channels. cap_us: the farthest that a host may move the throttle's pulse from neutral, either way.
+    field_of_view_deg: of the camera, from the left edge to the right one. wheelbase_m: from axle to axle.
     """
 
     name: str = "the recordings' car"
@@ -84,7 +84,7 @@ class Car:
 
     @property
     def reverses(self) -> bool:
-        """Whether it drives backwards too."""
+        """Whether it can drive backwards."""
         return self.pwm.throttle.low < 0
 
     @property
@@ -95,7 +95,10 @@ class Car:
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """What the Arduino is told, whole microseconds: of each channel period, shortest, neutral, longest; the cap."""
+        """The numbers sent to the Arduino, in whole microseconds.
+
+        For each channel the period, the shortest pulse, neutral and the longest pulse; then the cap.
+        """
         steering, throttle = (
             (round(c.period_us), c.ends_us[0], c.neutral_us, c.ends_us[1])
             for c in (self.pwm.steering, self.pwm.throttle)
@@ -109,12 +112,12 @@ class Car:
 
     @property
     def is_default(self) -> bool:
-        """Whether it is the one that the firmware drives before it is told."""
+        """Whether it is the car that the firmware assumes until it is told of another."""
         return self.numbers == DEFAULT_NUMBERS
 
     @property
     def cap(self) -> float:
-        """The most throttle forward that the cap lets through, an action in [0, 1]."""
+        """The largest forward throttle that the cap allows, an action in [0, 1]."""
         throttle = self.pwm.throttle
         return min(self.cap_us / abs(throttle.pulse_us(throttle.high) - throttle.neutral_us), 1.0)
 
@@ -124,14 +127,14 @@ class Car:
         return round(WIDTH_PX / 2 / math.tan(math.radians(self.field_of_view_deg) / 2), 2)
 
     def drives_like(self, other: "Car") -> bool:
-        """Whether an action means the same on both, and is seen the same: all but the name and the cap."""
+        """Whether actions and pictures mean the same on both cars: all is equal but the name and the cap."""
         mine, others = ({**c.description(), "name": ""} for c in (self, other))
         for description in (mine, others):
             description["throttle"] = {**description["throttle"], "cap_us": 0}
         return mine == others
 
     def description(self) -> dict[str, Any]:
-        """What car.yml says of it; Car.of() makes the same car of this."""
+        """The content of its car.yml, from which Car.of() makes the same car."""
         steering, throttle = self.pwm.steering, self.pwm.throttle
         reverse = {"reverse_us": throttle.pulse_us(throttle.low)} if self.reverses else {}
         return {
@@ -155,7 +158,7 @@ class Car:
 
     @classmethod
     def of(cls, content: object, where: str = "car.yml") -> "Car":
-        """The car that a mapping as car.yml's describes. CarError names what is missing, unknown or no car's."""
+        """The car that the content of a car.yml describes. CarError names what is missing, unknown or impossible."""
         content = _section(content, where, {"steering", "throttle"}, {"name", "camera", "wheelbase_m"})
         steering = _section(
             content["steering"], f"{where}: steering", {"period_us", "left_us", "neutral_us", "right_us"}, set()
@@ -205,7 +208,7 @@ class Car:
         if car.description()["steering"] == DEFAULT["steering"] and (
             {**car.description()["throttle"], "cap_us": 0} == {**DEFAULT["throttle"], "cap_us": 0}
         ):
-            # To the last bit: whole microseconds say a little less than the constants that were checked.
+            # The checked constants themselves, because whole microseconds are slightly less precise.
             car = cls(car.name, PwmCalibration(), cap_us, **measures)
         return car
 
@@ -244,7 +247,7 @@ def _whole(value: object, what: str) -> int:
 
 
 def _channel(name: str, period_us: int, pulses_us: tuple[int | None, int, int]) -> Channel:
-    """A channel by its pulses at action -1 (None: it has no actions below 0), 0 and 1."""
+    """A channel from its pulses at the actions -1 (None: there are no actions below 0), 0 and 1."""
     low_us, neutral_us, high_us = pulses_us
     upwards = high_us > neutral_us
     if high_us == neutral_us or (low_us is not None and (low_us == neutral_us or (low_us < neutral_us) != upwards)):
@@ -274,8 +277,8 @@ DEFAULT_NUMBERS = _DEFAULT_CAR.numbers
 
 
 def read_car(path: Path | str) -> Car:
-    """The car of a file. Raises CarError if it is missing, no YAML, or describes no car that can be driven."""
-    from rover_lib.onboard.params import read_params  # and YAML, which a car without a file needs not
+    """Read a car from a file. Raises CarError if it is missing, not YAML, or not a car that can be driven."""
+    from rover_lib.onboard.params import read_params  # imports YAML, which is not needed without a file
 
     if not Path(path).is_file():
         raise CarError(f"{path}: not found", remedy="`rover calibrate` writes one")
@@ -286,7 +289,7 @@ def read_car(path: Path | str) -> Car:
 
 
 def car_file() -> Path | None:
-    """The car.yml that counts on this machine, None if there is none."""
+    """The car.yml that is used on this machine, None if there is none."""
     if named := os.environ.get(FILE_VARIABLE):
         return Path(named)
     return next((place for place in PLACES if place.is_file()), None)
@@ -299,7 +302,7 @@ def default_place() -> Path:
 
 
 def this_car() -> Car:
-    """The car of this machine: its car.yml's, or else the one that the recordings are of. Raises as read_car()."""
+    """This machine's car, from its car.yml; without one, the car of the original recordings. Raises as read_car()."""
     path = car_file()
     return read_car(path) if path else _DEFAULT_CAR
 

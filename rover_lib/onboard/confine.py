@@ -1,11 +1,11 @@
-"""What a process that runs an artifact may still do: compute, read files, and answer on what it has open.
+"""Confine a process that runs an artifact: it may compute, read files, and answer through files that it has open.
 
-    reason = confine(memory_mb("policy_static.pt", threads=3))    # "" if the kernel holds it to that; else why not
+    reason = confine(memory_mb("policy_static.pt", threads=3))    # "" if the kernel enforces it, otherwise why not
 
-An artifact's operators are a closed list, and torch is a million lines that take what they are given: so whoever runs
-one gives up first what a policy does not need. It cannot open a file for writing, nor the serial port, nor a socket,
-start a program, or touch another process, and its memory has a limit. systemd's sandbox does some of that for the
-service as a whole, whose loop does need the port.
+Only operators of a closed list are accepted in an artifact, but torch is a million lines of code that may have bugs. So
+before a process runs an artifact, it gives up every right that a policy does not need. It can no longer open a file for
+writing, the serial port or a socket, start a program, or touch another process, and its memory has a limit. systemd's
+sandbox does some of this too, but for the service as a whole, whose control loop needs the serial port.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ ALLOWED = {
 }  # fmt: skip
 OPEN, OPENAT, CLONE, CLONE3, PRLIMIT, SECCOMP = (2, None), (257, 56), (56, 220), (435, 435), (302, 261), (317, 277)
 PROCESSORS = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}  # column above, and what the kernel calls it
-TO_WRITE = os.O_ACCMODE | os.O_CREAT | os.O_TRUNC  # any bit of these: more than reading
+TO_WRITE = os.O_ACCMODE | os.O_CREAT | os.O_TRUNC  # with any of these bits, a file is opened for more than reading
 CLONE_THREAD = 0x10000
 EPERM, ENOSYS = 1, 38
 # Of the kernel's filter machine: load a word of (number, architecture, address, six arguments), compare, return
@@ -54,7 +54,7 @@ ALLOW, REFUSE = 0x7FFF0000, 0x00050000  # REFUSE | errno
 
 
 def refuse_root() -> None:
-    """Raise ArtifactError for root, unless the environment says that there is nobody else."""
+    """Raise ArtifactError if root runs this process, unless the environment (AS_ROOT) allows it."""
     if os.geteuid() == 0 and os.environ.get(AS_ROOT) != "1":
         raise ArtifactError(
             "root does not load artifacts",
@@ -101,10 +101,10 @@ def _step(code: int, value: int, if_true: int = 0, if_false: int = 0) -> bytes:
 
 
 def confine(limit_mb: float) -> str:
-    """Give up, in all threads of this process and for good, all that an inference does not need.
+    """Give up every right that an inference does not need: in all threads of this process, and for good.
 
-    limit_mb: memory that it may take from now on, so import torch first. Returns why the kernel cannot hold it to the
-    rest, or ""; the memory's limit holds in any case.
+    limit_mb: memory that the process may allocate from now on, so import torch first. Returns "", or the reason why the
+    kernel cannot filter the system calls; the limit of memory holds in any case.
     """
     _lower(resource.RLIMIT_DATA, _bytes_with(limit_mb))
     _lower(resource.RLIMIT_CORE, 0)
@@ -125,7 +125,7 @@ def confine(limit_mb: float) -> str:
 
 @contextlib.contextmanager
 def less_memory(limit_mb: float) -> Iterator[None]:
-    """Inside, this process may take that much more memory; what would take more is a MemoryError."""
+    """Inside this context the process may allocate at most limit_mb more; beyond that, a MemoryError is raised."""
     before = resource.getrlimit(resource.RLIMIT_DATA)
     _lower(resource.RLIMIT_DATA, _bytes_with(limit_mb), hard=before[1])
     try:
@@ -135,13 +135,13 @@ def less_memory(limit_mb: float) -> Iterator[None]:
 
 
 def _bytes_with(limit_mb: float) -> int:
-    """Of this process's data, once it has taken that much more."""
+    """The size in bytes of this process's data once it has allocated limit_mb more."""
     status = Path("/proc/self/status").read_text()
     return int(status.partition("VmData:")[2].split()[0]) * 1024 + int(limit_mb * 1e6)
 
 
 def open_no_more() -> None:
-    """From now on this process opens no file at all, for reading neither."""
+    """From now on this process cannot open any file, not even for reading."""
     _lower(resource.RLIMIT_NOFILE, 0)
 
 

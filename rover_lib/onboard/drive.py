@@ -1,4 +1,4 @@
-"""A drive as a user asks for it: opens what it needs, in order, runs the control loop, and closes all in reverse.
+"""A whole drive: open all devices in order, run the control loop, and close everything in reverse order.
 
     report = Report()
     drive_car(DriveOptions(artifact=Path("policy_static.pt"), camera="0", port="/dev/ttyUSB0"), report)
@@ -47,30 +47,31 @@ from rover_lib.onboard.watch import (
     unfinished_drive,
 )
 
-REST_S = 1.0  # between plans that nobody drives by
+REST_S = 1.0  # between plans while the car is not driving
 TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"
 
 
 class OtherCar(Protocol):
-    """A car to drive that is not the one at the options' camera and port."""
+    """A car to drive instead of the one at the options' camera and port, such as a simulated one."""
 
     camera: str
     port: str
 
     def summary(self) -> dict[str, Any]:
-        """What became of the car, for the drive's report."""
+        """What happened to the car, for the drive's report."""
 
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """What a user asks of a drive: the options of `rover drive`. Either an artifact or a replay.
+    """The options of `rover drive`. There is either an artifact or a replay.
 
-    hz: commands a second. dry_run: no motor is driven. record: folder in which an episode is written; record_mb: what
-    all in it may take together, None: what the disk has. max_seconds, ticks: ends. throttle_limit, blend_ticks,
-    ensemble: instead of params.yml's. threads: the policy's, None: all cores but one. log_file: None: the user's.
-    replay: an episode whose pulses are sent. service: as a systemd service, disarmed until a human arms it.
-    film: the camera may be recorded pictures (a folder, a FIFO, an .mjpeg), which know nothing of where the car is.
-    latency_ms: what a plan takes at least, to compare. view: where a view may listen, None: the user's.
+    hz: commands per second. dry_run: no motor is driven. record: folder in which an episode is written. record_mb: how
+    much all episodes in it may take together; None: limited by the disk. max_seconds, ticks: when to end.
+    throttle_limit, blend_ticks, ensemble: replace the values of params.yml. threads: of the policy; None: all cores but
+    one. log_file: None: the user's. replay: an episode whose pulses are sent. service: run as a systemd service,
+    disarmed until a human arms it. film: the camera may be recorded pictures (a folder, a FIFO, an .mjpeg), which do
+    not show where the car is. latency_ms: make each plan take at least this long, for comparisons. view: the socket of
+    a view; None: the user's.
     """
 
     artifact: Path | None = None
@@ -107,10 +108,10 @@ def check_no_film(camera: str) -> None:
 def drive_car(
     options: DriveOptions, report: Report, car: Callable[[], AbstractContextManager[OtherCar]] | None = None
 ) -> None:
-    """Drives as the options say, in this process's main thread; raises as loop.drive.
+    """Drive as the options say, in this process's main thread. Raises as loop.drive.
 
-    report: is filled as it goes, so that it is there after a fault too. car: opens another than that of the options.
-    As a service it drives again and again, each time that a human arms the car, until it is told to stop.
+    report: filled during the drive, so that it is complete even after a fault. car: opens another car than that of the
+    options. As a service it drives each time that a human arms the car, until it is told to stop.
     """
     settings = Settings.of(
         params()["drive"],
@@ -126,7 +127,7 @@ def drive_car(
             found=f"{recorded.name!r} there, and this car is {this.name!r}",
             remedy="replay one of this car's",
         )
-    artifact = options.artifact.resolve() if options.artifact else None  # another may take its place meanwhile
+    artifact = options.artifact.resolve() if options.artifact else None  # `current` may point to another one later
     if not (controls or car or options.dry_run or options.film):
         check_no_film(options.camera)
     with ExitStack() as stack:
@@ -157,7 +158,7 @@ def drive_car(
 
 @dataclass(frozen=True)
 class _Opened:
-    """What every drive has open. link: None drives no motor."""
+    """What every drive has open. link: None: no motor is driven."""
 
     options: DriveOptions
     settings: Settings
@@ -192,7 +193,7 @@ def _replay(opened: _Opened, controls: Controls) -> None:
 
 
 def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
-    """Drives by an artifact's plans: once, or with a service each time that a human arms the car."""
+    """Drive by an artifact's plans: once, or as a service each time that a human arms the car."""
     options, report, log, link, feed = opened.options, opened.report, opened.log, opened.link, opened.feed
     this, stop = this_car(), opened.until.stop
     with ExitStack() as stack:
@@ -258,9 +259,9 @@ def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
 
 
 def another_car(manifest: dict[str, Any], this: Car) -> str:
-    """A sentence where an artifact was calibrated for another car than this one, "" if not. It may be driven by.
+    """A warning if an artifact was calibrated for another car than this one, else "". It may drive nevertheless.
 
-    An artifact that names none is for the recordings' car.
+    An artifact that names no car is for the car of the original recordings.
     """
     meant = car_of(manifest)
     if meant.drives_like(this):
@@ -272,7 +273,7 @@ def another_car(manifest: dict[str, Any], this: Car) -> str:
 
 
 def _then(arm: Arm, begin: Callable[[], object]) -> Arm:
-    """Arms, and then begins: a film starts when the loop does, not while somebody looks for the transmitter."""
+    """Arm, and then call begin(): a film must start with the loop, not while somebody looks for the transmitter."""
 
     def armed() -> Telemetry | None:
         telemetry = arm()
@@ -295,10 +296,10 @@ def arm_capped(
     notify: Callable[[str], None],
     still_wanted: Callable[[], object] = lambda: None,
 ) -> Telemetry:
-    """Arms a car whose Arduino then gives the host no more throttle than `limit`, whatever it asks for.
+    """Arm a car, after the Arduino was told to limit the host's throttle to `limit`.
 
-    limit, most: throttles in [0, 1]; the latter is the most that this drive may ask for, and `notify` is told where the
-    Arduino gives less. still_wanted: raises where nobody wants the car armed any more. Raises what that does, and
+    limit, most: throttles in [0, 1]. most: the largest that this drive may ask for; `notify` is told if the Arduino
+    allows less. still_wanted: raises if nobody wants the car armed any more. Raises what still_wanted raises, and
     LinkError as lower_cap() and arm().
     """
     channel = link.calibration.throttle
@@ -324,9 +325,10 @@ def arm_when_ready(
     notify: Callable[[str], None],
     checks: Sequence[Callable[[], object]] = (),
 ) -> Telemetry | None:
-    """Arms for a human in a terminal, as the loop's hooks do: says what is missing, and waits for it before.
+    """Arm for a human in a terminal, for the loop's hooks: say what is missing, wait for it, and then arm.
 
-    checks: what must go on working meanwhile. Raises NotArmed when told to stop, what a check raises, and as arm().
+    checks: called while waiting; each raises if its device fails. Raises NotArmed when told to stop, what a check
+    raises, and as arm().
     """
     told = ""
     while missing := what_is_missing(link):
@@ -341,10 +343,10 @@ def arm_when_ready(
 
 
 class _Arming:
-    """Arms the car with a camera that sees and a fresh plan, at the boosted priority, recorded; where that is refused,
-    all of it is undone.
+    """Arms the car and prepares the drive: a camera that sees, real-time priority, a fresh plan, and a recorder.
 
-    A context manager: leaving it ends what arming began. still_wanted: see arm_capped().
+    If arming is refused, all of that is undone. A context manager: leaving it ends what arming began. still_wanted: see
+    arm_capped().
     """
 
     still_wanted: Callable[[], object] = staticmethod(lambda: None)
@@ -355,7 +357,7 @@ class _Arming:
         self._planner, self._camera, self._mode, self._pilot = planner, camera, mode, pilot
         self._room: int | None = None
         if options.record and options.record_mb:
-            self._room = room_for(options.record, options.record_mb)  # now: it may take a while
+            self._room = room_for(options.record, options.record_mb)  # now, because it may take a while
         self._recorder: TakeoverRecorder | None = None
         self._armed: Telemetry | None = None
         self._driving, self._recording = ExitStack(), ExitStack()
@@ -376,7 +378,7 @@ class _Arming:
                     self._log.event(f"recorded: {outcome}")
 
     def arm(self) -> Telemetry | None:
-        """Arm the car, for the loop's hooks. Raises RoverError where that is refused; it may be called again then."""
+        """Arm the car, for the loop's hooks. Raises RoverError if that is refused; it may then be called again."""
         with ExitStack() as recording, ExitStack() as driving:
             driving.enter_context(self._planner.without_rest())
             if self._options.record:
@@ -399,13 +401,13 @@ class _Arming:
             self._recorder.command(*row, **columns)
 
     def record_human(self, link: ServoLink, stop: threading.Event, over: Callable[[], str | None]) -> None:
-        """After a takeover, where the drive is recorded: until the human lets go, or as TakeoverRecorder.human() ends.
+        """After a takeover in a recorded drive, record the human until TakeoverRecorder.human() ends.
 
-        Raises nothing: the human has the car, and opening the port again might take it away.
+        Raises nothing: the human has the car, and opening the port again might take it away from them.
         """
         if not self._recorder:
             return
-        self._driving.close()  # nothing is driven any more: no real time, and a plan a second
+        self._driving.close()  # the host no longer drives: ordinary priority, and one plan per second
         recorder = self._recorder.recorder
         self._log.event(TAKEN_OVER)
         try:
@@ -427,12 +429,12 @@ class _Arming:
 
 
 def _first_of(*ends: Callable[[], str | None]) -> Callable[[], str | None]:
-    """One reason to end a drive out of several."""
+    """Combine several reasons to end a drive: the first that applies."""
     return lambda: next((why for end in ends if (why := end())), None)
 
 
 def _all_of(*sources: Warnings) -> Warnings:
-    """One source of warnings out of several."""
+    """Combine several sources of warnings."""
 
     def warnings() -> Iterator[str]:
         for source in sources:

@@ -4,7 +4,7 @@ An engine is a module with
 
     load(path, manifest, threads) -> Engine
 
-that raises ArtifactError if it cannot run the artifact here. threads: None leaves the engine's own choice.
+that raises ArtifactError if it cannot run the artifact here. threads: None lets the engine choose.
 """
 
 import importlib
@@ -15,13 +15,13 @@ from typing import Any, Protocol
 import numpy as np
 
 TORCH, ONNXRUNTIME, HAILO = "qnnpack", "onnxruntime", "hailo"
-PACKAGES = {TORCH: "torch", ONNXRUNTIME: "onnxruntime", HAILO: "hailo_platform"}  # what has to be installed for it
+PACKAGES = {TORCH: "torch", ONNXRUNTIME: "onnxruntime", HAILO: "hailo_platform"}  # the package each engine needs
 MODULES = {
     TORCH: "rover_lib.onboard.torch_engine",
     ONNXRUNTIME: "rover_lib.onboard.onnx_engine",
     HAILO: "rover_lib.onboard.hailo_engine",
 }
-# Engines whose process cannot be held to computing and reading files, and why
+# Engines whose process cannot be confined (see confine.py), and why
 UNCONFINED = {HAILO: "HailoRT talks to the chip through its driver"}
 
 
@@ -32,42 +32,47 @@ class Engine(Protocol):
         """(S,) float32 and one (height, width, 3) uint8 per camera in, (1, chunk, A) out. Raises RuntimeError."""
 
     def give_back(self) -> bool:
-        """Drops what only loading needed, once it has run; whether predictions must be proven again after that."""
+        """Free the memory that only loading needed. Call it after a first run.
+
+        Returns whether the predictions must be checked again afterwards.
+        """
 
     @property
     def threads(self) -> int:
         """How many threads compute."""
 
     def set_threads(self, threads: int) -> None:
-        """Compute with that many threads from now on; torch's are those of the whole process."""
+        """Compute with that many threads from now on. For torch this sets the threads of the whole process."""
 
 
 class SessionEngine(ABC):
-    """What engines share whose threads are those of a session of ONNX Runtime, and which hold nothing to give back."""
+    """Base of the engines that compute in a session of ONNX Runtime. They have no memory to give back."""
 
     _threads: int
 
     @abstractmethod
     def _make_session(self, threads: int) -> None:
-        """Make the session with that many threads. Raises ArtifactError, and leaves the one that is there then."""
+        """Make the session with that many threads. Raises ArtifactError, and then keeps the present session."""
 
     def give_back(self) -> bool:
-        """As Engine: nothing is held that could be."""
+        """As Engine.give_back(): there is nothing to free."""
         return False
 
     @property
     def threads(self) -> int:
-        """As Engine, of what runs on the processor."""
+        """As Engine.threads: the threads of the part that runs on the processor."""
         return self._threads
 
     def set_threads(self, threads: int) -> None:
-        """As Engine: a session has its threads for life, so it is made anew. Raises ArtifactError."""
+        """As Engine.set_threads(). A session cannot change its threads, so a new one is made. Raises ArtifactError."""
         self._make_session(threads)
         self._threads = threads
 
 
 def module_of(name: str) -> Any:
-    """The engine's module, imported now, which takes seconds: by who limits what may be opened or allocated later.
+    """Import an engine's module now, which takes seconds, and return it.
+
+    For a process that will later limit what it may open or allocate.
 
     Raises KeyError for an engine that is not known, ImportError for one that is not installed.
     """

@@ -2,16 +2,16 @@
 
     raise CameraError("the camera delivers no frames", found=source, remedy="is it plugged in?")
 
-The command line prints them as one sentence and exits with 1; a traceback comes only with --debug. Whoever wants a part
-of one reads its field, and never takes its text apart.
+The command line prints an error as one sentence and exits with 1; it shows a traceback only with --debug. Code that
+needs a part of an error reads that field and never parses the text.
 """
 
 
 class RoverError(Exception):
-    """Base of every error that is the input's fault, not the program's.
+    """Base of every error that is caused by the input and not by the program.
 
-    what: was wrong, a clause without a full stop. found: instead of what was expected, None if `what` says all.
-    remedy: what to do about it, "" if there is nothing to say.
+    what: what was wrong, a clause without a full stop. found: what was found instead of what was expected; None if
+    `what` already says it. remedy: what the user can do about it; "" if there is nothing to suggest.
     """
 
     def __init__(self, what: str, *, found: object = None, remedy: str = ""):
@@ -24,7 +24,7 @@ class RoverError(Exception):
 
 
 def sentence_of(error: BaseException) -> str:
-    """What to say of any error: a RoverError's own words; of what the program did not foresee also its name."""
+    """One sentence for any error: a RoverError's own text; for an unexpected error, its type and its text."""
     return str(error) if isinstance(error, RoverError) else f"{type(error).__name__}: {error}"
 
 
@@ -41,7 +41,7 @@ class PwmError(RoverError):
 
 
 class FrameError(RoverError):
-    """A camera frame of a shape or type that is no picture."""
+    """A camera frame whose shape or type is not that of a picture."""
 
 
 class QuantizeError(RoverError):
@@ -49,35 +49,35 @@ class QuantizeError(RoverError):
 
 
 class DistillError(RoverError):
-    """A student that its teacher or the recordings cannot make."""
+    """A student that cannot be made from this teacher or these recordings."""
 
 
 class FinetuneError(RoverError):
-    """A policy, or recordings, of which nothing can be learned on."""
+    """A policy that cannot be trained further, or recordings that it cannot learn from."""
 
 
 class ArtifactError(RoverError):
-    """A policy file that is damaged, of another format, or that this machine cannot run."""
+    """A policy file that is damaged, has another format, or cannot run on this machine."""
 
 
 class PolicyError(RoverError):
-    """A policy that was given, or gave, something that must not drive a car."""
+    """An input to a policy, or a prediction of it, that must not drive a car."""
 
 
 class ParamsError(RoverError):
-    """params.yml or a parameter that makes no sense."""
+    """A params.yml that cannot be read, or a parameter with an impossible value."""
 
 
 class CarError(RoverError):
-    """A car.yml that describes no car, or none that may be driven."""
+    """A car.yml that does not describe a car, or describes one that must not be driven."""
 
 
 class TrainingError(RoverError):
-    """A training that went wrong, or that cannot go on from what was saved of it."""
+    """A training that failed, or that cannot continue from its saved state."""
 
 
 class WorldError(RoverError):
-    """A run in the balloon world that cannot be made."""
+    """A recording, training or trial in the balloon world that is not possible."""
 
 
 class DriveFault(RoverError):

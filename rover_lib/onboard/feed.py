@@ -1,16 +1,17 @@
-"""What a view gets to see of a drive, and all that it may ask: a stop.
+"""The drive's end of the view: it sends what the view shows, and accepts one request, a stop.
 
     feed = Feed(place, log, title="policy_static.pt")
     drive(..., until=Until(over=feed.over), hooks=Hooks(show=partial(feed.tick, report, camera, pilot)))
 
-The view (view.py) is another process, on a rover another user's. It listens at a Unix socket of whole messages; the
-drive looks once a second whether somebody does. Both ways nothing is ever waited for: a message is dropped while the
-one before is not read yet, and the next one, a tenth of a second later, says all again. So a view that hangs, floods or
-dies costs a drive what a failed system call does. What comes back is read a few messages a tick; one of them, STOP,
-ends the drive as its other ends do, and all others are nothing.
+The view (view.py) is another process; on a rover, another user runs it. It listens at a Unix socket that transports
+whole messages, and the drive checks once a second whether a view listens there. Neither side ever waits for the other.
+A message is dropped while the previous one has not been read; the next one follows a tenth of a second later and is
+complete in itself. So a view that hangs, floods or dies costs a drive no more than a failed system call. At each tick
+the drive reads a few of the view's messages: STOP ends the drive like any other reason to end it, and all others are
+ignored.
 
-A message is a line of JSON and, after it, the camera's newest picture: its own JPEG, or, of a camera that gives none,
-every nth pixel of every nth row, (h, w, 3) uint8 BGR, where the line has "shape".
+A message is a line of JSON, followed by the camera's newest picture: a JPEG if the camera delivers JPEGs, otherwise
+every nth pixel of every nth row, (h, w, 3) uint8 BGR, whose size is the line's "shape".
 """
 
 import contextlib
@@ -36,20 +37,20 @@ from rover_lib.onboard.servo_link import MISSING, REASONS, ServoLink
 from rover_lib.onboard.telemetry import FlightLog, Tick
 
 EVERY_S = 0.1  # between two messages
-AGAIN_S = 1.0  # between two looks whether somebody listens
-TOLD_S = 5.0  # between two lines of the log: a view that comes and goes must not fill it
-LAST_S = 0.2  # for the last message of a drive, whose car stands
-ASKED_MOST = 8  # messages of the view that are read at a tick
-STOP = re.compile(rb"stop ([0-9a-f.:]{1,45})", re.ASCII)  # and the address of who asked
-RAW_BYTES = 120_000  # of a picture that is no JPEG
-MOST_BYTES = 400_000  # of a message; one that would be larger goes without its picture
+AGAIN_S = 1.0  # between two checks whether a view listens
+TOLD_S = 5.0  # between two lines of the log, which a view that comes and goes must not fill
+LAST_S = 0.2  # for the last message of a drive; the car has stopped by then
+ASKED_MOST = 8  # of the view's messages are read at a tick
+STOP = re.compile(rb"stop ([0-9a-f.:]{1,45})", re.ASCII)  # and the address that asked
+RAW_BYTES = 120_000  # of a picture that is not a JPEG
+MOST_BYTES = 400_000  # of a message; a larger one is sent without its picture
 DRIVING, WAITING, TAKEN, ENDED = "driving", "waiting", "taken over", "ended"
 
 
 class Feed:
-    """A drive's end of the view. For the loop's thread alone; raises nothing, and waits for nothing but in ended().
+    """A drive's end of the view. Only the loop's thread may use it. It raises nothing, and waits only in ended().
 
-    place: where the view listens. log: its newest events are shown. title: what drives.
+    place: the socket at which the view listens. log: the view shows its newest events. title: the name of what drives.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class Feed:
         self.dropped = 0  # messages for which there was no room
 
     def close(self) -> None:
-        """Show nothing to anybody any more."""
+        """End the connection to the view."""
         if self._socket:
             self._socket.close()
             self._socket = None
@@ -80,17 +81,17 @@ class Feed:
             self._show(DRIVING, "", report, camera, pilot=pilot, tick=tick)
 
     def waiting(self, report: Report, camera: Camera | None, link: ServoLink | None, said: str = "") -> None:
-        """Call this while nobody has armed the car. said: how the drive before this one ended."""
+        """Call this while nobody has armed the car. said: how the previous drive ended."""
         if self._due():
             self._show(WAITING, said, report, camera, link=link)
 
     def taken_over(self, report: Report, camera: Camera | None, link: ServoLink | None, said: str) -> None:
-        """Call this while a human who took over is recorded. said: that, in words."""
+        """Call this while a human who took over is recorded. said: a sentence that says so."""
         if self._due():
             self._show(TAKEN, said, report, camera, link=link)
 
     def ended(self, report: Report, camera: Camera | None, link: ServoLink | None) -> None:
-        """Call this once after a drive: it shows what the pins do now, and tries for LAST_S where the view is busy."""
+        """Call this once after a drive: it shows what the pins do now, and retries up to LAST_S if the view is busy."""
         end_s = self._clock() + LAST_S
         self._ticks.clear()
         while self._connected() and not self._show(ENDED, report.ended, report, camera, link=link):
@@ -99,7 +100,7 @@ class Feed:
             self._sleep(LAST_S / 10)
 
     def over(self) -> str | None:
-        """Why this drive is over, None if nobody asked for a stop. The loop asks at each tick."""
+        """Why this drive must end; None if nobody asked for a stop. The loop calls this at each tick."""
         for _ in range(ASKED_MOST if self._socket else 0):
             try:
                 asked = self._socket.recv(64) if self._socket else b""
@@ -107,7 +108,7 @@ class Feed:
                 break
             except OSError:
                 asked = b""
-            if not asked:  # of a socket of messages: its other end is closed
+            if not asked:  # an empty message: the other end has closed the socket
                 self._lost("the view is gone")
                 break
             if stop := STOP.fullmatch(asked):
@@ -130,7 +131,7 @@ class Feed:
         try:
             wire.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_BYTES)
             wire.connect(str(self._place))
-        except OSError:  # nobody listens, or has no time to answer
+        except OSError:  # nobody listens, or the view is too busy to answer
             wire.close()
             return False
         self._socket = wire
@@ -153,14 +154,14 @@ class Feed:
         tick: Tick | None = None,
         link: ServoLink | None = None,
     ) -> bool:
-        """Whether the message went out."""
+        """Send a message; return whether it was sent."""
         try:
             message: dict[str, Any] = {"phase": phase, "text": text, "title": self._title, "sent_s": self._clock()}
             message |= {"tick": tick and tick._asdict(), "missed": report.missed, "machine": self._log.machine}
             message["events"] = [[round(event.t_s, 2), str(event)[:200]] for event in tuple(self._log.recent)]
             message |= self._pace() | self._pins(tick, link)
             if phase == TAKEN:
-                message["missing"] = ""  # nobody is about to arm it
+                message["missing"] = ""  # nobody is about to arm the car
             if pilot and pilot.plan:
                 plan, rate_hz = pilot.plan
                 actions = plan.actions.round(3).tolist()
@@ -181,7 +182,7 @@ class Feed:
         if tick:
             why = REASONS.get(tick.reason, "")
             return {"pins": [tick.pins_steering_us, tick.pins_throttle_us], "who": tick.state, "why": why}
-        with contextlib.suppress(RoverError):  # a link that is gone is told by who needs it
+        with contextlib.suppress(RoverError):  # whoever needs the link reports that it is gone
             if link and (telemetry := link.latest()):
                 missing = "" if telemetry.missing == "-" else MISSING[telemetry.missing]
                 pins = [telemetry.steering_us, telemetry.throttle_us]
@@ -210,7 +211,7 @@ class Feed:
         line = json.dumps(message).encode() + b"\n"
         try:
             (unread,) = struct.unpack("i", fcntl.ioctl(wire, termios.TIOCOUTQ, bytes(4)))
-            if unread:  # the view has not taken the one before
+            if unread:  # the view has not read the previous one
                 raise BlockingIOError
             wire.send(line + picture if len(line) + len(picture) < MOST_BYTES else line)
         except BlockingIOError:

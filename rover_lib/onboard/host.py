@@ -1,4 +1,4 @@
-"""What the machine says about itself: temperature, clock, throttling, memory. What it cannot tell is None, not 0.
+"""The machine's own state: temperature, clock, throttling, memory. A value that it does not report is None, not 0.
 
 Read from /proc and /sys: psutil would be a compiled package to pin and hash on every rover, and knows neither a
 process's peak memory on Linux nor what a Raspberry Pi's firmware throttles.
@@ -14,20 +14,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-# vcgencmd get_throttled: what is so now, and (16 bits higher) what has been since the start
+# Bits of vcgencmd get_throttled: true now, and 16 bits higher: has been true since the start
 THROTTLED_BITS = {0: "under-voltage", 1: "frequency capped", 2: "throttled", 3: "soft temperature limit"}
 
 
 @dataclass(frozen=True)
 class Host:
-    """Reads the machine's state. Paths and the command are arguments for the tests' sake."""
+    """Reads the machine's state. Paths and the command are arguments so that tests can replace them."""
 
     sys_root: Path = Path("/sys")
     proc_root: Path = Path("/proc")
     vcgencmd: str = "vcgencmd"
 
     def temperature_c(self) -> float | None:
-        """The processor's temperature; of another zone if none says it is the processor's."""
+        """The processor's temperature; that of another zone if none is labelled as the processor's."""
         readings = {}
         for zone in sorted(self.sys_root.glob("class/thermal/thermal_zone*")):
             milli_c = _number_in(zone / "temp")
@@ -51,7 +51,7 @@ class Host:
         return value if found.returncode == 0 and name == "throttled" and value.startswith("0x") else None
 
     def process_peak_memory_mb(self) -> float | None:
-        """The most memory that this process has had resident, ever."""
+        """The largest resident memory that this process has ever had."""
         for line in (_text_in(self.proc_root / "self/status") or "").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024 / 1e6
@@ -60,7 +60,7 @@ class Host:
         return kib * (1 if sys.platform == "darwin" else 1024) / 1e6 or None
 
     def core_ticks(self) -> list[tuple[int, int]] | None:
-        """Per core (busy, all) ticks since the machine's start."""
+        """For each core, (busy, total) ticks since the machine started."""
         rows = [line.split() for line in (_text_in(self.proc_root / "stat") or "").splitlines()]
         cores = [[int(v) for v in r[1:9]] for r in rows if r and r[0].startswith("cpu") and r[0] != "cpu"]
         return [(sum(c) - c[3] - c[4], sum(c)) for c in cores if len(c) > 4] or None  # 3, 4: idle, waiting for disks
@@ -75,12 +75,12 @@ class Host:
 
 
 def usable_cores() -> int:
-    """How many cores this process may run on: fewer than the machine's where somebody has chosen them for it."""
+    """How many cores this process may run on: fewer than the machine has if its affinity was restricted."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def throttled_means(value: str | None) -> list[str] | None:
-    """The sentences behind get_throttled's bits; None if there was no reading."""
+    """The meaning of each bit set in get_throttled's value, as text; None if there was no reading."""
     if value is None:
         return None
     bits = int(value, 16)
@@ -103,13 +103,13 @@ def _number_in(path: Path) -> float | None:
 
 
 def default_log() -> Path:
-    """Where a drive's flight log goes: systemd's state folder of the service, or the user's."""
+    """Where a drive's flight log goes: the service's state folder (from systemd), or the user's."""
     home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(os.environ.get("STATE_DIRECTORY") or Path(home) / "rover") / "flight.log"
 
 
 def is_listened_at(place: Path) -> bool:
-    """Whether a process listens at a Unix socket of whole messages; what it leaves there when it dies is not one."""
+    """Whether a process listens at a Unix socket of whole messages. A dead process's socket file does not count."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) as asking:
         return asking.connect_ex(str(place)) in (0, errno.EAGAIN)  # EAGAIN: it has no time to answer
 

@@ -1,11 +1,10 @@
-"""Plans beside the control loop: a thread that asks the policy about the newest frame, and the policy's own process.
+"""Plan while the control loop runs: a thread asks the policy about the newest frame; the policy has its own process.
 
     with PolicyProcess("policy_static.pt") as policy:
         with Planner(camera, policy.predict, commanded, policy.rate_hz) as planner:
             plan = planner.newest()
 
-The policy runs in a process of its own, so that nothing it does takes the control loop's turn, and it can be ended when
-it hangs.
+The policy has a process of its own, so that it cannot delay the control loop, and can be killed if it hangs.
 """
 
 import contextlib
@@ -47,10 +46,10 @@ Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint
 
 
 class Planner:
-    """Asks for a plan for the newest frame, again and again, in a thread; a context manager.
+    """Plans for the newest frame again and again, in a thread; a context manager.
 
-    predict: gives (chunk, 2) actions, unclipped, for a frame and a state, or raises. rate_hz: of the actions. rest_s:
-    pause after each plan, except in without_rest(); a car that stands would only get warm. limits: of its actions.
+    predict: returns (chunk, 2) actions, unclipped, for a frame and a state, or raises. rate_hz: of the actions. rest_s:
+    pause after each plan, except in without_rest(), so that a standing car does not get warm. limits: of the actions.
     """
 
     def __init__(
@@ -92,14 +91,14 @@ class Planner:
         return self._plan
 
     def wait(self, timeout_s: float, after: int = 0) -> Plan | None:
-        """The newest plan, as soon as its number is above `after`, or the time is over. Raises as newest()."""
+        """The newest plan, as soon as its number is above `after` or the time is over. Raises as newest()."""
         with self._news:
             self._news.wait_for(lambda: self._failure or (self._plan and self._plan.number > after), timeout_s)
         return self.newest()
 
     @contextlib.contextmanager
     def without_rest(self) -> Iterator[None]:
-        """Inside, plans follow each other without a rest."""
+        """Inside this context, plans follow each other without a pause."""
         self._no_rest.set()
         try:
             yield
@@ -107,9 +106,9 @@ class Planner:
             self._no_rest.clear()
 
     def renew(self, age_s: float) -> None:
-        """Waits for the next plan if the one that is there looked at an older frame; for use in without_rest().
+        """If the newest plan's frame is older than age_s, wait for the next plan. For use in without_rest().
 
-        Raises PolicyError if that does not come within FRESH_S, and as newest().
+        Raises PolicyError if none comes within FRESH_S, and as newest().
         """
         plan = self.newest()
         number = plan.number if plan else 0
@@ -121,7 +120,7 @@ class Planner:
 
     @property
     def asking_s(self) -> float:
-        """How long the policy has been computing its answer; 0 while it is not."""
+        """For how long the policy has been computing its present answer; 0 while it is idle."""
         asked = self._asked_s
         return 0.0 if asked is None else self._clock() - asked
 
@@ -145,26 +144,27 @@ class Planner:
                 self._no_rest.wait(self._rest_s)
         except RoverError as error:
             self._failure = error
-        except Exception as error:  # whatever it is, the loop must learn of it and stop the car
+        except Exception as error:  # whatever it is, the loop must be told, and stop the car
             self._failure = PolicyError(f"the policy failed ({type(error).__name__}: {error}); the car is stopped")
         with self._news:
             self._news.notify_all()
 
 
 class PolicyProcess:
-    """An artifact in a process of its own; a context manager. predict() is for one thread at a time.
+    """An artifact in a process of its own; a context manager. Only one thread at a time may call predict().
 
-    A process and not a thread, for the loop's sake: at p99 its commands were 1.4 to 3.5 ms late beside the process, and
-    5.4 to 6.3 ms beside a thread (measured on a workstation at commit 7343b87, which could do both).
+    With a process, the loop's commands were 1.4 to 3.5 ms late at p99, and with a thread instead of it 5.4 to 6.3 ms
+    (measured on a workstation at commit 7343b87, which could do both).
 
-    threads: of its engine, None: all cores but one, which is the loop's. Raises ArtifactError's sentences as
-    PolicyError if the artifact cannot be used here.
+    threads: of the engine; None: all cores but one, which is left for the loop. Raises PolicyError, with the sentence
+    of the ArtifactError, if the artifact cannot be used here.
 
-    What runs there is somebody's artifact, so that it is confined (see confine.py), and its answers are believed only
-    if they are of the shape that the manifest says, as it is read here. unconfined: why the kernel does not do that.
+    The artifact is not trusted. So the process is confined (see confine.py), and its answers are accepted only if they
+    have the shape that the manifest gives, which is read in this process. unconfined: why the kernel cannot confine the
+    process, "" if it does.
     """
 
-    program = __name__  # which the process runs
+    program = __name__  # the module that the process runs
 
     def __init__(self, artifact: Path | str, *, threads: int | None = None):
         self.artifact = Path(artifact)
@@ -214,23 +214,23 @@ class PolicyProcess:
 
     @property
     def rate_hz(self) -> float:
-        """Actions a second that a chunk is meant for."""
+        """Actions per second of a chunk."""
         return float(self.manifest["rate_hz"])
 
     @property
     def chunk(self) -> int:
-        """Actions of a plan."""
+        """Number of actions in a plan."""
         return int(self.manifest["chunk"])
 
     @property
     def pids(self) -> tuple[int, ...]:
-        """The policy's process, or nothing where none runs."""
+        """The id of the policy's process; empty if none runs."""
         return (self._process.pid,) if self._process else ()
 
     def predict(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
-        """(chunk, 2) float32 as Policy.predict_unclipped(), for one camera. Waits until it comes, or close().
+        """(chunk, 2) float32 as Policy.predict_unclipped(), for one camera. Waits for the answer, or until close().
 
-        Raises PolicyError with what the policy raised, or if its process has ended.
+        Raises PolicyError with the policy's own error, or if its process has ended.
         """
         pipe, frame = self._open_pipe(), np.ascontiguousarray(frame_bgr)
         try:
@@ -278,7 +278,7 @@ class PolicyProcess:
 
 
 def delayed(predict: Predict, latency_s: float) -> Predict:
-    """The same as predict, but an answer takes at least latency_s."""
+    """The same as `predict`, but each answer takes at least latency_s."""
 
     def predict_delayed(frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
         end = time.monotonic() + latency_s
@@ -291,14 +291,15 @@ def delayed(predict: Predict, latency_s: float) -> Predict:
 
 
 def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any], None] = lambda policy: None) -> None:
-    """The policy's process: an answer to each request until the other side is gone.
+    """Run the policy's process: answer each request until the other side closes the pipe.
 
-    An answer is "=" and bytes (first why it is not confined, then chunks), or "!" and an error's fields as JSON.
-    loaded: gets the policy before it is asked; for the laboratory, whose policies misbehave.
+    An answer is "=" and bytes, or "!" and the fields of an error as JSON. The bytes of the first answer say why the
+    process is not confined, those of all others are chunks. loaded: called with the loaded policy; used by the
+    laboratory to make policies misbehave.
     """
     with contextlib.suppress(EOFError, OSError):
         try:
-            # Here, because the side that drives must load no engine, and before the limits, which an engine exceeds.
+            # Here, because the process that drives must load no engine; and before the limits, which an engine exceeds.
             from rover_lib.onboard.policy import import_engine, load_policy
 
             unconfined = UNCONFINED.get(import_engine(artifact)) or confine(memory_mb(artifact, threads))
@@ -338,7 +339,7 @@ def _refusal(error: RoverError) -> bytes:
 
 
 def main(arguments: list[str], loaded: Callable[[Any], None] = lambda policy: None) -> None:
-    """What PolicyProcess starts. arguments: its pipe, artifact and threads. loaded: as of serve()."""
+    """The program that PolicyProcess starts. arguments: its pipe, artifact and threads. loaded: as for serve()."""
     fd, artifact, threads = arguments
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a policy that hangs must not outlive the loop
     os.nice(NICE)

@@ -1,10 +1,10 @@
-"""What a file or a folder is, told by its looks alone: nothing is loaded, so that every command can ask first.
+"""Recognise what kind of file or folder a path is, without loading it, so that every command can check its arguments.
 
     kinds_of("runs/mine/policy_static.pt")                  # ("artifact",)
     check_kind(path, "checkpoint")                          # KindError: ... this is an artifact already; deploy it ...
 
-A folder may be several at once: what `rover distill` leaves is a run and a LeRobot checkpoint. What cannot be told is
-left to the command, whose own error says what is wrong with it.
+A folder may be of several kinds: `rover distill` makes one that is both a run and a LeRobot checkpoint. A path of an
+unknown kind is not refused here; the command itself then reports what is wrong with it.
 """
 
 import json
@@ -31,14 +31,14 @@ CALLED = {
     "dataset": "a LeRobotDataset",
     "run": "a run's folder",
 }
-WANTED = {  # by what a command wants: the kinds that it takes, and how to come by one
+WANTED = {  # what a command wants: the kinds that it accepts, and how to get one
     "artifact": (("artifact",), "give a policy_<mode>.pt, which rover run makes of a checkpoint"),
     "checkpoint": (("checkpoint", "pretrained"), "give the trainer's best_model.pth, or LeRobot's pretrained_model"),
     "recordings": (("recordings", "dataset"), "give the folder that holds episode_*, or a LeRobotDataset's"),
     "run": (("run",), "give a folder that rover run has made, such as runs/mine"),
     "flight log": (("flight log",), "give the file that rover drive wrote, named by its --log"),
 }
-INSTEAD = {  # what to do with one, where something else was wanted
+INSTEAD = {  # (what was given, what was wanted): what to do instead
     ("artifact", "checkpoint"): "it is quantized already: deploy it, or give the checkpoint that it was made of",
     ("artifact", "run"): "give the folder in which it lies",
     ("checkpoint", "artifact"): "rover run CHECKPOINT EPISODES makes artifacts of it",
@@ -53,28 +53,28 @@ INSTEAD = {  # what to do with one, where something else was wanted
     ("run", "recordings"): "give the recordings that it was made of, which its load.json names",
 }
 EPISODE_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
-HEAD = 65536  # bytes of a file that are looked at
+HEAD = 65536  # bytes of a file that are read
 PICKLE_HEAD = 4096  # of a torch file's pickle, which names its keys early
 
 
 class KindError(RoverError):
-    """A file or a folder that is another thing than the command wants."""
+    """A file or a folder that is not of the kind that the command needs."""
 
 
 def kinds_of(path: Path | str) -> tuple[str, ...]:
-    """Keys of CALLED that the path is; none where nothing is there, or nothing that is known here."""
+    """The kinds of a path, as keys of CALLED; empty if the path does not exist or is of no known kind."""
     path = Path(path)
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
             return _of_folder(path)
-        return _of_file(path) if stat.S_ISREG(mode) else ()  # a FIFO or a device is not read from
+        return _of_file(path) if stat.S_ISREG(mode) else ()  # never read from a FIFO or a device
     except OSError:
         return ()
 
 
 def check_kind(path: Path | str, wanted: str) -> None:
-    """Raise KindError for a path that is something, and not what is wanted: a key of WANTED."""
+    """Raise KindError for a path of a known kind that is not the wanted one. wanted: a key of WANTED."""
     found = kinds_of(path)
     takes, remedy = WANTED[wanted]
     if not found or set(found) & set(takes):
@@ -85,7 +85,7 @@ def check_kind(path: Path | str, wanted: str) -> None:
 
 
 def check_output(path: Path, kind: str | None, *, appended: bool = False) -> None:
-    """Raise KindError for a file that a command shall not write: see `Output`."""
+    """Raise KindError for a file that a command must not write, see `Output`."""
     if path.is_dir():
         raise KindError(f"{path}: this is a folder, and one file is to be written", remedy="name the file in it")
     there = path.exists()
@@ -100,10 +100,13 @@ def check_output(path: Path, kind: str | None, *, appended: bool = False) -> Non
 
 
 class Output(click.Path):
-    """A command's option that names a file to write. Refused before any work is one that could not be written, and one
-    that would cost what is there, as far as that is known here and of another kind than what is written.
+    """A command's option that names a file to write.
 
-    kind: a key of CALLED, or None for what is none of these. appended: to what is there, instead of replacing it.
+    It is refused before any work is done if it could not be written, or if it exists and is of another known kind, and
+    so would be lost.
+
+    kind: of the file that is written, a key of CALLED; None if it has none of these kinds. appended: the file is
+    appended to and not replaced.
     """
 
     def __init__(self, kind: str | None = None, *, appended: bool = False):
@@ -118,8 +121,10 @@ class Output(click.Path):
 
 
 class Number(click.FloatRange):
-    """A command's option that is a number within limits, which click lets "nan" pass, as that is below and above none;
-    nor is infinity one."""
+    """A command's option that is a finite number within limits.
+
+    click alone accepts "nan", which is neither below nor above any limit.
+    """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         number = super().convert(value, param, ctx)
@@ -129,7 +134,7 @@ class Number(click.FloatRange):
 
 
 class PathTo(click.Path):
-    """A command's argument that names an existing thing of one kind, a key of WANTED. Raises KindError for another."""
+    """A command's argument: an existing path of one kind, a key of WANTED. Raises KindError for another kind."""
 
     def __init__(self, wanted: str):
         super().__init__(path_type=Path)
@@ -162,7 +167,7 @@ def _of_file(file: Path) -> tuple[str, ...]:
     if head[:4] == b"PK\x03\x04":
         return _of_archive(file)
     if head[:1] == b"{":
-        if b'"kind":"header"' in head.partition(b"\n")[0]:  # compact, as telemetry seals a line
+        if b'"kind":"header"' in head.partition(b"\n")[0]:  # without spaces, as telemetry.py writes it
             return ("flight log",)
         if (stage := _stage_of(head)) is not None:
             return ("stage",) if stage else ()
@@ -172,7 +177,7 @@ def _of_file(file: Path) -> tuple[str, ...]:
 
 
 def _of_archive(file: Path) -> tuple[str, ...]:
-    """Of a zip file as torch or `rover export` writes them; a damaged one is none of them."""
+    """The kinds of a zip file that torch or `rover export` wrote; none for a damaged one."""
     try:
         with zipfile.ZipFile(file) as z:
             names = z.namelist()
@@ -183,7 +188,7 @@ def _of_archive(file: Path) -> tuple[str, ...]:
                 return ()
             with z.open(pickled) as f:
                 keys = f.read(PICKLE_HEAD)
-    except Exception:  # zipfile says in many types that a file is damaged
+    except Exception:  # zipfile raises errors of many types for a damaged file
         return ()
     if b"model_state_dict" in keys:
         return ("checkpoint",)
@@ -191,7 +196,7 @@ def _of_archive(file: Path) -> tuple[str, ...]:
 
 
 def _stage_of(head: bytes) -> str | None:
-    """The stage that a report is of; its first keys say so, whatever its size."""
+    """The stage of a report. It is among the first keys, so that the head is enough for a file of any size."""
     text = head[:200].decode("utf-8", "replace")
     if '"schema"' not in text or '"stage"' not in text:
         return None

@@ -1,8 +1,9 @@
-"""Give back the memory that torch holds twice, and what loading leaves behind.
+"""Give back memory: weights that torch holds twice, and what malloc keeps after loading.
 
 XNNPACK packs the weights of an INT8 convolution when it runs for the first time, and computes with the packed copy from
-then on. torch keeps the original as long as the policy lives, for saving it, which nobody does on a rover: 66 MB of the
-full policy. Nothing in torch drops it: `setReleaseWeightsWhenPrepacking` does not reach XNNPACK's path.
+then on. torch keeps the original for as long as the policy exists, so that it can be saved, which nobody does on a
+rover. For the policy of full size this wastes 66 MB. torch has no way to drop the original:
+`setReleaseWeightsWhenPrepacking` has no effect on XNNPACK's path.
 """
 
 import ctypes
@@ -18,11 +19,11 @@ PACKED = "__torch__.torch.classes.quantized.Conv2dPackedParamsBase"
 
 
 def give_back_packed_weights(module: "torch.jit.ScriptModule") -> int:
-    """Return the pages of the convolutions' original weights to the kernel; how many bytes that were.
+    """Give the pages of the convolutions' original weights back to the kernel; return the number of bytes freed.
 
-    module: frozen, and it has run, so that its weights are packed. It cannot be saved afterwards, and whoever calls
-    this must prove that it still predicts what it did. Linear layers keep theirs: dynamic INT8 has other scales with
-    each frame. 0 where the system has no madvise.
+    module: frozen, and has run once, so that its weights are packed. It cannot be saved afterwards, and the caller must
+    check that it still predicts the same. Linear layers keep their weights, because dynamic INT8 has new scales for
+    each frame. Returns 0 where the system has no madvise.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if not hasattr(libc, "madvise"):
@@ -30,7 +31,7 @@ def give_back_packed_weights(module: "torch.jit.ScriptModule") -> int:
     given = 0
     for weight in _originals(module.graph):
         start, size = weight.untyped_storage().data_ptr(), weight.untyped_storage().nbytes()
-        first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE  # whole pages, none of which anything else lies on
+        first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE  # only whole pages, which nothing else shares
         length = (start + size) // mmap.PAGESIZE * mmap.PAGESIZE - first
         if length > 0 and libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(length), DONT_NEED) == 0:
             given += length
@@ -38,14 +39,14 @@ def give_back_packed_weights(module: "torch.jit.ScriptModule") -> int:
 
 
 def give_back_freed() -> None:
-    """Return to the kernel what malloc keeps for later: loading and checking an artifact frees tens of MB."""
+    """Give the kernel the memory that malloc keeps for later: after loading and checking an artifact, tens of MB."""
     libc = ctypes.CDLL(None)
     if hasattr(libc, "malloc_trim"):  # of glibc
         libc.malloc_trim(0)
 
 
 def _originals(block: Any) -> "Iterator[torch.Tensor]":
-    """The weights that packed parameters, constants of a frozen graph, still hold."""
+    """The original weights, still held by the packed parameters that are constants of a frozen graph."""
     import torch
 
     for node in block.nodes():

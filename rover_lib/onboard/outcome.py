@@ -1,10 +1,10 @@
-"""Whether a recorded drive did what it was to do: noted afterwards, in the episode's own file, and changed at will.
+"""Label recorded drives: whether a drive succeeded is noted afterwards in its episode, and may be changed any time.
 
     label([Path("episodes/episode_20261007_144013")], "hit")     # or "missed"; "none" takes it back
 
-It is `metadata.outcome` of episode_data.json. All else in that file stays as it is, to the byte; the file is the old
-one or the new one, whatever happens in between. A closed set and no free text, because outcomes are counted, and
-LeRobot's `next.success` is a yes or a no; what was to be done is the episode's action_label.
+The outcome is `metadata.outcome` in episode_data.json. Every other byte of that file stays the same, and the file is
+replaced atomically. An outcome is one of a few values and not free text, because outcomes are counted, and LeRobot's
+`next.success` is yes or no. What the drive was meant to do is the episode's action_label.
 """
 
 import json
@@ -27,16 +27,16 @@ _WHOLE = "copy the episode again, or label the one that it was copied from"
 
 
 def label(episodes: Sequence[Path], outcome: str) -> None:
-    """Notes an outcome, one of CHOICES, in each of some episode folders. Raises EpisodeError as labelled().
+    """Notes an outcome, one of CHOICES, in each of these episode folders. Raises EpisodeError as labelled().
 
-    All are read before the first is written.
+    All episodes are read before the first is written.
     """
     for path, text in [labelled(episode, outcome) for episode in episodes]:
         _replace(path, text)
 
 
 def labelled(episode: Path, outcome: str) -> tuple[Path, bytes]:
-    """An episode's file, and what is to be in it. Raises EpisodeError where there is no whole episode_data.json."""
+    """An episode's file, and its new content. Raises EpisodeError if it has no complete episode_data.json."""
     if outcome not in CHOICES:
         raise EpisodeError(f"an outcome is one of {', '.join(CHOICES)}", found=outcome)
     path = episode / DATA
@@ -68,12 +68,12 @@ def labelled(episode: Path, outcome: str) -> tuple[Path, bytes]:
 
 
 def _parsed(text: str) -> Any:
-    """With numbers as their text: so that two files can be compared, NaN too."""
+    """The parsed JSON, with numbers kept as text, so that two files can be compared even if they contain NaN."""
     return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
 
 
 def _with_outcome(text: str, outcome: str | None) -> str:
-    """The text of an episode with that JSON as metadata.outcome; None: without one."""
+    """The text of an episode file with that JSON as metadata.outcome; outcome None: without the member."""
     start = _skip(text, 0)
     for name, _, value, end in _members(text, start):
         if name == "metadata":
@@ -82,7 +82,7 @@ def _with_outcome(text: str, outcome: str | None) -> str:
 
 
 def _changed(text: str, outcome: str | None) -> str:
-    """The same of the text of metadata."""
+    """The same for the text of the metadata object alone."""
     members = list(_members(text, 0))
     found = [i for i, (name, *_) in enumerate(members) if name == "outcome"]
     if not found:
@@ -98,7 +98,7 @@ def _changed(text: str, outcome: str | None) -> str:
 
 
 def _added(text: str, start: int, member: str) -> str:
-    """With a member more at the end of the object that begins at `start`, spaced as its first one."""
+    """The text with one more member at the end of the object that begins at `start`, spaced like its first member."""
     members = list(_members(text, start))
     if not members:
         return f"{text[: start + 1]}{member}{text[start + 1 :]}"
@@ -107,9 +107,9 @@ def _added(text: str, start: int, member: str) -> str:
 
 
 def _members(text: str, start: int) -> Iterator[tuple[str, int, int, int]]:
-    """Of the object that begins at `start`: each name, where it begins, where its value begins, and where that ends.
+    """The members of the object at `start`: (name, start of the name, start of the value, end of the value).
 
-    ValueError where it is no object.
+    Raises ValueError if there is no object.
     """
     decoder = json.JSONDecoder()
     at = _skip(text, start + 1)
@@ -130,7 +130,7 @@ def _skip(text: str, at: int) -> int:
 
 
 def _replace(path: Path, data: bytes) -> None:
-    """The file has that in it, or what it had; owner and mode stay, so that a rover's service can go on reading it."""
+    """Replace a file atomically. Owner and mode stay the same, so that a rover's service can still read it."""
     try:
         before = path.stat()
         if data == path.read_bytes():

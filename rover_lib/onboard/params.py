@@ -1,4 +1,4 @@
-"""Parameters: the rover's own defaults, over them what a user has set on this machine, over both what one run sets."""
+"""Parameters, in rising priority: the rover's defaults, the user's params.yml on this machine, one run's own file."""
 
 import os
 from pathlib import Path
@@ -9,18 +9,18 @@ import yaml
 from rover_lib.onboard.errors import ParamsError
 
 DEFAULTS = Path(__file__).with_name("params.yml")  # all that a rover reads
-PLACES = (  # of the user's params.yml; the first that exists counts
+PLACES = (  # where the user's params.yml may be; the first one that exists is used
     Path(__file__).parents[2] / "params.yml",  # a checkout's
     Path("/etc/rover/params.yml"),  # an installed rover's
     Path(__file__).parents[1] / "params.yml",  # an installed workstation's
 )
-FOR_THIS_RUN = "ROVER_PARAMS"  # in the environment: a file put over the others, as `rover sweep` does for each run
+FOR_THIS_RUN = "ROVER_PARAMS"  # environment variable: a file over all others; `rover sweep` sets it for each run
 
 
 def params() -> dict[str, Any]:
-    """The rover's defaults, the user's values in their place where there are some, and the user's other sections.
+    """All parameters: the rover's defaults, replaced by the user's values where those exist, and other sections added.
 
-    Raises ParamsError for a file that is no YAML mapping.
+    Raises ParamsError for a file that is not a YAML mapping.
     """
     values = read_params(DEFAULTS)
     for place in PLACES:
@@ -33,7 +33,7 @@ def params() -> dict[str, Any]:
 
 
 class _EachKeyOnce(yaml.SafeLoader):
-    """YAML forbids a key that is there twice; PyYAML takes the last one, and nobody is told which value counts."""
+    """Refuses a key that appears twice. YAML forbids that, but PyYAML silently takes the last value."""
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
@@ -47,14 +47,14 @@ class _EachKeyOnce(yaml.SafeLoader):
 
 
 def read_params(path: Path | str) -> dict[str, Any]:
-    """The content of one file alone. Raises ParamsError if it is missing or unreadable, or no YAML mapping."""
+    """The content of one file. Raises ParamsError if it is missing, unreadable, or not a YAML mapping."""
     try:
         content = yaml.load(Path(path).read_text(), _EachKeyOnce)
     except FileNotFoundError:
         raise ParamsError(f"{path}: not found", remedy="it came with this package: install that again") from None
     except OSError as e:
         raise ParamsError(f"{path}: cannot be read ({e.strerror})") from None
-    except Exception as e:  # PyYAML lets pass what Python says of a date, a number, a byte or a depth that is none
+    except Exception as e:  # PyYAML passes on Python's own errors, of a bad date or number, or too deep nesting
         raise ParamsError(f"{path}: not readable as YAML ({' '.join(str(e).split())})") from None
     if content is None:  # nothing but comments
         return {}
@@ -64,7 +64,7 @@ def read_params(path: Path | str) -> dict[str, Any]:
 
 
 def _set(values: dict[str, Any], changes: dict[str, Any], where: str) -> None:
-    """Put `changes` in `values`, key by key, as deep as both are mappings. where: what an error names."""
+    """Merge `changes` into `values`, key by key, recursively where both are mappings. where: the file, for errors."""
     for key, change in changes.items():
         if not isinstance(values.get(key), dict):
             values[key] = change

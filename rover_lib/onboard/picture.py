@@ -1,12 +1,12 @@
-"""A picture that nobody vouches for: what it would take to decode it, whether all of it is there, what is on it.
+"""Check a picture from an untrusted source: the cost of decoding it, whether it is complete, and what it shows.
 
-    image = decode_jpeg(data)                  # PictureError: cut, damaged, no JPEG, or too much of one
+    image = decode_jpeg(data)                  # PictureError: cut short, damaged, not a JPEG, or too large
     mean, contrast = brightness(image)
     same = (block_sums(image) == block_sums(before)).mean()
 
-OpenCV decodes a JPEG that was cut and closed with an end marker, and only prints a warning; so does Pillow.
-simplejpeg is libjpeg-turbo too, as fast (0.98 ms for 640x360, OpenCV 1.05), gives the same bits, lets other threads run
-meanwhile, and hands the warning over.
+OpenCV and Pillow decode a JPEG that was cut short and closed with an end marker, and only print a warning. simplejpeg
+reports the warning to its caller. It uses libjpeg-turbo too, is as fast (0.98 ms for 640x360, OpenCV 1.05), gives the
+same bits, and lets other threads run meanwhile.
 """
 
 import re
@@ -21,20 +21,20 @@ from rover_lib.onboard.stage import open_plain
 
 MOST_BYTES = 8_000_000  # of a JPEG
 MOST_PIXELS = 3840 * 2160  # 25 MB decoded
-MOST_SCANS = 32  # a progressive JPEG has some ten, and each costs as much as all of a plain one
-FILLED_MOST = 4  # bytes that some webcams put before a marker; many more are there where a piece is missing
+MOST_SCANS = 32  # a progressive JPEG has about ten, and each costs as much as a whole plain JPEG
+FILLED_MOST = 4  # bytes that some webcams put before a marker; many more mean that a piece is missing
 LEAST = (48, 27)  # width and height below which there are no blocks to compare
 ROWS, COLUMNS = 9, 16  # of blocks
 
 
 class PictureError(RoverError):
-    """Bytes that are no whole picture, or a picture of another time than it should be."""
+    """Bytes that are not a complete picture, or a picture that was captured at the wrong time."""
 
 
 def decode_jpeg(data: bytes) -> np.ndarray:
-    """(h, w, 3) uint8 BGR. Raises PictureError for what is no JPEG, not all of one, or larger than any camera's.
+    """Decode to (h, w, 3) uint8 BGR. Raises PictureError if it is not a complete JPEG, or larger than any camera's.
 
-    Its size is known before anything is decoded. What it says of its orientation is not looked at.
+    The size is checked before anything is decoded. The orientation that the JPEG may contain is ignored.
     """
     if len(data) > MOST_BYTES:
         raise PictureError("a JPEG is too large", found=f"{len(data) / 1e6:.1f} MB", remedy="is it a camera's?")
@@ -47,7 +47,7 @@ def decode_jpeg(data: bytes) -> np.ndarray:
         try:
             return simplejpeg.decode_jpeg(data, "BGR")
         except ValueError as error:
-            filled = re.search(r"(\d+) extraneous bytes before marker", str(error))  # libjpeg tells it in no other way
+            filled = re.search(r"(\d+) extraneous bytes before marker", str(error))  # libjpeg reports it only as text
             if not filled or int(filled[1]) > FILLED_MOST:
                 raise
             return simplejpeg.decode_jpeg(data, "BGR", strict=False)
@@ -56,15 +56,16 @@ def decode_jpeg(data: bytes) -> np.ndarray:
 
 
 def read_jpeg(path: Path | str) -> np.ndarray:
-    """A file's picture, as decode_jpeg. Raises PictureError as that does; OSError if the file cannot be read."""
+    """Decode a file, and raise PictureError, as decode_jpeg(); raises OSError if the file cannot be read."""
     with open_plain(path, PictureError(f"{path}: no plain file", remedy="remove it")) as file:
         return decode_jpeg(file.read(MOST_BYTES + 1))
 
 
 def brightness(image: np.ndarray) -> tuple[float, float]:
-    """Mean of a picture's pixels, and its contrast: how far a grid of 16x9 means spreads, both in grey levels of 255.
+    """The mean of a picture's pixels, and its contrast, both in grey levels from 0 to 255.
 
-    The contrast is a standard deviation, of the colour that has most. A sensor's noise averages out in it.
+    The contrast is the standard deviation of the means of a 16x9 grid of blocks, for the colour where it is largest.
+    The sensor's noise averages out within a block.
     """
     small = cv2.resize(image, (160, 90), interpolation=cv2.INTER_NEAREST)
     cells = cv2.resize(small, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
@@ -72,12 +73,12 @@ def brightness(image: np.ndarray) -> tuple[float, float]:
 
 
 def block_sums(image: np.ndarray) -> np.ndarray:
-    """(144,) uint64, one per block of a 16x9 grid: equal sums are equal blocks, byte for byte.
+    """(144,) uint64, one sum per block of a 16x9 grid. Equal sums mean that the blocks are equal, byte for byte.
 
-    image: contiguous, and at least LEAST in size. What is left over at its right and lower edge is in no block.
+    image: contiguous, and at least LEAST in size. Pixels left over at the right and lower edge belong to no block.
     """
     height, width = image.shape[:2]
     rows, words = height // ROWS, width * 3 // 8 // COLUMNS
     lines = image.reshape(height, width * 3)[: rows * ROWS, : words * COLUMNS * 8]
-    eights = np.ascontiguousarray(lines).view(np.uint64)  # eight bytes at a time, wherever they overflow to
+    eights = np.ascontiguousarray(lines).view(np.uint64)  # eight bytes at a time; overflow does not matter
     return eights.reshape(ROWS, rows, -1).sum(1).reshape(ROWS, COLUMNS, words).sum(2).ravel()

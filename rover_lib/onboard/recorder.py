@@ -1,8 +1,9 @@
-"""Recording on the car: an episode beside a running loop, and the loop for a human who drives.
+"""Record on the car: an episode while the control loop runs, or an episode of a human who drives.
 
-A recorder of its own thread takes frames and writes everything to disk; whoever drives only hands over controls. All
-times are of the monotonic clock, mapped to the system's once, at the start: a clock that NTP sets meanwhile changes
-nothing. What fails here never stops a drive: it is logged once, and what was recorded until then is kept.
+The recorder's own thread takes frames and writes everything to disk; the loop only hands over controls. All times are
+taken from the monotonic clock, which is mapped to the system's clock once, at the start. So it does not matter if NTP
+sets the system's clock meanwhile. A fault of the recorder never stops a drive: it is logged once, and what was recorded
+until then is kept.
 """
 
 import contextlib
@@ -25,23 +26,23 @@ from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.status_line import StatusLine
 from rover_lib.onboard.watch import signals
 
-SPARE_BYTES = 16_000_000  # of the disk are left alone; finishing an episode needs some, and so does the rest of a Pi
-LEAST_BYTES = 1_000_000  # an episode that may only be smaller is not begun
-ROW_BYTES = 1000  # of a control or frame in both of its files, at the end
-QUEUE_MOST = 20_000  # controls that wait for the disk: minutes, and a few megabytes
-SILENT_S = 2.0  # without a frame, or a status of the Arduino, nothing is recorded any more
-CLOSE_S = 60.0  # a slow card may have much to catch up with
+SPARE_BYTES = 16_000_000  # always left free on the disk: to finish an episode, and for the rest of the Pi
+LEAST_BYTES = 1_000_000  # an episode that would have less room than this is not begun
+ROW_BYTES = 1000  # what a control or frame needs in both files at the end
+QUEUE_MOST = 20_000  # controls that may wait for the disk: some minutes, a few megabytes
+SILENT_S = 2.0  # without a frame or a status of the Arduino for this time, recording ends
+CLOSE_S = 60.0  # time for a slow card to catch up
 PAUSE_S = 5.0  # between two episodes
 
 _log = logging.getLogger("rover")
 
 
 class Recorder:
-    """An episode beside a running loop: controls are handed over, frames are taken from the camera in its own thread.
+    """Records an episode while a loop runs: the loop hands over controls, a thread takes frames from the camera.
 
-    folder: in which the episode appears on close(), as episode_YYYYMMDD_HHMMSS of the start in local time (a second
-    later if that is taken). about: its fps is found here. rate_hz: frames a second at most. most_bytes: limit of the
-    episode, see room_for(); None: what the disk has.
+    folder: where the episode appears on close(), named episode_YYYYMMDD_HHMMSS by its start in local time (a second
+    later if that name is taken). about: description of the episode; its fps is measured here. rate_hz: at most so many
+    frames per second. most_bytes: size limit of the episode, see room_for(); None: limited by the disk only.
     Raises EpisodeError if there is no room to record; later faults are in `failure`.
     """
 
@@ -58,14 +59,14 @@ class Recorder:
         self._camera, self._clock, self._most_bytes = camera, clock, most_bytes
         self.start_s = clock()
         self._to_system_s = time.time() - self.start_s
-        self._frame_s = 0.75 / rate_hz  # a frame sooner after the last one is of a faster camera, and left out
+        self._frame_s = 0.75 / rate_hz  # a frame that comes sooner is left out: the camera is faster
         self._writer = _new_episode(
             Path(folder),
             self.start_s + self._to_system_s,
             replace(about, fps=min(rate_hz, camera.wanted_hz)),
         )
         self.folder = self._writer.folder
-        self.path: Path | None = None  # the episode's, once it is there
+        self.path: Path | None = None  # of the episode, once it exists
         self.failure: str | None = None
         self._queue: deque[tuple] = deque()
         self._lost = 0
@@ -84,7 +85,7 @@ class Recorder:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if error and not self.controls and not self._queue:
-            self.discard()  # it had not begun: a car that was not armed, say
+            self.discard()  # the drive had not begun, say because the car was not armed
         self.close(sentence_of(error) if error else None)
 
     def control(
@@ -97,7 +98,7 @@ class Recorder:
         throttle_period_us: int | None,
         **extra: Any,
     ) -> None:
-        """Hands over one control at `host_s` of the clock; None is "no pulse". Never blocks, never raises.
+        """Hand over one control, at time `host_s` of the clock. None means "no pulse". Never blocks, never raises.
 
         extra: further columns of the episode, numbers or text.
         """
@@ -111,15 +112,15 @@ class Recorder:
         )
 
     def note(self, **metadata: Any) -> None:
-        """What else is to be in the episode's metadata, JSON's types; nothing where it has ended."""
+        """Add entries to the episode's metadata, of JSON's types. Does nothing if the episode has ended."""
         if self.failure is None and not self._closing.is_set():
             self._writer.metadata |= metadata
 
     def close(self, fault: str | None = None) -> Path | None:
-        """Ends the episode and returns its folder; None if it is none, and then `failure` says why.
+        """End the episode and return its folder; None if there is no usable episode, and `failure` says why.
 
-        fault: what ended it, if it was one. An episode that ended by a fault is kept as far as it goes; the fault is in
-        its metadata, and in `failure`.
+        fault: the fault that ended it, if there was one. An episode that a fault ended is kept as far as it goes; the
+        fault is noted in its metadata and in `failure`.
         """
         if fault and not self._closing.is_set():
             self._fail(fault)
@@ -130,7 +131,7 @@ class Recorder:
         return self.path
 
     def discard(self) -> None:
-        """Ends the episode and leaves nothing of it."""
+        """End the episode and remove all of it."""
         self._unwanted = True
         self._closing.set()
         self._thread.join(CLOSE_S)
@@ -169,7 +170,7 @@ class Recorder:
     def _run(self) -> None:
         try:
             self._collect()
-        except Exception as error:  # whatever it is: the car drives on, and what was recorded is an episode
+        except Exception as error:  # whatever it is, the car drives on, and what was recorded is kept
             self._fail(sentence_of(error))
         if self._unwanted:
             return self._writer.discard()
@@ -179,18 +180,18 @@ class Recorder:
             self._writer.metadata["controls_lost"] = self._lost
         try:
             path = self._writer.finish()
-            os.sync()  # "it is there" has to hold for a car that is switched off right after
+            os.sync()  # a reported episode must survive if the car is switched off right after
             self.path = path
         except Exception as error:
             self._fail(sentence_of(error))
 
     def _collect(self) -> None:
         newest = self._camera.latest()
-        seen = newest.number if newest else 0  # that one is from before
+        seen = newest.number if newest else 0  # that frame came before the episode began
         last_s, captured_s = self._clock(), -1e9
         while True:
             frame = self._camera.wait(seen, 0.1)
-            closing = self._closing.is_set()  # asked before the queue is emptied, so that nothing is lost
+            closing = self._closing.is_set()  # read before the queue is emptied, so that nothing is lost
             self._write_controls()
             if closing:
                 return
@@ -215,10 +216,10 @@ class Recorder:
 
 
 def room_for(folder: Path | str, most_mb: float) -> int:
-    """Bytes that the next episode in a folder may take, if all in it may take most_mb. Looks at every file.
+    """Bytes that the next episode may take in a folder whose whole content may take most_mb. Looks at every file.
 
-    Never more than half of what the disk has left: an episode is packed beside itself to be fetched, and a rover wants
-    to get another model some day.
+    The result is at most half of the free disk: an episode is packed on the same disk to be fetched, and a new model
+    needs room as well.
     """
     folder = Path(folder)
     taken = sum(path.lstat().st_size for path in folder.rglob("*"))
@@ -228,7 +229,7 @@ def room_for(folder: Path | str, most_mb: float) -> int:
 
 
 def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
-    """An open episode in `folder`, named by its start, or the next second that is free."""
+    """Open an episode in `folder`, named by its start; if that name is taken, by the next free second."""
     while True:
         name = time.strftime("episode_%Y%m%d_%H%M%S", time.localtime(start_s))
         writer = EpisodeWriter(folder / name, about, resolution=None, flags=True)
@@ -241,8 +242,10 @@ def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
 
 @dataclass(frozen=True)
 class RecordReport:
-    """What was recorded. folder: the episode's, None if it became none. seconds: from its start. not_measured: so many
-    controls without a pulse of steering, of throttle. fault: what ended it, None if it was asked to.
+    """What was recorded.
+
+    folder: of the episode, None if there is no usable one. seconds: its duration. not_measured: number of controls
+    without a pulse of steering, and of throttle. fault: what ended it, None if it was asked to end.
     """
 
     folder: Path | None
@@ -273,18 +276,18 @@ def record(
     status: TextIO | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> RecordReport:
-    """Records one episode of a human who drives, until `stop` is set or max_seconds are over.
+    """Record one episode of a human who drives, until `stop` is set or max_seconds are over.
 
-    A control is the newest status of the Arduino at a tick of rate_hz, at the time at which it came, once. What ends it
-    otherwise is the report's `fault`; what was recorded until then is kept. status: a stream for a line for people.
-    Raises EpisodeError if it cannot be begun.
+    At each tick of rate_hz, the Arduino's newest status is recorded as a control, with the time at which it arrived; no
+    status is recorded twice. If something else ends the episode, it is in the report's `fault`, and what was recorded
+    until then is kept. status: a stream for a status line for people. Raises EpisodeError if recording cannot begin.
     """
     stop = stop or threading.Event()
     lost = [0, 0]
     with contextlib.ExitStack() as stack:
         about = About(label, arduino_port=link.port, source="human", car=link.car)
         recorder = stack.enter_context(Recorder(folder, camera, about, rate_hz=rate_hz, clock=clock))
-        start = heard_s = recorder.start_s  # a status from before is not of this episode
+        start = heard_s = recorder.start_s  # earlier statuses do not belong to this episode
         if status:
             line = stack.enter_context(
                 StatusLine(

@@ -1,8 +1,8 @@
-"""Releases of the policy on the rover: what is in use changes at once or not at all, whenever the power goes.
+"""Releases of the policy on the rover. Switching is atomic, even if the power fails at any moment.
 
     releases = Releases("/var/lib/rover/models")
     name = releases.stage("/var/lib/rover/incoming").name    # what pack() wrote, or an artifact
-    releases.switch(name)                                     # proven before, proven again after; rolls back by itself
+    releases.switch(name)                                     # checked before and after; rolls back by itself
 
     models/current              a symbolic link to releases/<content hash>, and the only truth about what is in use
     models/releases/<hash>/     policy.pt, policy.pt.sha256 (for sha256sum -c), policy.pt.sig (its signature, for
@@ -10,9 +10,9 @@
     models/history.json         what was in use, the newest last; for rollback and prune
     models/.lock                held by whoever changes something
 
-A power cut may come between any two system calls, and takes with it what was not synced. So all that a release holds is
-synced before its folder gets its name, and all of that before `current` is renamed. What an interrupted command left
-(.new, .gone-... and .new-...) the next one removes. No decision depends on the clock.
+The power may fail between any two system calls, and whatever was not synced is then lost. So all files of a release are
+synced before its folder gets its name, and the folder before `current` is renamed. Leftovers of an interrupted command
+(.new, .gone-... and .new-...) are removed by the next command. No decision depends on the clock.
 """
 
 import contextlib
@@ -43,7 +43,7 @@ POLICY, DIGEST, ORIGIN = "policy.pt", "policy.pt.sha256", "release.json"
 SIGNATURE = "policy.pt.sig"
 SIGNERS = Path("/etc/rover/allowed_signers")  # of ssh-keygen(1); provision.yml writes it
 SIGNER, NAMESPACE = "rover", "rover-policy"  # the principal there, and what a signature is for
-NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # the second whole copy of a release in use that was damaged is ...-2
+NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # ...-2: a second copy, as the first was damaged in use
 PART = re.compile(r"part-\d{4,}")
 PART_BYTES = 8 << 20  # what a transfer that was cut off sends again at most
 MOST_PARTS = 1000
@@ -53,7 +53,7 @@ HISTORY = 100
 LOCK_TRIES, LOCK_S = 5, 0.05
 SANDBOX = "rover-check@{}.service"
 
-STAGE_MB = 400  # that staging may take, whoever asks for it: an artifact is a stranger's until it is staged
+STAGE_MB = 400  # memory that staging may take: until an artifact is staged, it is not trusted
 MAY_DIFFER = ("mode", "chunk", "camera")  # torch, engine and actions may not: this rover could not drive by them
 CODE_OF_MODE = {"static": b"ops.quantized.conv2d", "mixed": b"ops.quantized.conv2d", "dynamic": b"linear_dynamic"}
 ONNX_OF_MODE = {"static": b"QuantizeLinear", "mixed": b"QuantizeLinear"}
@@ -63,12 +63,12 @@ Check = Callable[[str], None]  # takes a release's name or "current"; raises Rov
 
 
 class ReleaseError(RoverError):
-    """A deployment that cannot be made; what was in use still is, unless the sentence says otherwise."""
+    """A deployment that failed. The release in use stays in use, unless the error says otherwise."""
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What a rover takes. camera: its name in the manifest; aspect: of its frames, width to height."""
+    """The artifacts that a rover accepts. camera: its name in the manifest. aspect: width / height of its frames."""
 
     chunk: int = 32
     camera: str = "cam_front"
@@ -76,7 +76,7 @@ class Expected:
     modes: tuple[str, ...] = ("static", "mixed")
 
     def refusals(self, manifest: dict[str, Any]) -> dict[str, str]:
-        """Why not to take an artifact, by kind: "mode", "chunk", "camera", "torch", "engine", "actions"."""
+        """Reasons to refuse an artifact, by kind: "mode", "chunk", "camera", "torch", "engine", "actions"."""
         refusals = {}
         if manifest["mode"] not in self.modes:
             refusals["mode"] = f"its mode is {manifest['mode']}, which is several times slower than {self.modes[0]}"
@@ -104,10 +104,10 @@ THIS_CAR = Expected()
 
 
 def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Iterable[str] = ()) -> dict[str, Any]:
-    """The manifest of an artifact that may be deployed; nothing in it is run.
+    """Check that an artifact may be deployed, without running it; return its manifest.
 
-    allow: kinds of refusal that are none, of MAY_DIFFER. Raises ArtifactError for a damaged file or a manifest that
-    does not fit the code beside it, ReleaseError for one that this rover does not take.
+    allow: kinds of refusal to ignore, of those in MAY_DIFFER. Raises ArtifactError for a damaged file or a manifest
+    that does not fit the code beside it, ReleaseError for an artifact that this rover does not accept.
     """
     allow = set(allow)
     if unknown := allow - set(MAY_DIFFER):
@@ -134,12 +134,13 @@ def pack(
     allow: Iterable[str] = (),
     key: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Cut an artifact into parts in a folder of their own, with a release.json that says what they make together.
+    """Cut an artifact into parts in a folder of their own, with a release.json that describes the whole.
 
-    Parts travel one by one, so that a transfer goes on where it was cut. What an earlier pack() wrote there is
-    replaced. key: of ssh, to sign the artifact with; a rover takes only what its own laptops have signed. Returns what
-    release.json says: name (the content hash), sha256, bytes, parts, mode, origin. Raises as inspect_artifact(), and
-    ReleaseError, with nothing touched, for a key that does not sign, or a folder that holds anything else.
+    Parts are sent one by one, so that an interrupted transfer can continue. The parts of an earlier pack() in the
+    folder are replaced. key: ssh key to sign the artifact with; a rover accepts only artifacts that its own laptops
+    have signed. Returns the content of release.json: name (the content hash), sha256, bytes, parts, mode, origin.
+    Raises as inspect_artifact(). Raises ReleaseError, and changes nothing, if the key cannot sign or the folder holds
+    other files.
     """
     artifact, folder = Path(artifact), Path(folder)
     manifest = inspect_artifact(artifact, expected, allow)
@@ -157,7 +158,7 @@ def pack(
             (folder / SIGNATURE).write_bytes(signature)
         (folder / ORIGIN).write_text(json.dumps(about, indent=1, sort_keys=True) + "\n")
     except BaseException:
-        for half in _packed_before(artifact, folder):  # a disk that is full has room again
+        for half in _packed_before(artifact, folder):  # make room on a full disk
             half.unlink()
         raise
     return about
@@ -187,7 +188,7 @@ def _is_packed(path: Path) -> bool:
 
 
 def sign(artifact: Path | str, key: Path | str) -> bytes:
-    """The signature of an artifact, as `ssh-keygen -Y sign` makes it; a key in the agent is used from there.
+    """Sign an artifact by `ssh-keygen -Y sign` and return the signature. A key in the ssh agent is used from there.
 
     Raises ReleaseError.
     """
@@ -225,7 +226,7 @@ def _about(artifact: Path, manifest: dict[str, Any]) -> dict[str, Any]:
         "sha256": sha256_of(artifact),
         "bytes": artifact.stat().st_size,
         "mode": manifest["mode"],
-        # Nothing of when: the same artifact from the same place must not look like another one to Ansible.
+        # No time: to Ansible, the same artifact from the same place must look unchanged.
         "origin": {"file": _file(artifact), "host": socket.gethostname()},
         "checkpoint": manifest["checkpoint"].get("sha256", ""),
     }
@@ -239,7 +240,7 @@ def _file(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Staged:
-    """What staging came to. name: of the release. changed: it was not there before."""
+    """The result of staging. name: of the release. changed: whether it is new."""
 
     name: str
     changed: bool
@@ -247,7 +248,7 @@ class Staged:
 
 @dataclass(frozen=True)
 class Release:
-    """One release as found on the disk. wrong: what is wrong with it, empty if nothing."""
+    """One release on the disk. wrong: what is wrong with it, empty if nothing."""
 
     name: str
     current: bool
@@ -259,10 +260,11 @@ class Release:
 
 
 class Releases:
-    """The models of a rover. check: proves that a release computes what it should; runs its parity vectors if None.
+    """The models of a rover.
 
-    signers: whose signatures it takes, SIGNERS if None. Every command that changes something holds the lock, and raises
-    ReleaseError if another one does.
+    check: checks that a release computes correctly; None: by running its parity vectors. signers: file of the accepted
+    signers, SIGNERS if None. Every method that changes something holds the lock, and raises ReleaseError if another
+    process holds it.
     """
 
     def __init__(
@@ -283,7 +285,7 @@ class Releases:
 
     @property
     def current(self) -> str | None:
-        """The name of the release in use; where `current` points to if that is no release."""
+        """The name of the release in use; if `current` does not point to a release, the path that it points to."""
         try:
             target = str(self.current_link.readlink())
         except OSError:
@@ -297,7 +299,7 @@ class Releases:
         return self.current_link / POLICY
 
     def path_of(self, name: str) -> Path:
-        """The policy of a release, or of "current". Raises ReleaseError for what is no name."""
+        """The path of the policy of a release, or of "current". Raises ReleaseError for an invalid name."""
         if name == "current":
             return self.policy
         if not NAME.fullmatch(name):
@@ -316,14 +318,14 @@ class Releases:
             if (folder / DIGEST).read_text().split()[:1] != [sha256_of(folder / POLICY)]:
                 return f"{POLICY} is not what {DIGEST} says"
             content = content_hash(folder / POLICY)
-        except Exception as e:  # whatever hinders reading it is what is wrong with it
+        except Exception as e:  # whatever prevents reading it is the answer
             return f"not readable ({type(e).__name__}: {e})"
         if content != named[1]:
             return f"tampered with: its content is {content[:12]}, not what its folder is named after"
         return ""
 
     def all(self) -> list[Release]:
-        """Every release, the one in use first, then those used last, then those never used."""
+        """All releases: first the one in use, then those used before, the latest first, then those never used."""
         current, releases = self.current, []
         for name in self._by_use():
             try:
@@ -338,7 +340,10 @@ class Releases:
         return releases
 
     def status(self) -> dict[str, Any]:
-        """What is: current, healthy (its bytes), since, releases, disk_free_mb, at_work (a command holds the lock)."""
+        """The present state: current, healthy, since, releases, disk_free_mb, at_work.
+
+        healthy: whether the bytes of the release in use are intact. at_work: whether a command holds the lock.
+        """
         releases = self.all()
         in_use = next((r for r in releases if r.current), None)
         wrong = {r.name: r.wrong for r in releases}  # each is read and hashed once
@@ -361,7 +366,7 @@ class Releases:
         }
 
     def verify(self, name: str = "current") -> None:
-        """Prove that a release's bytes are whole and that it computes here what it should (parity vectors).
+        """Check that a release's bytes are intact, and that it computes correctly here (parity vectors).
 
         Raises ReleaseError or ArtifactError.
         """
@@ -380,12 +385,12 @@ class Releases:
     def stage(
         self, source: Path | str, *, sha256: str | None = None, allow: Iterable[str] = (), unsigned: bool = False
     ) -> Staged:
-        """Make a release of an artifact, or of the folder that pack() wrote; what is in use stays in use.
+        """Make a release of an artifact, or of a folder that pack() wrote. The release in use stays in use.
 
-        Its signature is policy.pt.sig in that folder, or lies beside the artifact with .sig added to its name.
-        sha256: what the artifact's must be, if it is known. unsigned: take it from anybody. A release that is there and
-        whole is left as it is; one that is not whole is replaced, the one in use by a second copy beside it. Raises
-        ReleaseError, ArtifactError.
+        The signature is policy.pt.sig in that folder, or lies beside the artifact with .sig added to its name. sha256:
+        the expected one of the artifact, if it is known. unsigned: accept it without a signature. A release that exists
+        and is intact is left as it is. A damaged one is replaced; if it is in use, a second copy is made beside it.
+        Raises ReleaseError, ArtifactError.
         """
         source = Path(source)
         with _disk_errors_explained(), _memory_limited(source), self._exclusively():
@@ -399,7 +404,7 @@ class Releases:
             self._check_free_space(about["bytes"] if about else source.stat().st_size)
             new = self.releases / ".new"
             new.mkdir()
-            new.chmod(0o755)  # whatever the umask: the service's user reads it
+            new.chmod(0o755)  # whatever the umask is: the service's user must be able to read it
             parts = [source / f"part-{i:04d}" for i in range(about["parts"])] if about else [source]
             most = about["bytes"] if about else ARCHIVE_BYTES
             arrived, wanted = _join(parts, new / POLICY, most), sha256 or (about or {}).get("sha256")
@@ -432,9 +437,9 @@ class Releases:
             return Staged(name, True)
 
     def switch(self, name: str) -> bool:
-        """Use a release, after it was proven; prove it again through `current`, and go back if that fails.
+        """Check a release, switch to it, and check it again through `current`; switch back if that fails.
 
-        Returns whether anything changed. Raises ReleaseError, with what is in use now.
+        Returns whether anything changed. Raises ReleaseError, whose text says which release is in use now.
         """
         with _disk_errors_explained(), self._exclusively():
             before = self.current
@@ -457,7 +462,7 @@ class Releases:
             return True
 
     def rollback(self) -> str:
-        """Use the release before the one in use, the newest that can be proven. Returns its name."""
+        """Switch to the newest earlier release that passes its checks. Returns its name."""
         with _disk_errors_explained(), self._exclusively():
             refused = []
             for name in self._used_before():
@@ -467,7 +472,7 @@ class Releases:
                     refused.append(f"{name[:12]}: {error}")
                     continue
                 history = self._history()
-                # Before the switch: cut here, the next rollback begins where this one did.
+                # Before the switch: after a power cut here, the next rollback starts from the same point.
                 self._write_history(history[: len(history) - history[::-1].index(name)])
                 self._point_current_at(name)
                 return name
@@ -477,9 +482,9 @@ class Releases:
             )
 
     def prune(self, keep: int = 3) -> list[str]:
-        """Remove all but the `keep` releases used last; never the one in use. Returns the names of those removed.
+        """Remove all but the `keep` releases used last, but never the one in use. Returns the removed names.
 
-        One that was never in use counts as older than one that was, and one that is damaged is removed.
+        A release that was never in use counts as older than any that was. Damaged releases are removed.
         """
         if keep < 1:
             raise ReleaseError("at least 1 release is kept", found=keep)
@@ -496,7 +501,7 @@ class Releases:
 
     @contextlib.contextmanager
     def _exclusively(self) -> Iterator[None]:
-        """Holds the lock, and removes what an interrupted command left."""
+        """Hold the lock, and remove what an interrupted command left behind."""
         self.releases.mkdir(parents=True, exist_ok=True)
         file = os.open(self.models / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
         try:
@@ -511,7 +516,7 @@ class Releases:
             os.close(file)
 
     def _lock(self, file: int) -> None:
-        for left in reversed(range(LOCK_TRIES)):  # status() holds it for a moment, to find out who else does
+        for left in reversed(range(LOCK_TRIES)):  # status() holds it for a moment, to see whether another does
             try:
                 return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -521,11 +526,11 @@ class Releases:
 
     def _tidy(self) -> None:
         ours = (*self.releases.glob(".new"), *self.releases.glob(".gone-*"), *self.models.glob(".new-*"))
-        for left in ours:  # a .git, or whatever else is somebody's, stays
+        for left in ours:  # other files, such as a .git, stay
             shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
         history = self._history()
         if (current := self.current) in self._by_use() and history[-1:] != [current]:
-            self._write_history([*history, current])  # a switch was cut before it was written down
+            self._write_history([*history, current])  # a switch was interrupted before the history was written
 
     def _locked_by_another(self) -> bool:
         try:
@@ -567,11 +572,11 @@ class Releases:
             )
 
     def _intact(self, content: str) -> str | None:
-        """A release of that content which is whole, the one in use first."""
+        """The name of an intact release with that content, preferably the one in use."""
         return next((n for n in self._by_use() if n.startswith(content) and not self.wrong_with(n)), None)
 
     def _new_name(self, content: str) -> str:
-        """A name for a new release of that content; what has it and is not in use goes."""
+        """A free name for a new release with that content; an old one of that name is removed unless it is in use."""
         name, number = content, 1
         while (self.releases / name).exists():
             if name != self.current:
@@ -588,14 +593,14 @@ class Releases:
         return f"{self.current[:12]} stays in use" if self.current else "no model is in use"
 
     def _since(self) -> str | None:
-        """When `current` was switched, by the clock of then."""
+        """When `current` was switched, by the clock at that time."""
         try:
             return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.current_link.lstat().st_mtime))
         except (OSError, ValueError, OverflowError):
             return None
 
     def _nearest_folder(self) -> Path:
-        """The models' folder, or what of its path is there already."""
+        """The models' folder, or the nearest parent folder that exists."""
         return next(p for p in (self.models, *self.models.absolute().parents) if p.exists())
 
     def _point_current_at(self, name: str | None) -> None:
@@ -605,7 +610,7 @@ class Releases:
         else:
             new = self.models / ".new-current"
             new.symlink_to(Path("releases", name))
-            if self.current_link.is_dir() and not self.current_link.is_symlink():  # somebody's; a link it must be
+            if self.current_link.is_dir() and not self.current_link.is_symlink():  # not ours, which is a link
                 self.current_link.rename(self.models / ".new-was-current")  # the next command removes it
             new.replace(self.current_link)
         _sync(self.models)
@@ -618,9 +623,9 @@ class Releases:
             return []
 
     def _write_history(self, names: list[str]) -> None:
-        """Write the history, if there is room: a full disk must not keep a rover from going back, or from pruning.
+        """Write the history, if there is room. A full disk must not prevent a rollback or pruning.
 
-        The next command adds what is then missing.
+        The next command adds what is missing then.
         """
         new = self.models / ".new-history"
         with contextlib.suppress(OSError):

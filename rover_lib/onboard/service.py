@@ -1,31 +1,31 @@
-"""A drive as a systemd service: ready once it could drive, disarmed until a human arms it, watched by its ticks.
+"""Drive as a systemd service, which waits disarmed until a human arms the car, and which systemd's watchdog checks.
 
-How a human arms: `sudo rover arm-car` on the rover, or `ansible-playbook ansible/drive.yml -e rover_arm=true`. Either
-talks to the service through a socket that only root can use, asks what the car would drive by, and then requests to
-arm. A request names what it arms: the model's content hash, and a ticket of the service's, which is another after each
-start and after each attempt. So nobody is surprised by what another operator deployed in between, one request is one
-attempt, and nothing is left behind that could arm the car later. The Arduino has the last word, as always: the service
-says what it still wants (switch the transmitter on, let go of the throttle, wiggle the steering), and refuses
-requests meanwhile. Moving a stick takes the car back.
+A human arms the car by `sudo rover arm-car` on the rover, or by `ansible-playbook ansible/drive.yml -e rover_arm=true`.
+Both use a socket that only root may use: they ask the service what the car would drive by, and then send a request to
+arm. The request contains the model's content hash, so that nobody arms a model that another operator has just deployed.
+It also contains a ticket, which the service changes at each start and after each attempt, so that one request is one
+attempt and no old request can arm the car later. The Arduino has the last word. As long as something is missing, the
+service says what (switch the transmitter on, let go of the throttle, wiggle the steering) and refuses requests. Moving
+a stick takes the car back.
 
-However a drive ends, by a takeover too, the same process waits disarmed again, with the port open: opening it anew
-might reset the Arduino, and take the car from the human who has just taken it. While a takeover is recorded, nobody can
-ask for the car. What is broken for good (a camera that is gone, a port) ends the service, and systemd starts it again,
-disarmed.
+However a drive ends, also by a takeover, the same process then waits disarmed with the port still open. Opening the
+port again might reset the Arduino, and take the car from the human who has just taken over. While a takeover is
+recorded, nobody can arm the car. A permanent fault (the camera or the port is gone) ends the service; systemd starts it
+again, disarmed.
 
-A drive is over after --max-seconds of the service, or what the request says if that is less. Who arms from afar also
-promises to be heard of: without `rover heartbeat` within the time that the request says, the drive ends.
+A drive ends after the service's --max-seconds, or earlier if the request says so. A request from another machine also
+promises heartbeats: if no `rover heartbeat` comes within the time that the request gives, the drive ends.
 
-Disarmed, it is not in a hurry: no real-time priority, a plan a second. Both come before the Arduino is asked, and the
-car begins by a fresh plan.
+While disarmed, nothing has to be fast: the service has ordinary priority and one plan per second. Before the Arduino is
+asked to arm, it switches to real-time priority and full rate, and the car starts with a fresh plan.
 
-What the service says of itself (systemctl show --property=StatusText) begins with one of STATES; deploy.yml restarts it
-only while that is "disarmed".
+The service's status text (systemctl show --property=StatusText) begins with one of STATES; deploy.yml restarts the
+service only while this is "disarmed".
 
-systemd's watchdog hears of ticks that happened: while the car drives, those of the control loop; while it is disarmed,
-the checks of camera, policy and Arduino; while a human is recorded who took over, those of that; and for a while after
-a drive has ended, when an episode is finished. A loop that hangs, or a process that does, is killed after WatchdogSec;
-the Arduino has stopped the car 150 ms after the last command.
+systemd's watchdog is fed only by work that was really done: ticks of the control loop while the car drives; the checks
+of camera, policy and Arduino while it is disarmed; ticks of the recording while a human who took over is recorded; and
+for a limited time after a drive, while its episode is finished. If the loop or the process hangs, systemd kills it
+after WatchdogSec; by then the Arduino has long stopped the car, 150 ms after the last command.
 """
 
 import contextlib
@@ -48,7 +48,7 @@ from systemd_watchdog import WatchDog
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.host import is_listened_at
 
-if TYPE_CHECKING:  # who asks for the service's state, as every playbook does, waits for neither numpy nor OpenCV
+if TYPE_CHECKING:  # asking for the service's state, as every playbook does, must not import numpy or OpenCV
     from rover_lib.onboard.loop import Arm, Report
     from rover_lib.onboard.servo_link import Telemetry
 
@@ -56,27 +56,30 @@ UNIT = "rover-drive.service"
 RUNTIME = Path("/run/rover-drive")  # the unit's RuntimeDirectory=
 CHECK_S = 0.1  # between checks while disarmed
 FEED_S = 0.25  # WatchdogSec is 2 s
-FINISH_S = 80.0  # an episode on a slow card; TimeoutStopSec is 90 s then
+FINISH_S = 80.0  # to finish an episode on a slow card; TimeoutStopSec is 90 s then
 STATUS_S = 1.0
 REQUEST_S = 2.0  # how old a request to arm may be: a fresh plan within 0.8 s, an episode's folder, the Arduino's cap
 ARMED_S = 10.0  # a fresh plan comes within 0.8 s, the Arduino answers within 0.5, an episode's folder is made
 QUESTION_BYTES = 4096
-PERSONS = 1000  # users from here on are people; the service's own is not
+PERSONS = 1000  # user ids from here on belong to people; the service's own is below
 DISARMED, DRIVING, STOPPING = STATES = ("disarmed", "driving", "stopping")
 WAITING = "waiting for a human to arm it"
 
 
 class NotArmed(RoverError):
-    """The service was told to stop before a human armed the car."""
+    """The car was not armed: the request was refused, or the service was told to stop."""
 
 
 class ServiceError(RoverError):
-    """What cannot be asked of the service now."""
+    """The service cannot be reached, or does not do what was asked."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What an operator asks of a drive. None: the service's own limit; no heartbeat. Raises ValueError for no time."""
+    """Limits that an operator sets for a drive.
+
+    None means the service's own limit, or no heartbeat. Raises ValueError for a time that is not above 0.
+    """
 
     max_seconds: float | None = None
     heartbeat_s: float | None = None
@@ -87,19 +90,19 @@ class Request:
 
 
 def check_age(age_s: float) -> None:
-    """Raises NotArmed for a request to arm that is too old: who asked may be elsewhere with eyes and hands by now."""
-    if not age_s <= REQUEST_S:  # nor is NaN
+    """Raises NotArmed for a request to arm that is too old: whoever sent it may no longer be watching the car."""
+    if not age_s <= REQUEST_S:  # also refuses NaN
         raise NotArmed(
             f"{age_s:.1f} s have passed since the car was asked for, at most {REQUEST_S:g} may", remedy="ask again"
         )
 
 
 class Service:
-    """systemd's and the operators' side of a car's drives; a context manager, for the main thread.
+    """Talks to systemd and to operators about a car's drives; a context manager, for the main thread.
 
-    report: of the drive, whose ticks feed the watchdog. stop: ends the waiting. model: content hash of what it drives
-    by. Without systemd (no NOTIFY_SOCKET) nothing is told to anybody, and all else is the same; the socket is in
-    $RUNTIME_DIRECTORY. Raises ServiceError if it cannot be made there.
+    report: the drive's report, whose ticks feed the watchdog. stop: ends the waiting. model: content hash of the model
+    that drives. Without systemd (no NOTIFY_SOCKET) no notifications are sent, and everything else is the same. The
+    operators' socket is in $RUNTIME_DIRECTORY. Raises ServiceError if it cannot be made there.
     """
 
     def __init__(
@@ -112,10 +115,10 @@ class Service:
         clock: Callable[[], float] = time.monotonic,
     ):
         self._report, self._stop, self._notify, self._model, self._clock = report, stop, notify, model, clock
-        # One that never waits: systemd may be busy, and the loop must not be.
+        # Non-blocking: systemd may be busy, and the loop must not wait for it.
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self._systemd = WatchDog(sock=self._socket)
-        self._rounds = 0  # of checks that passed
+        self._rounds = 0  # rounds of checks that passed
         self._state = self._text = self._missing = ""
         self._done = threading.Event()
         self._threads = [
@@ -123,8 +126,8 @@ class Service:
             threading.Thread(target=self._listen, name="operators", daemon=True),
         ]
         self._turn = threading.Condition()  # guards the five below
-        self._ticket = ""  # of the next attempt; none: nobody can ask for one now
-        self._request: Request | None = None  # of the attempt, and of the drive
+        self._ticket = ""  # for the next attempt; empty: nobody can ask for one now
+        self._request: Request | None = None  # of the present attempt or drive
         self._asked = False
         self._asked_s = 0.0
         self._answer: dict[str, Any] | None = None
@@ -134,7 +137,7 @@ class Service:
         path = _socket_path()
         self._operators = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
-            if is_listened_at(path):  # taken from it, nobody could arm its car, and no heartbeat would reach a drive
+            if is_listened_at(path):  # if we took its socket, nobody could arm its car or send it heartbeats
                 self._operators.close()
                 raise ServiceError(f"{path}: another service listens there", remedy="end that one first")
             path.unlink(missing_ok=True)
@@ -167,12 +170,12 @@ class Service:
         *,
         said: str = "",
     ) -> "Telemetry | None":
-        """Ready: waits until a human arms the car and the Arduino agrees; what arm() returned.
+        """Report ready, wait until a human arms the car and the Arduino agrees, and return what arm() returned.
 
-        arm: calls check_request() just before the Arduino is told. checks: what must go on working meanwhile; each
-        raises if it does not. missing: what must be done before the car can be armed, "" if nothing; requests are
-        refused with it. said: how the drive before this ended. Raises NotArmed when told to stop, and what a check
-        raises.
+        arm: must call check_request() just before the Arduino is told. checks: called again and again while waiting;
+        each raises if its device fails. missing: what must be done before the car can be armed, "" if nothing; requests
+        are refused with this text. said: how the previous drive ended. Raises NotArmed when told to stop, and whatever
+        a check raises.
         """
         checks = tuple(checks)
         first, self._state, self._text = not self._rounds, DISARMED, ""
@@ -195,7 +198,7 @@ class Service:
                 if refusal := missing():
                     raise NotArmed(refusal)
                 telemetry = arm()
-            except RoverError as error:  # what is broken, and not only in the way, the next check finds
+            except RoverError as error:  # if something is really broken, the next check finds it
                 said = f"not armed: {error}"
                 self._notify(said)
                 self._reply(armed=False, text=str(error))
@@ -211,15 +214,15 @@ class Service:
         raise NotArmed("told to stop before a human armed the car")
 
     def check_request(self) -> None:
-        """Call this just before the Arduino is told to arm. Raises NotArmed where the operator asked too long ago."""
+        """Call this just before the Arduino is told to arm. Raises NotArmed if the operator asked too long ago."""
         check_age(self._clock() - self._asked_s)
 
     def alive(self) -> None:
-        """Tell the watchdog that what goes on after a drive is alive; to be called at each of its turns."""
+        """Tell the watchdog that the work after a drive goes on. To be called again and again during that work."""
         self._rounds += 1
 
     def over(self) -> str | None:
-        """Why this drive is over by what was requested, None if it is not. The loop asks at each tick."""
+        """Why the operator's limits end this drive; None if they do not. The loop calls this at each tick."""
         request, now = self._request or Request(), self._clock()
         if request.max_seconds is not None and now - self._armed_s >= request.max_seconds:
             return f"{request.max_seconds:g} s, as requested"
@@ -228,7 +231,7 @@ class Service:
         return None
 
     def _reply(self, **answer: Any) -> None:
-        """To the request that was tried. A refused one has used up its ticket, and no moment is without the next."""
+        """Answer the request that was tried. A refused request has used up its ticket, so a new one is made at once."""
         with self._turn:
             self._asked, self._answer = False, answer
             self._ticket = "" if answer["armed"] else secrets.token_hex(8)
@@ -245,7 +248,7 @@ class Service:
             with (
                 connection,
                 contextlib.suppress(OSError, ValueError, TypeError, OverflowError, RecursionError),
-            ):  # nonsense has no answer
+            ):  # nonsense gets no answer
                 connection.settimeout(1.0)
                 _, uid, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
                 if uid == 0 or uid == os.geteuid() >= PERSONS:
@@ -255,7 +258,7 @@ class Service:
     def _answer_to(
         self, ask: str, model: str = "", ticket: str = "", asked_s: float | None = None, **limits: float | None
     ) -> dict[str, Any]:
-        """asked_s: by the operator's own clock, time.monotonic() too; this process may have been stopped since."""
+        """asked_s: when the operator sent it, time.monotonic(); this process may have been suspended since then."""
         if ask == "heartbeat":
             self._heard_s = self._clock()
         if ask != "arm":
@@ -296,9 +299,9 @@ class Service:
                 self._tell(f"{DRIVING}: {self._report.ended or self._report.status}")
 
     def _stopping(self, why: str) -> None:
-        """Ends the watchdog's time: a policy has to be ended, and files to be written."""
+        """Tell systemd that the service stops, so that the watchdog leaves time to end the policy and write files."""
         self._state = STOPPING
-        # A notification is lines, and the library has no word for this one.
+        # A notification consists of lines; the library has no function for this one.
         self._tell(f"{STOPPING}: {why}", "STOPPING=1")
 
     def _tell(self, text: str, *more: str) -> None:
@@ -311,9 +314,9 @@ class Service:
 
 
 def state_of(unit: str = UNIT) -> dict[str, Any]:
-    """What systemd knows of the service: active, state (one of STATES, or ""), text, since, restarts, result.
+    """What systemd knows about the service: active, state (one of STATES, or ""), text, since, restarts, result.
 
-    Raises ServiceError where there is no systemd.
+    Raises ServiceError if there is no systemd.
     """
     names = ("LoadState", "ActiveState", "StatusText", "ActiveEnterTimestamp", "NRestarts", "Result", "UnitFileState")
     try:
@@ -341,7 +344,7 @@ def state_of(unit: str = UNIT) -> dict[str, Any]:
 
 
 def ask_service(unit: str = UNIT, **question: Any) -> dict[str, Any]:
-    """A service's answer to an operator. Raises ServiceError if it is not there to be asked, or gives none."""
+    """Send a question to the service and return its answer. Raises ServiceError if it is not reached or is silent."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(ARMED_S)
         try:
@@ -370,10 +373,11 @@ def arm_car(
     notify: Callable[[str], None] = lambda text: None,
     wait_s: float = 0.0,
 ) -> str:
-    """Arm the car whose service waits for it; what the service says then. Raises ServiceError if it does not drive.
+    """Arm the car whose service waits for it; return what the service then says. Raises ServiceError if it refuses.
 
-    model: content hash of the one that is meant; "": whichever the service has, which `confirm` may look at (model,
-    text), and raise. wait_s: for what is missing, such as the transmitter; each such sentence goes to `notify`.
+    model: content hash of the model that is meant; "": whichever the service has loaded. confirm: called with the
+    service's state (model, text) before arming; may raise. wait_s: how long to wait for what is missing, such as the
+    transmitter; each such sentence is passed to `notify`.
     """
     state = ask_service(unit, ask="state")
     if model and state["model"] != model:

@@ -1,17 +1,17 @@
-"""What goes into the episode of a drive: the policy's commands and, after a takeover, what the human does.
+"""Record a drive as an episode: the policy's commands and, after a takeover, what the human does.
 
     recorder = TakeoverRecorder(Recorder(...), mode="static")
     hooks = Hooks(record=recorder.command)
-    ...                                              # the loop raises TakenOver: it has ended, and armed nothing
+    ...                                              # the loop ends with TakenOver, and the car is disarmed
     takeover = recorder.human(link, armed, rate_hz=30, stop=stop)
 
-From the takeover on the car is the human's: here statuses of the Arduino are read and written down, until they let go,
-and nothing is sent to it. Each control has a column `driver`, one of recording.DRIVERS. A human's pulses are those of
-the receiver, as the Arduino measures them; where its pins do something else (a throttle that waits until it was at
-rest, a signal that was lost), nobody drives.
+After the takeover the human has the car: until they let go, this module only reads and records the Arduino's statuses,
+and sends nothing. Each control has a column `driver`, one of recording.DRIVERS. A human's pulses are those of the
+receiver, as the Arduino measures them. Where the Arduino's pins differ from the receiver (the throttle is blocked until
+it has been at rest once, or the signal was lost), the driver is "nobody".
 
-Who drove is known to a tick: the Arduino says in its first status after the takeover whether it still took the
-policy's last command, and a command that it did not take is not written.
+Who drove is exact to one tick: the Arduino's first status after the takeover says whether it still took the policy's
+last command. A command that it did not take is not recorded.
 """
 
 import threading
@@ -28,14 +28,17 @@ from rover_lib.onboard.servo_link import ServoLink, State, Telemetry
 
 LET_GO_S = 2.0  # with both sticks at rest for this time, the human has let go
 MOST_S = 300.0  # a transmitter that was put down with a stick held would fill the disk
-# As the firmware has them (vehicle.h): so far from rest a stick has not moved, or is the throttle at rest.
+# As in the firmware (vehicle.h): within these, a stick has not moved, or the throttle is at rest.
 STEERING_REST_US, THROTTLE_REST_US = 48, 32
 IGNORED = "i"  # the Arduino's word for a command that was not for who drives now
 
 
 @dataclass(frozen=True)
 class Takeover:
-    """What a human did with the car. controls: how many, by who drove. ended: why. fault: whether by one."""
+    """The recording of a human after a takeover.
+
+    controls: their number, by who drove. ended: why it ended. fault: whether a fault ended it.
+    """
 
     seconds: float
     controls: dict[str, int]
@@ -48,7 +51,7 @@ class Takeover:
 
 
 def driver_by(telemetry: Telemetry) -> str:
-    """Who drives by a status of the Arduino, one of DRIVERS: a human where its pins do what the receiver says."""
+    """Who drives according to a status, one of DRIVERS. A human drives if the pins do what the receiver says."""
     if telemetry.state is State.AUTONOMOUS:
         return POLICY
     pins = telemetry.steering_us, telemetry.throttle_us
@@ -60,21 +63,24 @@ def driver_by(telemetry: Telemetry) -> str:
 
 
 class TakeoverRecorder:
-    """A recorder's controls, with who drove at each; for the loop's thread alone. mode: of the artifact that drives."""
+    """Hands controls to a recorder, with who drove at each. Only the loop's thread may use it.
+
+    mode: of the artifact that drives.
+    """
 
     def __init__(self, recorder: Recorder, mode: str):
         self.recorder = recorder
         self._mode = mode
-        self._waiting: tuple[tuple, dict[str, Any]] | None = None  # the newest command: was it taken?
+        self._waiting: tuple[tuple, dict[str, Any]] | None = None  # the newest command, not yet known to be taken
         self._last_s = float("-inf")  # of the newest control that was handed over
 
     def command(self, *row: Any, **columns: Any) -> None:
-        """For the loop's hooks: a command went out, as Recorder.control(). Waits for nothing, raises nothing."""
+        """For the loop's hooks: a command was sent; arguments as of Recorder.control(). Never waits, never raises."""
         self.flush()
         self._waiting = row, columns
 
     def flush(self) -> None:
-        """The newest command was taken: it goes into the episode."""
+        """Record the newest command: the Arduino took it."""
         if self._waiting:
             row, columns = self._waiting
             self._waiting, self._last_s = None, row[0]
@@ -90,15 +96,15 @@ class TakeoverRecorder:
         over: Callable[[], str | None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> Takeover:
-        """Writes the Arduino's newest status at each tick of rate_hz until the human lets go, and says how that was.
+        """Record the Arduino's newest status at each tick of rate_hz until the human lets go.
 
-        armed: the status with which the car was armed, whose sticks were at rest; None: rest is neutral. stop: ends it.
-        over: called at each tick, may give another reason to end it. clock: the link's and the recorder's.
-        It ends as well after MOST_S, where the receiver has no signal or the link no status, the Arduino was reset, or
-        the recorder takes no more. Sends nothing, and raises nothing of a link that fails.
+        armed: the status with which the car was armed; its sticks were at rest. None: rest is neutral. stop: ends the
+        recording. over: called at each tick; may return another reason to end it. clock: the link's and the recorder's.
+        It also ends after MOST_S, if the receiver has no signal, the link no status, the Arduino was reset, or the
+        recorder takes no more. Sends nothing to the Arduino, and raises nothing if the link fails.
         """
         start_s = heard_s = signal_s = clock()
-        rest_s: float | None = None  # since when both sticks have been there
+        rest_s: float | None = None  # since when both sticks have been at rest
         counts, boot, tick = dict.fromkeys((HUMAN, NOBODY), 0), None, 0
         neutral = link.calibration.neutral()
         held_us = armed.receiver_steering_us if armed else None

@@ -1,9 +1,9 @@
-"""A hidden folder in which one process makes what will then take its place beside it.
+"""Build a folder's new content in a hidden folder beside it, one process at a time, and swap it in when complete.
 
     with made_beside(folder, files_of_a_run) as new:
         ...                                                     # fill it
 
-Two commands with the same --name would each remove what the other had made, and the later would win.
+Without this, two commands with the same --name would remove each other's files.
 """
 
 import fcntl
@@ -15,14 +15,14 @@ from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
 
-ADDED = ".added"  # in the folder of what was replaced: the names that replaced nothing, a line each
+ADDED = ".added"  # a file in the folder of replaced files: names of the new files that replaced nothing, one per line
 
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[Path]:
-    """That folder, empty, and this process's until the block ends; then it goes, with all that is left in it.
+    """An empty folder that only this process uses until the block ends; then it is removed with all its content.
 
-    What was left by a process that was killed goes first. Raises RoverError while another process is in it.
+    Whatever a killed process left in it is removed first. Raises RoverError while another process uses it.
     """
     held = _taken(folder)
     try:
@@ -36,17 +36,17 @@ def alone_in(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def made_beside(folder: Path, replaced: Callable[[Path], Iterable[Path]] = lambda _: ()) -> Iterator[Path]:
-    """`.<name>.new` beside a folder, empty: what is in it when the block ends well takes its place there.
+    """Give an empty folder `.<name>.new` beside `folder`; its content moves into `folder` if the block ends well.
 
-    All of it does, or nothing; the hidden folder goes in any case.
+    Either all of it moves or nothing; the hidden folder is removed in any case.
 
-    replaced: what of the folder goes then, beside all that has a successor; the rest stays. Until the new is whole it
-    lies in `.<name>.old`, from where the next one puts it back if this process was killed meanwhile.
-    Raises RoverError while another process makes something for that folder.
+    replaced: returns the files of `folder` to remove then, in addition to those with a successor; all others stay.
+    Until the new content is complete, the old files lie in `.<name>.old`. If this process is killed meanwhile, the next
+    call puts them back. Raises RoverError while another process makes something for that folder.
     """
     old = folder.with_name(f".{folder.name}.old")
     with alone_in(folder.with_name(f".{folder.name}.new")) as new:
-        if old.exists():  # the last one was killed while it took its place
+        if old.exists():  # the last process was killed during the swap
             _put_back(old, folder)
         yield new
         if folder.exists():
@@ -66,7 +66,7 @@ def _take_place(new: Path, folder: Path, old: Path, replaced: Iterable[Path]) ->
             (folder / name).rename(old / name)
         for name in made:
             (new / name).rename(folder / name)
-        old.rename(new / "replaced")  # done at once: a kill while it is removed must not leave a part to be put back
+        old.rename(new / "replaced")  # in one step: if we are killed while removing it, no part must be put back
     except BaseException:
         if old.exists():
             _put_back(old, folder)
@@ -74,7 +74,7 @@ def _take_place(new: Path, folder: Path, old: Path, replaced: Iterable[Path]) ->
 
 
 def _put_back(old: Path, folder: Path) -> None:
-    """Move what was being replaced back into its folder, over what of its successor is there. May be killed, too."""
+    """Move the replaced files back into their folder, over any new ones there. Safe if it is killed halfway, too."""
     added = old / ADDED
     if added.exists():
         for name in added.read_text().splitlines():
@@ -87,7 +87,7 @@ def _put_back(old: Path, folder: Path) -> None:
 
 
 def _taken(folder: Path) -> int:
-    """The folder's descriptor, which holds its lock. Made if it is not there."""
+    """Lock the folder, which is made if needed; return the descriptor that holds the lock."""
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -98,14 +98,14 @@ def _taken(folder: Path) -> int:
             raise RoverError(
                 f"{folder}: another process is at work in it", remedy="wait for it, or give another name"
             ) from None
-        except OSError:  # a network's file system that cannot lock a folder
+        except OSError:  # a network file system that cannot lock a folder
             pass
         try:
             if folder.stat().st_ino == os.fstat(held).st_ino:
                 return held
         except FileNotFoundError:
             pass
-        os.close(held)  # who was in it has just ended, and has removed it
+        os.close(held)  # the process that used it has just ended and removed it
 
 
 def _remove(path: Path) -> None:

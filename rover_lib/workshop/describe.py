@@ -1,4 +1,4 @@
-"""What a file or a folder of this project is, and what is in it: `rover inspect`; and the runs: `rover list`."""
+"""Describe a file or a folder of this project, for `rover inspect`, and list the runs, for `rover list`."""
 
 import json
 from pathlib import Path
@@ -11,14 +11,14 @@ from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import Source
 
-BULK = 200  # characters of a report's value; of a longer one only the count is shown
+BULK = 200  # characters; of a longer value in a report only the number of its items is shown
 STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "distill", "finetune", "learn")
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
-    """{kind: what is in it}, of everything that this project writes, and of what it reads.
+    """{kind: its content}, for every kind of file or folder that this project writes or reads.
 
-    Raises the RoverError of the kind's own loader: damaged, of another version, or nothing that is known here.
+    Raises the RoverError of that kind's loader if it is damaged, has another version, or is of no known kind.
     """
     path, kinds = source.path, kinds_of(source.path)
     kind = kinds[0] if kinds else None
@@ -79,7 +79,7 @@ def _counted(value: Any) -> Any:
 
 
 def runs(folder: Path | str) -> list[dict[str, str]]:
-    """{name, verdict} of each run in a folder such as runs/, by name. Raises RoverError where that is missing."""
+    """{name, verdict} of each run in a folder such as runs/, by name. Raises RoverError if there is no such folder."""
     folder = Path(folder)
     if not folder.is_dir():
         raise RoverError(f"{folder}: no such folder", remedy="make demo, or rover run, makes the first run")
@@ -88,7 +88,7 @@ def runs(folder: Path | str) -> list[dict[str, str]]:
 
 
 def verdict_of(run_dir: Path) -> str:
-    """The verdict of a run in a line; where it has none, what makes one."""
+    """A run's verdict in one line; if it has none yet, the command that makes one."""
     if (run_dir / "run.json").is_file():
         try:
             return str(read_stage(run_dir / "run.json", "run")["metrics"]["headline"])

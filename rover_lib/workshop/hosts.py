@@ -1,4 +1,4 @@
-"""Benchmarks of several machines beside each other: this one's, and those that ansible/benchmark.yml fetched.
+"""Compare benchmarks of several machines: this one's, and those that ansible/benchmark.yml fetched.
 
 benchmarks = read_benchmarks("runs/demo", "runs/rovers")
 print(benchmarks.table())
@@ -15,16 +15,17 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.cells import Table
 
-THIS = "this machine"  # a committed figure need not name it
+THIS = "this machine"  # instead of the host's name, which a committed figure need not show
 NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
 NO_SOAK = "none of the rovers was soaked; -e rover_soak_minutes=30 shows temperature, clock and throttling over time"
 
 
 @dataclass(frozen=True)
 class Benchmarks:
-    """by_host: contents of benchmark-<host>.json by host, this machine first. unusable: a sentence for each other file.
+    """by_host: contents of benchmark-<host>.json by host, this machine first. unusable: a sentence for each bad file.
 
-    Artifacts go by their mode; one of a rover that is not the run's, byte for byte, is called "static, another".
+    Artifacts are named by their mode. A rover's artifact that is not byte for byte the run's is called "static,
+    another".
     """
 
     by_host: dict[str, dict[str, Any]]
@@ -35,7 +36,7 @@ class Benchmarks:
         return {host: b for host, b in self.by_host.items() if b["metrics"].get("series")}
 
     def table(self) -> Table:
-        """A line for each host and artifact, a dash where a host has no sensor; below what there is to say about it."""
+        """A row for each host and artifact, with notes below. A dash means that the host has no such sensor."""
         header = ("host", "artifact", "p50 ms", "p95 ms", "p99 ms", "n", "C, most", "MHz, least", "throttled")
         rows, notes = [], []
         for host, b in self.by_host.items():
@@ -44,7 +45,7 @@ class Benchmarks:
             for name, v in m["artifacts"].items():
                 times = [f"{v[f'latency_{p}_ms']:.1f}" for p in ("p50", "p95", "p99")]
                 rows.append((host, name, *times, str(v["n"]), *state))
-                host, state = "", ("", "", "")  # once for each host
+                host, state = "", ("", "", "")  # shown only once for each host
         rovers = self.by_host.keys() - {THIS}
         if not rovers:
             notes.append(NO_ROVER)
@@ -57,10 +58,10 @@ class Benchmarks:
 
 
 def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
-    """All benchmark-<host>.json of a run's folder, and of the folder where Ansible leaves those of the rovers.
+    """All benchmark-<host>.json of a run's folder, and of the folder where Ansible puts those of the rovers.
 
-    A rover is called what the inventory calls it, which is in the file's name; of two with one name the fetched one
-    counts. A file that cannot be used is left out, and named.
+    A rover is named as in the inventory; the name is part of the file's name. If two benchmarks have the same name, the
+    fetched one is used. A file that cannot be used is left out and reported in `unusable`.
     """
     by_host: dict[str, dict[str, Any]] = {}
     unusable: list[str] = []
@@ -80,7 +81,7 @@ def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
 
 
 def _check(path: Path, content: Mapping[str, Any]) -> None:
-    """Raises RoverError unless there is in it what tables and figures read."""
+    """Raise RoverError unless the file has everything that tables and figures read."""
     try:
         metrics, env = content["metrics"], content["env"]
         series = metrics.get("series") or []
@@ -105,7 +106,10 @@ def _mode(name: str) -> str:
 
 
 def _named(content: Mapping[str, Any], ours: Mapping[str, str]) -> dict[str, Any]:
-    """With artifacts by mode; ours: {sha256: mode} of the run's. On a rover the file in use is always policy.pt."""
+    """A benchmark with its artifacts named by mode. On a rover the file in use is always called policy.pt.
+
+    ours: {sha256: mode} of the run's artifacts.
+    """
     metrics = content["metrics"]
     names: dict[str, str] = {}
     for name, v in metrics["artifacts"].items():

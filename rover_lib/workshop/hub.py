@@ -1,9 +1,9 @@
-"""Checkpoints and datasets of the Hugging Face Hub, by id and revision: user/name@main, or a tag, or a commit.
+"""Fetch checkpoints and datasets from the Hugging Face Hub, as user/name@revision: a branch, a tag or a commit.
 
     folder = fetched("user/name@v1", "model", CheckpointError)
 
-The revision must be said. So an id is never taken for a path that somebody mistyped, and nobody trains on what a name
-meant yesterday. What was fetched stays in the Hub's own cache, where later runs find it without network.
+The revision must be given. So a mistyped path is never taken for an id, and nobody trains on an outdated version
+without noticing. Fetched files stay in the Hub's own cache, where later runs find them without a network.
 """
 
 import re
@@ -17,22 +17,22 @@ FILES = {"model": ("*.json", "*.safetensors"), "dataset": ("meta/*", "data/*", "
 
 
 def is_hub_id(path: Path | str) -> bool:
-    """Whether it is user/name@revision, and nothing on this machine."""
+    """Whether it has the form user/name@revision, and no such file or folder is on this machine."""
     return bool(ID.fullmatch(str(path))) and not Path(path).exists()
 
 
 def absolute(path: Path | str) -> str:
-    """A path that means the same in another folder; an id of the Hub is one already."""
+    """A path that stays valid in another working folder. An id of the Hub is returned as it is."""
     return str(path) if is_hub_id(path) else str(Path(path).resolve())
 
 
 def fetched(hub_id: Path | str, kind: str, error: type[RoverError], files: Sequence[str] | None = None) -> Path:
-    """The folder of these files, fetched if they are not there yet.
+    """The folder that holds these files; they are fetched if they are not in the cache yet.
 
-    kind: "model" or "dataset". files: patterns, all that we read of such a repository if None. Raises `error`, in one
-    sentence, without network, for what the Hub does not have, and for what it does not give to everybody.
+    kind: "model" or "dataset". files: patterns; None: all that we read of such a repository. Raises `error`, in one
+    sentence, if there is no network, if the Hub does not have it, or if its owner restricts access.
     """
-    # here, because it takes a second that paths need not wait for
+    # here, because importing it takes a second, which a local path does not need
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RevisionNotFoundError
 
@@ -55,7 +55,7 @@ def fetched(hub_id: Path | str, kind: str, error: type[RoverError], files: Seque
         ) from None
     except RevisionNotFoundError:
         raise error(f"{hub_id}: has no revision '{revision}'", remedy="give a branch, a tag or a commit") from None
-    except Exception as e:  # of requests, of the Hub's client and of the disk, each with types of its own
+    except Exception as e:  # requests, the Hub's client and the disk each raise their own types
         reason = (str(e).strip().splitlines() or [""])[0][:160]
         raise error(
             f"{hub_id}: cannot be fetched as a {kind} ({type(e).__name__}{': ' if reason else ''}{reason})",

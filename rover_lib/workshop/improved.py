@@ -1,11 +1,12 @@
-"""Is a policy better than before? By rule, over whole held-out episodes: frames of one drive are alike.
+"""Decide by a fixed rule whether a policy is better than before, on held-out episodes.
 
     found = verdict(judged)
 
-The rule: an episode's error is the mean of its actions' errors. It is *better* if on the new held-out episodes that
-error fell, and chance would make it fall or rise as much in less than 5 of 100 cases, and if on the old ones it did not
-rise in that sense. Chance: each episode's difference might as well have had the other sign (Fisher's randomisation
-test), which needs at least six episodes of a kind to say anything.
+The error of an episode is the mean of its actions' errors. Whole episodes are compared and not single frames, because
+the frames of one drive are alike. A policy is *better* if its error fell significantly on the new held-out episodes,
+and did not rise significantly on the old ones. Significant means that chance would produce a change of this size, up or
+down, in less than 5 of 100 cases. It is computed by Fisher's randomisation test: if only chance were at work, each
+episode's difference could equally well have had the other sign. The test needs at least six episodes of a kind.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,16 +19,18 @@ import numpy as np
 from rover_lib.workshop.judge import shown_pct
 
 CHANCE = 0.05
-LEAST_EPISODES = 6  # of 5, all alike, chance makes 2 in 32
-EXACT = 12  # episodes at most for which all 2 ** 12 ways are counted; for more, DRAWN of them
+LEAST_EPISODES = 6  # with 5, all changed the same way, the chance is 2 in 32
+EXACT = 12  # most episodes for which all 2 ** 12 combinations of signs are tried; else DRAWN at random
 DRAWN = 10_000
 KINDS = ("old", "new")
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A held-out episode. kind: 'old' or 'new'. frames: that judged. before, after: by action, mean absolute error in
-    percent of the recorded range; None for an action that never changes.
+    """A held-out episode. kind: 'old' or 'new'. frames: how many frames the errors are of.
+
+    before, after: mean absolute error of each action, in percent of its recorded range; None for an action that never
+    changes.
     """
 
     name: str
@@ -37,7 +40,7 @@ class Judged:
     after: Mapping[str, float | None]
 
     def row(self) -> dict[str, Any]:
-        """The same as plain JSON types."""
+        """The same values as plain JSON types."""
         errors: dict[str, float | None] = {}
         for action, before in self.before.items():
             errors |= {f"before_{action}_pct": before, f"after_{action}_pct": self.after[action]}
@@ -45,16 +48,17 @@ class Judged:
 
     @property
     def change_points(self) -> float:
-        """After less before, mean over the actions that are judged: below 0 is better."""
+        """The change of the error (after - before), mean over the judged actions. Below 0 is better."""
         changes = [after - before for before, after in zip(self.before.values(), self.after.values(), strict=True)
                    if before is not None and after is not None]  # fmt: skip
         return float(np.mean(changes)) if changes else 0.0
 
 
 def chance_of(changes: Sequence[float]) -> float:
-    """How often differences of random sign have a mean at least as far from 0, two-sided. 1 for none.
+    """The two-sided p-value: how often changes with random signs have a mean at least as far from 0.
 
-    Of ways that are drawn, the one that was found is one more: chance is never 0.
+    Returns 1 for no changes. If signs are drawn at random, the actual ones count as one more draw, so that the result
+    is never 0.
     """
     found = np.asarray(changes, float)
     if not len(found):
@@ -64,12 +68,12 @@ def chance_of(changes: Sequence[float]) -> float:
     else:
         drawn = np.random.default_rng(0).choice([-1.0, 1.0], (DRAWN, len(found)))
         signs = np.vstack([np.ones(len(found)), drawn])
-    least = abs(found.sum()) * (1 - 1e-9)  # sums differ in their last bit by the order in which they are made
+    least = abs(found.sum()) * (1 - 1e-9)  # the last bit of a sum depends on the order of adding
     return float((np.abs(signs @ found) >= least).mean())
 
 
 def verdict(judged: Sequence[Judged]) -> dict[str, Any]:
-    """{"better": true, false, or None where that cannot be said, "why", "rule", "kinds": of each its figures}."""
+    """{"better": True, False, or None if it cannot be decided, "why", "rule", "kinds": the figures of each kind}."""
     kinds: dict[str, Any] = {}
     for kind in KINDS:
         changes = [each.change_points for each in judged if each.kind == kind]
@@ -109,7 +113,7 @@ def _said(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
 
 
 def summary(content: Mapping[str, Any]) -> str:
-    """finetune.json as people read it."""
+    """The content of finetune.json as text for people."""
     metrics = content["metrics"]
     learned = metrics["learned_from"]
     lines = [

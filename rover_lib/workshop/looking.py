@@ -1,10 +1,11 @@
-"""Does a policy look, or copy? Its state is its last action, and to repeat that is right most of the time.
+"""Check whether a policy uses its camera, or only repeats its last action, which is right most of the time.
 
     seen = look(fp32, report)
     for warning in seen.warnings(): ...
 
-Each frame is planned again with the state of another one, and with the picture of another one. A policy that only
-copies moves by the states and not by the pictures: it drives well on recordings, and off the track on a car.
+The policy's state is its last action. So for each frame it plans twice more: with the state of another frame, and with
+the picture of another frame. The plans of a policy that only copies change with the state and not with the picture.
+Such a policy looks good on recordings, but on a car it leaves the track.
 """
 
 import math
@@ -19,15 +20,15 @@ from rover_lib.workshop.compare import Fidelity, thinned
 from rover_lib.workshop.judge import follows, shown_pct
 from rover_lib.workshop.progress import Progress, silent
 
-FRAMES = 24  # planned twice more each, by FP32 alone: half a minute for a policy of full size
+FRAMES = 24  # each is planned twice more, in FP32 only: half a minute for a policy of full size
 
 
 @dataclass(frozen=True, eq=False)
 class Looking:
-    """How far plans move, mean over frames and steps, in units of each action.
+    """How much plans change, as a mean over frames and steps, in units of each action.
 
-    by_picture: with another frame's picture and their own state; by_state: the other way round; apart: how far the
-    plans of the two frames are from each other. Each (A,) float64.
+    by_picture: with another frame's picture and the frame's own state. by_state: with another frame's state and the
+    frame's own picture. apart: the difference between the plans of the two frames. Each is (A,) float64.
     """
 
     report: Fidelity
@@ -37,7 +38,7 @@ class Looking:
     apart: np.ndarray
 
     def summary(self) -> dict[str, Any]:
-        """By action and unit, for compare.json; percentages of an action that is not judged are None."""
+        """The same by action and unit, for compare.json; the percentages of an action that is not judged are None."""
         summary: dict[str, Any] = {"frames": self.frames}
         for i, action in enumerate(self.report.action_names):
             for name, moved in (("by_picture", self.by_picture), ("by_state", self.by_state), ("apart", self.apart)):
@@ -47,7 +48,7 @@ class Looking:
         return summary
 
     def table(self) -> Table:
-        """The same as a table for people."""
+        """The same as a table for people to read."""
         found, rows = self.summary(), []
         for action in self.report.action_names:
             pct = (shown_pct(found[f"{action}_{name}_pct"]).strip() for name in ("by_picture", "by_state", "apart"))
@@ -55,7 +56,7 @@ class Looking:
         return Table(("a plan moves by", "another picture", "another state", "both"), rows)
 
     def warnings(self) -> list[str]:
-        """What must be known before anybody drives it: an action that does not follow the camera."""
+        """A warning to read before anybody drives with this policy, if an action does not follow the camera."""
         judged = [(i, a) for i, a in enumerate(self.report.action_names) if self.report.pct(a) is not None]
         if judged and all(self.apart[i] == 0 for i, _ in judged):
             return ["this policy plans the same whatever it is shown"]
@@ -75,10 +76,10 @@ class Looking:
 
 
 def look(policy: Any, report: Fidelity, frames: int = FRAMES, progress: Progress = silent) -> Looking:
-    """Swap pictures and states among frames of a comparison whose reference `policy` is.
+    """Swap pictures and states between the frames of a comparison whose reference is `policy`.
 
-    The other frame is the one half of all frames away: of another drive, where there are several. Raises PolicyError
-    for fewer than two frames.
+    Each frame is swapped with the one half of all frames away, which is from another drive if there are several. Raises
+    PolicyError for fewer than two frames.
     """
     rows = thinned(range(len(report.samples)), frames)
     if len(rows) < 2:

@@ -1,10 +1,10 @@
-"""Do a policy's numbers fit the recordings? The wrong statistics raise nothing: they steer.
+"""Check that a policy's numbers fit the recordings: wrong statistics raise no error, the car just drives badly.
 
     fit = fits(checkpoint, samples, recordings.action_range())
     for warning in fit.warnings(): ...
 
-The policy plans on a few recorded frames. What it predicts must lie where the recorded actions do, and what it is told
-of its state must be of the size that it was trained on, once both are normalised by the checkpoint's statistics.
+The policy plans on a few recorded frames. Its predictions must lie in the range of the recorded actions. And the
+recorded states, normalised by the checkpoint's statistics, must be about as large as in training.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,18 +21,18 @@ from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.judge import Range, constant_actions
 from rover_lib.workshop.samples import Sample, frame_rate_hz, is_another_rate
 
-FRAMES = 12  # planned in FP32: ten seconds for a policy of full size
-BEYOND = 0.5  # of the recorded range, past either end: further than a policy overshoots
+FRAMES = 12  # planned in FP32, which takes ten seconds for a policy of full size
+BEYOND = 0.5  # of the recorded range, past either end; a good policy overshoots less
 MOST_BEYOND_PCT = 5.0
-LEAST_SPREAD = 0.1  # of the recorded spread: what moves less is no driver's
-LARGEST_STATE = 10.0  # standard deviations; those of other units are hundreds
+LEAST_SPREAD = 0.1  # of the recorded spread; a policy that moves less does not drive
+LARGEST_STATE = 10.0  # standard deviations; in wrong units there are hundreds
 
 
 @dataclass(frozen=True)
 class Action:
-    """One action's numbers: recorded and predicted ends, how much is predicted beyond, and the spreads' ratio.
+    """One action's recorded and predicted range, how often predictions lie beyond it, and the ratio of the spreads.
 
-    beyond_pct: of the predicted values, past the recorded range by more than BEYOND of it.
+    beyond_pct: percentage of predicted values that lie outside the recorded range by more than BEYOND of that range.
     """
 
     name: str
@@ -44,8 +44,10 @@ class Action:
 
 @dataclass(frozen=True)
 class Fit:
-    """What `fits` found. largest_state: (S,) by name, of the normalised recorded states, None if they stay raw.
-    plans_hz: the policy's steps a second. other_rates_hz: frames a second, by episode, where they are others.
+    """The result of `fits`.
+
+    largest_state: by name, the largest normalised recorded state; None if states are not normalised. plans_hz: steps
+    per second of the policy's plans. other_rates_hz: frames per second of each episode that has another rate.
     """
 
     frames: int
@@ -55,14 +57,14 @@ class Fit:
     other_rates_hz: dict[str, float]
 
     def table(self) -> Table:
-        """A table for people: where actions were recorded, and where this policy's lie on the same frames."""
+        """A table for people: the ranges of the recorded actions, and of the policy's actions on the same frames."""
         spans = (
             (a.name, *(f"{low:.3g} to {high:.3g}" for low, high in (a.recorded, a.predicted))) for a in self.actions
         )
         return Table(("", "recorded", "predicted"), list(spans))
 
     def warnings(self) -> list[str]:
-        """A sentence for each number that does not fit; the remedy is always the same one."""
+        """A sentence for each number that does not fit."""
         remedy = "are these the recordings, and the statistics, that it was trained with?"
         warnings = []
         for a in self.actions:
@@ -84,7 +86,7 @@ class Fit:
         return warnings
 
     def summary(self) -> dict[str, Any]:
-        """The same as plain JSON types, for load.json."""
+        """The same values as plain JSON types, for load.json."""
         actions = {
             a.name: {"predicted": list(a.predicted), "beyond_pct": a.beyond_pct, "spread": a.spread}
             for a in self.actions
@@ -93,10 +95,10 @@ class Fit:
 
 
 def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mapping[str, Range]) -> Fit:
-    """Plan on a few of the samples in FP32 and hold the plans against what was recorded there.
+    """Plan on a few of the samples in FP32 and compare the plans with the recorded actions.
 
-    samples: of whole episodes, one after the other; the rate of each is held against the policy's. An action that never
-    changes in the recordings is left out: nobody knows how far it may go.
+    samples: of whole episodes, one after the other; each episode's rate is compared with the policy's. An action that
+    never changes in the recordings is left out, because its possible range is not known.
     """
     config, few = checkpoint.config, thinned(samples, FRAMES)
     plans = predictions(ACT(config, checkpoint.weights), [inputs_of(s, config) for s in few]).numpy()

@@ -1,4 +1,4 @@
-"""Other programs: run to their end, or ended in an error that says their last words."""
+"""Run another program to its end; if it fails, the error contains the last lines that it printed."""
 
 import subprocess
 from collections.abc import Mapping
@@ -22,8 +22,8 @@ def run(
 ) -> str:
     """Run a command to its end and return its standard output.
 
-    error: what to raise, with `remedy`, if it cannot be started, fails, or takes longer than timeout_s; the sentence
-    has its name and the last lines that it printed. options: of subprocess.run.
+    error: the type to raise, with `remedy`, if the command cannot be started, fails, or takes longer than timeout_s.
+    The sentence has its name and the last lines that it printed. options: further ones of subprocess.run.
     """
     words = [str(part) for part in command]
     name = Path(words[0]).name
@@ -43,5 +43,5 @@ def run(
 
 
 def last_words(text: str, lines: int = LAST_LINES) -> str:
-    """The last lines that a program printed, in one."""
+    """The last lines that a program printed, joined to one line."""
     return " | ".join(text.strip().splitlines()[-lines:]) or "it printed nothing"

@@ -1,4 +1,4 @@
-"""Progress of what takes long: one type, one way to show nothing, and bars where somebody watches."""
+"""Progress bars for long work: the type of a bar, a silent one, and bars that appear only if somebody watches."""
 
 import os
 import sys
@@ -7,28 +7,28 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-TTY_VARIABLE = "ROVER_PROGRESS_TTY"  # the terminal of who started a run: the notebooks' bars are drawn there
+TTY_VARIABLE = "ROVER_PROGRESS_TTY"  # the terminal where a run was started: the notebooks draw their bars there
 
 T = TypeVar("T")
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 
 
 def silent(items: Iterable[T], **_: object) -> Iterable[T]:
-    """No bar: the default of every function that takes a `progress`."""
+    """Show no bar. This is the default of every function that takes a `progress`."""
     return items
 
 
 def terminal() -> Progress:
-    """A bar where someone watches; nothing in a log."""
+    """A bar if the output is a terminal; nothing if it goes to a log."""
     from tqdm import tqdm
 
     return partial(tqdm, disable=not sys.stderr.isatty(), leave=False)
 
 
 def watched() -> Progress:
-    """A notebook's bar where someone watches; bars in a stored output are noise.
+    """A notebook's bar if somebody watches; in stored outputs, bars would only be noise.
 
-    That is the terminal from which `rover run` was started, or a JupyterLab session.
+    Somebody watches in the terminal where `rover run` was started, or in a JupyterLab session.
     """
     from tqdm import tqdm
 
