@@ -27,6 +27,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import FOR_THIS_RUN, read_params
 from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
 from rover_lib.workshop import judge
+from rover_lib.workshop.hosts import benchmark_of
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import Progress, silent
 
@@ -434,14 +435,11 @@ def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> l
 
 
 def _timed(run: Path) -> dict[str, Any]:
-    """The benchmark of the run's artifacts. One of another host may lie beside it, of what the run was before."""
-    artifact = f"policy_{MODE}.pt"
-    made = read_stage(run / "quantize.json", "quantize")["metrics"]["modes"][MODE]["content_hash"]
-    for path in sorted(run.glob("benchmark-*.json")):
-        content = read_stage(path, "benchmark")
-        if content["inputs"].get(artifact) == made:
-            return content
-    raise SweepError(f"{run}: no benchmark of its {artifact}", remedy="remove that folder, and sweep again")
+    """The benchmark of the run's artifacts."""
+    path = benchmark_of(run, read_stage(run / "quantize.json", "quantize")["metrics"]["modes"])
+    if path is None:
+        raise SweepError(f"{run}: no benchmark of its artifacts", remedy="remove that folder, and sweep again")
+    return read_stage(path, "benchmark")
 
 
 def _beats(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
