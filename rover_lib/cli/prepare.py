@@ -280,14 +280,14 @@ def distill(
     """
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import read_stage
-    from rover_lib.workshop.distill import DistillRecipe, summary
+    from rover_lib.workshop.distill import DistillRecipe, phases_of, summary
     from rover_lib.workshop.distill import distill as teach
     from rover_lib.workshop.student import StudentShape
 
-    recipe = DistillRecipe.of(params(), steps, samples, seed)
     height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
     shape = StudentShape(height, width, **parts)
+    recipe = DistillRecipe.of(params(), steps, samples, seed, phases_of(shape, options["qat"]))
     folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal(), **options)
     content = read_stage(folder / "distill.json", "distill")
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")

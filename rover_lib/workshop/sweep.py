@@ -203,15 +203,16 @@ class Notebooks:
         """The student's checkpoint, in the run's own folder; what was begun goes on."""
         from rover_lib.onboard.params import params
         from rover_lib.workshop.checkpoint_files import written_in
-        from rover_lib.workshop.distill import DistillRecipe, distill
+        from rover_lib.workshop.distill import DistillRecipe, distill, phases_of
         from rover_lib.workshop.student import StudentShape
 
-        options = dict(job.student)
-        recipe = DistillRecipe.of(params(), **{key: options.pop(key, None) for key in ("steps", "samples", "seed")})
         _check_student(job.student)
+        options = dict(job.student)
+        given = {key: options.pop(key, None) for key in ("steps", "samples", "seed")}
         width, _, height = options.pop("size", "x").partition("x")
         qat = options.pop("qat", False)
         shape = StudentShape(int(height) if height else None, int(width) if width else None, **options)
+        recipe = DistillRecipe.of(params(), **given, phases=phases_of(shape, qat))
         made = distill(
             job.checkpoint, job.episodes, job.name, shape, runs_dir=folder, recipe=recipe, qat=qat, device="cpu"
         )
