@@ -235,8 +235,8 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
     found = {name: report.summary(name) for name in others}
     if as_json:
         return show(found, as_json)
-    sizes_mb = {name: policy.path.stat().st_size / 1e6 for name, policy in {"reference": fp32, **others}.items()}
-    click.echo("\n".join(aligned(c.comparison_rows(found, sizes_mb, "reference"))))
+    sizes_mb = {name: policy.path.stat().st_size / 1e6 for name, policy in others.items()}
+    click.echo("\n".join(aligned(c.comparison_rows(found, sizes_mb, fp32.path.stat().st_size / 1e6))))
     click.echo(f"errors on {len(held_out)} held-out frames, of the recorded range, and microseconds of pulse")
 
 
