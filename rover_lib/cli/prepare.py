@@ -235,8 +235,8 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
     found = {name: report.summary(name) for name in others}
     if as_json:
         return show(found, as_json)
-    sizes_mb = {name: policy.path.stat().st_size / 1e6 for name, policy in {"reference": fp32, **others}.items()}
-    click.echo("\n".join(aligned(c.comparison_rows(found, sizes_mb, "reference"))))
+    sizes_mb = {name: policy.path.stat().st_size / 1e6 for name, policy in others.items()}
+    click.echo("\n".join(aligned(c.comparison_rows(found, sizes_mb, fp32.path.stat().st_size / 1e6))))
     click.echo(f"errors on {len(held_out)} held-out frames, of the recorded range, and microseconds of pulse")
 
 
@@ -280,14 +280,14 @@ def distill(
     """
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import read_stage
-    from rover_lib.workshop.distill import DistillRecipe, summary
+    from rover_lib.workshop.distill import DistillRecipe, phases_of, summary
     from rover_lib.workshop.distill import distill as teach
     from rover_lib.workshop.student import StudentShape
 
-    recipe = DistillRecipe.of(params(), steps, samples, seed)
     height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
     shape = StudentShape(height, width, **parts)
+    recipe = DistillRecipe.of(params(), steps, samples, seed, phases_of(shape, options["qat"]))
     folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal(), **options)
     content = read_stage(folder / "distill.json", "distill")
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")

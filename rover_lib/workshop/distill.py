@@ -15,7 +15,7 @@ import math
 import shutil
 import sys
 import zlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -59,6 +59,7 @@ from rover_lib.workshop.student import StudentShape, gmac, initial_weights, stud
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 from rover_lib.workshop.untrusted import numbers
 
+PHASES = ("backbone", "transformer", "together", "qat")
 Notes = dict[str, list[dict[str, Any]]]  # of what a student does without, by part
 NOBODY_DROVE = "Judged on recordings alone: nobody drove."
 
@@ -99,22 +100,38 @@ class DistillRecipe:
 
     @classmethod
     def of(
-        cls, params: dict[str, Any], steps: int | None = None, samples: int | None = None, seed: int | None = None
+        cls,
+        params: dict[str, Any],
+        steps: int | None = None,
+        samples: int | None = None,
+        seed: int | None = None,
+        phases: Collection[str] = PHASES,
     ) -> "DistillRecipe":
-        """That of params.yml, with what is not None in its place. steps: in all. Raises DistillError."""
+        """That of params.yml, with what is not None in its place. steps: in all, of these phases alone. Raises
+        DistillError.
+        """
         recipe = numbers(cls, params["distill"], "params.yml: distill", DistillError)
         if steps is not None:
-            recipe = recipe.of_steps(steps)
+            recipe = recipe.of_steps(steps, phases)
         given = {"samples": samples, "seed": seed}
         return replace(recipe, **{name: value for name, value in given.items() if value is not None})
 
-    def of_steps(self, steps: int) -> "DistillRecipe":
-        """The same with that many steps in all, at least one in each phase."""
+    def of_steps(self, steps: int, phases: Collection[str] = PHASES) -> "DistillRecipe":
+        """The same with that many steps in all, at least one in each of these phases and none in the others."""
         if steps < 1:
             raise DistillError("a student needs at least 1 step", found=steps)
-        names = ("backbone_steps", "transformer_steps", "together_steps", "qat_steps")
-        planned = max(sum(getattr(self, name) for name in names), 1)
-        return replace(self, **{name: max(1, round(steps * getattr(self, name) / planned)) for name in names})
+        planned = {phase: getattr(self, f"{phase}_steps") for phase in PHASES if phase in phases}
+        share = steps / max(sum(planned.values()), 1)
+        counts = {phase: max(1, round(share * count)) for phase, count in planned.items()}
+        return replace(self, **{f"{phase}_steps": counts.get(phase, 0) for phase in PHASES})
+
+
+def phases_of(shape: StudentShape, qat: bool) -> list[str]:
+    """The phases in which a student of that shape learns: one of its teacher's own shape only rounding."""
+    phases = ["backbone"] if (shape.height, shape.width) != (None, None) else []
+    if shape != StudentShape():
+        phases += ["transformer", "together"]
+    return [*phases, "qat"] if qat else phases
 
 
 def distill(

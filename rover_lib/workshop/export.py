@@ -94,7 +94,8 @@ class Parity:
 
     tolerance: of FP32, in action units, or of the largest planned where that is above 1. int8_errors: INT8 may differ
     by at least `tolerance`, and by this many times its own largest error against FP32, because flipped roundings are of
-    the size of quantization itself. vectors: how many samples are stored in the artifact.
+    the size of quantization itself; steering and throttle by no more than `artifact.largest_tolerance`. vectors: how
+    many samples are stored in the artifact.
     """
 
     tolerance: float = 1e-4
@@ -151,6 +152,9 @@ class Exporter:
             errors = (actions - self.float_actions).abs().amax((0, 1))
             for name, error in zip(config.action_names, errors, strict=True):
                 allowed[name] = max(allowed[name], parity.int8_errors * error.item())
+        # What INT8 loses is for the gates to judge; a rover takes no tolerance that would let another plan pass.
+        mode = _mode(policy)
+        allowed = {name: min(most, artifact.largest_tolerance(mode, name)) for name, most in allowed.items()}
         gap = (actions[self.stored] - expected).abs().max().item()
         if gap > max(allowed.values()):
             raise QuantizeError(f"{path}: the written graph differs from the policy by {gap:.3g}; nothing was written")
@@ -187,13 +191,17 @@ def export(
     return Exporter(checkpoint, samples, parity).export(policy, path, calibration)
 
 
+def _mode(policy: ACT | QuantizedPolicy) -> str:
+    return policy.scheme.mode if isinstance(policy, QuantizedPolicy) else "fp32"
+
+
 def _manifest(
     policy: ACT | QuantizedPolicy, checkpoint: Checkpoint, calibration: Calibration | None, form: Form
 ) -> dict[str, Any]:
     """What the artifact says of itself, apart from what only its graph can tell."""
     config = checkpoint.config
     scheme = policy.scheme if isinstance(policy, QuantizedPolicy) else None
-    mode = scheme.mode if scheme else "fp32"
+    mode = _mode(policy)
     arithmetic = {"fp32": "float", "dynamic": "dynamic"}
     return {
         "schema": artifact.SCHEMA,

@@ -80,6 +80,26 @@ def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
     return Benchmarks({h: by_host[h] for h in sorted(by_host, key=lambda h: (h != THIS, h))}, unusable)
 
 
+def benchmark_of(run_dir: Path | str, made: Mapping[str, Mapping[str, Any]]) -> Path | None:
+    """The benchmark of a run's own artifacts, this machine's before another's; None if there is none.
+
+    made: quantize.json's modes. A run that is made again keeps the benchmarks of other hosts, which are of what it was
+    before. Raises RoverError for a damaged file.
+    """
+    paths = sorted(Path(run_dir).glob("benchmark-*.json"))
+    for path in sorted(paths, key=lambda p: p.stem != f"benchmark-{socket.gethostname()}"):
+        if is_of(read_stage(path, "benchmark")["inputs"], made):
+            return path
+    return None
+
+
+def is_of(inputs: Mapping[str, str], made: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Whether a stage's inputs are some of a run's artifacts, and no others. made: quantize.json's modes."""
+    ours = {f"policy_{mode}.pt": each["content_hash"] for mode, each in made.items()}
+    named = {file: digest for file, digest in inputs.items() if file in ours}
+    return bool(named) and all(ours[file] == digest for file, digest in named.items())
+
+
 def _check(path: Path, content: Mapping[str, Any]) -> None:
     """Raise RoverError unless the file has everything that tables and figures read."""
     try:

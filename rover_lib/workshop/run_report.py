@@ -6,7 +6,6 @@ print(text(content["metrics"]))
 
 import os
 import re
-import socket
 from base64 import b64encode
 from collections.abc import Mapping
 from html import escape
@@ -18,10 +17,11 @@ from rover_lib.onboard.columns import aligned, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+from rover_lib.workshop.hosts import benchmark_of, is_of
 from rover_lib.workshop.run_folder import says_how_it_was_taught
 from rover_lib.workshop.verdict import CALLED, Names, against, count, error_pct, verdict
 
-STAGES = ("load", "quantize", "compare", "benchmark")  # without which there is nothing to judge
+STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
 LATER = ("arm", "distill")  # that `make arm` and `rover world students` add to a run
 PAGE = "report.html"
 FIGURES = {  # of the run's folder, with what each shows
@@ -48,14 +48,17 @@ def write(run_dir: Path | str) -> dict[str, Any]:
     """Judge a run and leave run.json and report.html in its folder. Returns run.json's content.
 
     Made anew of what is there, so that `make arm` and `rover world students` count once they were made. Raises
-    RoverError where a stage is missing or lacks what is to be judged, and where an artifact is another one than was
-    compared.
+    RoverError where a stage is missing, is of other artifacts or lacks what is to be judged, and where an artifact is
+    another one than was compared.
     """
     folder, p = Path(run_dir), params()
     files = _files(folder)
     contents = {stage: read_stage(path, stage) for stage, path in files.items()}
     try:
-        _refuse_other_artifacts(folder, contents["quantize"]["metrics"]["modes"])
+        made = contents["quantize"]["metrics"]["modes"]
+        _refuse_other_artifacts(folder, made, contents["compare"]["inputs"])
+        files["benchmark"] = _benchmark(folder, made)
+        contents["benchmark"] = read_stage(files["benchmark"], "benchmark")
         given = contents["load"]["params"]
         names = Names(*(_typed(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
         judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names)
@@ -76,13 +79,14 @@ def write(run_dir: Path | str) -> dict[str, Any]:
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    """The JSON of each stage; the benchmark is this machine's, where there is one. Raises RoverError."""
+    """The JSON of each stage but the benchmark. Raises RoverError for one that is missing, and without a benchmark."""
     if not folder.is_dir():
         raise RoverError(f"{folder}: there is no such run", remedy="rover list shows the runs that there are")
-    benchmarks = sorted(folder.glob("benchmark-*.json"), key=lambda p: p.stem != f"benchmark-{socket.gethostname()}")
     files = {stage: folder / f"{stage}.json" for stage in (*STAGES, *LATER)}
-    files["benchmark"] = benchmarks[0] if benchmarks else folder / "benchmark-<host>.json"
-    if missing := [files[stage].name for stage in STAGES if not files[stage].is_file()]:
+    missing = [files[stage].name for stage in STAGES if not files[stage].is_file()]
+    if not any(folder.glob("benchmark-*.json")):
+        missing.append("benchmark-<host>.json")
+    if missing:
         raise RoverError(
             f"{folder}: no verdict without {', '.join(missing)}", remedy="rover run makes them, of a checkpoint"
         )
@@ -92,8 +96,25 @@ def _files(folder: Path) -> dict[str, Path]:
     return files
 
 
-def _refuse_other_artifacts(folder: Path, modes: Mapping[str, Any]) -> None:
-    """Raise RoverError for a policy_<mode>.pt that was put there later: all figures are of another."""
+def _benchmark(folder: Path, modes: Mapping[str, Any]) -> Path:
+    """The benchmark of the run's own artifacts. Raises RoverError if there is none."""
+    path = benchmark_of(folder, modes)
+    if path is None:
+        raise RoverError(
+            f"{folder}: no benchmark of its artifacts, only of others", remedy="'rover run' of its checkpoint times it"
+        )
+    return path
+
+
+def _refuse_other_artifacts(folder: Path, modes: Mapping[str, Any], compared: Mapping[str, str]) -> None:
+    """Raise RoverError for a comparison of other artifacts, and for a policy_<mode>.pt that was put there later: all
+    figures are of another. modes: quantize.json's. compared: compare.json's inputs.
+    """
+    if not is_of(compared, modes):
+        raise RoverError(
+            f"{folder / 'compare.json'}: is of other artifacts than this run's",
+            remedy="'rover run' of its checkpoint compares them",
+        )
     for mode, made in modes.items():
         path = folder / f"policy_{mode}.pt"
         if path.is_file() and (found := content_hash(path)) != made["content_hash"]:

@@ -27,6 +27,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import FOR_THIS_RUN, params, read_params
 from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
 from rover_lib.workshop import judge
+from rover_lib.workshop.hosts import benchmark_of
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import Progress, silent
 
@@ -219,15 +220,16 @@ class Notebooks:
     def _taught(self, job: Job, folder: Path) -> Path:
         """The student's checkpoint, in the run's own folder; what was begun goes on."""
         from rover_lib.workshop.checkpoint_files import written_in
-        from rover_lib.workshop.distill import DistillRecipe, distill
+        from rover_lib.workshop.distill import DistillRecipe, distill, phases_of
         from rover_lib.workshop.student import StudentShape
 
-        options = dict(job.student)
-        recipe = DistillRecipe.of(params(), **{key: options.pop(key, None) for key in ("steps", "samples", "seed")})
         _check_student(job.student)
+        options = dict(job.student)
+        given = {key: options.pop(key, None) for key in ("steps", "samples", "seed")}
         width, _, height = options.pop("size", "x").partition("x")
         qat = options.pop("qat", False)
         shape = StudentShape(int(height) if height else None, int(width) if width else None, **options)
+        recipe = DistillRecipe.of(params(), **given, phases=phases_of(shape, qat))
         made = distill(
             job.checkpoint, job.episodes, job.name, shape, runs_dir=folder, recipe=recipe, qat=qat, device="cpu"
         )
@@ -451,14 +453,11 @@ def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> l
 
 
 def _timed(run: Path) -> dict[str, Any]:
-    """The benchmark of the run's artifacts. One of another host may lie beside it, of what the run was before."""
-    artifact = f"policy_{MODE}.pt"
-    made = read_stage(run / "quantize.json", "quantize")["metrics"]["modes"][MODE]["content_hash"]
-    for path in sorted(run.glob("benchmark-*.json")):
-        content = read_stage(path, "benchmark")
-        if content["inputs"].get(artifact) == made:
-            return content
-    raise SweepError(f"{run}: no benchmark of its {artifact}", remedy="remove that folder, and sweep again")
+    """The benchmark of the run's artifacts."""
+    path = benchmark_of(run, read_stage(run / "quantize.json", "quantize")["metrics"]["modes"])
+    if path is None:
+        raise SweepError(f"{run}: no benchmark of its artifacts", remedy="remove that folder, and sweep again")
+    return read_stage(path, "benchmark")
 
 
 def _beats(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

@@ -265,8 +265,14 @@ def test_a_run_without_fp32_is_refused(tmp_path):
         compare.load_policies(tmp_path)
 
 
+def test_an_artifact_may_be_called_reference_too():
+    summary = {f"steering_{which}_pct": 0.5 for which in ("mae", "p95", "max")}
+    rows = compare.comparison_rows({"reference": summary}, {"reference": 10.0}, 40.0)
+    assert [row[:3] for row in rows[1:]] == [["reference", "40.0", "1.0"], ["reference", "10.0", "4.0"]]
+
+
 def test_a_comparison_has_each_action_in_both_units():
     summary = {f"steering_{which}_pct": 0.5 for which in ("mae", "p95", "max")} | {"steering_mae_us": 3.0}
-    rows = compare.comparison_rows({"static": summary}, {"fp32": 40.0, "static": 10.0}, "fp32")
+    rows = compare.comparison_rows({"static": summary}, {"static": 10.0}, 40.0)
     assert rows[0][3:] == ["steering mean %", "p95", "largest", "mean us"]
-    assert rows[1][:3] == ["fp32", "40.0", "1.0"] and rows[2][2:] == ["4.0", "0.50", "0.50", "0.50", "3.00"]
+    assert rows[1][:3] == ["reference", "40.0", "1.0"] and rows[2][2:] == ["4.0", "0.50", "0.50", "0.50", "3.00"]

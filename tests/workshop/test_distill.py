@@ -418,3 +418,19 @@ def test_a_recipe_of_few_steps_keeps_all_phases(recipe, steps):
     short = recipe.of_steps(steps)
     phases = short.backbone_steps, short.transformer_steps, short.together_steps, short.qat_steps
     assert min(phases) >= 1 and abs(sum(phases) - steps) <= 4
+
+
+@pytest.mark.parametrize(
+    ("shape", "qat", "phases"),
+    [
+        (SHAPE, False, {"backbone", "transformer", "together"}),
+        (SHAPE, True, {"backbone", "transformer", "together", "qat"}),
+        (StudentShape(decoder_layers=1), False, {"transformer", "together"}),
+        (StudentShape(), True, {"qat"}),
+    ],
+)
+def test_steps_are_shared_by_the_phases_that_it_learns_in(shape, qat, phases):
+    short = DistillRecipe.of(params(), steps=1000, phases=distill_module.phases_of(shape, qat))
+    counts = {phase: getattr(short, f"{phase}_steps") for phase in distill_module.PHASES}
+    assert {phase for phase, steps in counts.items() if steps} == phases
+    assert abs(sum(counts.values()) - 1000) <= len(phases)

@@ -14,7 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from policies import TINY, lerobot_policy, memory_samples, trainer_content
 
+from rover_lib.onboard.artifact import LARGEST_TOLERANCE
 from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.policy import load_policy
 from rover_lib.workshop import act, observe
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
@@ -454,6 +456,15 @@ def test_same_inputs_same_content(tiny, calibration, made, tmp_path):
     assert hashes == {content_hash(tmp_path / "a.pt")}
     other = export(ACT(tiny.config, tiny.weights), tiny, tmp_path / "c.pt", samples=memory_samples(2))
     assert other not in hashes
+
+
+def test_a_policy_that_loses_much_by_int8_is_an_artifact_all_the_same(tiny, calibration, tmp_path):
+    """What it loses is for the gates to judge; what may differ on a car stays within what a reader takes."""
+    bias = tiny.weights["action_head.bias"] + torch.tensor([0.0, 0.5])
+    off = ACT(tiny.config, {**tiny.weights, "action_head.bias": bias})
+    export(q.QuantizedPolicy(Scheme(), tiny.config, off, {}), tiny, tmp_path / "a.pt", memory_samples(2), calibration)
+    manifest = load_policy(tmp_path / "a.pt").manifest
+    assert manifest["parity"]["tolerance"]["throttle"] == LARGEST_TOLERANCE["int8"]
 
 
 def test_the_optimizer_is_not_in_the_artifact(tiny_policy, artifacts):

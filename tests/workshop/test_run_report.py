@@ -58,7 +58,40 @@ def test_figures_of_another_artifact_are_no_verdict(run_dir, artifacts):
     stage = read_stage(run_dir / "quantize.json", "quantize")
     stage["metrics"]["modes"]["static"]["content_hash"] = content_hash(artifacts["static"])
     (run_dir / "quantize.json").write_text(json.dumps(stage))
+    for path in (run_dir / "compare.json", next(run_dir.glob("benchmark-*.json"))):
+        content = json.loads(path.read_text())
+        content["inputs"]["policy_static.pt"] = content_hash(artifacts["static"])
+        path.write_text(json.dumps(content))
     report.write(run_dir)
+
+
+def of_another_run(path):
+    content = json.loads(path.read_text())
+    content["inputs"] = {name: "0" * 64 for name in content["inputs"]}
+    for timed in content["metrics"].get("artifacts", {}).values():
+        timed["latency_p50_ms"] = 9999.0
+    return json.dumps(content)
+
+
+def test_times_of_what_the_run_was_before_are_no_verdict(run_dir):
+    """A run that is made again keeps the benchmarks of other hosts."""
+    (own,) = run_dir.glob("benchmark-*.json")
+    (run_dir / "benchmark-a-host.json").write_text(of_another_run(own))
+    content = report.write(run_dir)
+    assert own.name in content["inputs"] and "benchmark-a-host.json" not in content["inputs"]
+    assert all(mode["latency_p50_ms"] < 9999 for mode in content["metrics"]["modes"])
+    own.unlink()
+    (run_dir / "run.json").unlink()
+    with pytest.raises(RoverError, match="no benchmark of its artifacts"):
+        report.write(run_dir)
+    assert not (run_dir / "run.json").exists()
+
+
+def test_a_comparison_of_what_the_run_was_before_is_no_verdict(run_dir):
+    (run_dir / "compare.json").write_text(of_another_run(run_dir / "compare.json"))
+    with pytest.raises(RoverError, match=r"compare\.json: is of other artifacts than this run's"):
+        report.write(run_dir)
+    assert not (run_dir / "run.json").exists()
 
 
 def test_leaves_the_same_verdict_as_json_page_and_words(run_dir):
