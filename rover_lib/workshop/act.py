@@ -42,6 +42,12 @@ EMBEDDINGS = {
 }
 
 
+def backbone_blocks(backbone: str) -> list[str]:
+    """LeRobot's names of a backbone's residual blocks, in the order of the data."""
+    _, depths, _ = BACKBONES[backbone]
+    return [f"backbone.layer{stage}.{block}" for stage, depth in enumerate(depths, 1) for block in range(depth)]
+
+
 @dataclass(frozen=True)
 class Affine:
     """x * scale + shift, per channel: all of LeRobot's normalisation modes are of this form."""

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_lib.workshop.act import BACKBONES, ActConfig, Weights, norm_gain
+from rover_lib.workshop.act import ActConfig, Weights, backbone_blocks, norm_gain
 from rover_lib.workshop.lessons import BatchedPolicy
 from rover_lib.workshop.refit import Gram, refitted
 
@@ -44,8 +44,7 @@ def without_channels(
     "error_refit_pct"}: how far its second convolution is off on the pictures, see `refit.refitted`.
     """
     made = {name: weight.detach().float().cpu().clone() for name, weight in weights.items()}
-    _, depths, _ = BACKBONES[config.backbone]
-    names = [f"backbone.layer{stage}.{block}" for stage, depth in enumerate(depths, 1) for block in range(depth)]
+    names = backbone_blocks(config.backbone)
     widths = {name: len(made[f"{name}.bn1.weight"]) for name in names}
     names = [name for name in names if kept_of(widths[name], share) < widths[name]]
     notes = []

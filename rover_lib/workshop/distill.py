@@ -46,7 +46,7 @@ from rover_lib.workshop.export import export
 from rover_lib.workshop.fake_quant import RoundedPolicy
 from rover_lib.workshop.judge import Range, not_judged, pct_of_range, shown_pct, worst
 from rover_lib.workshop.lerobot_checkpoint import read_origin
-from rover_lib.workshop.lessons import BatchedPolicy, Lessons, in_another_light, judged_ranges, plans_of
+from rover_lib.workshop.lessons import BatchedPolicy, Lessons, as_driven, in_another_light, judged_ranges, plans_of
 from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.quantize import QuantizedPolicy, quantize
@@ -509,14 +509,16 @@ def _int8_errors(
 ) -> dict[str, float | None]:
     """Of static INT8, on the samples: int8_<action>_pct to its own FP32, int8_teacher_<action>_pct to the teacher.
 
-    weights: the student's. rounded: the same in INT8. taught: (n, C, A) of the teacher.
+    weights: the student's. rounded: the same in INT8. taught: (n, C, A), what the teacher would drive; the student's
+    plans are clipped like them to be compared.
     """
     inputs = [inputs_of(s, work.config) for s in samples]
     exact, int8 = (predictions(policy, inputs) for policy in (ACT(work.config, weights), rounded.module))
+    driven = torch.from_numpy(as_driven(int8.numpy(), work.config.action_names))
     errors: dict[str, float | None] = {}
     for i, (action, recorded) in enumerate(work.opened.recordings.action_range().items()):
-        for name, other in (("int8", exact), ("int8_teacher", torch.from_numpy(taught))):
-            off = (int8[..., i] - other[..., i]).abs().mean().item()
+        for name, own, other in (("int8", int8, exact), ("int8_teacher", driven, torch.from_numpy(taught))):
+            off = (own[..., i] - other[..., i]).abs().mean().item()
             errors[f"{name}_{action}_pct"] = pct_of_range(off, recorded)
     return errors
 

@@ -136,8 +136,7 @@ class Exporter:
         calibration: of a quantized policy, for the manifest. Raises QuantizeError if what was written does not give
         what the policy gave, or anything that is not finite.
         """
-        checkpoint, parity = self.checkpoint, self.parity
-        config = checkpoint.config
+        checkpoint, config = self.checkpoint, self.checkpoint.config
         module: nn.Module = policy.module if isinstance(policy, QuantizedPolicy) else policy
         form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(module, config)
         # A slow engine's eager form is not asked more than tells whether the writing went well.
@@ -145,19 +144,19 @@ class Exporter:
         actions = form.predict(self.inputs)
         if not torch.isfinite(actions).all():
             raise QuantizeError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
-        # Float rounds in proportion: an arm's degrees are a hundred times a car's shares.
-        sizes = actions.abs().amax((0, 1)).clamp(min=1).tolist()
-        allowed = {n: parity.tolerance * size for n, size in zip(config.action_names, sizes, strict=True)}
-        if isinstance(policy, QuantizedPolicy):
-            errors = (actions - self.float_actions).abs().amax((0, 1))
-            for name, error in zip(config.action_names, errors, strict=True):
-                allowed[name] = max(allowed[name], parity.int8_errors * error.item())
+        # By the policy's own error: by what was written, the limit would grow with what went wrong in writing.
+        limits = self._tolerance(policy, expected, self.stored)
+        gaps = (actions[self.stored] - expected).abs().amax((0, 1)).tolist()
+        for (name, most), gap in zip(limits.items(), gaps, strict=True):
+            if not gap <= most:  # NaN is not within
+                raise QuantizeError(
+                    f"{path}: {name} of the written graph differs from the policy's by {gap:.3g}; nothing was written"
+                )
         # What INT8 loses is for the gates to judge; a rover takes no tolerance that would let another plan pass.
-        mode = _mode(policy)
-        allowed = {name: min(most, artifact.largest_tolerance(mode, name)) for name, most in allowed.items()}
-        gap = (actions[self.stored] - expected).abs().max().item()
-        if gap > max(allowed.values()):
-            raise QuantizeError(f"{path}: the written graph differs from the policy by {gap:.3g}; nothing was written")
+        allowed = {
+            name: min(most, artifact.largest_tolerance(_mode(policy), name))
+            for name, most in self._tolerance(policy, actions, np.arange(len(actions))).items()
+        }
         vectors = {
             "state": np.stack([self.inputs[i][0][0].numpy() for i in self.stored]),
             "chunk": np.stack([actions[i].numpy() for i in self.stored]),
@@ -177,6 +176,19 @@ class Exporter:
             },
         }
         return form.save(path, manifest, vectors)
+
+    def _tolerance(self, policy: ACT | QuantizedPolicy, actions: Tensor, rows: np.ndarray) -> dict[str, float]:
+        """How far another computation of a policy's actions may be off, by action, in its units.
+
+        actions: (n, C, A), of the policy; rows: of the samples that they answer, (n,).
+        """
+        # Float rounds in proportion: an arm's degrees are a hundred times a car's shares.
+        sizes = actions.abs().amax((0, 1)).clamp(min=1).tolist()
+        allowed = [self.parity.tolerance * size for size in sizes]
+        if isinstance(policy, QuantizedPolicy):
+            errors = (actions - self.float_actions[rows]).abs().amax((0, 1)).tolist()
+            allowed = [max(a, self.parity.int8_errors * e) for a, e in zip(allowed, errors, strict=True)]
+        return dict(zip(self.checkpoint.config.action_names, allowed, strict=True))
 
 
 def export(

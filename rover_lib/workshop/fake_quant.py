@@ -23,6 +23,7 @@ from rover_lib.workshop.act import (
     Columns,
     Pair,
     Weights,
+    backbone_blocks,
     block_of,
     fits_columns,
     folded,
@@ -137,13 +138,12 @@ def parameters(config: ActConfig, weights: Mapping[str, Tensor]) -> Iterator[tup
 
     stem = folded(w.at("backbone.conv1"), w.at("backbone.bn1"))
     yield "backbone.stem.0", of_columns(*stem, config.image_norm[0]) if fits_columns(config) else stem
-    kind, depths, _ = BACKBONES[config.backbone]
-    for stage, depth in enumerate(depths, 1):
-        for name in (f"backbone.layer{stage}.{block}" for block in range(depth)):
-            for i, folded_pair in enumerate(folded_block(w.at(name), kind)):
-                yield f"{name}.body.{2 * i}", folded_pair
-            if f"{name}.downsample" in w:
-                yield f"{name}.shortcut", folded(w.at(f"{name}.downsample.0"), w.at(f"{name}.downsample.1"))
+    kind, _, _ = BACKBONES[config.backbone]
+    for name in backbone_blocks(config.backbone):
+        for i, folded_pair in enumerate(folded_block(w.at(name), kind)):
+            yield f"{name}.body.{2 * i}", folded_pair
+        if f"{name}.downsample" in w:
+            yield f"{name}.shortcut", folded(w.at(f"{name}.downsample.0"), w.at(f"{name}.downsample.1"))
     yield "image_project", pair(w.at("encoder_img_feat_input_proj"))
     yield "state_project", pair(w.at("encoder_robot_state_input_proj"))
     if config.pre_norm:

@@ -105,8 +105,12 @@ def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progres
         frames = torch.from_numpy(np.stack([prepare_frame(s.frame_bgr(), *size) for s in block]))
         states = torch.from_numpy(np.stack([s.state for s in block]).astype(np.float32))
         plans.append(policy(frames.to(device), states.to(device)).cpu().numpy())
-    low, high = action_limits(policy.config.action_names, this_car())
-    return np.concatenate(plans).clip(low, high)
+    return as_driven(np.concatenate(plans), policy.config.action_names)
+
+
+def as_driven(plans: np.ndarray, action_names: Sequence[str]) -> np.ndarray:
+    """Plans, (n, C, A), clipped to what a pulse can express."""
+    return plans.clip(*action_limits(action_names, this_car()))
 
 
 def judged_ranges(action_range: Mapping[str, tuple[float, float]]) -> np.ndarray:

@@ -434,3 +434,16 @@ def test_steps_are_shared_by_the_phases_that_it_learns_in(shape, qat, phases):
     counts = {phase: getattr(short, f"{phase}_steps") for phase in distill_module.PHASES}
     assert {phase for phase, steps in counts.items() if steps} == phases
     assert abs(sum(counts.values()) - 1000) <= len(phases)
+
+
+def test_int8_is_held_against_what_its_teacher_would_drive(monkeypatch):
+    """Both plan the same beyond what a pulse can express, where the teacher's plans are clipped."""
+    plans = np.float32([[[1.5, -0.2], [0.5, 0.1]]])
+    monkeypatch.setattr(distill_module, "predictions", lambda policy, inputs: torch.from_numpy(plans))
+    monkeypatch.setattr(distill_module, "ACT", lambda config, weights: None)
+    ranges = {"steering": (-1.0, 1.0), "throttle": (0.0, 0.2)}
+    recordings = SimpleNamespace(action_range=lambda: ranges)
+    config, opened = SimpleNamespace(action_names=tuple(ranges)), SimpleNamespace(recordings=recordings)
+    work, taught = SimpleNamespace(config=config, opened=opened), plans.clip((-1, 0), (1, 1))
+    errors = distill_module._int8_errors(work, {}, SimpleNamespace(module=None), [], taught)
+    assert len(errors) == 4 and set(errors.values()) == {0.0}

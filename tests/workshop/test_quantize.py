@@ -467,6 +467,20 @@ def test_a_policy_that_loses_much_by_int8_is_an_artifact_all_the_same(tiny, cali
     assert manifest["parity"]["tolerance"]["throttle"] == LARGEST_TOLERANCE["int8"]
 
 
+def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, tmp_path, monkeypatch):
+    bias = tiny.weights["action_head.bias"] + torch.tensor([0.1, 0.0])
+    off = ACT(tiny.config, {**tiny.weights, "action_head.bias": bias})  # steering may differ, throttle may not
+
+    def badly_written(module, config):
+        return SimpleNamespace(predict=lambda inputs: predictions(module, inputs) + torch.tensor([0.0, 0.5]))
+
+    monkeypatch.setattr("rover_lib.workshop.export.TorchScript", badly_written)
+    policy = q.QuantizedPolicy(Scheme(), tiny.config, off, {})
+    with pytest.raises(QuantizeError, match="throttle of the written graph differs"):
+        export(policy, tiny, tmp_path / "a.pt", memory_samples(2), calibration)
+    assert not (tmp_path / "a.pt").exists()
+
+
 def test_the_optimizer_is_not_in_the_artifact(tiny_policy, artifacts):
     assert "optimizer_state_dict" in trainer_content(tiny_policy)
     acting = 4 * sum(v.numel() for k, v in tiny_policy.state_dict().items() if "vae" not in k) / 1e6
