@@ -549,14 +549,14 @@ class Releases:
         try:
             about = _read_json(folder / ORIGIN)
             if not (NAME.fullmatch(about["name"]) and NAME.fullmatch(about["sha256"])):
-                raise ValueError("its hashes are none")
+                raise ValueError("its name or sha256 is not a hash")
             origin = {key: about["origin"][key] for key in ("file", "host")}
             if not all(isinstance(v, str) and v.isprintable() for v in origin.values()):
-                raise ValueError("its origin is none")
+                raise ValueError("its origin is not printable text")
             size, parts = about["bytes"], about["parts"]
             counts = isinstance(size, int) and isinstance(parts, int)
             if not counts or not 0 < size <= ARCHIVE_BYTES or not 0 < parts <= MOST_PARTS:
-                raise ValueError("its sizes are none")
+                raise ValueError("its sizes are impossible")
             return {"name": about["name"], "sha256": about["sha256"], "origin": origin, "bytes": size, "parts": parts}
         except (OSError, ValueError, KeyError, TypeError, ReleaseError) as e:
             raise ReleaseError(

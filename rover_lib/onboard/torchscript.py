@@ -81,10 +81,10 @@ def check_program(z: zipfile.ZipFile, path: Path | str) -> None:
             _check_opcodes(read_record(z, f"archive/{record}"), OPCODES, {"torch.jit._pickle.build_intlist"})
         attributes = _read_pickle(read_record(z, "archive/data.pkl"), {}, f"{module}.{name}")
         if not isinstance(attributes, _Module):
-            raise Unknown("a module that is none")
+            raise Unknown("data that is not a module")
         stored = {n.removeprefix("constants/"): size for n, size in sizes.items() if n.startswith("constants/")}
         if not isinstance(_read_pickle(read_record(z, "archive/constants.pkl"), stored), tuple):
-            raise Unknown("constants that are none")
+            raise Unknown("constants that are not a tuple")
 
 
 def unknown_operators(graph: Any) -> list[str]:

@@ -46,7 +46,7 @@ def named_weights(path: Path, state: dict[Any, Any], file_bytes: int) -> dict[st
     odd = [k for k, v in state.items() if not isinstance(k, str) or not isinstance(v, Tensor)]
     if odd:
         raise CheckpointError(
-            f"{path}: weights that are no tensors: {listed(odd)}", remedy="save policy.state_dict() as it is"
+            f"{path}: these weights are not tensors: {listed(odd)}", remedy="save policy.state_dict() as it is"
         )
     if outside := [k for k in state if not k.startswith("model.")]:
         raise CheckpointError(f"{path}: names outside 'model.': {listed(outside)}", remedy=IS_IT_WHOLE)

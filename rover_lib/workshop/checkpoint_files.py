@@ -46,7 +46,7 @@ def write_trainer(
     """
     if not trainer_can_hold(config):
         raise CheckpointError(
-            f"{path}: the trainer's format has no place for this policy's normalisation or rate",
+            f"{path}: the trainer's format cannot hold this policy's normalisation or rate",
             remedy="use LeRobot's folder",
         )
     content = {

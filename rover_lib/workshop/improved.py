@@ -96,8 +96,8 @@ def _said(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
     few = [f"{kinds[k]['episodes']} {k}" for k in KINDS if kinds[k]["episodes"] < LEAST_EPISODES]
     if few:
         return None, (
-            f"not to be said whether it is better: held out were only {' and '.join(few)} episodes, and below "
-            f"{LEAST_EPISODES} of a kind chance explains everything; record more, or let it drive"
+            f"undecided whether it is better: held out were only {' and '.join(few)} episodes, and below "
+            f"{LEAST_EPISODES} of a kind no change is more than chance; record more, or let it drive"
         )
     moved = {kind: kinds[kind]["change_points"] for kind in KINDS if kinds[kind]["chance"] < CHANCE}
     if moved.get("old", 0) > 0:
@@ -105,7 +105,7 @@ def _said(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
     if moved.get("new", 0) > 0:
         return False, f"worse: on the new episodes it is {moved['new']:.2f} points further from the human"
     if "new" not in moved:
-        return None, "not to be said whether it is better: on the new episodes the difference is within chance"
+        return None, "undecided whether it is better: on the new episodes the difference may be chance"
     return (
         True,
         f"better: on the new episodes it is {-moved['new']:.2f} points nearer to the human, and no worse on the old",

@@ -58,7 +58,7 @@ def lerobot_folder(path: Path) -> Path | None:
     for steps in (path / "checkpoints", path):
         if found := sorted(p.parent.name for p in steps.glob(f"*/{PRETRAINED}")):
             raise CheckpointError(
-                f"{steps}: which of its checkpoints is the last is not said",
+                f"{steps}: it does not say which of its checkpoints is the last",
                 found=listed(found),
                 remedy=f"give one of them, as in {steps / found[-1]}",
             )
@@ -191,7 +191,9 @@ def _features(folder: Path, raw: Mapping[str, Any], key: str) -> dict[str, tuple
     """Type and shape of each of the config's features, by name."""
     features = raw.get(key) or {}
     if not isinstance(features, dict):
-        raise CheckpointError(f"{folder}/config.json: '{key}' is no object", found=shown(features), remedy=COPY_AGAIN)
+        raise CheckpointError(
+            f"{folder}/config.json: '{key}' is not an object", found=shown(features), remedy=COPY_AGAIN
+        )
     checked = {}
     for name, feature in features.items():
         kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
@@ -249,7 +251,7 @@ class Normaliser:
         texts = isinstance(self.modes, dict) and all(isinstance(v, str) for v in self.modes.values())
         if not texts or not isinstance(self.eps, (int, float)) or not 0 <= self.eps <= 1:
             raise CheckpointError(
-                f"{self.where}: a norm_map of texts and an eps from 0 to 1 are expected",
+                f"{self.where}: norm_map must map names to texts, and eps must be from 0 to 1",
                 found=f"{shown(self.modes)} and {shown(self.eps)}",
                 remedy=COPY_AGAIN,
             )
@@ -292,14 +294,15 @@ class Normaliser:
         )
         if not named:
             raise CheckpointError(
-                f"{self.where}: its steps are no list of objects with a registry_name and a config", remedy=COPY_AGAIN
+                f"{self.where}: its steps are not a list of objects with a registry_name and a config",
+                remedy=COPY_AGAIN,
             )
         return [{**s, "config": s.get("config") or {}} for s in steps]
 
     def _read_statistics(self, folder: Path, name: Any) -> dict[str, Tensor]:
         if not isinstance(name, str) or Path(name).name != name or not name.isprintable():
             raise CheckpointError(
-                f"{self.where}: its state file {shown(name)} is no file of the folder", remedy=COPY_AGAIN
+                f"{self.where}: its state file {shown(name)} is not a file in the folder", remedy=COPY_AGAIN
             )
         return _read_safetensors(folder / name, STATISTICS_BYTES)
 
@@ -332,7 +335,7 @@ class Normaliser:
             )
         if odd := [p for p in pairs[mode] if stats[p].dtype not in FLOATS]:
             raise CheckpointError(
-                f"{self.where}: statistics of '{key}' are no floats ({odd})", remedy="compute them again"
+                f"{self.where}: statistics of '{key}' are not floats ({odd})", remedy="compute them again"
             )
         a, b = (stats[p].double().flatten() for p in pairs[mode])
         if len(a) != size or len(b) != size:

@@ -2,8 +2,8 @@
 
     recordings = load_dataset(Source(Path("my_dataset"), ("throttle", "steering")), chunk=32)
 
-What its numbers mean is read from the names of its features, and said by the user where they have none; it is never
-guessed, because a throttle in the place of a steering angle trains, calibrates and compares without any complaint.
+The meaning of its numbers is read from the names of its features, or given by the user if they have no names. It is
+never guessed: if throttle and steering were swapped, training, calibration and comparison would not notice.
 """
 
 import json
@@ -144,16 +144,17 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
 
 @dataclass(frozen=True)
 class _Exported:
-    """What our own export says of an episode. driver: where nobody intervened; outcome: None: it says nothing."""
+    """What our own export says of an episode. driver: where nobody intervened. outcome: None: not labelled."""
 
     driver: str
     outcome: str | None = None
 
 
 def _exported(root: Path, episodes: int, marked: bool) -> tuple[list[_Exported], tuple[Fault, ...]]:
-    """Of each episode; what is known without it where REPORT is not there, or of other episodes, which is a fault.
+    """What our own export's REPORT says of each episode, and the faults found in it.
 
-    marked: the dataset marks interventions.
+    If there is no REPORT, or one for other episodes (a fault), the result has what is known without it. marked: whether
+    the dataset marks interventions.
     """
     default = [_Exported(POLICY if marked else HUMAN)] * episodes
     path = root / REPORT
@@ -176,7 +177,7 @@ def _exported(root: Path, episodes: int, marked: bool) -> tuple[list[_Exported],
 
 
 def fetched(source: Source) -> Source:
-    """The same, of a dataset on the Hub, as a folder of this machine. Its version is read before gigabytes are."""
+    """The same source, with a dataset of the Hub fetched to a local folder. Its version is checked before gigabytes."""
     given = source.path, "dataset", EpisodeError
     _read_info(hub.fetched(*given, files=("meta/*",)))
     return replace(source, path=hub.fetched(*given))
@@ -192,7 +193,9 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise EpisodeError(f"{path}: not readable as JSON ({shown(str(e))})", remedy=COPY_AGAIN) from None
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if not isinstance(version, str) or not version.startswith("v"):
-        raise EpisodeError(f"{path}: says no version of LeRobot's format", found=shown(version), remedy=COPY_AGAIN)
+        raise EpisodeError(
+            f"{path}: does not name a version of LeRobot's format", found=shown(version), remedy=COPY_AGAIN
+        )
     if version.startswith(("v1", "v2")):
         raise EpisodeError(
             f"{root}: a LeRobotDataset {version}, only v3 is read",
@@ -202,9 +205,9 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise EpisodeError(f"{root}: a LeRobotDataset {shown(version)}, only v3 is known here")
     features, fps = info.get("features"), info.get("fps")
     if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
-        raise EpisodeError(f"{path}: says no frames a second", found=shown(fps), remedy=COPY_AGAIN)
+        raise EpisodeError(f"{path}: does not give a number of frames per second", found=shown(fps), remedy=COPY_AGAIN)
     if not isinstance(features, dict) or not all(_is_feature(f) for f in features.values()):
-        raise EpisodeError(f"{path}: its features are no objects with a dtype and a shape", remedy=COPY_AGAIN)
+        raise EpisodeError(f"{path}: its features are not objects with a dtype and a shape", remedy=COPY_AGAIN)
     return info
 
 
@@ -214,7 +217,7 @@ def _is_feature(feature: Any) -> bool:
 
 
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, tuple[_Camera, ...]]:
-    """Which cameras and which numbers are whose."""
+    """Find the cameras that the policy looks through, and the names and columns of states and actions."""
     features = info["features"]
     keys = camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
     if not keys:
@@ -231,14 +234,15 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
     for key in (STATE, ACTION):
         if key not in features or len(features[key]["shape"]) != 1:
             found = features[key]["shape"] if key in features else listed(features)
-            raise EpisodeError(f"{root}: has no '{key}' that is a row of numbers", found=found, remedy="record one")
+            what = f"{root}: its '{key}' is missing or not a row of numbers"
+            raise EpisodeError(what, found=found, remedy="record one")
     actions, action_order = _named(root, features, ACTION, source.action_names)
     states, state_order = _named(root, features, STATE, _state_names(features, source.action_names))
     return Layout(names, states, actions, float(info["fps"]), state_order, action_order), cameras
 
 
 def _state_names(features: Mapping[str, Any], said: tuple[str, ...]) -> tuple[str, ...]:
-    """A state's own names, or what the user says of the actions, if those were called the same or it has none."""
+    """The state's own names; the user's names of the actions if it has none, or if the actions had the same names."""
     own = _names(features[STATE])
     if own and not (said and own == _names(features[ACTION])):
         return own
@@ -257,8 +261,8 @@ def _named(
     if not names:
         example = ACTION_NAMES if size == len(ACTION_NAMES) else [f"joint_{i}" for i in range(1, size + 1)]
         raise EpisodeError(
-            f"{root}: '{key}' does not say which of its {size} numbers is what",
-            remedy=f"say it once, in the order of its numbers: --action-names {','.join(example)}",
+            f"{root}: '{key}' does not name its {size} numbers",
+            remedy=f"name them in the order of the numbers: --action-names {','.join(example)}",
         )
     if len(names) != size or len(set(names)) != size:
         raise EpisodeError(
@@ -288,7 +292,7 @@ def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int
     shape = list(feature["shape"])
     if len(shape) == 3 and 3 in (shape[0], shape[2]):
         return (shape[0], shape[1]) if shape[2] == 3 else (shape[1], shape[2])
-    raise EpisodeError(f"{root}: '{key}' is no camera in colour", found=shape, remedy="choose another: --camera NAME")
+    raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy="choose another: --camera NAME")
 
 
 def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> None:
@@ -336,7 +340,7 @@ def _opened(root: Path) -> "LeRobotDataset":
 
 @contextmanager
 def _said_of(path: Path, what: str) -> Iterator[None]:
-    """Whatever a loader says of a file, in one sentence."""
+    """Turn any error of a loader into an EpisodeError of one sentence."""
     try:
         yield
     except EpisodeError:
@@ -366,7 +370,7 @@ def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str,
             if broken := np.flatnonzero(~np.isfinite(values)).tolist():
                 raise EpisodeError(
                     f"{root}: {name} of '{key}' is {values[broken[0]]:g} in frame {broken[0]} and {len(broken) - 1} "
-                    "more, which is no number that was recorded",
+                    "more, which cannot have been recorded",
                     remedy="leave those episodes out (lerobot-edit-dataset can), or record them again",
                 )
             if wrong := np.flatnonzero((values < low) | (values > high)).tolist():
@@ -379,7 +383,7 @@ def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str,
 
 
 def _is_mark(feature: Any) -> bool:
-    """Whether it is a yes or a no for each frame."""
+    """Whether a feature is one yes or no for each frame."""
     return bool(feature) and feature["dtype"] == "bool" and list(feature["shape"]) == [1]
 
 

@@ -3,8 +3,9 @@
     with on_this_machine(workers=2) as client:
         failed = sweep(Sheet.read("sweep.yml").jobs(), "runs/sweep", client)
 
-Each run is a folder as any other, with job.json beside its stages. What is there is not made again, so that a sweep
-that was ended goes on where it was. docs/sweep.md has the sheet, clusters, and what a thousand policies take.
+Each run is an ordinary run's folder, with job.json beside its stages. Finished parts are not done again, so that an
+interrupted sweep continues where it was. docs/sweep.md describes the sheet, clusters, and the cost of a thousand
+policies.
 """
 
 import fcntl
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 JOB, REPORT, FIGURE = "job.json", "sweep.json", "sweep.png"
-TIMING = "timing"  # the resource of a worker that has a machine to itself while it works
+TIMING = "timing"  # the Dask resource of a worker that has a machine to itself while it works
 STUDENT_OPTIONS = (  # as of `rover distill`
     "size",
     "decoder_layers",
@@ -70,7 +71,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """What it varies, and a few digits that no other has: stays the same while the sheet grows."""
+        """What the run varies, and a few unique digits. Stays the same when the sheet grows."""
         settings = {**self.student, **self.notebooks, **self.params}
         parts = [Path(self.checkpoint).stem, *(f"{key.split('.')[-1]}{value}" for key, value in settings.items())]
         digits = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:6]
@@ -94,14 +95,14 @@ class Sheet:
 
     @classmethod
     def read(cls, path: Path | str) -> "Sheet":
-        """Paths in the file are taken from where the command is typed. Raises SweepError, ParamsError."""
+        """Paths in the file are relative to the working folder. Raises SweepError, ParamsError."""
         from rover_lib.workshop.run import NAMES, NOTEBOOKS, parameters_of
 
         if not Path(path).exists():
             raise SweepError(f"{path}: not found", remedy=A_SHEET)
         content = read_params(path)
         if unknown := sorted(map(str, set(content) - set(cls.__dataclass_fields__))):
-            raise SweepError(f"{path}: {unknown[0]!r} is nothing that a sheet has",
+            raise SweepError(f"{path}: a sheet has no key {unknown[0]!r}",
                              remedy=f"known are {', '.join(cls.__dataclass_fields__)}")  # fmt: skip
         for key in ("checkpoints", "episodes"):
             if not content.get(key):
@@ -142,12 +143,12 @@ class Sheet:
         ]
         names = [job.name for job in jobs]
         if twice := {name for name in names if names.count(name) > 1}:
-            raise SweepError("a run stands in the sheet twice", found=sorted(twice)[0])
+            raise SweepError("the sheet has the same run twice", found=sorted(twice)[0])
         return jobs
 
 
 def _check_student(student: Mapping[str, Any]) -> None:
-    """Raise SweepError for what `rover distill` would not take as that option, rather than to teach another student."""
+    """Raise SweepError for a value that `rover distill` would refuse or read as something else."""
     for key, value in student.items():
         if key == "size":
             right, what = re.fullmatch(r"\d+x\d+", str(value)) is not None, "WIDTHxHEIGHT"
@@ -189,7 +190,7 @@ def _combinations(values: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any
 
 
 class Work(Protocol):
-    """What is done for a job in the sweep's folder; both parts leave nothing half-made and may be done again."""
+    """The two parts of a job. Both leave nothing half-made in the sweep's folder, and may be repeated."""
 
     def prepare(self, job: Job, folder: Path) -> None: ...
 
@@ -218,7 +219,7 @@ class Notebooks:
             write(folder / job.name)
 
     def _taught(self, job: Job, folder: Path) -> Path:
-        """The student's checkpoint, in the run's own folder; what was begun goes on."""
+        """Teach the student in the run's own folder, or continue; return its checkpoint."""
         from rover_lib.workshop.checkpoint_files import written_in
         from rover_lib.workshop.distill import DistillRecipe, distill, phases_of
         from rover_lib.workshop.student import StudentShape
@@ -260,11 +261,11 @@ def _settings_of(job: Job, folder: Path) -> Iterator[None]:
 def do(part: str, work: Work, job: Job, folder: Path, fingerprint: str) -> str:
     """Do one part of a job, "prepare" or "benchmark", unless it is done. Returns its name.
 
-    fingerprint: of the job's files as the sweep found them. Files that change meanwhile are another sweep's: it finds
-    another one, and makes the run again.
+    fingerprint: of the job's files when the sweep began. If files change meanwhile, the next sweep computes another
+    fingerprint, and makes the run again.
 
-    One process at a time works on a job: where a lost worker is still alive, its successor waits for it, and then finds
-    the work done.
+    Only one process at a time works on a job. If a worker that was thought lost is still alive, its successor waits for
+    it, and then finds the work done.
     """
     with (folder / f".{job.name}.lock").open("w") as lock:
         fcntl.lockf(lock, fcntl.LOCK_EX)  # which works on a network's file systems too
@@ -278,7 +279,7 @@ def do(part: str, work: Work, job: Job, folder: Path, fingerprint: str) -> str:
 
 
 def parts_done(job: Job, folder: Path, fingerprint: str) -> list[str]:
-    """What is done of a job, of the very files that it names. A job.json that cannot be read counts as none."""
+    """The finished parts of a job, made from exactly these files. Empty if job.json cannot be read."""
     try:
         content = json.loads((folder / job.name / JOB).read_text())
         return list(content["done"]) if content["fingerprint"] == fingerprint else []
@@ -287,8 +288,10 @@ def parts_done(job: Job, folder: Path, fingerprint: str) -> list[str]:
 
 
 def fingerprints(jobs: Sequence[Job]) -> dict[str, str]:
-    """A hash for each job, by its name, that changes with the checkpoint's and the recordings' files: with their names,
-    sizes and times, as hashing their content takes long. A place that many jobs have is looked through once.
+    """A hash for each job, by its name, which changes with the files of its checkpoint and recordings.
+
+    It is of their names, sizes and times, because hashing their content takes long. Files that many jobs share are
+    looked up once.
     """
     places = {place for job in jobs for place in (job.checkpoint, job.episodes)}
     found = {place: _files_in(Path(place)) for place in places}
@@ -309,7 +312,7 @@ def _files_in(place: Path) -> bytes:
 
 @contextmanager
 def on_this_machine(workers: int | None = None) -> Iterator["Client"]:
-    """A Dask of this machine's own: that many processes, or one for each two cores; the first may time."""
+    """A local Dask cluster of `workers` processes, or one for every two cores. Only the first may run benchmarks."""
     from distributed import Client, Nanny, Scheduler, SpecCluster
 
     count = workers or max(1, (os.cpu_count() or 1) // 2)
@@ -329,7 +332,7 @@ def on_this_machine(workers: int | None = None) -> Iterator["Client"]:
 
 @contextmanager
 def on_cluster(address: str) -> Iterator["Client"]:
-    """A Dask that somebody else runs. Raises SweepError where it does not answer, or no worker of it may time."""
+    """Connect to a running Dask cluster. Raises SweepError if it does not answer, or no worker may run benchmarks."""
     from distributed import Client
 
     try:
@@ -358,11 +361,11 @@ def sweep(
     work: Work | None = None,
     progress: Progress = silent,
 ) -> dict[str, str]:
-    """Do what is missing of these jobs. Returns a sentence for each that failed, by its name; the others are whole.
+    """Do the missing parts of these jobs. Returns a sentence for each failed job, by its name; all others are complete.
 
-    together: time a run as soon as it is prepared, on a worker with a machine of its own, while others prepare; else
-    all benchmarks come after all that would disturb them. A worker that dies costs what it was doing: another does it
-    again, three times at most. Ended at any moment, the same call goes on.
+    together: benchmark a run as soon as it is prepared, on a worker with a machine of its own, while others prepare.
+    Otherwise all benchmarks come last, when nothing disturbs them. If a worker dies, another repeats what it was doing,
+    at most three times. After an interruption, the same call continues.
     """
     from distributed import as_completed
 

@@ -542,12 +542,16 @@ PACKED = {
         "not what 'rover release pack' writes",
     ),
     "a long description": ("release.json", lambda p: p.write_text(" " * 9_000_000), "not what 'rover release pack'"),
-    "a billion parts": ("release.json", describes(parts=10**9, bytes=10**9), "its sizes are none"),
-    "a terabyte": ("release.json", describes(bytes=10**12), "its sizes are none"),
-    "less than nothing": ("release.json", describes(bytes=-1), "its sizes are none"),
+    "a billion parts": ("release.json", describes(parts=10**9, bytes=10**9), "its sizes are impossible"),
+    "a terabyte": ("release.json", describes(bytes=10**12), "its sizes are impossible"),
+    "less than nothing": ("release.json", describes(bytes=-1), "its sizes are impossible"),
     "fewer bytes than there are": ("release.json", describes(bytes=1000), "larger than it can be"),
-    "another name": ("release.json", describes(name="../../harm"), "its hashes are none"),
-    "a terminal's commands": ("release.json", describes(origin={"file": "\x1b[2J", "host": ""}), "its origin is none"),
+    "another name": ("release.json", describes(name="../../harm"), "its name or sha256 is not a hash"),
+    "a terminal's commands": (
+        "release.json",
+        describes(origin={"file": "\x1b[2J", "host": ""}),
+        "its origin is not printable text",
+    ),
 }
 
 

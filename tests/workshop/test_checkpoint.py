@@ -702,7 +702,7 @@ def test_what_lerobot_train_leaves_is_found(tmp_path):
     folder = tmp_path / "out/checkpoints/000020/pretrained_model"
     for part in (policy, inner, outer):
         part.save_pretrained(folder)
-    with pytest.raises(CheckpointError, match="which of its checkpoints is the last is not said, found 000020"):
+    with pytest.raises(CheckpointError, match="it does not say which of its checkpoints is the last, found 000020"):
         load_checkpoint(tmp_path / "out")  # copied by what leaves links out
     (tmp_path / "out/checkpoints/last").symlink_to("000020")
     assert lerobot_folder(tmp_path) is None

@@ -58,7 +58,7 @@ def test_names_stay_while_the_sheet_grows(sheet):
     [
         ({"checkpoints": "left out"}, "no 'checkpoints' in it"),
         ({"episodes": ["a", "b"]}, "episodes must be one folder"),
-        ({"checkpoint": "a.pth"}, "'checkpoint' is nothing that a sheet has"),
+        ({"checkpoint": "a.pth"}, "a sheet has no key 'checkpoint'"),
         ({"notebooks": {"sample": 1}}, "no notebook has a parameter 'sample'"),
         ({"notebooks": {"run_dir": "x"}}, "no notebook has a parameter 'run_dir'"),
         ({"notebooks": [1]}, "notebooks must be a mapping"),
