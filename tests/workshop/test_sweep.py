@@ -84,7 +84,7 @@ def test_a_wrong_sheet_is_a_sentence(sheet, changes, said):
 
 def test_a_key_that_is_no_text_is_a_sentence(tmp_path):
     (tmp_path / "sheet.yml").write_text("1: 2\nfoo: 3\n")
-    with pytest.raises(SweepError, match="'1' is nothing that a sheet has"):
+    with pytest.raises(SweepError, match="a sheet has no key '1'"):
         Sheet.read(tmp_path / "sheet.yml")
 
 
