@@ -417,7 +417,7 @@ def test_a_human_is_recorded(tmp_path):
 def test_an_unplugged_arduino_keeps_what_there_is(tmp_path, monkeypatch, how, says):
     monkeypatch.setattr(module, "SILENT_S", 0.3)
     link = FakeLink()
-    setattr(link, how, 0.3)
+    setattr(link, how, 1.0)
     with FakeCamera().filming() as camera:
         report = record(camera, link, tmp_path, max_seconds=5)
     assert report.seconds < 3

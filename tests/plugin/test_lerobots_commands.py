@@ -321,7 +321,8 @@ def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifac
                 needs.until(lambda: record.process.poll() is not None or waits_for_a_human(record), 30)
                 record.process.send_signal(signal.SIGINT)
             status = record.ended()
-            after = [e.pulse_us for e in board.pulses() if e.pin == "throttle"]
+            after: list[int] = []
+            needs.until(lambda: after.extend(e.pulse_us for e in board.pulses() if e.pin == "throttle") or after, 30)
             assert after and max(after) <= GATES.throttle_max_us  # nothing drives it again
     assert status == -signal.SIGKILL if happens is kill else status != 0
     wanted = {interrupt: "KeyboardInterrupt", take_over: "TakenOver: the human took over"}

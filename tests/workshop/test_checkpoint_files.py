@@ -108,7 +108,7 @@ def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_pat
     with pytest.raises(CheckpointError, match="plans 15 steps a second, found recordings of 30 frames"):
         read.recorded_as(Layout(("cam_front",), rate_hz=30.0))
     assert json.loads((tmp_path / "origin.json").read_text()) == ORIGIN | {"rate_hz": 15.0}
-    with pytest.raises(CheckpointError, match="no place for this policy's normalisation or rate"):
+    with pytest.raises(CheckpointError, match="cannot hold this policy's normalisation or rate"):
         write_trainer(tmp_path / "best_model.pth", slow, weights, 0.25, ORIGIN, **SETTINGS)
     for damaged in ('{"rate_hz": 0}', '{"rate_hz": NaN}', '{"rate_hz": true}'):
         (tmp_path / "origin.json").write_text(damaged)
@@ -129,6 +129,6 @@ def test_other_statistics_beside_the_same_weights_are_another_policy(config, wei
 
 def test_the_trainers_format_has_no_place_for_normalised_actions(config, weights, tmp_path):
     normalised = replace(config, action_unnorm=Affine((0.4, 0.02), (0.1, 0.05)))
-    with pytest.raises(CheckpointError, match="no place for this policy's normalisation"):
+    with pytest.raises(CheckpointError, match="cannot hold this policy's normalisation"):
         write_trainer(tmp_path / "best_model.pth", normalised, weights, 0.25, ORIGIN, **SETTINGS)
     assert not list(tmp_path.iterdir())

@@ -84,7 +84,7 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         ("[]", "does not name a version"),
         (features(front=None), "has no camera, found"),
         (features(left=info()["features"]["observation.images.front"]), "has 2 cameras, found front, left"),
-        (features(action=None), "has no 'action'"),
+        (features(action=None), "its 'action' is missing or not a row of numbers"),
         (
             features(state={"dtype": "float32", "shape": [2, 2]}),
             "its 'observation.state' is missing or not a row of numbers",
