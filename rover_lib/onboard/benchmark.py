@@ -94,7 +94,7 @@ class BenchmarkOptions:
 
     warmup: inferences of each policy that are not counted. iterations: number of rounds. duration_s: instead, a soak
     test: rounds until this time is over, with a time series. at_most_s: limits the time by doing fewer rounds, but at
-    least LEAST_ROUNDS. threads: of the engines; 0: all cores, None: as they are. rate_hz: at most so many inferences
+    least LEAST_ROUNDS. threads: of the engines; 0: all cores, None: as they are. rate_hz: at most that many inferences
     per second, on absolute deadlines, as in a drive; None: as fast as possible. main: the policy whose figures are at
     the top level (None: the first). reference: the policy with whose p50 the others are compared. memory_alone: measure
     each artifact's memory in a process of its own, which takes seconds each.

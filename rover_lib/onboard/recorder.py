@@ -41,7 +41,7 @@ class Recorder:
     """Records an episode while a loop runs: the loop hands over controls, a thread takes frames from the camera.
 
     folder: where the episode appears on close(), named episode_YYYYMMDD_HHMMSS by its start in local time (a second
-    later if that name is taken). about: description of the episode; its fps is measured here. rate_hz: at most so many
+    later if that name is taken). about: description of the episode; its fps is measured here. rate_hz: maximum
     frames per second. most_bytes: size limit of the episode, see room_for(); None: limited by the disk only.
     Raises EpisodeError if there is no room to record; later faults are in `failure`.
     """
