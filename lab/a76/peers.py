@@ -25,8 +25,7 @@ from lab.a76.count import COUNTED, OURS, Counted, Guest, count_artifact, side_by
 from lab.a76.count_run import REFERENCE, chunks_here, errors_pct
 from lab.a76.report import artifact_metrics
 from lab.debian import install_packages, missing_packages
-from rover_lib.onboard.artifact import read_manifest
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.artifact import car_of, read_manifest
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import action_limits
 from rover_lib.onboard.preprocess import prepare_frame
@@ -297,7 +296,7 @@ def peer_metrics(
     if not np.isfinite(counted.chunks).all():
         raise CountError("a peer gave actions that are not finite")
     names = manifest["action_names"]
-    low, high = action_limits(names, this_car())
+    low, high = action_limits(names, car_of(manifest))
     errors = errors_pct(reference, np.clip(counted.chunks, low, high), names, ranges)  # as predict_chunk clips
     frames = {"frames": len(reference), "frames_on_the_core": len(counted.chunks)}
     return artifact_metrics(counted, manifest) | errors | {"reference": REFERENCE} | frames

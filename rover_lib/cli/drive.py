@@ -94,9 +94,9 @@ def log(
     if video:
         from rover_lib.workshop.film import write_film
         from rover_lib.workshop.progress import terminal
-        from rover_lib.workshop.replay import moments
+        from rover_lib.workshop.replay import load_replay
 
-        shown = moments(file, drive, pictures)
+        shown = load_replay(file, drive, pictures)
         width = video_width // 2 * 2
         count = write_film(video, shown, rate_hz=video_hz, width=width, progress=terminal())
         click.echo(f"drawn: {video}, {count} pictures, {video.stat().st_size / 1e6:.2f} MB", err=as_json)

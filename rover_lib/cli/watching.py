@@ -14,7 +14,7 @@ from rover_lib.onboard.cli import open_view
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.host import default_view
 from rover_lib.onboard.kinds import check_kind, kinds_of
-from rover_lib.workshop.replay import show_replay
+from rover_lib.workshop.replay import load_replay
 from rover_lib.world.child import Child
 
 
@@ -31,7 +31,7 @@ def watch(file: Path, drive: int, options: dict[str, Any]) -> None:
     """
     kinds = kinds_of(file)
     if {"flight log", "recordings"} & set(kinds):
-        return open_view(**options, opened=open_browser, replay=show_replay(file, drive))
+        return open_view(**options, opened=open_browser, replay=load_replay(file, drive))
     check_kind(file, "artifact")
     place = options.setdefault("feed", None) or default_view()
     options["feed"] = place

@@ -703,7 +703,10 @@ def open_view(
     opened: Callable[[str], object] = lambda url: None,
     replay: Any = None,
 ) -> None:
-    """Serve the view until SIGINT or SIGTERM. opened: is told its URL. replay: what a view.View shows instead."""
+    """Serve the view until SIGINT or SIGTERM.
+
+    opened: called with its URL. replay: a workshop.replay.Replay that is shown instead of the drives that connect.
+    """
     import asyncio
 
     from rover_lib.onboard.host import default_view
@@ -711,7 +714,14 @@ def open_view(
 
     token = read_token(token_file) if token_file else new_token()
     place = None if replay else feed or default_view()
-    view = View(Address(web_port, interface), token, place, drive_user=drive_user, replay=replay is not None)
+    view = View(
+        Address(web_port, interface),
+        token,
+        place,
+        drive_user=drive_user,
+        replay=replay is not None,
+        car=replay and replay.car,
+    )
 
     def tell(url: str) -> None:
         # The journal may be read by others than the owner of the file.
@@ -719,7 +729,7 @@ def open_view(
         sys.stdout.flush()
         opened(url)
 
-    asyncio.run(view.run(tell, replay))
+    asyncio.run(view.run(tell, replay and replay.show))
 
 
 @main.command(short_help="Summarize a flight log.")

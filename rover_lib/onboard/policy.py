@@ -22,7 +22,7 @@ def action_limits(names: Sequence[str], car: Car) -> np.ndarray:
 
 
 class Policy:
-    """A loaded artifact. Use `load_policy`."""
+    """A loaded artifact, as `load_policy` returns it. car: the one whose actions it plans."""
 
     def __init__(self, path: Path, engine: Engine, manifest: dict[str, Any]):
         self.path = path
@@ -34,7 +34,8 @@ class Policy:
         self.rate_hz = float(manifest["rate_hz"])
         self.image_size: tuple[int, int] = (manifest["cameras"][0]["height"], manifest["cameras"][0]["width"])
         self._engine = engine
-        self._low, self._high = action_limits(self.action_names, car_of(manifest))
+        self.car = car_of(manifest)
+        self._low, self._high = action_limits(self.action_names, self.car)
 
     def predict_chunk(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
         """Next actions for one observation.

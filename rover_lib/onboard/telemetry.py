@@ -36,6 +36,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import ParamsError, RoverError
 from rover_lib.onboard.host import Host, throttled_means
 from rover_lib.onboard.params import params
@@ -439,6 +440,15 @@ class Flight:
         if isinstance(hz, (int, float)) and hz > 0:
             return 1000 / hz
         return float(np.median(np.diff(self.ticks["t_s"])) * 1000) if len(self.ticks["t_s"]) > 1 else None
+
+    @property
+    def car(self) -> Car:
+        """The car that was driven, by the header; the original recordings' car if the header names none.
+
+        Raises CarError for a description of no car.
+        """
+        described = self.header.get("drive", {}).get("car")
+        return Car.of(described, f"{self.path}: its car") if described else Car()
 
     def summary(self) -> dict[str, Any]:
         """The drive in figures; None where nothing was measured.

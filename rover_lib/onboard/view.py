@@ -35,7 +35,7 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from rover_lib.onboard.ahead import CarShape, from_now
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car import Car, this_car
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.host import is_listened_at, throttled_means
 from rover_lib.onboard.pwm import ARDUINO_STEP_US
@@ -112,9 +112,12 @@ def read_token(path: Path) -> str:
 
 
 class View:
-    """The server. address: for browsers. place: the socket for drives, None: there are none, a replay is shown.
+    """The web server of the view.
 
-    drive_user: who may feed it beside this user; None: nobody. Raises ViewError as run().
+    address: where browsers reach it. place: the socket to which drives connect, None if a replay is shown instead.
+    drive_user: another user whose drives are accepted besides this user's. replay: whether a past drive is shown. car:
+    the car whose drives are shown, None: this machine's. Raises ViewError for an unknown user, CarError as this_car(),
+    ParamsError as CarShape.of.
     """
 
     def __init__(
@@ -124,6 +127,7 @@ class View:
         place: Path | None = None,
         drive_user: str | None = None,
         replay: bool = False,
+        car: Car | None = None,
     ):
         self._address, self._token, self._place, self._replay = address, token, place, replay
         self._users = {0, os.geteuid()}
@@ -133,7 +137,7 @@ class View:
             except KeyError:
                 raise ViewError(f"no user {drive_user!r} is known here", remedy="provision the rover") from None
         self._open_to_all = drive_user is not None  # the socket; who comes is looked at
-        car = this_car()
+        car = car or this_car()
         self._shape, self._pwm = CarShape.of(car), car.pwm
         self._drives: list[socket.socket] = []  # the newest last, which is the one that is shown
         self._number = 0

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from rover_lib.onboard.artifact import content_hash
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car import Car, this_car
 from rover_lib.onboard.columns import number, ratio
 from rover_lib.onboard.errors import PolicyError, PwmError
 from rover_lib.onboard.policy import Policy, action_limits, load_policy
@@ -69,7 +69,8 @@ class Fidelity:
     """Chunks of every artifact on the same n frames.
 
     reference: (n, C, A) float32 of FP32; chunks: the same by mode; recorded: (n, C, A), or None where nobody
-    drove; is_pad: (n, C) bool, steps after the end of the recording; action_range: name -> (least, most).
+    drove; is_pad: (n, C) bool, steps after the end of the recording; action_range: name -> (least, most); car: the
+    one whose actions FP32 plans.
     """
 
     action_names: tuple[str, ...]
@@ -79,6 +80,7 @@ class Fidelity:
     chunks: dict[str, np.ndarray]
     recorded: np.ndarray | None
     is_pad: np.ndarray
+    car: Car
 
     def errors(self, mode: str) -> np.ndarray:
         """(n, C, A) float64 absolute difference to FP32, in units of the action."""
@@ -99,8 +101,11 @@ class Fidelity:
         return None if pct is None else errors * pct
 
     def us(self, action: str) -> float:
-        """What one unit of an action is in microseconds of pulse; NaN for an action that is no servo's."""
-        return us_per_unit(action)
+        """Microseconds of the car's pulse per unit of an action; NaN for an action that is no servo's."""
+        try:
+            return self.car.pwm.us_per_unit(action)
+        except PwmError:
+            return math.nan
 
     def warnings(self) -> list[str]:
         """A sentence for each action that is not judged; its percentages are None."""
@@ -155,16 +160,19 @@ class Fidelity:
 class LerobotEager:
     """LeRobot's own ACTPolicy in eager FP32, behind an artifact's interface: where a policy comes from, and the
     yardstick of its speed. Downloads nothing.
+
+    car: the one whose actions it plans; None: this machine's.
     """
 
-    def __init__(self, checkpoint: Checkpoint):
+    def __init__(self, checkpoint: Checkpoint, car: Car | None = None):
         c = checkpoint.config
         self.config, self.chunk = c, c.chunk
         self.action_names, self.state_names = c.action_names, c.state_names
         self._policy = lerobot_act(c)
         self._policy.model.load_state_dict(checkpoint.weights)
         self._policy.eval()
-        self._low, self._high = action_limits(c.action_names, this_car())
+        self.car = car or this_car()
+        self._low, self._high = action_limits(c.action_names, self.car)
 
     def predict_chunk(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
         """As `Policy.predict_chunk`: (C, A) float32, clipped to what a pulse can express."""
@@ -184,14 +192,6 @@ def _affine(x: np.ndarray, affine: Affine | None) -> torch.Tensor:
     if affine is None:
         return torch.from_numpy(x)
     return torch.from_numpy(x * np.asarray(affine.scale, np.float32) + np.asarray(affine.shift, np.float32))
-
-
-def us_per_unit(action: str) -> float:
-    """Microseconds of pulse per unit of an action; NaN for an action that is no servo's."""
-    try:
-        return this_car().pwm.us_per_unit(action)
-    except PwmError:
-        return math.nan
 
 
 def artifacts(run_dir: Path | str) -> dict[str, Path]:
@@ -238,7 +238,8 @@ def fidelity(
 ) -> Fidelity:
     """Run every policy on every sample.
 
-    reference, others: policies with predict_chunk(frame_bgr, state) -> (C, A), chunk and action_names.
+    reference, others: policies with predict_chunk(frame_bgr, state) -> (C, A), chunk and action_names; the reference
+    also has car.
     samples: with frame_bgr() and state; chunk (C, A) and is_pad (C,) where there is a recording.
     action_range: name -> (least, most). progress: of the samples.
     Raises PolicyError for no samples, policies of other actions or chunks, or an action without a range.
@@ -274,6 +275,7 @@ def fidelity(
         chunks={mode: np.stack(chunks) for mode, chunks in planned.items()},
         recorded=np.stack([s.chunk for s in samples]) if recorded else None,
         is_pad=np.asarray(pads, bool),
+        car=reference.car,
     )
 
 

@@ -15,11 +15,11 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from rover_lib.onboard.ahead import CarShape, from_now
-from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.replay import AHEAD, Moment
+from rover_lib.workshop.replay import AHEAD, Replay
 
 WIDTH = 640
 PANEL = 118  # rows below the picture
@@ -36,40 +36,40 @@ class FilmError(RoverError):
 
 def write_film(
     path: Path,
-    moments: Sequence[Moment],
+    replay: Replay,
     *,
     rate_hz: float = 30.0,
     width: int = WIDTH,
     quality: int = 50,
     progress: Progress = silent,
 ) -> int:
-    """Writes a film at the drive's own pace; its number of pictures.
+    """Write a film of a drive at its own pace, and return how many pictures it has.
 
-    path: .mp4 or .webp. rate_hz: pictures a second. width: of the film, even. quality: of a .webp, 1 to 100. Raises
-    FilmError for another kind of file, or where no picture of the drive is whole.
+    path: .mp4 or .webp. rate_hz: pictures per second. width: of the film, even. quality: of a .webp, 1 to 100.
+    Raises FilmError for another kind of file, or if every picture of the drive is damaged; ParamsError as CarShape.of.
     """
     if path.suffix not in KINDS:
         raise FilmError(f"{path}: a film ends in {' or '.join(KINDS)}", found=path.suffix or "no ending")
     with atomic_path(path) as temporary:
         # The encoders tell the kind by the name, and the temporary one has another.
         encode = _write_mp4 if path.suffix == ".mp4" else functools.partial(_write_webp, quality=quality)
-        count = encode(temporary, _pictures(moments, rate_hz, width, progress), rate_hz)
+        count = encode(temporary, _pictures(replay, rate_hz, width, progress), rate_hz)
         if not count:
             raise FilmError(f"{path}: no picture of this drive is whole")
     return count
 
 
-def _pictures(moments: Sequence[Moment], rate_hz: float, width: int, progress: Progress) -> Iterator[np.ndarray]:
+def _pictures(replay: Replay, rate_hz: float, width: int, progress: Progress) -> Iterator[np.ndarray]:
     """One for each time of the film, (h, w, 3) uint8 RGB with even sides, all of one size."""
-    times_s = np.array([m.t_s for m in moments])
-    shape = CarShape.of()
+    times_s = np.array([m.t_s for m in replay.moments])
+    shape = CarShape.of(replay.car)
     size: tuple[int, int] | None = None
     for at_s in progress(np.arange(0.0, times_s[-1] + 1e-9, 1 / rate_hz), "drawing"):
-        moment = moments[int(np.searchsorted(times_s, at_s + 1e-9, side="right")) - 1]
+        moment = replay.moments[int(np.searchsorted(times_s, at_s + 1e-9, side="right")) - 1]
         frame = moment.frame_bgr()
         if frame is None:
             continue
-        picture = drawn(moment.head, frame, shape)
+        picture = drawn(moment.head, frame, shape, replay.car.pwm)
         size = size or (width, round(width * picture.shape[0] / picture.shape[1] / 2) * 2)
         if size != picture.shape[1::-1]:
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
@@ -100,10 +100,10 @@ def _write_webp(path: Path, pictures: Iterator[np.ndarray], rate_hz: float, qual
     return len(images)
 
 
-def drawn(head: dict[str, Any], frame_bgr: np.ndarray, shape: CarShape) -> np.ndarray:
-    """A moment's picture, (h, WIDTH, 3) uint8 RGB, with where the car is led and, below, what is known.
+def drawn(head: dict[str, Any], frame_bgr: np.ndarray, shape: CarShape, pwm: PwmCalibration) -> np.ndarray:
+    """A moment's picture, (h, WIDTH, 3) uint8 RGB: the planned path is drawn into it, and the commands are below it.
 
-    head: of a Moment. frame_bgr: (h, w, 3) uint8.
+    head: of a Moment. frame_bgr: (h, w, 3) uint8. shape, pwm: of the car that was driven.
     """
     height = round(WIDTH * frame_bgr.shape[0] / frame_bgr.shape[1] / 2) * 2
     picture = cv2.resize(frame_bgr, (WIDTH, height), interpolation=cv2.INTER_AREA)
@@ -113,7 +113,7 @@ def drawn(head: dict[str, Any], frame_bgr: np.ndarray, shape: CarShape) -> np.nd
     canvas = np.full((height + PANEL, WIDTH, 3), (20, 23, 26), np.uint8)
     canvas[:height] = picture[:, :, ::-1]
     image = Image.fromarray(canvas)
-    _draw_panel(ImageDraw.Draw(image), head, height)
+    _draw_panel(ImageDraw.Draw(image), head, height, pwm)
     return np.asarray(image)
 
 
@@ -134,11 +134,11 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), size)
 
 
-def _draw_panel(draw: ImageDraw.ImageDraw, head: dict[str, Any], top: int) -> None:
-    tick, pins, calibration = head["tick"], head.get("pins") or [None, None], this_car().pwm
+def _draw_panel(draw: ImageDraw.ImageDraw, head: dict[str, Any], top: int, pwm: PwmCalibration) -> None:
+    tick, pins = head["tick"], head.get("pins") or [None, None]
     for row, (name, us) in enumerate(zip(("steering", "throttle"), pins, strict=True)):
         y = top + 10 + 30 * row
-        pin = None if us is None else calibration.channel(name).action(us)
+        pin = None if us is None else pwm.channel(name).action(us)
         draw.text((10, y), name, INK, _font(14))
         _draw_bar(draw, (84, y, 264, y + 18), name, tick[name], pin)
         value = "" if tick[name] is None else f"{tick[name]:+.2f}" if name == "steering" else f"{tick[name]:.3f}"

@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from rover_lib.onboard.car import Car
 from rover_lib.onboard.host import THROTTLED_BITS
 from rover_lib.onboard.pwm import Channel
 from rover_lib.onboard.servo_link import State
@@ -40,7 +39,7 @@ def flight_figure(flight: Flight) -> Figure:
         len(rows), height_in=sum(heights) + 3.4 + 0.19 * len(listed), height_ratios=heights, sharex=True
     )
     panel = dict(zip(rows, axes[:, 0], strict=True))
-    t_s, calibration = ticks["t_s"], _car_of(flight).pwm
+    t_s, calibration = ticks["t_s"], flight.car.pwm
     times_s = [t_s, flight.machine["t_s"], np.array([e.t_s for e in flight.events])]
     end_s = max((float(t.max()) for t in times_s if len(t)), default=1.0) or 1.0
     start_s = float(t_s[0]) if len(t_s) else 0.0  # what was made ready before is listed, not drawn
@@ -72,11 +71,6 @@ def flight_figure(flight: Flight) -> Figure:
     if listed:
         fig.supxlabel(_event_list(listed), fontsize=9, x=0.01, ha="left", linespacing=1.4)
     return fig
-
-
-def _car_of(flight: Flight) -> Car:
-    described = flight.header.get("drive", {}).get("car")
-    return Car.of(described, f"{flight.path}: its car") if described else Car()
 
 
 def _title(flight: Flight, summary: Mapping[str, Any]) -> str:

@@ -1,6 +1,6 @@
 """A drive that was, as a view shows one that is: its pictures, each with what the flight log says of that moment.
 
-    for moment in moments("flight.log"):
+    for moment in load_replay("flight.log").moments:
         moment.head                # a message as feed.py makes them
         moment.frame_bgr()
 
@@ -11,7 +11,7 @@ which the log names. It has no plans either, but what became of them: "plan" is 
 import asyncio
 import csv
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.kinds import kinds_of
 from rover_lib.onboard.picture import PictureError, read_jpeg
+from rover_lib.onboard.recording import recorded_car
 from rover_lib.onboard.servo_link import REASONS
 from rover_lib.onboard.telemetry import Flight, LogError, Tick, read_log
 from rover_lib.workshop.episodes import load_recordings
@@ -55,17 +56,43 @@ class Moment:
             return None
 
 
-def moments(file: Path | str, drive: int = -1, pictures: Path | None = None) -> list[Moment]:
-    """A moment for each picture, of a flight log or of a recording alone.
+@dataclass(frozen=True)
+class Replay:
+    """A drive that was. car: the one that was driven. moments: one for each picture, in their order; at least one."""
 
-    drive: which one of a log. pictures: the episode that was recorded with it, None: the one that the log names. Of a
-    folder of several episodes the first. Raises LogError, and EpisodeError where there are no pictures.
+    car: Car
+    moments: list[Moment]
+
+    async def show(self, view: "View") -> None:
+        """Show the drive in a view at its own pace, again and again. It never returns."""
+        while True:
+            begin_s, next_s = time.monotonic(), 0.0
+            for moment in self.moments:
+                if moment.t_s < next_s:
+                    continue
+                next_s = moment.t_s + 0.9 / PAGE_HZ
+                await asyncio.sleep(max(0.0, begin_s + moment.t_s - time.monotonic()))
+                image = moment.frame_bgr()
+                head = dict(moment.head)
+                jpeg = b""
+                if image is not None:
+                    head["size"] = [image.shape[1], image.shape[0]]
+                    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+                view.show(head, jpeg)
+            await asyncio.sleep(AGAIN_S)
+
+
+def load_replay(file: Path | str, drive: int = -1, pictures: Path | None = None) -> Replay:
+    """The replay of a flight log, or of a recording alone; of a folder of several episodes, the first one's.
+
+    drive: which drive of a log. pictures: the episode that was recorded with it, None: the one that the log names.
+    Raises LogError; EpisodeError if there are no pictures; CarError if the file describes no car.
     """
     file = Path(file)
     if "flight log" not in kinds_of(file):
         return _of_recording(file)
     flight = read_log(file, drive)
-    return _of_flight(flight, pictures or recorded_with(flight))
+    return Replay(flight.car, _of_flight(flight, pictures or recorded_with(flight)))
 
 
 def recorded_with(flight: Flight) -> Path:
@@ -136,9 +163,9 @@ def _of_flight(flight: Flight, episode: Path) -> list[Moment]:
     return [Moment(m.t_s - found[0].t_s, m.head, m.frame) for m in found]
 
 
-def _of_recording(folder: Path) -> list[Moment]:
+def _of_recording(folder: Path) -> Replay:
     episode = load_recordings(folder).episodes[0]
-    car, found = this_car(), []
+    car, found = recorded_car(episode.path), []
     for number, sample in enumerate(episode.samples, 1):
         steering, throttle = (float(v) for v in sample.chunk[0])
         pulses = car.pwm.pulses(*(float(v) for v in np.clip([steering, throttle], *car.limits)))
@@ -148,7 +175,7 @@ def _of_recording(folder: Path) -> list[Moment]:
         head = _head(episode.id, sample.time_s, ahead, 30.0) | {"tick": tick}
         head["pins"] = [pulses.steering_us, pulses.throttle_us]
         found.append(Moment(sample.time_s - episode.samples[0].time_s, head, sample.frame_path))
-    return found
+    return Replay(car, found)
 
 
 def _head(title: str, now_s: float, ahead: Sequence[Sequence[float]], rate_hz: float) -> dict[str, Any]:
@@ -177,27 +204,3 @@ def _plain(value: Any) -> Any:
         return str(value)
     value = float(value)
     return None if np.isnan(value) else int(value) if value.is_integer() else value
-
-
-def show_replay(file: Path, drive: int) -> "Callable[[View], Awaitable[None]]":
-    """Shows a drive in a view, in its own time and again and again. Raises as moments()."""
-    shown = moments(file, drive)
-
-    async def show(view: "View") -> None:
-        while True:
-            begin_s, next_s = time.monotonic(), 0.0
-            for moment in shown:
-                if moment.t_s < next_s:
-                    continue
-                next_s = moment.t_s + 0.9 / PAGE_HZ
-                await asyncio.sleep(max(0.0, begin_s + moment.t_s - time.monotonic()))
-                image = moment.frame_bgr()
-                head = dict(moment.head)
-                jpeg = b""
-                if image is not None:
-                    head["size"] = [image.shape[1], image.shape[0]]
-                    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
-                view.show(head, jpeg)
-            await asyncio.sleep(AGAIN_S)
-
-    return show

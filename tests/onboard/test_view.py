@@ -17,6 +17,7 @@ import pytest
 aiohttp = pytest.importorskip("aiohttp", reason="needs the extra view: pip install 'rover-policy[view]'")
 
 from rover_lib.onboard import view as v  # noqa: E402  # after it is known that it can be
+from rover_lib.onboard.car import read_car  # noqa: E402
 
 TOKEN = "a-token-of-the-tests"
 JPEG = b"\xff\xd8 a picture \n \xff\xd9"
@@ -346,16 +347,21 @@ def test_a_view_without_a_file_left_takes_drives_again_later(tmp_path, monkeypat
     asyncio.run(scene())
 
 
-def test_stopped_is_the_neutral_of_this_car(tmp_path, monkeypatch):
+@pytest.mark.parametrize("told", ["of this machine", "of the replayed drive"])
+def test_stopped_is_the_neutral_of_the_car_that_drives(tmp_path, monkeypatch, told):
     """A speed controller with reverse stands at 1500 us, and 120 is no pulse of it."""
     (tmp_path / "car.yml").write_text("""
 steering: {period_us: 20000, left_us: 2000, neutral_us: 1500, right_us: 1000}
 throttle: {period_us: 20000, neutral_us: 1500, forward_us: 2000, reverse_us: 1000}
 """)
-    monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
+    options = {}
+    if told == "of this machine":
+        monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
+    else:
+        options["car"] = read_car(tmp_path / "car.yml")
 
     async def scene():
-        async with Bench(tmp_path) as bench:
+        async with Bench(tmp_path, **options) as bench:
             page, drive = await bench.page(), bench.drive()
             for throttle_us, stands in ((1560, False), (1500, True), (1440, False), (1503, True)):
                 drive.send(HEAD | {"pins": [1500, throttle_us]})

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.stage import plain
@@ -33,8 +34,8 @@ class Fixed:
 
     chunk = CHUNK
 
-    def __init__(self, base, off=None, names=("steering", "throttle")):
-        self.base, self.off, self.action_names = np.float32(base), off, names
+    def __init__(self, base, off=None, names=("steering", "throttle"), car=None):
+        self.base, self.off, self.action_names, self.car = np.float32(base), off, names, car or Car()
         self.calls = 0
 
     def predict_chunk(self, frame_bgr, state):
@@ -255,9 +256,15 @@ def test_gates_are_exact_at_the_limit_and_blind_to_what_is_not_judged():
     assert rows["static accuracy_loss_pct"]["found"] == 1.0
 
 
-def test_us_per_unit_is_the_calibrations():
-    assert compare.us_per_unit("throttle") == PwmCalibration().us_per_unit("throttle")
-    assert math.isnan(compare.us_per_unit("gripper"))
+def test_microseconds_are_of_the_policys_car():
+    """Whatever car this machine has: a run may be of another one."""
+    described = Car().description()
+    described["steering"] = {"period_us": 20000, "left_us": 1900, "neutral_us": 1500, "right_us": 1100}
+    for car, us in ((Car.of(described), 400), (Car(), PwmCalibration().us_per_unit("steering"))):
+        base, off = np.full((3, 2), 0.1), [np.full((3, 2), 0.01)]
+        report = compare.fidelity(Fixed(base, car=car), {"static": Fixed(base, off)}, [sample()], RANGE)
+        assert report.us("steering") == pytest.approx(us) and math.isnan(report.us("gripper"))
+        assert report.summary("static")["steering_mae_us"] == pytest.approx(0.01 * us, rel=1e-4)
 
 
 def test_a_run_without_fp32_is_refused(tmp_path):

@@ -14,10 +14,14 @@ from PIL import Image
 
 from rover_lib.cli import main
 from rover_lib.onboard.ahead import CarShape
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.recording import About, EpisodeWriter
 from rover_lib.onboard.telemetry import FlightLog, LogError, Tick, read_log
 from rover_lib.workshop import film as f
 from rover_lib.workshop import replay as r
+from rover_lib.workshop.progress import silent
 
 SECONDS, HZ, PICTURES_HZ = 2.0, 30, 10
 
@@ -32,10 +36,11 @@ class Pace:
         return self.now
 
 
-def drive(folder, *, recorded=True, pictures=True):
+def drive(folder, *, recorded=True, pictures=True, car=None):
     """A flight log and the episode that was recorded with it; the log's path."""
+    described = {"car": car.description()} if car else {}
     clock, episode = Pace(), folder / "episodes" / "episode_1"
-    with FlightLog(folder / "flight.log", header={"hz": HZ, "artifact": "runs/x/policy_static.pt"},
+    with FlightLog(folder / "flight.log", header={"hz": HZ, "artifact": "runs/x/policy_static.pt"} | described,
                    max_bytes=1_000_000, keep=1, clock=clock) as log:  # fmt: skip
         log.event("armed")
         for k in range(round(SECONDS * HZ)):
@@ -60,7 +65,7 @@ def drive(folder, *, recorded=True, pictures=True):
 
 
 def test_each_picture_has_what_the_log_says_of_its_moment(tmp_path):
-    found = r.moments(drive(tmp_path))
+    found = r.load_replay(drive(tmp_path)).moments
     ticks = read_log(tmp_path / "flight.log").ticks
     assert [round(m.t_s, 2) for m in found] == [round(k / PICTURES_HZ, 2) for k in range(20)]  # and none from outside
     for k, moment in enumerate(found):
@@ -83,19 +88,53 @@ def test_the_ribbon_and_the_bars_are_of_the_moment():
     head = {"tick": {"steering": 0.5, "throttle": 0.1, "plan_age_ms": 150, "latency_ms": 90, "late_ms": 0.4},
             "pins": [1456, 120], "who": "A", "missed": 0,
             "events": [[1.0, "armed"]], "sent_s": 0.0, "plan": plan}  # fmt: skip
-    shape = CarShape.of()
-    picture = f.drawn(head, frame, shape)
+    shape, pwm = CarShape.of(), PwmCalibration()
+    picture = f.drawn(head, frame, shape, pwm)
     assert picture.shape == (360 + f.PANEL, 640, 3)
     way = np.argwhere(picture[:360, :, 1].astype(int) > picture[:360, :, 0] + 15)
     assert way[:, 0].min() > 125 and abs(way[:, 1].mean() - 320) < 2  # below the horizon, straight ahead
-    to_the_left = f.drawn(head | {"plan": plan | {"actions": [[0.6, 0.09]] * 30}}, frame, shape)
+    to_the_left = f.drawn(head | {"plan": plan | {"actions": [[0.6, 0.09]] * 30}}, frame, shape, pwm)
     way = np.argwhere(to_the_left[:360, :, 1].astype(int) > to_the_left[:360, :, 0] + 15)
     assert way[:, 1].mean() < 310
-    assert (f.drawn(head | {"plan": plan | {"actions": [[0.6, 0.0]] * 30}}, frame, shape)[:360] == 90).all()
+    assert (f.drawn(head | {"plan": plan | {"actions": [[0.6, 0.0]] * 30}}, frame, shape, pwm)[:360] == 90).all()
     bar = picture[360 + 19, 84:265]  # steering: half of its left half, and the pin in the middle
     filled = np.flatnonzero((bar == f.FILL).all(axis=1))
     assert (84 + filled.min(), 84 + filled.max()) == pytest.approx((129, 172), abs=3)
     assert np.flatnonzero((bar == f.PIN).all(axis=1)).mean() == pytest.approx(90, abs=1)
+
+
+OTHER = Car.of(
+    {
+        "name": "another car",
+        "steering": {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1000},
+        "throttle": {"period_us": 20000, "neutral_us": 1500, "forward_us": 2000},
+        "camera": {"field_of_view_deg": 120},
+        "wheelbase_m": 0.5,
+    }
+)
+
+
+def test_a_film_is_of_the_car_that_was_driven(tmp_path):
+    replay = r.load_replay(drive(tmp_path, car=OTHER))
+    assert replay.car == OTHER
+    moment = replay.moments[10]
+    picture = f.drawn(moment.head, moment.frame_bgr(), CarShape.of(OTHER), OTHER.pwm)
+    with_this_machines = f.drawn(moment.head, moment.frame_bgr(), CarShape.of(), PwmCalibration())
+    filmed = list(f._pictures(replay, PICTURES_HZ, f.WIDTH, silent))[10]
+    assert (filmed == picture).all() and (filmed != with_this_machines).any()
+    # Its steering pin stood at 1500 us, which is neutral for that car: the line is in the middle of the bar.
+    bar = filmed[-f.PANEL + 12, 84:265]
+    assert np.flatnonzero((bar == f.PIN).all(axis=1)).mean() == pytest.approx(90, abs=1)
+
+
+def test_a_replayed_recording_has_its_own_cars_pulses(tmp_path):
+    with EpisodeWriter(tmp_path / "episode_20260101_000000", About("a test", car=OTHER), (64, 36)) as writer:
+        for n in range(60):
+            pulses = OTHER.pwm.pulses(0.5, 0.1)
+            writer.control(n / 30, n * 33, pulses.steering_us, pulses.throttle_us, 20000, 20000)
+            writer.frame(n / 30, np.full((36, 64, 3), n, np.uint8))
+    replay = r.load_replay(tmp_path)
+    assert replay.car == OTHER and replay.moments[3].head["pins"] == [1750, 1550]
 
 
 @pytest.mark.slow
@@ -137,9 +176,9 @@ def test_pictures_of_another_drive_are_refused(tmp_path):
     late = [f"{i},{float(row.split(',')[1]) + 1000},{row.split(',')[2]}" for i, row in enumerate(rows[1:])]
     (tmp_path / "episodes/episode_1/frame_data.csv").write_text("\n".join([rows[0], *late]))
     with pytest.raises(EpisodeError, match="none of its pictures is of the drive"):
-        r.moments(log)
+        r.load_replay(log)
     with pytest.raises(LogError, match="no drive 3"):
-        r.moments(log, drive=3)
+        r.load_replay(log, drive=3)
 
 
 def test_a_view_shows_it_again_and_again_in_its_own_time(tmp_path, monkeypatch):
@@ -156,7 +195,7 @@ def test_a_view_shows_it_again_and_again_in_its_own_time(tmp_path, monkeypatch):
 
     monkeypatch.setattr(r.asyncio, "sleep", sleep)
     with pytest.raises(asyncio.CancelledError):
-        asyncio.run(r.show_replay(drive(tmp_path), -1)(View()))
+        asyncio.run(r.load_replay(drive(tmp_path)).show(View()))
     assert [h["tick"]["t_s"] for h, _ in shown[:20]] == sorted(h["tick"]["t_s"] for h, _ in shown[:20])
     assert shown[20][0]["tick"] == shown[0][0]["tick"] and r.AGAIN_S in slept
     assert {h["phase"] for h, _ in shown} == {"replay"} and all(p[:2] == b"\xff\xd8" for _, p in shown)

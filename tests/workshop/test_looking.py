@@ -1,6 +1,6 @@
 """Whether a policy looks or copies, by policies of which it is known."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +8,7 @@ import pytest
 import torch
 from policies import memory_samples
 
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.workshop.compare import LerobotEager, fidelity
 from rover_lib.workshop.looking import FRAMES, look
@@ -24,6 +25,7 @@ class Known:
     copies: float
     names: tuple[str, ...] = ("steering", "throttle")
     asked: int = 0
+    car: Car = field(default_factory=Car)
 
     def __post_init__(self):
         self.chunk, self.action_names = CHUNK, self.names
