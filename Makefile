@@ -8,6 +8,7 @@ READY := $(VENV)/.ready
 # In the order of the folders: ansible and lab have the longest files, and one of them at the end would run alone.
 PYTEST := $(VENV)/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 NAME ?= mine
+DEMO := runs/demo/.made
 # In a container there may be nobody but root, and what is loaded here was made here; see onboard/confine.py.
 export ROVER_AS_ROOT := 1
 # Some containers' images forbid Python to keep what it compiles: then every process compiles torch anew, for 2 s.
@@ -50,6 +51,7 @@ $(READY): pyproject.toml lerobot_robot_rover/pyproject.toml
 	@touch $@
 
 demo: $(READY)
+	@rm -f $(DEMO)
 	$(ROVER) world record runs/demo/episodes
 	$(ROVER) world train runs/demo/episodes runs/demo/best_model.pth
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
@@ -57,6 +59,7 @@ demo: $(READY)
 	$(ROVER) distill runs/demo/best_model.pth runs/demo/episodes --name demo-small --size 96x54 --feedforward 256 --steps 20 --samples 200
 	$(ROVER) world students runs/demo runs/demo-small --worlds 20
 	$(ROVER) report runs/demo
+	@touch $(DEMO)
 
 watch: $(READY)
 	@test -f runs/demo/policy_static.pt || $(MAKE) demo
@@ -72,8 +75,12 @@ lint: $(READY)
 	$(VENV)/bin/mypy
 	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware lab lerobot_robot_rover notebooks rover_lib tests
 
-# The demo is the tests' whole run; it is made once, and tests/test_demo.py holds it to the gates of params.yml.
-test: lint demo
+# The demo is the tests' whole run; tests/test_demo.py holds it to the gates of params.yml. For tests it is made again only
+# if something that it is made from has changed since: the demo takes minutes, and most of a day's changes are to tests.
+$(DEMO): $(READY) $(shell find rover_lib notebooks -name '*.py' -o -name '*.ipynb' -o -name '*.html') $(wildcard params.yml car.yml)
+	$(MAKE) demo
+
+test: lint $(DEMO)
 	$(PYTEST)
 
 # Without nbval, whose import is three seconds in each process: no notebook is among these.
@@ -81,12 +88,12 @@ test-fast: $(READY)
 	$(PYTEST) -p no:nbval --override-ini 'addopts=-q -rs --strict-markers' -m 'not slow and not emulated and not release' tests
 
 # Real time, whole fleets and whole machines: for a quiet machine, before something is given to others.
-check-release: lint demo
+check-release: lint $(DEMO)
 	$(VENV)/bin/pytest -m release tests
 	$(VENV)/bin/pytest notebooks
 	$(MAKE) faults faults-cars random pi-fast pi
 
-coverage: demo
+coverage: $(DEMO)
 	$(VENV)/bin/pytest --cov=rover_lib --cov=lab --cov=lerobot_robot_rover --cov-report=term
 
 # NAME=full needs no checkpoint: it makes one. policy_static.onnx.zip is the last that is made of it.
