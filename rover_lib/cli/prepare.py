@@ -384,11 +384,11 @@ def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> 
     What is repaired in them or left out is printed, and kept in OUT/rover_export.json. Where a policy drove, each frame
     says whether a human had taken over: LeRobot's `intervention`.
     """
-    from rover_lib.workshop.export_dataset import DRIVEN_BY, OUTCOMES, REPORT
+    from rover_lib.workshop.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
     from rover_lib.workshop.export_dataset import export_dataset as write
 
     report = write(episodes, out, progress=terminal(), **options)
-    for name in ("episodes_are", DRIVEN_BY, OUTCOMES):  # long, and in the file
+    for name in ("episodes_are", CAR, DRIVEN_BY, OUTCOMES):  # long, and in the file
         del report[name]
     show({"exported": report | {"report": str(out / REPORT)}}, as_json)
 

@@ -442,15 +442,14 @@ def recorded_car(folder: Path | str) -> Car:
     return Car.of(described, f"{folder}: its car")
 
 
-def read_controls(folder: Path | str, pwm: PwmCalibration | None = None) -> Controls:
+def read_controls(folder: Path | str) -> Controls:
     """The controls of an episode folder with both pulses measured, from control_data.csv, or else episode_data.json.
 
     Times are the system's, unless its clock was set meanwhile or controls arrived in a burst: then they are the
-    Arduino's. pwm: None: the recording's own car. Raises EpisodeError where no control is left, CarError as
-    recorded_car().
+    Arduino's. Raises EpisodeError where no control is left, CarError as recorded_car().
     """
     folder = Path(folder)
-    pwm = pwm or recorded_car(folder).pwm
+    pwm = recorded_car(folder).pwm
     for name, read in (("control_data.csv", _csv_rows), ("episode_data.json", json_controls)):
         rows = read(folder / name)
         timed = [(row, t_s, arduino) for row in rows if (t_s := _found(row, "system_timestamp")) is not None

@@ -514,7 +514,7 @@ def _int8_errors(
     """
     inputs = [inputs_of(s, work.config) for s in samples]
     exact, int8 = (predictions(policy, inputs) for policy in (ACT(work.config, weights), rounded.module))
-    driven = torch.from_numpy(as_driven(int8.numpy(), work.config.action_names))
+    driven = torch.from_numpy(as_driven(int8.numpy(), work.config.action_names, samples))
     errors: dict[str, float | None] = {}
     for i, (action, recorded) in enumerate(work.opened.recordings.action_range().items()):
         for name, own, other in (("int8", int8, exact), ("int8_teacher", driven, torch.from_numpy(taught))):

@@ -39,6 +39,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.pwm import NEUTRAL, PwmCalibration
 from rover_lib.onboard.recording import (
@@ -125,7 +126,6 @@ def load_recordings(
     chunk: int = 32,
     sync_s: float = 0.05,
     progress: Progress = silent,
-    pwm: PwmCalibration | None = None,
 ) -> Recordings:
     """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset, also of the Hub.
 
@@ -165,7 +165,7 @@ def load_recordings(
         )
     faults = _Faults(root)
     read = (
-        _load_episode(folder, chunk, sync_s, pwm, faults)
+        _load_episode(folder, chunk, sync_s, faults)
         for folder in progress(folders, desc="reading episodes", total=len(folders))
     )
     episodes = tuple(episode for episode in read if episode)
@@ -181,9 +181,7 @@ def load_recordings(
     return Recordings(root, episodes, faults.listed(), source)
 
 
-def _load_episode(
-    folder: Path, chunk: int, sync_s: float, pwm: PwmCalibration | None, faults: _Faults
-) -> Episode | None:
+def _load_episode(folder: Path, chunk: int, sync_s: float, faults: _Faults) -> Episode | None:
     """One folder's episode, or None with a fault that says why."""
     try:
         present = any((folder / name).exists() for name in DATA_FILES)
@@ -194,12 +192,12 @@ def _load_episode(
         faults.add(folder, "no_data", f"none of {', '.join(DATA_FILES)} is there")
         return None
     try:
-        pwm = pwm or recorded_car(folder).pwm
+        car = recorded_car(folder)
     except CarError as e:
         faults.add(folder, "no_car", str(e))
         return None
     (label, outcome), tables = _read_tables(folder, faults)
-    controls = _read_controls(*tables["control_samples"], pwm, faults)
+    controls = _read_controls(*tables["control_samples"], car.pwm, faults)
     frames = _read_frames(folder, *tables["frame_samples"], faults)
     if not controls or not frames:
         faults.add(
@@ -210,7 +208,7 @@ def _load_episode(
         return None
     source = tables["control_samples"][0]
     controls = _place_bursts(controls, source, faults)
-    samples = _make_samples(folder, frames, controls, chunk, sync_s, faults)
+    samples = _make_samples(folder, car, frames, controls, chunk, sync_s, faults)
     if not samples:
         faults.add(folder, "nothing_usable", "no frame with a picture, an action and a known state")
         return None
@@ -530,7 +528,7 @@ def _nearest(times_s: np.ndarray, sorted_s: np.ndarray, within_s: float) -> tupl
 
 
 def _make_samples(
-    folder: Path, frames: list[_Frame], controls: list[_Control], chunk: int, sync_s: float, faults: _Faults
+    folder: Path, car: Car, frames: list[_Frame], controls: list[_Control], chunk: int, sync_s: float, faults: _Faults
 ) -> tuple[Sample, ...]:
     actions, known, near, drivers = _actions_of(frames, controls, sync_s)
     if not near.any():
@@ -573,6 +571,7 @@ def _make_samples(
                     is_pad=pads[k].copy(),
                     row=i,
                     driver=drivers[i],
+                    car=car,
                 )
             )
     faults.add(folder, "frame_without_state", "the previous frame's action is not known", unknown_state)

@@ -20,13 +20,12 @@ from rover_lib.onboard.artifact import ONNX_SUFFIX
 from rover_lib.onboard.car import Car
 from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.onboard.recording import recorded_car
 from rover_lib.onboard.wheel_version import release
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint import Checkpoint
-from rover_lib.workshop.episodes import Sample
 from rover_lib.workshop.observe import Calibration
 from rover_lib.workshop.quantize import QuantizedPolicy, int8_layers
+from rover_lib.workshop.samples import ACTION_NAMES, Sample, car_of
 
 
 class Form(Protocol):
@@ -114,7 +113,7 @@ class Exporter:
         if not samples:
             raise QuantizeError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
         self.checkpoint, self.parity = checkpoint, parity or Parity()
-        self.car = _car_of(samples)
+        self.car = car_of(samples)
         self.float_policy = ACT(checkpoint.config, checkpoint.weights)
         self.inputs = [inputs_of(s, checkpoint.config) for s in samples]
         self.stored = np.unique(np.linspace(0, len(samples) - 1, self.parity.vectors).round().astype(int))
@@ -163,8 +162,9 @@ class Exporter:
         }
         for at, camera in enumerate(config.cameras, 1):
             vectors[f"frame_{camera}"] = np.stack([self.inputs[i][at].numpy() for i in self.stored])
+        names_car = bool({*config.action_names} & {*ACTION_NAMES}) and not self.car.drives_like(Car())
         manifest = _manifest(policy, checkpoint, calibration, form) | {
-            **({} if self.car.drives_like(Car()) else {"car": self.car.description()}),
+            **({"car": self.car.description()} if names_car else {}),
             "weights_mb": _weights_mb(module),
             "gmac": self.gmac,
             "parity": {
@@ -239,19 +239,6 @@ def _manifest(
         },
         "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": release(), **form.versions},
     }
-
-
-def _car_of(samples: Sequence[Sample]) -> Car:
-    """Of whose recordings they are. Raises QuantizeError if several."""
-    cars: list[Car] = []
-    for folder in {s.frame_path.parent.parent for s in samples if isinstance(s, Sample)}:
-        car = recorded_car(folder)
-        if not any(car.drives_like(other) for other in cars):
-            cars.append(car)
-    if len(cars) > 1:
-        names = ", ".join(sorted(car.name for car in cars))
-        raise QuantizeError("the recordings are of several cars", found=names, remedy="take those of one")
-    return cars[0] if cars else Car()
 
 
 def _in_blocks(frame: Tensor, size: int = 4) -> Tensor:

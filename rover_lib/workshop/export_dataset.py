@@ -34,6 +34,7 @@ from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.lerobot_dataset import (
     ACTION,
     BACKEND,
+    CAR,
     DRIVEN_BY,
     INTERVENTION,
     OUTCOMES,
@@ -48,6 +49,7 @@ from rover_lib.workshop.samples import (
     Episode,
     Recordings,
     Sample,
+    car_of,
     frame_rate_hz,
     is_another_rate,
 )
@@ -70,8 +72,8 @@ def export_dataset(
 
     video: AV1, LeRobot's usual, far smaller and not equal to the last bit; else PNG in parquet, which is. size:
     (height, width) of the pictures, resized as a rover resizes what its camera gives; None: as recorded. The folder
-    appears when it is whole. Raises EpisodeError for recordings that cannot be used, of several rates or, without a
-    size, of several picture sizes, and for a folder that is there; RoverError while another process makes it.
+    appears when it is whole. Raises EpisodeError for recordings that cannot be used, of several cars or rates or,
+    without a size, of several picture sizes, and for a folder that is there; RoverError while another process makes it.
     """
     out = Path(out)
     if out.exists() or out.is_symlink():
@@ -84,6 +86,7 @@ def export_dataset(
     if recordings.layout.rate_hz is not None:
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = _rate_hz(recordings)
+    car_of(recordings.samples)  # raises for several cars
     with alone_in(out.with_name(f".{out.name}.new")) as beside:
         new = beside / out.name
         report = _write(recordings, new, rate_hz, video, size, progress)
@@ -200,6 +203,7 @@ def _write(
         "episodes_are": origins,
         DRIVEN_BY: driven_by,
         OUTCOMES: outcomes,
+        CAR: car_of(recordings.samples).description(),
     }
 
 

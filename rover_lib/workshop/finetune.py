@@ -32,7 +32,7 @@ from torch import Tensor
 from rover_lib.onboard import preprocess
 from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.recording import HUMAN, recorded_car
+from rover_lib.onboard.recording import HUMAN
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import act, training
 from rover_lib.workshop import lessons as lessons_module
@@ -309,10 +309,10 @@ def _refuse_no_car(policy: Checkpoint) -> None:
 
 def _refuse_another_car(read: Sequence[Recordings]) -> None:
     first = read[0].episodes[0]
-    car = recorded_car(first.path)
+    car = first.samples[0].car
     for recordings in read:
         for episode in recordings.episodes:
-            if not recorded_car(episode.path).drives_like(car):
+            if not episode.samples[0].car.drives_like(car):
                 raise FinetuneError(
                     f"{episode.path}: was recorded with another car than {first.path}",
                     remedy="a policy drives one car: give recordings of that one alone",

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rover_lib.onboard.car import this_car
-from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.car import Car, this_car
+from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.policy import action_limits
 from rover_lib.onboard.recording import HIT, HUMAN, MISSED, POLICY
 from rover_lib.workshop import hub
@@ -45,8 +45,12 @@ STATE, ACTION = "observation.state", "action"
 NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index")
 INTERVENTION = "intervention"  # as lerobot-rollout writes it: in this frame a human had taken over from a policy
 SUCCESS = "next.success"
-REPORT = "rover_export.json"  # beside a dataset of our own, where it says for each episode:
-DRIVEN_BY, OUTCOMES = "driven_by", "outcomes"  # who drove where nobody intervened; what the drive came to, or null
+REPORT = "rover_export.json"  # beside a dataset of our own; of each episode it says:
+DRIVEN_BY, OUTCOMES = (
+    "driven_by",
+    "outcomes",
+)  # who drove where nobody intervened; what the drive came to, or null
+CAR = "car"  # and of them all, the content of their car.yml
 COPY_AGAIN = "copy the whole dataset again"
 UNEVEN = 0.1  # of the time between two frames
 
@@ -132,10 +136,12 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     _check_episodes(root, dataset, number)
     starts = np.flatnonzero(np.diff(number, prepend=-1))
     exported, faults = _exported(root, len(starts), INTERVENTION in columns)
+    _check_numbers(root, columns, layout, exported.car)
     episodes = []
     parts = np.split(np.arange(len(number)), starts[1:])
-    for rows, said in progress(list(zip(parts, exported, strict=True)), desc="reading episodes", total=len(starts)):
-        episodes.append(_episode(root, pictures, columns, rows, chunk, said))
+    for i, rows in enumerate(progress(parts, desc="reading episodes", total=len(starts))):
+        who, outcome = exported.drivers[i], exported.outcomes[i]
+        episodes.append(_episode(root, pictures, columns, rows, chunk, exported.car, who, outcome))
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
     for sample in last.values():  # a file that was cut lacks its end
         sample.frame_bgr()
@@ -144,19 +150,24 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
 
 @dataclass(frozen=True)
 class _Exported:
-    """What our own export says of an episode. driver: where nobody intervened. outcome: None: not labelled."""
+    """What our own export says of a dataset.
 
-    driver: str
-    outcome: str | None = None
-
-
-def _exported(root: Path, episodes: int, marked: bool) -> tuple[list[_Exported], tuple[Fault, ...]]:
-    """What our own export's REPORT says of each episode, and the faults found in it.
-
-    If there is no REPORT, or one for other episodes (a fault), the result has what is known without it. marked: whether
-    the dataset marks interventions.
+    drivers: of each episode, who drove where nobody intervened. outcomes: of each episode, None if it is not labelled.
+    car: whose actions they are.
     """
-    default = [_Exported(POLICY if marked else HUMAN)] * episodes
+
+    drivers: list[str]
+    outcomes: list[str | None]
+    car: Car
+
+
+def _exported(root: Path, episodes: int, marked: bool) -> tuple[_Exported, tuple[Fault, ...]]:
+    """What our own export's REPORT says, and the faults found in it.
+
+    If there is no REPORT, or one for other episodes (a fault), the result has what is known without it: LeRobot's
+    datasets do not say which car it was, so it is this machine's. marked: whether the dataset marks interventions.
+    """
+    default = _Exported([POLICY if marked else HUMAN] * episodes, [None] * episodes, this_car())
     path = root / REPORT
     if not path.is_file():
         return default, ()
@@ -167,13 +178,14 @@ def _exported(root: Path, episodes: int, marked: bool) -> tuple[list[_Exported],
         if DRIVEN_BY not in report:  # of before there were takeovers
             return default, ()
         driven_by, outcomes = report[DRIVEN_BY], report[OUTCOMES]
+        car = Car.of(report[CAR], "the exported car") if CAR in report else default.car
         if not len(driven_by) == len(outcomes) == episodes:
             raise ValueError(f"it is of {len(driven_by)} episodes, here are {episodes}")
         if not set(driven_by) <= {POLICY, HUMAN} or not set(outcomes) <= {None, HIT, MISSED}:
             raise ValueError("it names who drove, or what it came to, by unknown words")
-    except (OSError, ValueError, RecursionError, TypeError, KeyError) as e:
+    except (OSError, ValueError, RecursionError, TypeError, KeyError, CarError) as e:
         return default, (Fault(REPORT, "another_export", 1, f"not used: {shown(str(e))}"),)
-    return [_Exported(*both) for both in zip(driven_by, outcomes, strict=True)], ()
+    return _Exported(driven_by, outcomes, car), ()
 
 
 def fetched(source: Source) -> Source:
@@ -362,8 +374,13 @@ def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str,
         for key, order in ((STATE, layout.state_order), (ACTION, layout.action_order)):
             rows = np.stack(list(columns[key])).astype(np.float32).reshape(len(columns[key]), -1)
             columns[key] = np.ascontiguousarray(rows[:, list(order)])
+    return columns
+
+
+def _check_numbers(root: Path, columns: Mapping[str, np.ndarray], layout: Layout, car: Car) -> None:
+    """Raise EpisodeError for states and actions that are not finite, and for actions beyond what the car can do."""
     for key, labels in ((STATE, layout.state_names), (ACTION, layout.action_names)):
-        lows, highs = action_limits(labels, this_car())
+        lows, highs = action_limits(labels, car)
         for i, name in enumerate(labels):
             low, high = (lows[i], highs[i]) if key == ACTION else (-np.inf, np.inf)
             values = columns[key][:, i]
@@ -379,7 +396,6 @@ def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str,
                     f"a rover's lies from {low:g} to {high:g}",
                     remedy="are the names in the right order (--action-names), and the numbers in our units?",
                 )
-    return columns
 
 
 def _is_mark(feature: Any) -> bool:
@@ -424,9 +440,11 @@ def _episode(
     columns: Mapping[str, np.ndarray],
     rows: np.ndarray,
     chunk: int,
-    said: _Exported,
+    car: Car,
+    driver: str,
+    outcome: str | None,
 ) -> Episode:
-    """rows: of the whole dataset, those of one episode. said: by our own export."""
+    """rows: of the whole dataset, those of one episode. car, driver, outcome: as in _Exported."""
     meta, first, n = pictures.dataset.meta, int(rows[0]), len(rows)
     number = int(columns["episode_index"][first])
     name, keys = f"episode_{number:06d}", [camera.key for camera in pictures.cameras]
@@ -438,7 +456,6 @@ def _episode(
     actions, pads = columns[ACTION][rows], index >= n
     chunks = actions[np.minimum(index, n - 1)]
     taken_over = columns[INTERVENTION][rows] if INTERVENTION in columns else np.zeros(n, bool)
-    outcome = said.outcome
     if outcome is None and SUCCESS in columns:
         outcome = HIT if columns[SUCCESS][rows].any() else MISSED
     samples = tuple(
@@ -451,7 +468,8 @@ def _episode(
             is_pad=pads[k].copy(),
             pictures=pictures,
             row=int(row),
-            driver=HUMAN if taken_over[k] else said.driver,
+            driver=HUMAN if taken_over[k] else driver,
+            car=car,
         )
         for k, row in enumerate(rows)
     )

@@ -19,13 +19,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_lib.onboard.car import this_car
 from rover_lib.onboard.policy import action_limits
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine, lerobot_act
 from rover_lib.workshop.checkpoint import Checkpoint
-from rover_lib.workshop.episodes import Sample
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.samples import Sample, car_of
 from rover_lib.workshop.training import Frames, Given, Resumable, RowFile, frames_of, swapped_states
 
 BLOCK = 8  # samples that a policy is asked about at once
@@ -105,12 +104,12 @@ def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progres
         frames = torch.from_numpy(np.stack([prepare_frame(s.frame_bgr(), *size) for s in block]))
         states = torch.from_numpy(np.stack([s.state for s in block]).astype(np.float32))
         plans.append(policy(frames.to(device), states.to(device)).cpu().numpy())
-    return as_driven(np.concatenate(plans), policy.config.action_names)
+    return as_driven(np.concatenate(plans), policy.config.action_names, samples)
 
 
-def as_driven(plans: np.ndarray, action_names: Sequence[str]) -> np.ndarray:
-    """Plans, (n, C, A), clipped to what a pulse can express."""
-    return plans.clip(*action_limits(action_names, this_car()))
+def as_driven(plans: np.ndarray, action_names: Sequence[str], samples: Sequence[Sample]) -> np.ndarray:
+    """Plans, (n, C, A), clipped to what a pulse of the samples' car can express. Raises EpisodeError as car_of()."""
+    return plans.clip(*action_limits(action_names, car_of(samples)))
 
 
 def judged_ranges(action_range: Mapping[str, tuple[float, float]]) -> np.ndarray:

@@ -5,13 +5,14 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.picture import PictureError, read_jpeg
 from rover_lib.onboard.recording import CHANNELS, HUMAN, POLICY
@@ -95,7 +96,8 @@ class Sample:
 
     time_s: seconds since the episode's first frame. state: (S,) float32, in our recordings the previous frame's
     [steering, throttle]. chunk: (chunk, A) float32, this frame's action and the following ones. is_pad: (chunk,)
-    bool, True past the end. driver: who drove at this frame, one of onboard.recording.DRIVERS.
+    bool, True past the end. driver: who drove at this frame, one of onboard.recording.DRIVERS. car: whose actions they
+    are.
     """
 
     episode: str
@@ -106,6 +108,7 @@ class Sample:
     is_pad: np.ndarray
     row: int  # of the frame: in its episode, or in the whole of a LeRobotDataset
     driver: str = HUMAN
+    car: Car = field(default_factory=Car)
 
     @property
     def frame_name(self) -> str:
@@ -124,6 +127,21 @@ class Sample:
             raise EpisodeError(
                 f"{self.frame_path}: {e.what}", found=e.found, remedy="delete it or record the episode again"
             ) from None
+
+
+def car_of(samples: Iterable[Any]) -> Car:
+    """The car that samples were recorded with; Car() for observations that come from no recording.
+
+    Raises EpisodeError for samples of cars that drive differently: the same action means another pulse on each.
+    """
+    cars: list[Car] = []
+    for car in {id(s.car): s.car for s in samples if isinstance(s, Sample)}.values():  # an episode's samples share one
+        if not any(car.drives_like(other) for other in cars):
+            cars.append(car)
+    if len(cars) > 1:
+        names = ", ".join(sorted(car.name for car in cars))
+        raise EpisodeError("the recordings are of several cars", found=names, remedy="use those of one car")
+    return cars[0] if cars else Car()
 
 
 def frame_rate_hz(samples: Sequence[Sample]) -> float | None:

@@ -1,6 +1,7 @@
 """A car that is not the first: its recordings, its artifacts, its reverse, and a drive on another one."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,12 +16,15 @@ from rover_lib.onboard.artifact import car_of
 from rover_lib.onboard.car import Car, yaml_of
 from rover_lib.onboard.cli import main
 from rover_lib.onboard.drive import another_car, arm_capped
-from rover_lib.onboard.errors import ArtifactError, CarError
+from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.pilot import ReplayPilot
 from rover_lib.onboard.plan import Follower, Plan, Settings
 from rover_lib.onboard.policy import action_limits
 from rover_lib.onboard.recording import About, Controls, EpisodeWriter, read_controls, recorded_car
 from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.lessons import as_driven
+from rover_lib.workshop.plots.recordings import episode_overview
+from rover_lib.workshop.samples import car_of as car_of_samples
 
 CRAWLER = Car.of(
     {
@@ -56,6 +60,28 @@ def test_a_recording_of_the_first_car_is_as_ever(tmp_path):
     folder = episode(tmp_path, Car())
     assert "car" not in json.loads((folder / "episode_data.json").read_text())["metadata"]
     assert recorded_car(folder) == Car()
+
+
+def test_samples_know_their_car_whatever_this_machine_has(tmp_path):
+    """Without a car.yml here: plans of a car with reverse are clipped to what that car can do, and drawn with it."""
+    episode(tmp_path, CRAWLER)
+    recordings = load_recordings(tmp_path)
+    assert car_of_samples(recordings.samples) == CRAWLER
+    plans = np.tile(np.float32([0.2, -0.6]), (1, 4, 1))
+    assert (as_driven(plans, ("steering", "throttle"), recordings.samples) == plans).all()
+    drawn = [line.get_ydata() for ax in episode_overview(recordings.episodes[0]).axes for line in ax.lines]
+    assert [1550, 1450] in [[max(line), min(line)] for line in drawn]
+
+
+def test_recordings_of_two_cars_make_no_policy(tmp_path):
+    episode(tmp_path, CRAWLER)
+    episode(tmp_path, Car(), "episode_20260101_000100")
+    samples = load_recordings(tmp_path).samples
+    with pytest.raises(EpisodeError, match="of several cars, found crawler, the recordings' car; use those of one car"):
+        car_of_samples(samples)
+    same = Car.of(CRAWLER.description() | {"name": "its twin"})
+    twins = [replace(sample, car=same) if i % 2 else sample for i, sample in enumerate(samples[:20])]
+    assert car_of_samples(twins) == twins[0].car == CRAWLER
 
 
 def test_a_recording_of_no_car_is_left_out_and_said(tmp_path):

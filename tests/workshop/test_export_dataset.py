@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,10 +11,14 @@ from click.testing import CliRunner
 from test_episodes import edit, load, record
 
 from rover_lib.cli import main
+from rover_lib.onboard.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.recording import About, EpisodeWriter
 from rover_lib.workshop.export_dataset import export_dataset
+from rover_lib.workshop.samples import car_of
 
+CRAWLER = read_car(Path(__file__).parents[2] / "lab/cars/crawler.yml")
 CHUNK = 8  # as test_episodes' load
 
 # AV1 of tiny pictures and LeRobot's import: seconds
@@ -200,9 +205,45 @@ def test_without_our_report_all_else_is_a_policys(mixed, tmp_path):
     assert [s.driver for s in again.episodes[2].samples] == ["policy"] * 15 + ["human"] * 10
 
 
+def backwards(folder, name, car):
+    """An episode of two seconds, half of it backwards if the car can."""
+    with EpisodeWriter(folder / name, About("there and back", car=car), resolution=(64, 36)) as writer:
+        for n in range(60):
+            pulses = car.pwm.pulses(0.5, -0.1 if n >= 30 and car.reverses else 0.1)
+            writer.control(n / 30, n * 33, pulses.steering_us, pulses.throttle_us, car.numbers[0], car.numbers[4])
+            writer.frame(n / 30, np.full((36, 64, 3), n, np.uint8))
+
+
+def test_a_dataset_of_another_car_is_read_as_its_own(tmp_path):
+    """On a machine that has no car.yml. Without our report a dataset is of this machine's car, which has no reverse."""
+    backwards(tmp_path / "mine", "episode_20260101_120000", CRAWLER)
+    export_dataset(tmp_path / "mine", tmp_path / "out")
+    again = load(tmp_path / "out")
+    assert car_of(again.samples) == CRAWLER and again.action_range()["throttle"] == pytest.approx((-0.1, 0.1))
+    (tmp_path / "out" / "rover_export.json").unlink()
+    with pytest.raises(EpisodeError, match="a rover's lies from 0 to 1"):
+        load(tmp_path / "out")
+
+
+def test_a_dataset_that_says_no_car_is_of_this_machines(tmp_path, monkeypatch):
+    backwards(tmp_path / "mine", "episode_20260101_120000", CRAWLER)
+    export_dataset(tmp_path / "mine", tmp_path / "out")
+    (tmp_path / "out" / "rover_export.json").unlink()
+    (tmp_path / "car.yml").write_text(yaml_of(CRAWLER))
+    monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
+    assert car_of(load(tmp_path / "out").samples) == CRAWLER
+
+
+def test_two_cars_are_no_dataset(tmp_path):
+    backwards(tmp_path / "mine", "episode_20260101_120000", CRAWLER)
+    backwards(tmp_path / "mine", "episode_20260101_120001", Car())
+    assert "of several cars, found crawler, the recordings' car" in refused(tmp_path / "mine", tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     "change",
     [
+        lambda report: report.update(car={"name": "a cat"}),
         lambda report: report["driven_by"].pop(),
         lambda report: report["driven_by"].__setitem__(0, "the cat"),
         lambda report: report["outcomes"].__setitem__(0, ["hit"]),

@@ -9,7 +9,6 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.onboard.car import this_car
 from rover_lib.workshop.episodes import Episode, Recordings, Sample
 from rover_lib.workshop.observe import Calibration, RangeObserver
 from rover_lib.workshop.plots import claims
@@ -149,7 +148,7 @@ def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) 
     """A car's steering and throttle, and their pulses."""
     times_s = [s.time_s for s in samples]
     actions = np.stack([s.chunk[0] for s in samples])
-    pulses = [this_car().pwm.pulses(*(float(v) for v in a)) for a in actions]
+    pulses = [samples[0].car.pwm.pulses(*(float(v) for v in a)) for a in actions]
     upper, lower = fields
     rows = (
         (upper, actions[:, 0], actions[:, 1], "{} (share of full)"),
