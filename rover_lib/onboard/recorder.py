@@ -335,11 +335,11 @@ def record_episodes(
     notify: Callable[[str], None] = _log.info,
     **options: Any,
 ) -> Iterator[RecordReport]:
-    """Opens camera and Arduino and records one episode after another; for the main thread: signals end them.
+    """Open camera and Arduino, and record one episode after another. Call it in the main thread: it handles signals.
 
-    options: of record(), for each.
-    SIGINT ends an episode; a second one, or one in the pause before the next episode, ends it all, and so do SIGTERM,
-    SIGHUP, SIGQUIT and a fault. Raises RoverError if it cannot be begun.
+    options: further arguments of record(), for each episode. notify: is called with sentences for people.
+    SIGINT ends an episode. A second SIGINT, or one in the pause before the next episode, ends the recording, as SIGTERM,
+    SIGHUP, SIGQUIT and a fault do. Raises RoverError if recording cannot begin.
     """
     stop, leave = SignalEvent(), SignalEvent()
 
