@@ -5,8 +5,8 @@ episode_YYYYMMDD_HHMMSS/
 
 "No pulse" is a flag, not a 0. A recording made on the car has two more columns for each control, steering_measured and
 throttle_measured: true or false in JSON, True or False in CSV. If one is false, that channel has no values: its
-normalized, raw_us and period_us are null in JSON and empty in CSV, which pandas reads as NaN and no program mistakes for
-"stopped". Files without the two columns come from the user's recorder (or the balloon world, where no pulse is ever
+normalized, raw_us and period_us are null in JSON and empty in CSV, which pandas reads as NaN and no program mistakes
+for "stopped". Files without the two columns come from the user's recorder (or the balloon world, where no pulse is ever
 lost); in them, a pulse or period of 0 means "not measured". More columns may follow: `driver` says who drove, one of
 DRIVERS. Whether a drive succeeded, one of OUTCOMES, is metadata.outcome, noted afterwards (outcome.py).
 """
@@ -47,7 +47,7 @@ CONTROL_FIELDS = (
 )
 FLAG_FIELDS = ("steering_measured", "throttle_measured")
 FRAME_FIELDS = ("frame_id", "timestamp", "image_path")
-# Who drove at a control: a policy; a human, whose pulses went to the servos; or nobody, while the car was held in neutral.
+# Who drove at a control: a policy; a human, whose pulses went to the servos; or nobody, and the car was in neutral.
 POLICY, HUMAN, NOBODY = DRIVERS = ("policy", "human", "nobody")
 HIT, MISSED = OUTCOMES = ("hit", "missed")  # whether a drive succeeded: metadata.outcome
 

@@ -90,7 +90,7 @@ class Request:
 
 
 def check_age(age_s: float) -> None:
-    """Raises NotArmed for a request to arm that is too old: whoever sent it may no longer be watching the car."""
+    """Raise NotArmed for a request to arm that is too old: whoever sent it may no longer be watching the car."""
     if not age_s <= REQUEST_S:  # also refuses NaN
         raise NotArmed(
             f"{age_s:.1f} s have passed since the car was asked for, at most {REQUEST_S:g} may", remedy="ask again"
@@ -127,7 +127,7 @@ class Service:
         ]
         self._turn = threading.Condition()  # guards the five below
         self._ticket = ""  # for the next attempt; empty: nobody can ask for one now
-        self._request: Request | None = None  # of the present attempt or drive
+        self._request: Request | None = None  # that of the present attempt or drive
         self._asked = False
         self._asked_s = 0.0
         self._answer: dict[str, Any] | None = None
@@ -218,11 +218,11 @@ class Service:
         check_age(self._clock() - self._asked_s)
 
     def alive(self) -> None:
-        """Tell the watchdog that the work after a drive goes on. To be called again and again during that work."""
+        """Tell the watchdog that the work after a drive goes on. Call it again and again during that work."""
         self._rounds += 1
 
     def over(self) -> str | None:
-        """Why the operator's limits end this drive; None if they do not. The loop calls this at each tick."""
+        """Return why the operator's limits end this drive; None if they do not. The loop calls this at each tick."""
         request, now = self._request or Request(), self._clock()
         if request.max_seconds is not None and now - self._armed_s >= request.max_seconds:
             return f"{request.max_seconds:g} s, as requested"
@@ -258,7 +258,10 @@ class Service:
     def _answer_to(
         self, ask: str, model: str = "", ticket: str = "", asked_s: float | None = None, **limits: float | None
     ) -> dict[str, Any]:
-        """asked_s: when the operator sent it, time.monotonic(); this process may have been suspended since then."""
+        """Return the answer to an operator's question.
+
+        asked_s: when the operator sent it, by time.monotonic(): this process may have been suspended since then.
+        """
         if ask == "heartbeat":
             self._heard_s = self._clock()
         if ask != "arm":
@@ -314,9 +317,10 @@ class Service:
 
 
 def state_of(unit: str = UNIT) -> dict[str, Any]:
-    """What systemd knows about the service: active, state (one of STATES, or ""), text, since, restarts, result.
+    """Return what systemd knows about the service.
 
-    Raises ServiceError if there is no systemd.
+    Keys: installed, active, state (one of STATES, or ""), text, since, restarts, result, at_boot. Raises ServiceError
+    if there is no systemd.
     """
     names = ("LoadState", "ActiveState", "StatusText", "ActiveEnterTimestamp", "NRestarts", "Result", "UnitFileState")
     try:
