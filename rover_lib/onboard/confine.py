@@ -44,11 +44,12 @@ ALLOWED = {
     "exit": (60, 93), "exit_group": (231, 94),
 }  # fmt: skip
 OPEN, OPENAT, CLONE, CLONE3, PRLIMIT, SECCOMP = (2, None), (257, 56), (56, 220), (435, 435), (302, 261), (317, 277)
-PROCESSORS = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}  # column above, and what the kernel calls it
+# By processor: the column of its numbers above, and the kernel's number for its architecture
+PROCESSORS = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
 TO_WRITE = os.O_ACCMODE | os.O_CREAT | os.O_TRUNC  # a file opened with any of these bits is not only read
 CLONE_THREAD = 0x10000
 EPERM, ENOSYS = 1, 38
-# Of the kernel's filter machine: load a word of (number, architecture, address, six arguments), compare, return
+# Instructions of the kernel's filters: load a word of (number, architecture, address, six arguments), compare, return
 LOAD, JUMP_EQUAL, JUMP_ANY_BIT, RETURN = 0x20, 0x15, 0x45, 0x06
 ALLOW, REFUSE = 0x7FFF0000, 0x00050000  # REFUSE | errno
 

@@ -58,7 +58,7 @@ class OtherCar(Protocol):
     port: str
 
     def summary(self) -> dict[str, Any]:
-        """What happened to the car, for the drive's report."""
+        """Return what happened to the car, for the drive's report."""
 
 
 @dataclass(frozen=True)
@@ -304,10 +304,9 @@ def arm_capped(
     LinkError as lower_cap() and arm() do.
     """
     channel = link.calibration.throttle
-    asked = max(
-        (limit, -limit) if channel.low < 0 else (limit,), key=lambda a: abs(channel.pulse_us(a) - channel.neutral_us)
-    )
-    cap_us = link.lower_cap(channel.pulse_us(asked)).cap_us
+    directions = (limit, -limit) if channel.low < 0 else (limit,)
+    farthest_us = max(map(channel.pulse_us, directions), key=lambda us: abs(us - channel.neutral_us))
+    cap_us = link.lower_cap(farthest_us).cap_us
     span_us = abs(channel.pulse_us(most) - channel.neutral_us)
     if cap_us - channel.neutral_us < span_us:
         cap = most * (cap_us - channel.neutral_us) / span_us

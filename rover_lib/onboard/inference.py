@@ -32,7 +32,7 @@ from rover_lib.onboard.engines import UNCONFINED
 from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
 from rover_lib.onboard.plan import LIMITS, Commanded, Plan
 
-LOAD_S = 120.0  # an engine and a full policy from a slow card
+LOAD_S = 120.0  # time to load an engine and a full-size policy from a slow card
 POLL_S = 0.05
 WAIT_S = 0.1
 FRESH_S = 0.8  # longest wait for a fresh plan: WatchdogSec of the service is 2 s, and the Arduino has to answer too

@@ -116,7 +116,7 @@ def _members(text: str, start: int) -> Iterator[tuple[str, int, int, int]]:
     while text[at : at + 1] != "}":
         begin = at
         name, at = decoder.raw_decode(text, at)
-        value = _skip(text, _skip(text, at) + 1)  # behind the colon
+        value = _skip(text, _skip(text, at) + 1)  # after the colon
         _, end = decoder.raw_decode(text, value)
         yield name, begin, value, end
         at = _skip(text, end)

@@ -41,11 +41,11 @@ from rover_lib.onboard.stage import open_plain, sha256_of, version_of
 MODELS = Path("/var/lib/rover/models")
 POLICY, DIGEST, ORIGIN = "policy.pt", "policy.pt.sha256", "release.json"
 SIGNATURE = "policy.pt.sig"
-SIGNERS = Path("/etc/rover/allowed_signers")  # of ssh-keygen(1); provision.yml writes it
+SIGNERS = Path("/etc/rover/allowed_signers")  # in the format of ssh-keygen(1); provision.yml writes it
 SIGNER, NAMESPACE = "rover", "rover-policy"  # the principal there, and what a signature is for
 NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # ...-2: a second copy, because the first was damaged while in use
 PART = re.compile(r"part-\d{4,}")
-PART_BYTES = 8 << 20  # what a transfer that was cut off sends again at most
+PART_BYTES = 8 << 20  # the most that is sent again after a transfer was cut off
 MOST_PARTS = 1000
 SPARE_BYTES = 64 << 20  # left free for logs
 JSON_BYTES = 100_000  # largest release.json or history.json
@@ -166,7 +166,7 @@ def pack(
 
 
 def _packed_before(artifact: Path, folder: Path) -> list[Path]:
-    """The files of an earlier pack(), release.json first. Raises ReleaseError if the folder holds anything else."""
+    """Return the files of an earlier pack(), release.json first. Raises ReleaseError if there are other files."""
     if not folder.exists():
         return []
     remedy = "pack into a folder of its own"

@@ -55,11 +55,11 @@ if TYPE_CHECKING:  # asking for the service's state, as every playbook does, mus
 UNIT = "rover-drive.service"
 RUNTIME = Path("/run/rover-drive")  # the unit's RuntimeDirectory=
 CHECK_S = 0.1  # between checks while disarmed
-FEED_S = 0.25  # WatchdogSec is 2 s
+FEED_S = 0.25  # between two looks at whether to feed the watchdog, whose WatchdogSec is 2 s
 FINISH_S = 80.0  # to finish an episode on a slow card; TimeoutStopSec is 90 s then
 STATUS_S = 1.0
-REQUEST_S = 2.0  # how old a request to arm may be: a fresh plan within 0.8 s, an episode's folder, the Arduino's cap
-ARMED_S = 10.0  # a fresh plan comes within 0.8 s, the Arduino answers within 0.5, an episode's folder is made
+REQUEST_S = 2.0  # longest age of a request to arm: a fresh plan takes 0.8 s, then an episode's folder and the cap
+ARMED_S = 10.0  # longest wait for an answer: a fresh plan takes 0.8 s, the Arduino 0.5, and an episode's folder
 QUESTION_BYTES = 4096
 PERSONS = 1000  # user ids from here on belong to people; the service's own is below
 DISARMED, DRIVING, STOPPING = STATES = ("disarmed", "driving", "stopping")
