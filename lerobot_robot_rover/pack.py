@@ -66,5 +66,5 @@ def main(artifact: Path, folder: Path, n_action_steps: int) -> None:
     """Pack ARTIFACT into the new FOLDER, for LeRobot's --policy.path."""
     try:
         click.echo(f"packed: {pack(artifact, folder, n_action_steps=n_action_steps)}")
-    except RoverError as error:
+    except (RoverError, OSError) as error:
         raise click.ClickException(str(error)) from None
