@@ -2,7 +2,7 @@
 
     lerobot-record --robot.type=rover --teleop.type=rover_transmitter ...
 
-LeRobot imports this because of the distribution's name, and finds the classes by the names of their configs.
+LeRobot imports this package because of its distribution's name, and finds the classes by the names of their configs.
 """
 
 from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig

@@ -1,4 +1,7 @@
-"""What LeRobot has to know of an artifact. The name of this file, of modeling_ and of processor_ are LeRobot's rule."""
+"""The configuration by which LeRobot runs an artifact.
+
+LeRobot prescribes the name of this module, and those of the modeling_ and processor_ modules beside it.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,16 +11,17 @@ from lerobot.optim.optimizers import OptimizerConfig
 
 from rover_lib.onboard.errors import ParamsError, PolicyError
 
-N_ACTION_STEPS = 8  # of 30 a second: no action's plan is older than half a second, as `rover drive` has it
+N_ACTION_STEPS = 8  # at 30 a second: so no action's plan is older than half a second, as in `rover drive`
 
 
 @PreTrainedConfig.register_subclass("rover_artifact")
 @dataclass
 class RoverArtifactConfig(PreTrainedConfig):
-    """artifact: a policy_<mode>.pt or .onnx.zip; a relative path is looked for in the pretrained folder first.
+    """How LeRobot runs an artifact. Raises ParamsError for impossible values.
 
-    n_action_steps: actions of a chunk that are driven by before the next is computed. threads: the policy's, None: all
-    cores but one.
+    artifact: a policy_<mode>.pt or .onnx.zip; a relative path is looked for in the pretrained folder first.
+    n_action_steps: how many actions of a chunk are used before the next chunk is computed. threads: of the policy;
+    None: all cores but one.
     """
 
     artifact: str = ""
@@ -34,7 +38,7 @@ class RoverArtifactConfig(PreTrainedConfig):
 
     @property
     def file(self) -> Path:
-        """The artifact's. Raises ParamsError if none was named, or there is no such file."""
+        """The artifact's file. Raises ParamsError if none was named, or if it does not exist."""
         if not self.artifact:
             raise ParamsError(
                 "no artifact is named", remedy="--policy.artifact=runs/mine/policy_static.pt, or a packed --policy.path"
@@ -59,16 +63,16 @@ class RoverArtifactConfig(PreTrainedConfig):
         return None
 
     def get_optimizer_preset(self) -> OptimizerConfig:
-        """Raises PolicyError: nothing in an artifact can be trained."""
+        """Raise PolicyError: nothing in an artifact can be trained."""
         raise not_trained()
 
     def get_scheduler_preset(self) -> None:
         return None
 
     def validate_features(self) -> None:
-        """The artifact's manifest is what counts; modeling_rover_artifact looks at it."""
+        """Do nothing: what counts is the artifact's manifest, which modeling_rover_artifact checks."""
 
 
 def not_trained() -> PolicyError:
-    """The error for all that LeRobot's training asks of a policy."""
+    """Return the error for everything that LeRobot's training asks of a policy."""
     return PolicyError("an artifact is not trained", remedy="train its checkpoint, and `rover run` that")

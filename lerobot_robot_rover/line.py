@@ -1,7 +1,7 @@
-"""The serial port that a robot and its transmitter share: one owner, found by the port's name.
+"""Share a serial port between a robot and its transmitter: both find its only owner by the port's name.
 
-line = line_to("/dev/ttyUSB0")      # the same value for whoever names the same port in this process
-link = line.open()                  # the first opens it, the last that closes it closes it
+line = line_to("/dev/ttyUSB0")      # the same line for everyone in this process who names this port
+link = line.open()                  # the first user opens the port, and the last close() closes it
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ _lines: WeakValueDictionary[str, Line] = WeakValueDictionary()
 
 
 class Line:
-    """A port, and who uses it. Use line_to(). For one thread.
+    """A port and its users. Get it from line_to(). For one thread.
 
-    transmitters: the teleoperators on it; with one, a human may drive without arming anything. humans_action: whether
-    the newest action that a teleoperator gave is the human's own and was not sent yet. before_drive: waits until the
-    car can be armed, None while no robot is connected.
+    transmitters: the teleoperators on the port; if there is one, a human may drive without arming anything.
+    humans_action: whether a teleoperator has returned the human's own action, and the robot has not been given it yet.
+    before_drive: waits until the car can be armed; None while no robot is connected.
     """
 
     def __init__(self, port: str):
@@ -32,7 +32,10 @@ class Line:
         self._users = 0
 
     def open(self) -> ServoLink:
-        """The link, opened by the first. Raises CarError for a bad car.yml, LinkError as ServoLink.open()."""
+        """Return the link; the first user opens it.
+
+        Raises CarError for a bad car.yml, LinkError as ServoLink.open() does.
+        """
         if self._link is None:
             link = ServoLink(self.port)
             link.open()
@@ -41,7 +44,7 @@ class Line:
         return self._link
 
     def close(self) -> None:
-        """Given back by one; the last sends neutral and closes the port. Raises nothing."""
+        """Give the link back. When the last user does, neutral is sent and the port is closed. Raises nothing."""
         self._users = max(0, self._users - 1)
         if not self._users and self._link:
             link, self._link = self._link, None
@@ -55,23 +58,23 @@ class Line:
         return self._link
 
     def take_humans_action(self) -> bool:
-        """Whether the action that now comes to the robot is the human's own; said once."""
+        """Return whether the action that the robot is given now is the human's own. Asked again, it is not."""
         humans, self.humans_action = self.humans_action, False
         return humans
 
 
 def line_to(port: str) -> Line:
-    """The one of this process to a port, by whatever name, /dev/serial/by-id/... too."""
-    key = os.path.realpath(port)  # not Path's: a name, which need not exist yet
+    """Return this process's only line to a port. Any name of the port will do, also /dev/serial/by-id/..."""
+    key = os.path.realpath(port)  # the port need not exist yet
     line = _lines.get(key)
-    # After plugging in anew, the port may have been given to another device than the line's own name leads to.
+    # Devices may have been plugged in anew since: then the line's own name may lead to another port than this one.
     if line is None or os.path.realpath(line.port) != key:
         line = _lines[key] = Line(port)
     return line
 
 
 def wait_for_humans() -> None:
-    """Before an episode: waits until the car of each connected robot can be armed. Raises as its connect()."""
+    """Wait, before an episode, until the car of each connected robot can be armed. Raises as Rover.connect() does."""
     for line in list(_lines.values()):
         if line.before_drive:
             line.before_drive()

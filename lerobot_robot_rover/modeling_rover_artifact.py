@@ -1,4 +1,4 @@
-"""An artifact as a policy of LeRobot: the same confined process as in `rover drive`, asked by LeRobot's loop."""
+"""Make an artifact a LeRobot policy: LeRobot's loop asks the same confined process that `rover drive` uses."""
 
 import logging
 import shutil
@@ -30,8 +30,8 @@ _log = logging.getLogger("rover")
 class RoverArtifactPolicy(PreTrainedPolicy):
     """Runs an artifact. It has no weights that LeRobot could see, save or train.
 
-    Raises ParamsError and PolicyError for an artifact that is not there, is damaged or has other actions, and for a
-    dataset of another rate or camera than its own.
+    Raises ParamsError or PolicyError for an artifact that is missing, damaged or made for other actions, and for a
+    dataset whose rate or camera is not the artifact's.
     """
 
     config_class = RoverArtifactConfig
@@ -45,7 +45,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         self._plans = 0
         self._process = PolicyProcess(config.file, threads=config.threads)
         self._close = weakref.finalize(self, self._process.close)  # at the program's end too
-        self._process.__enter__()  # its first inferences, which are slow, are over then
+        self._process.__enter__()  # returns after the first inferences, which are slow
         try:
             self._check(self._process.manifest, dataset_meta)
         except BaseException:
@@ -55,31 +55,33 @@ class RoverArtifactPolicy(PreTrainedPolicy):
             _log.warning("the policy's process is not confined: %s", self._process.unconfined)
 
     def get_optim_params(self) -> dict:
-        """Raises PolicyError: nothing in an artifact can be trained."""
+        """Raise PolicyError: nothing in an artifact can be trained."""
         raise not_trained()
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
-        """Raises PolicyError: an artifact has no loss."""
+        """Raise PolicyError: an artifact has no loss."""
         raise not_trained()
 
     def reset(self) -> None:
-        """Before an episode. Where a rover is connected it waits for the human's gesture, which is no part of the
-        episode then."""
+        """Prepare for an episode.
+
+        If a rover is connected, this waits for the human's gesture, so that the gesture is not part of the episode.
+        """
         self._queue.clear()
         wait_for_humans()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """(B, 2) [steering, throttle], the next of the chunk; a new one is computed after n_action_steps."""
+        """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps, that of a new chunk."""
         if not self._queue:
             chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
             self._queue.extend(chunk.transpose(0, 1))
         return self._queue.popleft()
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """(B, chunk, 2) float32 [steering, throttle], clipped as by `rover drive`.
+        """Return (B, chunk, 2) float32 [steering, throttle], clipped as `rover drive` clips it.
 
-        batch: `observation.images.<camera>`, (B, 3, h, w) float in [0, 1] RGB, and `observation.state`, (B, 2). Raises
-        PolicyError for what is not there, and for a prediction that is not finite or far out of range.
+        batch: has `observation.images.<camera>`, (B, 3, h, w) float in [0, 1] RGB, and `observation.state`, (B, 2).
+        Raises PolicyError if one of them is missing, and for a prediction that is not finite or far out of range.
         """
         camera = f"{OBS_IMAGES}.{self._camera}"
         if missing := {camera, OBS_STATE} - set(batch):
@@ -95,7 +97,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, *, config: Any = None, **kwargs: Any):
-        """The policy in a folder that pack() wrote. Raises ParamsError for all else, a repository of the Hub too."""
+        """Return the policy in a folder that pack() wrote. Raises ParamsError for anything else, such as a Hub name."""
         folder = Path(pretrained_name_or_path)
         if not folder.is_dir():
             raise ParamsError(f"{folder}: not a folder", remedy="`python -m lerobot_robot_rover` packs an artifact")
@@ -108,7 +110,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         self.config._save_pretrained(save_directory)
 
     def _check(self, manifest: dict[str, Any], dataset_meta: Any) -> None:
-        """That LeRobot's loop can run this artifact as `rover drive` would."""
+        """Raise PolicyError or ParamsError unless LeRobot's loop can run this artifact as `rover drive` would."""
         cameras = [camera["name"] for camera in manifest["cameras"]]
         names = manifest["state_names"], manifest["action_names"]
         if names != (ACTIONS, ACTIONS) or len(cameras) != 1:
@@ -144,5 +146,5 @@ class RoverArtifactPolicy(PreTrainedPolicy):
 
 
 def _stop_s() -> float:
-    """Age of a plan at which `rover drive` stops the car."""
+    """Return the age of a plan at which `rover drive` stops the car."""
     return Settings.of(params()["drive"]).stop_s

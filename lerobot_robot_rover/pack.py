@@ -1,4 +1,4 @@
-"""A folder that LeRobot takes for a pretrained policy, with an artifact in it.
+"""Pack an artifact into a folder that LeRobot takes for a pretrained policy.
 
 python -m lerobot_robot_rover runs/mine/policy_static.pt mine
 lerobot-record --policy.path=mine ...
@@ -19,10 +19,10 @@ from rover_lib.onboard.errors import ParamsError, RoverError
 
 
 def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_ACTION_STEPS) -> Path:
-    """Writes the new folder: the artifact, its config.json and the files of processors that do nothing. Returns it.
+    """Write the new folder and return it. It contains the artifact, its config.json and processors that do nothing.
 
-    Raises ArtifactError for a file that is none, ParamsError for a folder that is there already. It is there whole, or
-    not at all.
+    n_action_steps: see RoverArtifactConfig. Raises ArtifactError for a file that is no artifact, ParamsError for a
+    folder that exists. The folder appears complete, or not at all.
     """
     artifact, folder = Path(artifact), Path(folder)
     check_artifact(artifact)
@@ -60,11 +60,11 @@ def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_AC
     type=click.IntRange(min=1),
     default=N_ACTION_STEPS,
     show_default=True,
-    help="Actions of a chunk that are driven by before the next is computed.",
+    help="How many actions of a chunk are used before the next chunk is computed.",
 )
 def main(artifact: Path, folder: Path, n_action_steps: int) -> None:
-    """Put ARTIFACT into the new FOLDER, as LeRobot's --policy.path wants it."""
+    """Pack ARTIFACT into the new FOLDER, for LeRobot's --policy.path."""
     try:
         click.echo(f"packed: {pack(artifact, folder, n_action_steps=n_action_steps)}")
-    except RoverError as error:
+    except (RoverError, OSError) as error:
         raise click.ClickException(str(error)) from None

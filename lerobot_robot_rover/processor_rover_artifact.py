@@ -1,4 +1,4 @@
-"""What LeRobot does around a policy, here nothing but a batch dimension: an artifact normalises inside its graph."""
+"""Steps that LeRobot runs around a policy. Here they only add a batch dimension: an artifact normalises by itself."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig
 def make_rover_artifact_pre_post_processors(
     config: RoverArtifactConfig, dataset_stats: Any = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    """The two pipelines. LeRobot's commands set values in the steps for names and device, so these must be there."""
+    """Return the two pipelines. LeRobot's commands set values in the steps for names and device, so they must exist."""
     before = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](
         steps=[
             RenameObservationsProcessorStep(rename_map={}),

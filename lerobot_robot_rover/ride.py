@@ -1,7 +1,7 @@
-"""A drive by actions that come from elsewhere: the control loop of `rover drive`, in a thread beside LeRobot's loop.
+"""Drive by actions that come from elsewhere: `rover drive`'s control loop, in a thread beside LeRobot's loop.
 
-LeRobot calls when it likes, and the Arduino wants a command every 34 ms. So the newest action is what the loop sends,
-HOLD_S at most: then the car is in neutral and disarmed, as it is after each fault that the loop knows.
+LeRobot calls when it likes, but the Arduino wants a command every 34 ms. So the control loop repeats the newest action,
+for at most HOLD_S. After that the car is put in neutral and disarmed, as after every fault that the loop detects.
 """
 
 import sys
@@ -19,16 +19,17 @@ from rover_lib.onboard.servo_link import ServoLink, Telemetry
 from rover_lib.onboard.watch import SWITCH_S, HealthWatch
 
 RATE_HZ = 50.0  # an action waits 20 ms at most; at 100 Hz a busy machine's pauses of 10 ms would count as missed ticks
-# How long an action is repeated: a loop of 30 Hz may miss two turns. The Arduino allows a silent host 150 ms, and a
-# host whose loop hangs is to get no more than that: the next tick after these, 120 ms at the latest, sends neutral.
+# How long an action is repeated: LeRobot's loop, at 30 Hz, may miss two turns. The Arduino allows a silent host 150 ms,
+# and a host whose LeRobot loop hangs must not get more: the first tick after HOLD_S, at 120 ms or before, sends
+# neutral.
 HOLD_S = 0.1
-ARMED_S = 3.0  # the cap's answer and the arming's, 0.5 s each, and a busy machine
+ARMED_S = 3.0  # the answers to the cap and to arming, 0.5 s each, and time for a busy machine
 
 
 class Ride:
     """One drive, from arming to neutral. For one thread beside its own.
 
-    Use it once: begin(), then put() at least every HOLD_S. over: it has ended, by itself or by a fault.
+    Use it once: begin(), then put() at least every HOLD_S, then end().
     """
 
     def __init__(
@@ -53,12 +54,14 @@ class Ride:
 
     @property
     def over(self) -> bool:
-        """Whether the car is no longer driven by this."""
+        """Whether the drive has ended, for whatever reason."""
         return self._thread.ident is not None and (bool(self.report.ended) or not self._thread.is_alive())
 
     def begin(self, steering: float, throttle: float) -> None:
-        """Arms the car, and drives by that action. Raises LinkError and CameraError where arming is refused, DriveFault
-        where it takes too long."""
+        """Arm the car and drive by this action.
+
+        Raises LinkError or CameraError if arming is refused, DriveFault if it takes too long.
+        """
         self._sight.check()
         self._action = (steering, throttle)
         self._thread.start()
@@ -68,7 +71,7 @@ class Ride:
         self.check()
 
     def put(self, steering: float, throttle: float) -> None:
-        """The action from now on. Raises what ended the drive, DriveFault if that was that none came in time."""
+        """Drive by this action from now on. Raises what ended the drive; DriveFault if no action came in time."""
         if self.over:
             self.check()
             late_ms = (self._clock() - self._given_s) * 1e3
@@ -79,14 +82,14 @@ class Ride:
         self._action, self._given_s = (steering, throttle), self._clock()
 
     def check(self) -> None:
-        """Raises what ended the drive if that was a fault, or the human's takeover."""
+        """Raise what ended the drive, if it was a fault or the human's takeover."""
         if self.over:
-            self._thread.join()  # it may still hear what the Arduino answers to neutral
+            self._thread.join()  # it may still be waiting for the answer to neutral
         if self._settled.is_set() and self._error:
             raise self._error
 
     def end(self) -> None:
-        """Neutral, and disarmed. Raises nothing; a fault that was there already is kept for check()."""
+        """End the drive in neutral and disarmed. Raises nothing; check() raises a fault that came before."""
         self._stop.set()
         if self._thread.ident is not None and self._thread is not threading.current_thread():
             self._thread.join()
@@ -94,10 +97,10 @@ class Ride:
     # ---- in the thread: the pilot of loop.drive
 
     def ready(self, stop: threading.Event) -> None:
-        """Waits for nothing: there is an action from the start."""
+        """Return at once: there is an action from the start."""
 
     def order(self, now_s: float) -> Order:
-        """The newest action. Raises CameraError for a camera by which nobody should drive."""
+        """Return the newest action as an order. Raises CameraError if nobody should drive by what the camera shows."""
         frame = self._camera.latest()
         if frame:
             self._sight.watch(frame, now_s)
@@ -107,7 +110,7 @@ class Ride:
         return Order(steering, throttle, pulses.steering_us, pulses.throttle_us, frame=number)
 
     def sent(self, at_s: float, order: Order) -> None:
-        """Notes when an order went out."""
+        """Take note of when an order was sent."""
         self._sight.sent(at_s, order.throttle)
 
     def _late(self) -> str | None:
@@ -135,7 +138,7 @@ class Ride:
                 report=self.report,
                 clock=self._clock,
             )
-        except BaseException as error:  # of whatever kind, LeRobot's loop must learn of it
+        except BaseException as error:  # of any kind: LeRobot's loop must learn of it
             self._error = error
         finally:
             sys.setswitchinterval(before)

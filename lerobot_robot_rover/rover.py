@@ -39,11 +39,12 @@ NO_PROMISE = (
 @RobotConfig.register_subclass("rover")
 @dataclass(kw_only=True)
 class RoverConfig(RobotConfig):
-    """port: the Arduino's. camera: a number, /dev/videoN, or with film a folder, FIFO or .mjpeg of JPEGs.
+    """The rover's settings in LeRobot. Raises ParamsError for impossible values.
 
-    camera_name: the picture is `observation.images.<camera_name>` in the dataset. width, height: of the pictures that
-    LeRobot gets, pixels; the camera's are made that by what policies see through. throttle_limit: in [0, 1], None:
-    params.yml's. log: of the flight log, None: where `rover drive` writes it.
+    port: of the Arduino. camera: a number, /dev/videoN, or, with film, a folder, FIFO or .mjpeg of JPEGs. camera_name:
+    the picture is `observation.images.<camera_name>` in the dataset. width, height: size of the pictures that LeRobot
+    gets, in pixels; camera frames are resized to it as they are for a policy (prepare_frame). throttle_limit: in
+    [0, 1]; None: that of params.yml. log: file of the flight log; None: where `rover drive` writes it.
     """
 
     port: str = "/dev/ttyUSB0"
@@ -67,8 +68,8 @@ class Rover(Robot):
     """A car with a camera and an Arduino, as LeRobot's commands drive and record it.
 
     With a `rover_transmitter` on the same port the human drives, and nothing is sent. Otherwise send_action() drives:
-    it arms the car, which takes the human's gesture each time, and the car is stopped and disarmed when no action
-    comes for 0.1 s. Not for several threads.
+    it arms the car, for which a human must make the gesture each time. When no action comes for 0.1 s, the car is
+    stopped and disarmed. For one thread at a time.
     """
 
     config_class = RoverConfig
@@ -85,12 +86,12 @@ class Rover(Robot):
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
-        """The state, which is the action before, and (height, width, 3) of the camera's picture."""
+        """The state, which is the previous action, and the camera's picture, (height, width, 3)."""
         return {**self.action_features, self.config.camera_name: (self.config.height, self.config.width, 3)}
 
     @cached_property
     def action_features(self) -> dict[str, type]:
-        """steering in [-1, 1], positive to the left, and throttle in [0, 1], or from -1 of a car with reverse."""
+        """steering in [-1, 1], positive to the left, and throttle in [0, 1], or from -1 on a car with reverse."""
         return dict.fromkeys(ACTIONS, float)
 
     @property
@@ -102,16 +103,16 @@ class Rover(Robot):
         return True
 
     def calibrate(self) -> None:
-        """Nothing: a car is measured once, by `rover calibrate`, which writes its car.yml."""
+        """Do nothing: a car is measured once, by `rover calibrate`, which writes its car.yml."""
 
     def configure(self) -> None:
-        """Nothing: the Arduino is told of the car when its port is opened."""
+        """Do nothing: the Arduino is told of the car when its port is opened."""
 
     def connect(self, calibrate: bool = True) -> None:
-        """Opens camera and Arduino; without a `rover_transmitter` it then waits until a human has made the gesture
-        for arming, and says what is missing. Nothing is armed yet: the first action does that.
+        """Open camera and Arduino. Nothing is armed yet: the first action does that.
 
-        Raises CameraError, LinkError and CarError for what is not there or does not fit, ParamsError, and
+        Without a `rover_transmitter`, this then waits until a human has made the gesture for arming, and says what is
+        missing. Raises CameraError, LinkError or CarError for what is not there or does not fit, ParamsError, and
         DeviceAlreadyConnectedError.
         """
         if self._open:
@@ -138,12 +139,11 @@ class Rover(Robot):
             self._open = stack.pop_all()
 
     def get_observation(self) -> dict[str, Any]:
-        """The newest picture, (height, width, 3) uint8 RGB, and steering and throttle of the action before this, which
-        are neutral before the first.
+        """Return the newest picture, (height, width, 3) uint8 RGB, and steering and throttle of the previous action.
 
-        Waits for a picture that LeRobot has not seen; where the car is not armed, first for the human's gesture as
-        connect(). Raises CameraError for a camera that stopped, froze or shows nothing, LinkError for a link that is
-        gone, and what ended the drive: DriveFault, TakenOver.
+        Both are neutral before the first action. Waits for a picture that LeRobot has not seen. If the car is not
+        armed, it first waits for the human's gesture, as connect() does. Raises CameraError for a camera that stopped,
+        froze or shows nothing, LinkError if the link is gone, and DriveFault or TakenOver if that ended the drive.
         """
         self._check_connected()
         if self._ride:
@@ -165,10 +165,11 @@ class Rover(Robot):
         return {**dict(zip(ACTIONS, self._action, strict=True)), self.config.camera_name: picture}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Drives by an action, or leaves it to the human whose own it is; gives what the car was told.
+        """Drive by an action and return what the car was told. A human's own action is not sent: the car follows them.
 
-        action: steering and throttle, finite, at most 0.25 beyond an end, to which they are clipped; the throttle also
-        to the limit. Raises PolicyError for others, LinkError where arming is refused, and what ended the drive.
+        action: finite steering and throttle, at most 0.25 beyond an end of their range. They are clipped to it, and the
+        throttle of an action that is sent also to the limit. Raises PolicyError for other actions, LinkError if arming
+        is refused, and what ended the drive.
         """
         self._check_connected()
         steering, throttle = self._valid(action)
@@ -182,7 +183,7 @@ class Rover(Robot):
         return dict(zip(ACTIONS, self._action, strict=True))
 
     def disconnect(self) -> None:
-        """Neutral first, then all is closed. Raises DeviceNotConnectedError."""
+        """Send neutral, then close everything. Raises DeviceNotConnectedError."""
         self._check_connected()
         opened, self._open = self._open, None
         if opened:
@@ -202,7 +203,7 @@ class Rover(Robot):
         return FlightLog(path, header=header, max_bytes=max_bytes, keep=keep)
 
     def _wait_for_human(self) -> None:
-        """Until the car can be armed, unless it is driven."""
+        """Wait until the car can be armed, unless it is being driven."""
         if self._ride and not self._ride.over:
             return
         arm_when_ready(lambda: None, self._link, threading.Event(), self._log.event, [self._camera.latest])
@@ -210,7 +211,7 @@ class Rover(Robot):
     def _next_frame(self):
         newest = self._camera.latest()
         after = self._seen
-        if newest and time.monotonic() - newest.captured_s > LATE_FRAME_S:  # nobody looked for a while
+        if newest and time.monotonic() - newest.captured_s > LATE_FRAME_S:  # nobody asked for a while
             after = max(after, newest.number)
         frame = self._camera.wait(after, LATE_FRAME_S)
         if frame is None:
@@ -220,7 +221,7 @@ class Rover(Robot):
         return frame
 
     def _valid(self, action: dict[str, Any]) -> tuple[float, float]:
-        """As the last boundary of `rover drive` takes them."""
+        """Return steering and throttle, checked and clipped as at the last boundary of `rover drive`."""
         if set(action) != set(ACTIONS):
             raise PolicyError("an action of the rover is steering and throttle", found=sorted(map(str, action)))
         try:
@@ -231,7 +232,7 @@ class Rover(Robot):
         return steering, throttle
 
     def _driven(self, steering: float, throttle: float) -> tuple[float, float]:
-        """What is sent of an action that is to be driven by."""
+        """Drive by an action, and return what was sent: neutral if its picture was too old."""
         if self._ride:
             self._ride.put(steering, throttle)
             return steering, throttle

@@ -1,4 +1,4 @@
-"""The human's transmitter as a teleoperator of LeRobot: what the Arduino measures of its receiver."""
+"""The human's transmitter as a LeRobot teleoperator: its actions are what the Arduino measures of the receiver."""
 
 import logging
 import time
@@ -14,7 +14,7 @@ from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.service import CHECK_S
 from rover_lib.onboard.servo_link import MISSING, LinkError, ServoLink, Telemetry
 
-WITHHELD_S = 0.5  # far longer than a status of a moved stick takes
+WITHHELD_S = 0.5  # far longer than until a status shows a moved stick
 
 _log = logging.getLogger("rover")
 
@@ -22,7 +22,7 @@ _log = logging.getLogger("rover")
 @TeleoperatorConfig.register_subclass("rover_transmitter")
 @dataclass(kw_only=True)
 class RoverTransmitterConfig(TeleoperatorConfig):
-    """port: the Arduino's, the same as the robot's."""
+    """port: of the Arduino, the same as the robot's."""
 
     port: str = "/dev/ttyUSB0"
 
@@ -34,8 +34,8 @@ class RoverTransmitterConfig(TeleoperatorConfig):
 class RoverTransmitter(Teleoperator):
     """The sticks of a human who drives the car in manual: the Arduino passes their pulses on, and measures them.
 
-    LeRobot has no word for "not measured", and a lost signal is no zero: get_action() raises then. Not for several
-    threads.
+    LeRobot has no word for "not measured", and a lost signal is not a zero, so get_action() raises then. For one thread
+    at a time.
     """
 
     config_class = RoverTransmitterConfig
@@ -51,12 +51,12 @@ class RoverTransmitter(Teleoperator):
 
     @cached_property
     def action_features(self) -> dict[str, type]:
-        """steering in [-1, 1], positive to the left, and throttle in [0, 1], or from -1 of a car with reverse."""
+        """steering in [-1, 1], positive to the left, and throttle in [0, 1], or from -1 on a car with reverse."""
         return {"steering": float, "throttle": float}
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """None: a transmitter cannot be told anything."""
+        """Empty: a transmitter cannot be told anything."""
         return {}
 
     @property
@@ -68,14 +68,16 @@ class RoverTransmitter(Teleoperator):
         return True
 
     def calibrate(self) -> None:
-        """Nothing: `rover calibrate` measures the sticks' ends once, for car.yml."""
+        """Do nothing: `rover calibrate` measures the sticks' ends once, for car.yml."""
 
     def configure(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def connect(self, calibrate: bool = True) -> None:
-        """Waits until the transmitter gives a signal, and says so. Raises LinkError and CarError as the robot, and
-        DeviceAlreadyConnectedError."""
+        """Open the port and wait until the transmitter gives a signal; say so if it does not yet.
+
+        Raises LinkError and CarError as the robot does, and DeviceAlreadyConnectedError.
+        """
         if self._link:
             raise DeviceAlreadyConnectedError(f"the transmitter at {self.config.port} is connected already")
         link = self._line.open()
@@ -92,8 +94,10 @@ class RoverTransmitter(Teleoperator):
         self._link = link
 
     def get_action(self) -> dict[str, float]:
-        """The sticks, as car.yml reads their pulses. Raises LinkError for a signal that is lost, for a throttle that
-        the Arduino does not pass on, and for a link that is gone."""
+        """Return steering and throttle of the sticks, by this machine's car.yml.
+
+        Raises LinkError if the signal is lost, if the Arduino does not pass the throttle on, or if the link is gone.
+        """
         if not self._link:
             raise DeviceNotConnectedError(f"the transmitter at {self.config.port} is not connected: connect() first")
         telemetry = self._link.latest()
@@ -108,10 +112,10 @@ class RoverTransmitter(Teleoperator):
         return {"steering": actions.steering, "throttle": actions.throttle}
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def disconnect(self) -> None:
-        """The port is closed with the robot's end of it. Raises DeviceNotConnectedError."""
+        """Give the port back; it is closed once the robot has given it back too. Raises DeviceNotConnectedError."""
         if not self._link:
             raise DeviceNotConnectedError(f"the transmitter at {self.config.port} is not connected: connect() first")
         self._link = None
@@ -125,7 +129,10 @@ class RoverTransmitter(Teleoperator):
         )
 
     def _check_passed_on(self, telemetry: Telemetry) -> None:
-        """The Arduino withholds a throttle that was not at rest since a reset, a lost signal or a takeover."""
+        """Raise LinkError if the Arduino has withheld the throttle for longer than WITHHELD_S.
+
+        It does so until the throttle has been at rest once after a reset, a lost signal or a takeover.
+        """
         throttle = telemetry.receiver_throttle_us
         moves = self._link is not None and self._link.calibration.throttle.moves
         if not moves or throttle is None or not moves(throttle) or moves(telemetry.throttle_us):
@@ -140,7 +147,7 @@ class RoverTransmitter(Teleoperator):
 
 
 def _sticks(telemetry: Telemetry | None) -> tuple[int, int, int, int] | None:
-    """Pulses of steering and throttle, and their periods, microseconds; None where one is not measured."""
+    """Return the pulses of steering and throttle, and their periods, in microseconds; None if one was not measured."""
     if telemetry is None:
         return None
     t = telemetry

@@ -7,7 +7,7 @@ from rover_lib.onboard import cli as onboard
 from rover_lib.onboard.cli import VERSION, Rover
 
 ROVERS = onboard.main.commands
-# By what a user does, as `rover --help` lists them; inspect, drive and log know more here than on the rover.
+# Grouped by what a user does, as `rover --help` lists them. inspect, drive, view and log can do more here than there.
 SECTIONS = {
     "Prepare a policy": (
         prepare.run,
@@ -38,7 +38,7 @@ SECTIONS = {
 
 
 class Workstation(Rover):
-    """The commands in sections."""
+    """Lists its commands in sections."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         width = formatter.width - 6 - max(map(len, self.commands))

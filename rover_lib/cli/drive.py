@@ -1,4 +1,4 @@
-"""Driving on a workstation: in the balloon world too, and flight logs as figures."""
+"""Commands for driving on a workstation, also in the balloon world, and for showing and drawing drives."""
 
 from functools import partial
 from pathlib import Path
@@ -24,11 +24,11 @@ from rover_lib.onboard.kinds import Number, Output, PathTo
 )
 @click.pass_context
 def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **options: Any) -> None:
-    """Drive ARTIFACT: arms the car once camera, plan and Arduino are ready, and stops it whatever fails.
+    """Drive by ARTIFACT: arm the car once camera, plan and Arduino are ready, and stop it whatever fails.
 
     Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could
-    not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start; with
-    --service, which waits disarmed after each drive, another request.
+    not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with
+    --service, which waits disarmed after each drive, another request does.
     """
     from rover_lib.world.car import VirtualCar
 
@@ -44,10 +44,10 @@ def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **op
 def view(file: Path | None, drive: int, **options: Any) -> None:
     """Show a drive in a browser: its picture, its plan, what the pins do. The page can stop the car and nothing else.
 
-    Without FILE it shows the `rover drive` of this machine, which may come and go. FILE: an artifact drives through the
-    balloon world; a flight log, or a recording, is shown as it was.
+    Without FILE it shows the `rover drive` of this machine, which may come and go. If FILE is an artifact, it drives
+    through the balloon world; the drive in a flight log or a recording is shown again.
 
-    Who has the page's URL may look and stop; without --interface only from this machine.
+    Whoever has the page's URL may look and stop; without --interface, only from this machine.
     """
     from rover_lib.cli import watching
 

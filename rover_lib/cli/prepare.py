@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def _size(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int, int] | None:
-    """WIDTHxHEIGHT as (height, width)."""
+    """Parse WIDTHxHEIGHT; return (height, width)."""
     if value is None:
         return None
     if (sizes := re.fullmatch(r"(\d+)x(\d+)", value)) is None:
@@ -38,7 +38,7 @@ CAMERA = click.option(
 
 
 def with_source(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose `episodes` is a Source: where they are, and what a user says of them."""
+    """Give a command its `episodes` as a Source: where the recordings are, and what the user says about them."""
 
     @ACTION_NAMES
     @CAMERA
@@ -276,7 +276,7 @@ def distill(
     """Teach a smaller policy what CHECKPOINT plans on the recordings in EPISODES.
 
     Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot, policy_static.pt to drive with, and
-    distill.json in the run's folder. Ended at any moment and started again, it goes on where it was.
+    distill.json in the run's folder. If it is ended at any moment, the same command continues where it was.
     """
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import read_stage
@@ -346,10 +346,10 @@ def finetune(
 def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
     """Write the policies of the run in RUN_DIR for another engine.
 
-    --onnx: for ONNX Runtime, by the run's own calibration. Such a file goes wherever an artifact goes (benchmark,
+    --onnx: for ONNX Runtime, with the run's own calibration. Such a file can be used like any artifact (benchmark,
     compare, drive, release), and a rover with that engine needs no torch; model.onnx is inside.
 
-    --hailo: a kit of networks, calibration set and scripts, calibrated on the run's recordings; docs/hailo.md leads on.
+    --hailo: a kit of networks, calibration set and scripts, calibrated on the run's recordings; see docs/hailo.md.
     """
     if not onnx and kit is None:
         raise click.UsageError("for which engine? --onnx, or --hailo OUT")
@@ -380,15 +380,15 @@ def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
 def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> None:
     """Write our recordings in EPISODES as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.
 
-    lerobot-train trains at the size of the pictures: as recorded, it takes 25 times as long as at a fifth of the sides.
-    What is repaired in them or left out is printed, and kept in OUT/rover_export.json. Where a policy drove, each frame
-    says whether a human had taken over: LeRobot's `intervention`.
+    lerobot-train trains at the size of the pictures: at the recorded size it takes 25 times as long as with sides a
+    fifth as long. What is repaired in the recordings or left out is printed, and kept in OUT/rover_export.json. In a
+    drive of a policy, each frame says whether a human had taken over: LeRobot's `intervention`.
     """
     from rover_lib.workshop.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
     from rover_lib.workshop.export_dataset import export_dataset as write
 
     report = write(episodes, out, progress=terminal(), **options)
-    for name in ("episodes_are", CAR, DRIVEN_BY, OUTCOMES):  # long, and in the file
+    for name in ("episodes_are", CAR, DRIVEN_BY, OUTCOMES):  # too long to print; the file has them
         del report[name]
     show({"exported": report | {"report": str(out / REPORT)}}, as_json)
 

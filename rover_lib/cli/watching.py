@@ -1,4 +1,4 @@
-"""What `rover view FILE` shows: an artifact that drives through the balloon world, or a drive that was."""
+"""Show the FILE of `rover view`: let an artifact drive through the balloon world, or show a recorded drive again."""
 
 import contextlib
 import os
@@ -19,15 +19,16 @@ from rover_lib.world.child import Child
 
 
 def open_browser(url: str) -> None:
-    """Where there is a screen; elsewhere a browser would take over the terminal."""
+    """Open a browser if there is a screen; without one, a browser would take over the terminal."""
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         webbrowser.open(url)
 
 
 def watch(file: Path, drive: int, options: dict[str, Any]) -> None:
-    """As `rover view FILE`. drive: of a flight log, which. Raises KindError for a file that cannot be driven or shown.
+    """Do what `rover view FILE` asks for, until the view is ended.
 
-    An artifact's drive is a process of its own, and ends with the view.
+    drive: which drive of a flight log to show. An artifact drives in a process of its own, which ends with the view.
+    Raises KindError for a file that is neither an artifact nor a drive.
     """
     kinds = kinds_of(file)
     if {"flight log", "recordings"} & set(kinds):
@@ -49,7 +50,7 @@ def watch(file: Path, drive: int, options: dict[str, Any]) -> None:
 
 
 def _tell_end(child: Child) -> None:
-    """What a drive said last, once it has ended; the page stays open."""
+    """Print a drive's last words once it has ended. The page stays open."""
     child.process.wait()
-    with contextlib.suppress(ValueError):  # closed, as the view has ended too
+    with contextlib.suppress(ValueError):  # the stream is closed, because the view has ended too
         click.echo(f"the drive has ended: {child.last_words()}; Ctrl-C ends the view", err=True)

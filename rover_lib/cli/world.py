@@ -45,9 +45,10 @@ def record(out_dir: Path, count: int, seed: int) -> None:
 def train(episodes: Path, output: Path, **options: Any) -> None:
     """Train LeRobot's ACT on EPISODES and write the checkpoint OUTPUT, as a trainer's .pth.
 
-    `small` takes minutes on two cores, `full`, the policy of the real car, about an hour: at a quarter of its pixels,
-    then carried to 640x360. Ended at any moment (Ctrl-C, a power cut), the same command goes on where it was. Until it
-    is done that takes 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover; a few --steps do not make a policy drive.
+    `small` takes minutes on two cores, `full`, the policy of the real car, about an hour: it is trained at a
+    quarter of its pixels and then carried to 640x360. If it is ended at any moment (Ctrl-C, a power cut), the same
+    command continues where it was. For that it keeps 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover, until it is
+    done. A few --steps do not make a policy drive.
     """
     from rover_lib.world.train import train as train_policy
 
@@ -79,7 +80,7 @@ def trial(artifact: Path, worlds: int, seed: int, as_json: bool) -> None:
 @click.option("--worlds", type=click.IntRange(min=1), default=40, show_default=True)
 @AS_JSON
 def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
-    """Drive RUN_DIR's static policy with late plans, by the car's loop in virtual time, and count the balloons it hits.
+    """Drive by RUN_DIR's static policy with late plans, in the car's loop and virtual time, and count balloons hit.
 
     Leaves drive.json and the executed notebook 07 in RUN_DIR, and says whether the gate of params.yml holds.
     """
@@ -87,7 +88,7 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
     from rover_lib.workshop.run import execute
     from rover_lib.world.latency import table
 
-    with _anew(run_dir / "drive.json"):  # that one may be of another version
+    with _anew(run_dir / "drive.json"):  # the present one may be of another version
         execute("07_drive", run_dir, worlds=worlds)
     content = read_stage(run_dir / "drive.json", "drive")
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
@@ -95,8 +96,8 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
 
 @contextlib.contextmanager
 def _anew(file: Path) -> Iterator[None]:
-    """Inside there is no such file, so that it is made; where it is not, the one of before is back."""
-    before = file.with_name(f".{file.name}.before")  # of a process that was killed, if it is there now
+    """Move a file away, so that the block has to make it anew. If the block does not, the old file is put back."""
+    before = file.with_name(f".{file.name}.before")  # if it exists now, a process was killed here
     if file.exists():
         file.replace(before)
     try:
@@ -122,9 +123,10 @@ def _anew(file: Path) -> Iterator[None]:
 def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, **options: Any) -> None:
     """Judge the students that `rover distill` left in STUDENT_RUNS beside the teacher in TEACHER_RUN.
 
-    Each folder has a policy_static.pt, and arm.json where it was counted. They drive through the same worlds, left
-    alone and pushed, each as late as computed for it. Leaves distill.json and the executed notebook 08 in TEACHER_RUN,
-    and says which student may take its teacher's place. Ended at any moment, the same command goes on where it was.
+    Each folder has a policy_static.pt, and an arm.json if its instructions were counted. All policies drive through
+    the same worlds: left alone, and pushed with plans that are as late as was computed for the policy. Leaves
+    distill.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its teacher's place. If
+    it is ended at any moment, the same command continues where it was.
     """
     from rover_lib.workshop.run import execute
     from rover_lib.world.frontier import sentences, table
@@ -154,11 +156,12 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps per training [default: params.yml].")
 @AS_JSON
 def learn(run_dir: Path, out: Path | None, worlds: int, as_json: bool, **options: Any) -> None:
-    """Let the policy in RUN_DIR drive while an expert takes over where a human would, and learn on from that.
+    """Let the policy in RUN_DIR drive while an expert takes over where a human would, and train it further on that.
 
-    Beside it, it learns from as many seconds of plain demonstrations. Both are judged in worlds that taught nobody,
-    after each round. Leaves learn.json and the executed notebook 09 in RUN_DIR. Ended at any moment, the same command
-    goes on where it was; with more worlds only those that are missing are driven.
+    For comparison, another copy of the policy is trained on plain demonstrations of the same duration. After each
+    round, both are judged in worlds in which neither has learned. Leaves learn.json and the executed notebook 09 in
+    RUN_DIR. If it is ended at any moment, the same command continues where it was; with more --worlds, it drives only
+    in those that are missing.
     """
     from rover_lib.workshop.run import execute
     from rover_lib.world.learn import Experiment, measured, table

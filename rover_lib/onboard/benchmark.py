@@ -30,10 +30,11 @@ LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
 
 
 def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeout_s: float = 300) -> float | None:
-    """Peak resident memory of a fresh process that loads one artifact and predicts three times.
+    """Return the peak resident memory, in MB, of a fresh process that loads one artifact and predicts three times.
 
-    A fresh one, because the calling process holds all compared policies, so that its own peak says nothing about one of
-    them. None if the machine does not report it. Raises PolicyError if the artifact does not load or predict there.
+    The process is a fresh one because the calling process holds all compared policies, so that its own peak says
+    nothing about one of them. Returns None if the machine does not report it. Raises PolicyError if the artifact does
+    not load or predict there.
     """
     code = (
         "import sys, numpy as np\n"
@@ -65,7 +66,7 @@ def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeou
 
 
 def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
-    """The distribution of one policy's latencies, and the rates that follow from it.
+    """Return the distribution of one policy's latencies, and the rates that follow from it.
 
     throughput_fps: inferences per second without pauses (1000 / mean). control_rate_hz: the highest rate at which 95 %
     of the inferences end within their period (1000 / p95).
@@ -94,10 +95,10 @@ class BenchmarkOptions:
 
     warmup: inferences of each policy that are not counted. iterations: number of rounds. duration_s: instead, a soak
     test: rounds until this time is over, with a time series. at_most_s: limits the time by doing fewer rounds, but at
-    least LEAST_ROUNDS. threads: of the engines; 0: all cores, None: as they are. rate_hz: at most that many inferences
-    per second, on absolute deadlines, as in a drive; None: as fast as possible. main: the policy whose figures are at
-    the top level (None: the first). reference: the policy with whose p50 the others are compared. memory_alone: measure
-    each artifact's memory in a process of its own, which takes seconds each.
+    least LEAST_ROUNDS. threads: of the engines; 0: all cores; None: leave them as they are. rate_hz: at most that many
+    inferences per second, on absolute deadlines, as in a drive; None: as fast as possible. main: the policy whose
+    figures are at the top level (None: the first). reference: the policy that the speed of the others is compared with.
+    memory_alone: measure each artifact's memory in a process of its own, which takes seconds each.
     """
 
     warmup: int = 10
@@ -275,7 +276,7 @@ class _Run:
             self.per_core_pct = [100 * busy / total if total > 0 else 0.0 for busy, total in spans]
 
     def metrics_of(self, name: str, cores: int) -> dict[str, Any]:
-        """The figures of one policy: those measured, and those known from its manifest and file."""
+        """Return the figures of one policy: those measured, and those known from its manifest and file."""
         policy, times_ms = self.policies[name], self.latencies_ms[name]
         manifest = getattr(policy, "manifest", None) or {}
         path = getattr(policy, "path", None)
@@ -291,7 +292,7 @@ class _Run:
         }
 
     def speedup(self, name: str, reference: str) -> dict[str, float | None]:
-        """How many times as fast as the reference: by p50, and the range over 5 to 95 % of the rounds."""
+        """Return how many times as fast as the reference a policy is: by p50, and from 5 to 95 % of the rounds."""
         times_ms, reference_ms = self.latencies_ms[name], self.latencies_ms[reference]
         p50_ms, reference_p50_ms = (float(np.percentile(x, 50)) for x in (times_ms, reference_ms))
         paired = np.asarray(reference_ms) / np.maximum(times_ms, 1e-9)
@@ -303,7 +304,7 @@ class _Run:
         }
 
     def host_metrics(self) -> dict[str, Any]:
-        """The machine during the run: the highest temperature, the lowest clock, and the last throttling flags."""
+        """Return the machine's state in the run: load of its cores, highest temperature, lowest clock, throttling."""
         temperatures_c = [r["temperature_c"] for r in self.readings if r["temperature_c"] is not None]
         clocks_mhz = [r["clock_mhz"] for r in self.readings if r["clock_mhz"] is not None]
         throttled = self.readings[-1]["throttled"]

@@ -1,6 +1,6 @@
 """The rover's own command line: what works where only rover_lib.onboard is installed.
 
-Thin: it parses, calls the library and prints.
+It is thin: it parses arguments, calls the library and prints.
 """
 
 import contextlib
@@ -22,9 +22,9 @@ from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
 FILE = click.Path(path_type=Path)
 ARTIFACT = PathTo("artifact")
 MOST_THREADS = 256  # torch takes any number, and the process crashes where the system has no more
-LONG_LIST = 12  # longer ones are for programs
-BUSY = 0.5  # load per core, of the last minute, beside which a time is no measurement
-# Of every command that works with the car:
+LONG_LIST = 12  # longer lists are for programs, and not printed for people
+BUSY = 0.5  # load per core in the last minute; above it, times are only rough
+# Options that several commands share:
 CAMERA = click.option(
     "--camera", default="0", show_default=True, help="A number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
 )
@@ -56,8 +56,9 @@ WORKSTATION_COMMANDS = frozenset(
 
 
 class Unread:
-    """Standard output that nobody may read any more, as behind `| head`: that changes neither what a command does nor
-    its exit code.
+    """Standard output whose reader may have gone, as with `| head`.
+
+    That changes neither what a command does nor its exit code.
     """
 
     def __init__(self, stream: Any):
@@ -86,7 +87,7 @@ class Unread:
 
 
 class Rover(click.Group):
-    """A bad input ends in one sentence and exit code 1; --debug adds the traceback."""
+    """A group of commands in which a bad input ends in one sentence and exit code 1; --debug adds the traceback."""
 
     def main(self, *args: Any, **options: Any) -> Any:
         with contextlib.redirect_stdout(cast(TextIO, Unread(sys.stdout))):
@@ -114,7 +115,7 @@ class Rover(click.Group):
 
 
 class OnlyOnboard(Rover):
-    """The rover's commands alone: one of the workstation's ends in a sentence that says so, and exit code 2."""
+    """The rover's commands alone. A command of the workstation ends in a sentence that says so, and exit code 2."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -177,14 +178,14 @@ def main(debug: bool) -> None:
 
 
 def drive_options(command: Callable) -> Callable:
-    """The options of driving, on the rover and in the world."""
+    """Add the options of driving, on the rover and in the balloon world."""
     for option in reversed(DRIVE_OPTIONS):
         command = option(command)
     return command
 
 
-def _spares(_: click.Context, __: click.Parameter, file: Any) -> Any:
-    """The file, which costs nothing else of the user's. Raises KindError."""
+def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
+    """Return the file. Raises KindError if another of the user's files would be lost by writing it."""
     if file and file.name != "-":
         check_output(Path(file.name), None, appended=True)
     return file
@@ -224,7 +225,7 @@ DRIVE_OPTIONS = (
         "--json",
         "json_file",
         type=click.File("w", lazy=True),
-        callback=_spares,
+        callback=_check_json_file,
         help="Write a summary of the drive to this file; - prints it.",
     ),
     click.option("--replay", type=PathTo("recordings"), help="Send this episode's pulses; no policy, no camera."),
@@ -240,17 +241,17 @@ DRIVE_OPTIONS = (
 @drive_options
 @click.pass_context
 def drive(ctx: click.Context, **options: Any) -> None:
-    """Drive ARTIFACT: arms the car once camera, plan and Arduino are ready, and stops it whatever fails.
+    """Drive by ARTIFACT: arm the car once camera, plan and Arduino are ready, and stop it whatever fails.
 
     Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could
-    not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Nothing arms it again but another start; with
-    --service, which waits disarmed after each drive, another request.
+    not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with
+    --service, which waits disarmed after each drive, another request does.
     """
     ctx.exit(run_drive(**options))
 
 
 def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
-    """Drive by DriveOptions, print or write what it was, and return the exit code. car: as of drive_car()."""
+    """Drive by DriveOptions, print or write the summary, and return the exit code. car: see drive_car()."""
     from rover_lib.onboard.drive import DriveOptions, drive_car
     from rover_lib.onboard.errors import DriveFault, TakenOver
     from rover_lib.onboard.loop import Report
@@ -319,9 +320,9 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -
 @click.argument("episodes", type=PathTo("recordings"), nargs=-1, required=True, metavar="EPISODE [EPISODE]...")
 @click.argument("outcome", type=click.Choice(["hit", "missed", "none"]))
 def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
-    """Note in each EPISODE, a folder of one recorded drive, what it came to; `none` takes that back.
+    """Note in each EPISODE, a folder of one recorded drive, whether it hit or missed; `none` removes the note.
 
-    It is in its episode_data.json as metadata.outcome, and nothing else in it changes. A drive that failed is kept:
+    The note is metadata.outcome in its episode_data.json, where nothing else changes. A drive that failed is kept:
     `rover inspect` counts outcomes, and `rover export-dataset` writes them.
     """
     from rover_lib.onboard.outcome import label
@@ -407,8 +408,8 @@ def calibrate(
             notify=lambda text: click.echo(text, err=True),
             **more,
         )
-        link.tell(car)  # and not the last one that was tried
-    click.echo(yaml_of(car), nl=False)  # first: should writing fail, it can be copied from here
+        link.tell(car)  # the Arduino still has the last one that was tried
+    click.echo(yaml_of(car), nl=False)  # before writing: if that fails, it can be copied from here
     write_car(car, path)
     click.echo(f"rover: written to {path}", err=True)
 
@@ -422,7 +423,7 @@ def inspect(file: Path, as_json: bool) -> None:
 
 
 def describe_artifact(file: Path) -> dict[str, Any]:
-    """What `rover inspect` says of an artifact that is whole. Raises ArtifactError for another."""
+    """Return what `rover inspect` says of an intact artifact. Raises ArtifactError for any other file."""
     from rover_lib.onboard.artifact import check_artifact, content_hash, read_manifest
 
     check_artifact(file)
@@ -662,7 +663,7 @@ def status(releases: Any, as_json: bool) -> None:
 
 
 def view_options(command: Callable) -> Callable:
-    """The options of a view, on the rover and on a workstation."""
+    """Add the options of a view, on the rover and on a workstation."""
     for option in reversed(VIEW_OPTIONS):
         command = option(command)
     return command
@@ -688,8 +689,8 @@ VIEW_OPTIONS = (
 def view(**options: Any) -> None:
     """Show the drive of this machine in a browser: its picture, its plan, what the pins do. A drive may come and go.
 
-    The page can stop the car and nothing else. Who has its URL may do so; without --interface only from this machine,
-    or through `ssh -L 8470:127.0.0.1:8470`.
+    The page can stop the car and nothing else. Whoever has its URL may do so; without --interface, only from this
+    machine, or through `ssh -L 8470:127.0.0.1:8470`.
     """
     open_view(**options)
 
@@ -724,7 +725,7 @@ def open_view(
     )
 
     def tell(url: str) -> None:
-        # The journal may be read by others than the owner of the file.
+        # The journal may have other readers than the token's file.
         click.echo(url.replace(token, "...") if token_file else url)
         sys.stdout.flush()
         opened(url)

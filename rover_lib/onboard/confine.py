@@ -19,12 +19,12 @@ from pathlib import Path
 
 from rover_lib.onboard.errors import ArtifactError
 
-# Memory of an inference beside torch itself: activations, weights in two forms, stacks of threads. The policy of full
-# size takes 183 MB so (INT8, 68 MB of file) or 334 (FP32, 261), measured on x86-64.
+# Memory of an inference beside torch itself: activations, weights in two forms, stacks of threads. The full-size policy
+# takes 183 MB of it in INT8 (a file of 68 MB) and 334 in FP32 (261), measured on x86-64.
 MEMORY_MB, MEMORY_PER_FILE, THREAD_MB = 80, 2.5, 20
 AS_ROOT = "ROVER_AS_ROOT"  # the services unset it: roles/rover/templates/sandbox.j2
 PR_SET_NO_NEW_PRIVS = 38
-SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC = 1, 1  # of all threads, those that torch has started too
+SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC = 1, 1  # TSYNC: for all threads, also those that torch has started
 
 # Numbers of system calls: (x86_64, aarch64), from linux/arch/x86/entry/syscalls/syscall_64.tbl and
 # linux/include/uapi/asm-generic/unistd.h; None: that processor has none. The frequent ones first.
@@ -44,11 +44,12 @@ ALLOWED = {
     "exit": (60, 93), "exit_group": (231, 94),
 }  # fmt: skip
 OPEN, OPENAT, CLONE, CLONE3, PRLIMIT, SECCOMP = (2, None), (257, 56), (56, 220), (435, 435), (302, 261), (317, 277)
-PROCESSORS = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}  # column above, and what the kernel calls it
-TO_WRITE = os.O_ACCMODE | os.O_CREAT | os.O_TRUNC  # with any of these bits, a file is opened for more than reading
+# By processor: the column of its numbers above, and the kernel's number for its architecture
+PROCESSORS = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
+TO_WRITE = os.O_ACCMODE | os.O_CREAT | os.O_TRUNC  # a file opened with any of these bits is not only read
 CLONE_THREAD = 0x10000
 EPERM, ENOSYS = 1, 38
-# Of the kernel's filter machine: load a word of (number, architecture, address, six arguments), compare, return
+# Instructions of the kernel's filters: load a word of (number, architecture, address, six arguments), compare, return
 LOAD, JUMP_EQUAL, JUMP_ANY_BIT, RETURN = 0x20, 0x15, 0x45, 0x06
 ALLOW, REFUSE = 0x7FFF0000, 0x00050000  # REFUSE | errno
 
@@ -63,12 +64,12 @@ def refuse_root() -> None:
 
 
 def memory_mb(artifact: Path | str, threads: int) -> float:
-    """Megabytes of memory that a process may take to load an artifact and to run it."""
+    """Return the megabytes of memory that a process may take to load an artifact and run it."""
     return MEMORY_MB + MEMORY_PER_FILE * Path(artifact).stat().st_size / 1e6 + THREAD_MB * threads
 
 
 def filter_of(processor: str) -> bytes:
-    """The kernel's filter for a processor of PROCESSORS: 8 bytes an instruction, see linux/filter.h."""
+    """Return the kernel's filter for a processor of PROCESSORS: 8 bytes per instruction, see linux/filter.h."""
     column, architecture = PROCESSORS[processor]
     program = [
         _step(LOAD, 4),
@@ -82,7 +83,7 @@ def filter_of(processor: str) -> bytes:
             program.extend([_step(JUMP_EQUAL, number, 0, len(steps)), *steps])
 
     def if_argument(index: int, jump: bytes) -> list[bytes]:
-        """jump: over one step if the argument is allowed."""
+        """Allow a call by one of its arguments. jump: skips one step, the refusal, if the argument is allowed."""
         return [_step(LOAD, 16 + 8 * index), jump, _step(RETURN, REFUSE | EPERM), _step(RETURN, ALLOW)]
 
     for call in ALLOWED.values():
@@ -91,7 +92,7 @@ def filter_of(processor: str) -> bytes:
         when(call, *if_argument(flags, _step(JUMP_ANY_BIT, TO_WRITE, 0, 1)))
     when(CLONE, *if_argument(0, _step(JUMP_ANY_BIT, CLONE_THREAD, 1, 0)))
     when(CLONE3, _step(RETURN, REFUSE | ENOSYS))  # its flags are in memory; the C library then takes clone
-    when(PRLIMIT, *if_argument(0, _step(JUMP_EQUAL, 0, 1, 0)))  # its own
+    when(PRLIMIT, *if_argument(0, _step(JUMP_EQUAL, 0, 1, 0)))  # only for this process itself
     program.append(_step(RETURN, REFUSE | EPERM))
     return b"".join(program)
 
@@ -135,13 +136,13 @@ def less_memory(limit_mb: float) -> Iterator[None]:
 
 
 def _bytes_with(limit_mb: float) -> int:
-    """The size in bytes of this process's data once it has allocated limit_mb more."""
+    """Return the size in bytes that this process's data will have once it has allocated limit_mb more."""
     status = Path("/proc/self/status").read_text()
     return int(status.partition("VmData:")[2].split()[0]) * 1024 + int(limit_mb * 1e6)
 
 
 def open_no_more() -> None:
-    """From now on this process cannot open any file, not even for reading."""
+    """Forbid this process to open any file from now on, even for reading."""
     _lower(resource.RLIMIT_NOFILE, 0)
 
 

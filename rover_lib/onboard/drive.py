@@ -58,7 +58,7 @@ class OtherCar(Protocol):
     port: str
 
     def summary(self) -> dict[str, Any]:
-        """What happened to the car, for the drive's report."""
+        """Return what happened to the car, for the drive's report."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class DriveOptions:
 
 
 def check_no_film(camera: str) -> None:
-    """Raises CameraError for pictures that do not come from a camera's device."""
+    """Raise CameraError for pictures that do not come from a camera's device."""
     path = path_of(camera)
     if path.exists() and not path.is_char_device():
         raise CameraError(
@@ -108,10 +108,11 @@ def check_no_film(camera: str) -> None:
 def drive_car(
     options: DriveOptions, report: Report, car: Callable[[], AbstractContextManager[OtherCar]] | None = None
 ) -> None:
-    """Drive as the options say, in this process's main thread. Raises as loop.drive.
+    """Drive as the options say, in this process's main thread. Raises as loop.drive() does.
 
-    report: filled during the drive, so that it is complete even after a fault. car: opens another car than that of the
-    options. As a service it drives each time that a human arms the car, until it is told to stop.
+    report: filled during the drive, so that it is complete even after a fault. car: opens a car that is driven instead
+    of the one at the options' camera and port. As a service, this drives each time that a human arms the car, until it
+    is told to stop.
     """
     settings = Settings.of(
         params()["drive"],
@@ -158,7 +159,7 @@ def drive_car(
 
 @dataclass(frozen=True)
 class _Opened:
-    """What every drive has open. link: None: no motor is driven."""
+    """All that every kind of drive has opened. link: None: no motor is driven."""
 
     options: DriveOptions
     settings: Settings
@@ -169,13 +170,13 @@ class _Opened:
     until: Until
 
     def run(self, pilot: Pilot, hooks: Hooks) -> None:
-        """One drive; raises as loop.drive."""
+        """Run the control loop for one drive. Raises as loop.drive() does."""
         rate_hz, report = self.options.hz, self.report
         drive(pilot, self.link, self.log, rate_hz=rate_hz, until=self.until, hooks=hooks, report=report)
 
 
 def _replay(opened: _Opened, controls: Controls) -> None:
-    """Sends the pulses of a recording."""
+    """Send the pulses of a recording."""
     options, report, log, link = opened.options, opened.report, opened.log, opened.link
     limit = 1.0 if options.throttle_limit is None else options.throttle_limit
     pilot = ReplayPilot(controls, throttle_limit=limit, calibration=this_car().pwm)
@@ -211,7 +212,7 @@ def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
         said = ""
 
         def show_waiting() -> None:
-            asked = feed.over()  # of a service nothing more: it is disarmed
+            asked = feed.over()  # a waiting service ignores a stop from the view: it is disarmed anyway
             feed.waiting(report, camera, link, said)
             if asked and not service:
                 raise NotArmed(asked)
@@ -259,7 +260,7 @@ def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
 
 
 def another_car(manifest: dict[str, Any], this: Car) -> str:
-    """A warning if an artifact was calibrated for another car than this one, else "". It may drive nevertheless.
+    """Return a warning if an artifact was calibrated for another car than this one, else "". It may drive all the same.
 
     An artifact that names no car is for the car of the original recordings.
     """
@@ -273,7 +274,7 @@ def another_car(manifest: dict[str, Any], this: Car) -> str:
 
 
 def _then(arm: Arm, begin: Callable[[], object]) -> Arm:
-    """Arm, and then call begin(): a film must start with the loop, not while somebody looks for the transmitter."""
+    """Return a function that arms and then calls begin(): a film must start with the loop, not while arming waits."""
 
     def armed() -> Telemetry | None:
         telemetry = arm()
@@ -284,7 +285,7 @@ def _then(arm: Arm, begin: Callable[[], object]) -> Arm:
 
 
 def what_is_missing(link: ServoLink) -> str:
-    """What a human must do before the Arduino can be armed, "" if nothing. Raises LinkError as latest()."""
+    """Return what a human must do before the Arduino can be armed, "" if nothing. Raises LinkError as latest() does."""
     telemetry = link.latest()
     return MISSING[telemetry.missing] if telemetry and telemetry.missing != "-" else ""
 
@@ -300,13 +301,12 @@ def arm_capped(
 
     limit, most: throttles in [0, 1]. most: the largest that this drive may ask for; `notify` is told if the Arduino
     allows less. still_wanted: raises if nobody wants the car armed any more. Raises what still_wanted raises, and
-    LinkError as lower_cap() and arm().
+    LinkError as lower_cap() and arm() do.
     """
     channel = link.calibration.throttle
-    asked = max(
-        (limit, -limit) if channel.low < 0 else (limit,), key=lambda a: abs(channel.pulse_us(a) - channel.neutral_us)
-    )
-    cap_us = link.lower_cap(channel.pulse_us(asked)).cap_us
+    directions = (limit, -limit) if channel.low < 0 else (limit,)
+    farthest_us = max(map(channel.pulse_us, directions), key=lambda us: abs(us - channel.neutral_us))
+    cap_us = link.lower_cap(farthest_us).cap_us
     span_us = abs(channel.pulse_us(most) - channel.neutral_us)
     if cap_us - channel.neutral_us < span_us:
         cap = most * (cap_us - channel.neutral_us) / span_us
@@ -328,7 +328,7 @@ def arm_when_ready(
     """Arm for a human in a terminal, for the loop's hooks: say what is missing, wait for it, and then arm.
 
     checks: called while waiting; each raises if its device fails. Raises NotArmed when told to stop, what a check
-    raises, and as arm().
+    raises, and what arm() raises.
     """
     told = ""
     while missing := what_is_missing(link):
@@ -429,7 +429,7 @@ class _Arming:
 
 
 def _first_of(*ends: Callable[[], str | None]) -> Callable[[], str | None]:
-    """Combine several reasons to end a drive: the first that applies."""
+    """Combine several reasons to end a drive; the first that applies is returned."""
     return lambda: next((why for end in ends if (why := end())), None)
 
 
@@ -445,7 +445,7 @@ def _all_of(*sources: Warnings) -> Warnings:
 
 @contextlib.contextmanager
 def _flight_log(options: DriveOptions, settings: Settings, report: Report) -> Iterator[FlightLog]:
-    """An open flight log whose events are also lines on the terminal, above the report's status."""
+    """Open a flight log whose events are also lines on the terminal, above the report's status."""
     (max_bytes, keep), path = log_limits(), options.log_file or default_log()
     header: dict[str, Any] = {"artifact": str(options.artifact or options.replay), "hz": options.hz, **vars(settings)}
     if not (car := this_car()).drives_like(Car()):

@@ -1,8 +1,8 @@
-"""Artifacts run by a Hailo chip: a compiled network (HEF), and in ONNX Runtime what follows it on the processor.
+"""Run artifacts on a Hailo chip: it runs a compiled network (HEF), and ONNX Runtime runs the rest on the processor.
 
-The chip is driven by HailoRT's Python package, `hailo_platform`, which Hailo's packages install beside the driver, by
-`create_infer_model`, which the Hailo-8, 8L and 10H all have. A network that was right in the compiler's emulator may
-compute something else on the chip: the parity vectors that every artifact has are asked of the device itself.
+HailoRT's Python package `hailo_platform` drives the chip; Hailo's packages install it beside the driver. Its
+`create_infer_model` works with the Hailo-8, 8L and 10H. A network that was right in the compiler's emulator may compute
+something else on the chip, so the parity vectors of every artifact are checked on the device itself.
 """
 
 import math
@@ -18,14 +18,14 @@ from rover_lib.onboard.engines import SessionEngine
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.host import usable_cores
 
-TIMEOUT_MS = 1000  # for one inference: some thirty times what one should take
-LARGEST_SIDE = 8192  # of an output
+TIMEOUT_MS = 1000  # for one inference: about thirty times what it should take
+LARGEST_SIDE = 8192  # of an output's shape
 
 
 class HailoEngine(SessionEngine):
-    """A network on the chip, and the rest of the policy on the processor. Use `load`.
+    """A network on the chip, and the rest of the policy on the processor. Make it with `load`.
 
-    runs: the manifest's "hailo", see `_checked`.
+    _runs: the manifest's "hailo", see `_checked`.
     """
 
     def __init__(self, path: Path, manifest: dict[str, Any], threads: int | None):
@@ -57,7 +57,7 @@ class HailoEngine(SessionEngine):
         self.set_threads(threads or usable_cores())
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
-        """As engines.Engine."""
+        """As Engine.run()."""
         given = dict(zip(self._frames, frames_rgb, strict=True))
         if "state" in self._inputs:
             given["state"] = _affine(state, self._runs["state"]).reshape(1, 1, -1)
@@ -68,7 +68,7 @@ class HailoEngine(SessionEngine):
             if self._rest is None:
                 return _affine(self._answers["actions"], self._runs["actions"])
             (y,) = self._rest.run(None, {"state": state[None], **self._answers})
-        except Exception as e:  # HailoRT has a dozen types, and so has ONNX Runtime
+        except Exception as e:  # HailoRT raises a dozen types, and so does ONNX Runtime
             raise RuntimeError(f"{type(e).__name__}: {e}") from None
         return y
 
@@ -76,12 +76,16 @@ class HailoEngine(SessionEngine):
         if self._rest_model is None:
             self._rest = None
             return
-        from rover_lib.onboard.onnx_engine import session_of  # here, because a whole network on the chip does without
+        from rover_lib.onboard.onnx_engine import session_of  # here: a whole network on the chip does not need it
 
         self._rest = session_of(self._rest_model, threads, self._path)
 
     def _matched(self, model: Any, streams: list[Any], shapes: dict[str, list[int]]) -> dict[str, str]:
-        """HailoRT's name of the stream for each of ours: by its size; where several have it, by the original name."""
+        """Return HailoRT's name of the stream for each of our names.
+
+        A stream is found by its size and, if several have that size, by its original name. Raises ArtifactError unless
+        exactly one stream matches each name, and no stream is left over.
+        """
         matched = {}
         for name, shape in shapes.items():
             alike = [s.name for s in streams if math.prod(s.shape) == math.prod(shape)]
@@ -103,7 +107,7 @@ class HailoEngine(SessionEngine):
 
 
 def load(path: Path, manifest: dict[str, Any], threads: int | None) -> HailoEngine:
-    """Raises ArtifactError where there is no chip, or HailoRT does not take the network."""
+    """Load an artifact for the chip. Raises ArtifactError if there is no chip, or HailoRT refuses the network."""
     try:
         return HailoEngine(path, manifest, threads)
     except ArtifactError:
@@ -117,7 +121,11 @@ def load(path: Path, manifest: dict[str, Any], threads: int | None) -> HailoEngi
 
 
 def _checked(manifest: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The manifest's "hailo": {network, outputs: {name: shape}, original_names, state, actions: scale and shift}."""
+    """Return the manifest's "hailo". Raises ArtifactError if it does not say how the network runs.
+
+    It has network ("backbone" or "whole"), outputs (name: shape), original_names, and state and actions, each None or
+    a scale and a shift.
+    """
     runs: Any = manifest.get("hailo")
     expected = {f"features_{c['name']}" for c in manifest["cameras"]}
     try:
@@ -137,7 +145,7 @@ def _checked(manifest: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _require(fact: bool) -> None:
-    """No assert: Python leaves those out when it is told to optimise."""
+    """Raise ValueError unless `fact` holds. Not an assert: Python leaves those out when it is told to optimise."""
     if not fact:
         raise ValueError
 

@@ -1,7 +1,7 @@
 """The machine's own state: temperature, clock, throttling, memory. A value that it does not report is None, not 0.
 
-Read from /proc and /sys: psutil would be a compiled package to pin and hash on every rover, and knows neither a
-process's peak memory on Linux nor what a Raspberry Pi's firmware throttles.
+The values are read from /proc and /sys. psutil would be a compiled package to pin and hash on every rover, and it knows
+neither a process's peak memory on Linux nor what a Raspberry Pi's firmware throttles.
 """
 
 import errno
@@ -27,7 +27,7 @@ class Host:
     vcgencmd: str = "vcgencmd"
 
     def temperature_c(self) -> float | None:
-        """The processor's temperature; that of another zone if none is labelled as the processor's."""
+        """Return the processor's temperature, or that of the hottest zone if none is labelled as the processor's."""
         readings = {}
         for zone in sorted(self.sys_root.glob("class/thermal/thermal_zone*")):
             milli_c = _number_in(zone / "temp")
@@ -37,12 +37,12 @@ class Host:
         return max(cpu or readings.values(), default=None)
 
     def clock_mhz(self) -> float | None:
-        """The slowest core's clock now; None where the machine does not say."""
+        """Return the slowest core's clock now; None if the machine does not report it."""
         files = self.sys_root.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_cur_freq")
         return min((khz / 1000 for f in files if (khz := _number_in(f)) is not None), default=None)
 
     def throttled(self) -> str | None:
-        """What `vcgencmd get_throttled` says on a Raspberry Pi, such as "0x0"."""
+        """Return what `vcgencmd get_throttled` reports on a Raspberry Pi, such as "0x0"; None elsewhere."""
         try:
             found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
         except (OSError, subprocess.SubprocessError):
@@ -51,22 +51,22 @@ class Host:
         return value if found.returncode == 0 and name == "throttled" and value.startswith("0x") else None
 
     def process_peak_memory_mb(self) -> float | None:
-        """The largest resident memory that this process has ever had."""
+        """Return the largest resident memory that this process has ever had, in MB of 10**6 bytes."""
         for line in (_text_in(self.proc_root / "self/status") or "").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024 / 1e6
-        # ru_maxrss second: a child inherits its parent's, VmHWM starts anew
+        # ru_maxrss comes second: a child inherits its parent's, while VmHWM starts anew
         kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return kib * (1 if sys.platform == "darwin" else 1024) / 1e6 or None
 
     def core_ticks(self) -> list[tuple[int, int]] | None:
-        """For each core, (busy, total) ticks since the machine started."""
+        """Return (busy, total) ticks since the machine started for each core; None if they are not reported."""
         rows = [line.split() for line in (_text_in(self.proc_root / "stat") or "").splitlines()]
         cores = [[int(v) for v in r[1:9]] for r in rows if r and r[0].startswith("cpu") and r[0] != "cpu"]
         return [(sum(c) - c[3] - c[4], sum(c)) for c in cores if len(c) > 4] or None  # 3, 4: idle, waiting for disks
 
     def reading(self) -> dict[str, Any]:
-        """Temperature, clock and throttling now."""
+        """Return temperature, clock and throttling now."""
         return {
             "temperature_c": self.temperature_c(),
             "clock_mhz": self.clock_mhz(),
@@ -75,12 +75,12 @@ class Host:
 
 
 def usable_cores() -> int:
-    """How many cores this process may run on: fewer than the machine has if its affinity was restricted."""
+    """Return how many cores this process may run on: fewer than the machine has if its affinity was restricted."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def throttled_means(value: str | None) -> list[str] | None:
-    """The meaning of each bit set in get_throttled's value, as text; None if there was no reading."""
+    """Return the meaning of each bit set in get_throttled's value, as text; None if there was no reading."""
     if value is None:
         return None
     bits = int(value, 16)
@@ -103,17 +103,17 @@ def _number_in(path: Path) -> float | None:
 
 
 def default_log() -> Path:
-    """Where a drive's flight log goes: the service's state folder (from systemd), or the user's."""
+    """Return where a drive's flight log goes: into the service's state folder (from systemd), or the user's."""
     home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(os.environ.get("STATE_DIRECTORY") or Path(home) / "rover") / "flight.log"
 
 
 def is_listened_at(place: Path) -> bool:
-    """Whether a process listens at a Unix socket of whole messages. A dead process's socket file does not count."""
+    """Return whether a process listens at a SOCK_SEQPACKET socket. The socket file of a dead process does not count."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) as asking:
         return asking.connect_ex(str(place)) in (0, errno.EAGAIN)  # EAGAIN: it has no time to answer
 
 
 def default_view() -> Path:
-    """Where the user's view listens for drives: beside their flight log."""
+    """Return where the user's view listens for drives: beside their flight log."""
     return default_log().with_name("view")

@@ -1,4 +1,4 @@
-"""Plan while the control loop runs: a thread asks the policy about the newest frame; the policy has its own process.
+"""Plan while the control loop runs: a thread asks the policy for a plan of the newest frame, again and again.
 
     with PolicyProcess("policy_static.pt") as policy:
         with Planner(camera, policy.predict, commanded, policy.rate_hz) as planner:
@@ -32,10 +32,10 @@ from rover_lib.onboard.engines import UNCONFINED
 from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
 from rover_lib.onboard.plan import LIMITS, Commanded, Plan
 
-LOAD_S = 120.0  # an engine and a full policy from a slow card
+LOAD_S = 120.0  # time to load an engine and a full-size policy from a slow card
 POLL_S = 0.05
 WAIT_S = 0.1
-FRESH_S = 0.8  # WatchdogSec of the service is 2 s, and the Arduino has to answer too
+FRESH_S = 0.8  # longest wait for a fresh plan: WatchdogSec of the service is 2 s, and the Arduino has to answer too
 END_S = 1.0
 NICE = 5  # the control loop goes first
 PR_SET_PDEATHSIG = 1
@@ -48,8 +48,9 @@ Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint
 class Planner:
     """Plans for the newest frame again and again, in a thread; a context manager.
 
-    predict: returns (chunk, 2) actions, unclipped, for a frame and a state, or raises. rate_hz: of the actions. rest_s:
-    pause after each plan, except in without_rest(), so that a standing car does not get warm. limits: of the actions.
+    predict: returns (chunk, 2) actions, unclipped, for a frame and a state, or raises. rate_hz: actions per
+    second of a plan. rest_s: pause after each plan, except in without_rest(), so that a standing car does not get warm.
+    limits: of the actions, see Plan.
     """
 
     def __init__(
@@ -85,13 +86,13 @@ class Planner:
             self._thread.join(END_S)
 
     def newest(self) -> Plan | None:
-        """The newest plan, None before the first. Raises what the camera or the policy raised."""
+        """Return the newest plan, None before the first. Raises what the camera or the policy raised."""
         if self._failure:
             raise self._failure
         return self._plan
 
     def wait(self, timeout_s: float, after: int = 0) -> Plan | None:
-        """The newest plan, as soon as its number is above `after` or the time is over. Raises as newest()."""
+        """Wait for a plan numbered above `after`, or until the time is over. Returns and raises as newest() does."""
         with self._news:
             self._news.wait_for(lambda: self._failure or (self._plan and self._plan.number > after), timeout_s)
         return self.newest()
@@ -108,7 +109,7 @@ class Planner:
     def renew(self, age_s: float) -> None:
         """If the newest plan's frame is older than age_s, wait for the next plan. For use in without_rest().
 
-        Raises PolicyError if none comes within FRESH_S, and as newest().
+        Raises PolicyError if none comes within FRESH_S, and what newest() raises.
         """
         plan = self.newest()
         number = plan.number if plan else 0
@@ -120,7 +121,7 @@ class Planner:
 
     @property
     def asking_s(self) -> float:
-        """For how long the policy has been computing its present answer; 0 while it is idle."""
+        """Seconds that the policy has been computing its present answer for; 0 while it is idle."""
         asked = self._asked_s
         return 0.0 if asked is None else self._clock() - asked
 
@@ -144,7 +145,7 @@ class Planner:
                 self._no_rest.wait(self._rest_s)
         except RoverError as error:
             self._failure = error
-        except Exception as error:  # whatever it is, the loop must be told, and stop the car
+        except Exception as error:  # of any type: the loop must be told, and stop the car
             self._failure = PolicyError(f"the policy failed ({type(error).__name__}: {error}); the car is stopped")
         with self._news:
             self._news.notify_all()
@@ -199,7 +200,7 @@ class PolicyProcess:
         self.close()
 
     def close(self) -> None:
-        """Ends the process, whatever it is doing."""
+        """End the process, whatever it is doing."""
         self._closing.set()
         if self._process:
             self._process.terminate()
@@ -228,7 +229,7 @@ class PolicyProcess:
         return (self._process.pid,) if self._process else ()
 
     def predict(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
-        """(chunk, 2) float32 as Policy.predict_unclipped(), for one camera. Waits for the answer, or until close().
+        """Return (chunk, 2) float32 as Policy.predict_unclipped() does, for one camera. close() ends the wait for it.
 
         Raises PolicyError with the policy's own error, or if its process has ended.
         """
@@ -278,7 +279,7 @@ class PolicyProcess:
 
 
 def delayed(predict: Predict, latency_s: float) -> Predict:
-    """The same as `predict`, but each answer takes at least latency_s."""
+    """Return a `predict` whose answers take at least latency_s each."""
 
     def predict_delayed(frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
         end = time.monotonic() + latency_s
@@ -339,7 +340,7 @@ def _refusal(error: RoverError) -> bytes:
 
 
 def main(arguments: list[str], loaded: Callable[[Any], None] = lambda policy: None) -> None:
-    """The program that PolicyProcess starts. arguments: its pipe, artifact and threads. loaded: as for serve()."""
+    """Run as the program that PolicyProcess starts. arguments: its pipe, artifact and threads. loaded: see serve()."""
     fd, artifact, threads = arguments
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a policy that hangs must not outlive the loop
     os.nice(NICE)

@@ -53,8 +53,8 @@ INSTEAD = {  # (what was given, what was wanted): what to do instead
     ("run", "recordings"): "give the recordings that it was made of, which its load.json names",
 }
 EPISODE_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
-HEAD = 65536  # bytes of a file that are read
-PICKLE_HEAD = 4096  # of a torch file's pickle, which names its keys early
+HEAD = 65536  # bytes that are read of a file
+PICKLE_HEAD = 4096  # bytes that are read of a torch file's pickle, which names its keys early
 
 
 class KindError(RoverError):
@@ -62,7 +62,7 @@ class KindError(RoverError):
 
 
 def kinds_of(path: Path | str) -> tuple[str, ...]:
-    """The kinds of a path, as keys of CALLED; empty if the path does not exist or is of no known kind."""
+    """Return the kinds of a path, as keys of CALLED; empty if the path does not exist or is of no known kind."""
     path = Path(path)
     try:
         mode = path.stat().st_mode
@@ -177,7 +177,7 @@ def _of_file(file: Path) -> tuple[str, ...]:
 
 
 def _of_archive(file: Path) -> tuple[str, ...]:
-    """The kinds of a zip file that torch or `rover export` wrote; none for a damaged one."""
+    """Return the kinds of a zip file that torch or `rover export` wrote; none for a damaged one."""
     try:
         with zipfile.ZipFile(file) as z:
             names = z.namelist()
@@ -196,7 +196,10 @@ def _of_archive(file: Path) -> tuple[str, ...]:
 
 
 def _stage_of(head: bytes) -> str | None:
-    """The stage of a report. It is among the first keys, so that the head is enough for a file of any size."""
+    """Return the stage of a report; None if it is no report.
+
+    The stage is among the first keys, so that the head is enough for a file of any size.
+    """
     text = head[:200].decode("utf-8", "replace")
     if '"schema"' not in text or '"stage"' not in text:
         return None

@@ -1,11 +1,11 @@
-"""The control loop: a command at each absolute deadline, and a stopped car at the end of every fault.
+"""The control loop: it sends a command at each absolute deadline, and every fault ends in a stopped car.
 
     with ServoLink(port) as link:
         report = drive(pilot, link, log, rate_hz=30, until=Until(max_seconds=60))
 
-Nothing is driven by on an exception: whatever ends the loop, neutral is the first that is sent after it, and the
-Arduino stops by itself 150 ms after the last command should that not get through. What is opened around it, and by
-what options, is in drive.py.
+The loop never drives on after an exception: whatever ends it, the next command is neutral. If that does not get
+through, the Arduino stops the car by itself 150 ms after the last command. drive.py opens all that the loop needs, by
+the options of a drive.
 """
 
 import logging
@@ -26,19 +26,19 @@ from rover_lib.onboard.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink
 from rover_lib.onboard.telemetry import ARMED, Tick
 
 RATES_HZ = (10.0, 100.0)
-KEEP_S = 0.034  # between commands, also where ticks are rarer: the Arduino takes 100 ms without one for a pause
-RESEND_S = 0.018  # a command takes 3 ms on the wire, a status that is under way 7, its own 7
-SPARE_S = 0.004  # before a deadline nothing is sent again
-READ_S = 0.005  # for the thread that reads the port, after a pause of the whole process
-# A single pause of 150 ms is the Arduino's affair, which stops the car then, and so is a second one soon after one of
-# 100 ms. Shorter ones it lets pass. Together they may take no more time out of half a second than one: a machine that
-# is busy but healthy misses a tick now and then (4 of 55,801 beside builds, docs/driving.md), never several again and
-# again.
+KEEP_S = 0.034  # longest time between commands, even if ticks are rarer: to the Arduino, 100 ms without one is a pause
+RESEND_S = 0.018  # time to be acknowledged: 3 ms for the command, 7 for a status already on the wire, 7 for its own
+SPARE_S = 0.004  # nothing is sent again so shortly before a deadline
+READ_S = 0.005  # time for the thread that reads the port, after a pause of the whole process
+# The Arduino itself stops the car after a single pause of 150 ms, and after a second pause soon after one of 100 ms. It
+# lets shorter pauses pass, so they are added up here: within half a second, all of them together may take no longer
+# than a single one. A machine that is busy but healthy misses a tick now and then (4 of 55,801 beside builds,
+# docs/driving.md), never several again and again.
 LATE_MOST_S = 0.15
 LATE_WITHIN_S = 0.5
 
-Arm = Callable[[], Telemetry | None]  # arms the car; None: no motor is driven
-Warnings = Callable[[], Iterable[str]]  # sentences about what was out of the ordinary since the last call
+Arm = Callable[[], Telemetry | None]  # arms the car and returns the status that says so; None: no motor is driven
+Warnings = Callable[[], Iterable[str]]  # sentences about what was unusual since the last call
 
 
 class Log(Protocol):
@@ -47,15 +47,15 @@ class Log(Protocol):
     start_s: float
 
     def tick(self, row: Tick) -> None:
-        """One control tick. Waits for nothing."""
+        """Log one control tick, without waiting."""
 
     def event(self, text: str, *, level: int = logging.INFO, **fields: Any) -> None:
-        """Something that happened. Waits for nothing."""
+        """Log something that happened, without waiting."""
 
 
 @dataclass(frozen=True)
 class Until:
-    """What ends a drive as asked: a count of ticks, a duration, `stop`, or `over`, which may give the reason."""
+    """When a drive ends as asked: after `ticks` or `max_seconds`, when `stop` is set or `over` returns a reason."""
 
     ticks: int | None = None
     max_seconds: float | None = None
@@ -65,11 +65,11 @@ class Until:
 
 @dataclass(frozen=True)
 class Hooks:
-    """What an assembly adds to the loop.
+    """Functions that the caller adds to the loop.
 
-    arm: called once all is ready, arms the car, and may wait for a human before; None: the link's own arm(), at once.
-    warnings: called once a second; the sentences that it gives go to the log. record: takes each command, as
-    Recorder.control does. show: is told of each command once it went out, for a view.
+    arm: called once all is ready; it arms the car, and may first wait for a human. None: the link's arm(), at once.
+    warnings: called once a second; the sentences that it returns are logged. record: called with each command, with
+    the arguments of Recorder.control(). show: called with each tick once its command has been sent, for a view.
     """
 
     arm: Arm | None = None
@@ -80,27 +80,31 @@ class Hooks:
 
 @dataclass
 class Report:
-    """What a drive was. Times of ticks in milliseconds; jitter: how late a command went out after its deadline."""
+    """The outcome of a drive, and its state while it lasts.
+
+    late_ms, plan_age_ms and latency_ms have one value per tick; the last two have none where no plan is followed.
+    late_ms: how long after its deadline the command was sent; the summary calls it jitter.
+    """
 
     ticks: int = 0
     missed: int = 0
     resent: int = 0
     seconds: float = 0.0
     ended: str = ""
-    status: str = "getting ready"  # a line for people
+    status: str = "getting ready"  # one line for people
     memory_mb: float | None = None  # resident, of the loop's process and its children, at the end
     memory_growth_mb: float | None = None  # since the first minute
-    world: dict[str, Any] = field(default_factory=dict)  # what became of a car that is not a real one
+    world: dict[str, Any] = field(default_factory=dict)  # figures of a simulated car, added to the summary
     late_ms: array = field(default_factory=lambda: array("f"), repr=False)
     plan_age_ms: array = field(default_factory=lambda: array("f"), repr=False)
     latency_ms: array = field(default_factory=lambda: array("f"), repr=False)
 
     def clear(self) -> None:
-        """As new, for another drive that those who look at this one follow too."""
+        """Make it as new, for another drive: whoever shows this report then follows that one."""
         vars(self).update(vars(Report()))
 
     def summary(self) -> dict[str, Any]:
-        """For JSON: ticks, missed, jitter_p50_ms, jitter_p99_ms, jitter_max_ms, plan_age_p95_ms, ..."""
+        """Return the summary, for JSON: ticks, missed, jitter_p50_ms, jitter_p99_ms, jitter_max_ms, ..."""
 
         def at(values: array, pct: float) -> float | None:
             return round(float(np.percentile(values, pct)), 3) if len(values) else None
@@ -135,12 +139,12 @@ def drive(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Report:
-    """Arms the car, then sends the pilot's order at each deadline until one of the ends is reached.
+    """Arm the car, then send the pilot's order at each deadline until the drive ends.
 
-    link: None drives no motor. rate_hz: of the commands, within RATES_HZ. until: None: the pilot's own end. report: is
-    filled as it goes, so that it is there after a fault too.
-    Raises RoverError if it cannot be begun, DriveFault with what stopped the car, TakenOver when the human did;
-    whatever it is, the car was told neutral before.
+    link: None: no motor is driven. rate_hz: commands per second, within RATES_HZ. until: None: the drive ends when the
+    pilot has no more orders. report: is filled during the drive, so that it is there after a fault too.
+    Raises RoverError if the drive cannot begin, DriveFault if a fault stopped the car, TakenOver if the human did. From
+    arming on, neutral is sent before anything is raised.
     """
     if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
         raise ParamsError(f"a car is driven at {RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz", found=f"{rate_hz:g}")
@@ -155,7 +159,7 @@ def drive(
         loop.arm()
         report.ended = loop.run()
     except BaseException as error:
-        stopped = loop.neutral()  # first of all, and before anything that may take long
+        stopped = loop.neutral()  # before anything else, which may take long
         report.ended = sentence_of(error)
         log.event(report.ended, level=logging.ERROR)
         if isinstance(error, RoverError) and not isinstance(error, (DriveFault, TakenOver)) and loop.armed:
@@ -185,10 +189,10 @@ class _Loop:
     def __post_init__(self) -> None:
         self.armed = False
         self.start_s = 0.0
-        self.boot = 0  # of the Arduino that was armed
-        self.sequence = 0  # of the newest command
+        self.boot = 0  # number of the Arduino's start at which it was armed
+        self.sequence = 0  # number of the newest command
         self.sent_s = 0.0
-        self.late: deque[tuple[float, float]] = deque()  # deadlines that were missed: when that was seen, by how much
+        self.late: deque[tuple[float, float]] = deque()  # missed deadlines: when it was seen, seconds late
         self.last: Order | None = None
         self.port_stuck = False  # the port did not take the last command
 
@@ -200,16 +204,16 @@ class _Loop:
         self.log.event(ARMED if self.link else "dry run: no motor is driven")
 
     def neutral(self) -> str:
-        """Stops the car; a sentence about how that went."""
+        """Stop the car and return a sentence about how that went."""
         if not self.link:
             return "neutral: no motor was driven"
         try:
             return f"neutral: {self.link.neutral().why}"
-        except Exception as error:  # of whatever kind: what stopped the car before it is what must be told
+        except Exception as error:  # of any kind: it must not hide what stopped the car before it
             return f"neutral was not answered, the Arduino stops by itself: {sentence_of(error)}"
 
     def run(self) -> str:
-        """Ticks until something ends it; what did."""
+        """Run tick after tick until something ends the drive, and return the reason."""
         report, until = self.report, self.until
         self.start_s = start = self.clock()
         n = seconds = 0
@@ -257,7 +261,7 @@ class _Loop:
         return f"{who}: steering {order.steering:+.2f}, throttle {order.throttle:.3f}{plan}; {late}"
 
     def _wait(self, deadline: float) -> None:
-        """Until the deadline; a command that the Arduino has not acknowledged is sent again, and so is an old one."""
+        """Wait for the deadline; meanwhile send the last command again if it is not acknowledged or is KEEP_S old."""
         link, last = self.link, self.last
         while link and last and (again := max(self.sent_s + RESEND_S, self.clock())) < deadline - SPARE_S:
             self.sleep(max(0.0, again - self.clock()))
@@ -270,13 +274,16 @@ class _Loop:
                 else:
                     self.report.resent += 1
                 self._put(link, last)
-            except LinkError:  # the next tick looks at it
+            except LinkError:  # the next tick raises what it means
                 break
         if (left := deadline - self.clock()) > 0:
             self.sleep(left)
 
     def _telemetry(self) -> Telemetry | None:
-        """The newest, if the Arduino still lets us drive."""
+        """Return the Arduino's newest status; None without a link.
+
+        Raises DriveFault or TakenOver if that status does not let the host drive, LinkError if the link failed.
+        """
         if not self.link:
             return None
         telemetry = self.link.latest()
@@ -301,7 +308,10 @@ class _Loop:
         return telemetry
 
     def _check_time(self, now: float, late_s: float) -> None:
-        """Ticks were missed, the next is that late: raises DriveFault if that was so too often lately."""
+        """Note that ticks were missed and that the present one is late_s late.
+
+        Raises DriveFault if such ticks were late by more than LATE_MOST_S altogether within LATE_WITHIN_S.
+        """
         self.late.append((now, late_s))
         while self.late[0][0] < now - LATE_WITHIN_S:
             self.late.popleft()
@@ -322,7 +332,7 @@ class _Loop:
             self.port_stuck = False
         except LinkError as error:
             self.link.latest()  # raises if the port is gone
-            if not self.port_stuck:  # perhaps for a moment only; the Arduino knows when to stop
+            if not self.port_stuck:  # perhaps for a moment only; if not, the Arduino stops the car
                 self.log.event(f"a command was not sent: {error}")
             self.port_stuck = True
 

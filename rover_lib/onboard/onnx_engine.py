@@ -1,4 +1,4 @@
-"""Artifacts run by ONNX Runtime, for a rover without torch."""
+"""Run artifacts in ONNX Runtime, on a rover without torch."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,12 +12,12 @@ from rover_lib.onboard.engines import SessionEngine
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.host import usable_cores
 
-onnxruntime.disable_telemetry_events()  # nobody was asked
-ERRORS_ONLY = 3  # of ONNX Runtime's log, which warns of what a machine without a graphics card lacks
+onnxruntime.disable_telemetry_events()  # nobody has agreed to it
+ERRORS_ONLY = 3  # log level; ONNX Runtime warns of what a machine without a graphics card lacks
 
 
 def session_of(model: bytes, threads: int, path: Path | str = "the model") -> onnxruntime.InferenceSession:
-    """A model of ours in ONNX Runtime, on the processor. path: where it is from. Raises ArtifactError."""
+    """Make a session for one of our models, on the processor. path: the model's, for errors. Raises ArtifactError."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = ERRORS_ONLY
@@ -28,27 +28,27 @@ def session_of(model: bytes, threads: int, path: Path | str = "the model") -> on
     options.add_session_config_entry("session.x64quantprecision", "1")
     try:
         session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as e:  # it has a dozen types
+    except Exception as e:  # ONNX Runtime raises a dozen types
         why = " ".join(str(e).split())[:200]
         raise ArtifactError(f"{path}: ONNX Runtime cannot load it ({why})", remedy="quantize again") from None
-    # It keeps the bytes, beside the weights that it has packed, for making itself anew with other providers: 68 MB.
+    # The session keeps the model's bytes (68 MB) beside its packed weights, only to be made again with other providers.
     session._model_bytes = None
     return session
 
 
 class OnnxEngine(SessionEngine):
-    """The model of an ONNX artifact. Use `load`."""
+    """The model of an ONNX artifact. Make it with `load`."""
 
     def __init__(self, path: Path, threads: int):
         self._path = path
         self.set_threads(threads)
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
-        """As engines.Engine."""
+        """As Engine.run()."""
         inputs = dict(zip(self._names, (state[None], *frames_rgb), strict=True))
         try:
             (y,) = self._session.run(None, inputs)
-        except Exception as e:  # it has a dozen types, none of which is a RuntimeError
+        except Exception as e:  # ONNX Runtime raises a dozen types, none of them a RuntimeError
             raise RuntimeError(str(e)) from None
         return y
 
@@ -59,7 +59,7 @@ class OnnxEngine(SessionEngine):
 
 
 def load(path: Path, manifest: dict[str, Any], threads: int | None) -> OnnxEngine:
-    """Raises ArtifactError for a model that ONNX Runtime refuses, or with other inputs than its manifest says."""
+    """Load an artifact. Raises ArtifactError if ONNX Runtime refuses it, or its inputs are not the manifest's."""
     engine = OnnxEngine(path, threads or usable_cores())
     wanted = ["state", *(f"frame_{c['name']}" for c in manifest["cameras"])]
     if engine._names != wanted:

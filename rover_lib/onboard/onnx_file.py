@@ -1,11 +1,11 @@
-"""What an .onnx would run, read without running any of it and without the package onnx: its protobuf, field by field.
+"""Check what an .onnx file would run, without running it and without the package onnx: read its protobuf by fields.
 
     with open_archive("policy_static.onnx.zip") as z:
         check_model(z, "policy_static.onnx.zip")
 
 The models of this project have one form: one graph of one opset of the standard operators, numbers as attributes, and
 weights whose bytes are all there. Anything else that ONNX can say (other files to read weights from, operators of a
-library to load, functions, loops and branches, strings) is refused, known or not, before ONNX Runtime sees it.
+library to load, functions, loops and branches, strings) is refused before ONNX Runtime sees it, known here or not.
 """
 
 import math
@@ -16,8 +16,8 @@ from pathlib import Path
 from rover_lib.onboard.archive import ONNX, Unknown, nothing_unknown, read_record
 
 OPSET, NODES, NAME_BYTES = 17, 5000, 200
-FIELDS, MOST_DIMENSIONS = 100_000, 8  # of a whole model; of a tensor
-LARGEST_NUMBER = 10_000_000  # of an attribute
+FIELDS, MOST_DIMENSIONS = 100_000, 8  # most fields of a whole model; most dimensions of a tensor
+LARGEST_NUMBER = 10_000_000  # in an attribute
 OPERATORS = frozenset({
     "Add", "Cast", "Concat", "Conv", "DequantizeLinear", "Div", "Erf", "Identity", "LayerNormalization", "MatMul",
     "MaxPool", "Mul", "QuantizeLinear", "Relu", "Reshape", "Slice", "Softmax", "Squeeze", "Transpose", "Unsqueeze",
@@ -25,9 +25,9 @@ OPERATORS = frozenset({
 ATTRIBUTES = frozenset(
     {"axis", "dilations", "epsilon", "kernel_shape", "pads", "perm", "strides", "to"}
 )  # each a number or a list of numbers
-ITEM_BYTES = {1: 4, 2: 1, 3: 1, 6: 4, 7: 8}  # by onnx.TensorProto's data types: float32, uint8, int8, int32, int64
+ITEM_BYTES = {1: 4, 2: 1, 3: 1, 6: 4, 7: 8}  # by data type of onnx.TensorProto: float32, uint8, int8, int32, int64
 
-# Of onnx.proto: the fields that are taken of each message, by number
+# From onnx.proto: the fields of each message that are accepted, by number
 MODEL = {1: "ir_version", 2: "producer_name", 7: "graph", 8: "opset_import"}
 GRAPH = {1: "node", 2: "name", 5: "initializer", 11: "input", 12: "output"}
 NODE = {1: "input", 2: "output", 3: "name", 4: "op_type", 5: "attribute"}
@@ -42,14 +42,14 @@ Value = int | memoryview
 def check_model(z: zipfile.ZipFile, path: Path | str) -> None:
     """Raise ArtifactError unless the archive's model is of the one form that artifacts have.
 
-    z: from open_archive(). Nothing in it is run, and no tensor is made.
+    z: an archive from open_archive(). Nothing in it is run, and no tensor is made.
     """
     with nothing_unknown(path, "model"):
         _Model(memoryview(read_record(z, ONNX)))
 
 
 class _Model:
-    """A model's protobuf. Raises Unknown if it is not of the one form that artifacts have."""
+    """Checks a model's protobuf. Raises Unknown if it is not of the one form that artifacts have."""
 
     def __init__(self, model: memoryview):
         self._left = FIELDS
@@ -119,7 +119,10 @@ class _Model:
             raise Unknown(f"a tensor of {sizes} in {stored} bytes"[:80])
 
     def _fields(self, message: memoryview, known: dict[int, str], what: str) -> Iterator[tuple[str, Value]]:
-        """(field, value) of a protobuf message: a number, or the bytes. Raises Unknown for another field."""
+        """Yield (field, value) for each field of a protobuf message; a value is a number or bytes.
+
+        Raises Unknown for a field that is not in `known`, for a damaged message, and for more than FIELDS in all.
+        """
         at, end = 0, len(message)
         while at < end:
             self._left -= 1
@@ -146,7 +149,7 @@ class _Model:
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """(number, where it ends)"""
+    """Return a number and the position after it. Raises Unknown if it does not end."""
     value = 0
     for shift in range(0, 70, 7):
         if at >= len(message):

@@ -27,7 +27,7 @@ _WHOLE = "copy the episode again, or label the one that it was copied from"
 
 
 def label(episodes: Sequence[Path], outcome: str) -> None:
-    """Notes an outcome, one of CHOICES, in each of these episode folders. Raises EpisodeError as labelled().
+    """Note an outcome, one of CHOICES, in each of these episode folders. Raises EpisodeError as labelled() does.
 
     All episodes are read before the first is written.
     """
@@ -36,7 +36,7 @@ def label(episodes: Sequence[Path], outcome: str) -> None:
 
 
 def labelled(episode: Path, outcome: str) -> tuple[Path, bytes]:
-    """An episode's file, and its new content. Raises EpisodeError if it has no complete episode_data.json."""
+    """Return an episode's file and its new content. Raises EpisodeError if it has no complete episode_data.json."""
     if outcome not in CHOICES:
         raise EpisodeError(f"an outcome is one of {', '.join(CHOICES)}", found=outcome)
     path = episode / DATA
@@ -68,12 +68,12 @@ def labelled(episode: Path, outcome: str) -> tuple[Path, bytes]:
 
 
 def _parsed(text: str) -> Any:
-    """The parsed JSON, with numbers kept as text, so that two files can be compared even if they contain NaN."""
+    """Parse JSON, with numbers kept as text, so that two files can be compared even if they contain NaN."""
     return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
 
 
 def _with_outcome(text: str, outcome: str | None) -> str:
-    """The text of an episode file with that JSON as metadata.outcome; outcome None: without the member."""
+    """Return an episode file's text with metadata.outcome set to that JSON, or without it if `outcome` is None."""
     start = _skip(text, 0)
     for name, _, value, end in _members(text, start):
         if name == "metadata":
@@ -82,7 +82,7 @@ def _with_outcome(text: str, outcome: str | None) -> str:
 
 
 def _changed(text: str, outcome: str | None) -> str:
-    """The same for the text of the metadata object alone."""
+    """Do the same for the text of the metadata object alone."""
     members = list(_members(text, 0))
     found = [i for i, (name, *_) in enumerate(members) if name == "outcome"]
     if not found:
@@ -98,7 +98,7 @@ def _changed(text: str, outcome: str | None) -> str:
 
 
 def _added(text: str, start: int, member: str) -> str:
-    """The text with one more member at the end of the object that begins at `start`, spaced like its first member."""
+    """Add a member at the end of the object that begins at `start`, spaced like its first member; return the text."""
     members = list(_members(text, start))
     if not members:
         return f"{text[: start + 1]}{member}{text[start + 1 :]}"
@@ -107,7 +107,7 @@ def _added(text: str, start: int, member: str) -> str:
 
 
 def _members(text: str, start: int) -> Iterator[tuple[str, int, int, int]]:
-    """The members of the object at `start`: (name, start of the name, start of the value, end of the value).
+    """Yield the members of the object at `start`: (name, start of the name, start of the value, end of the value).
 
     Raises ValueError if there is no object.
     """
@@ -116,7 +116,7 @@ def _members(text: str, start: int) -> Iterator[tuple[str, int, int, int]]:
     while text[at : at + 1] != "}":
         begin = at
         name, at = decoder.raw_decode(text, at)
-        value = _skip(text, _skip(text, at) + 1)  # behind the colon
+        value = _skip(text, _skip(text, at) + 1)  # after the colon
         _, end = decoder.raw_decode(text, value)
         yield name, begin, value, end
         at = _skip(text, end)

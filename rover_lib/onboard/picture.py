@@ -56,13 +56,13 @@ def decode_jpeg(data: bytes) -> np.ndarray:
 
 
 def read_jpeg(path: Path | str) -> np.ndarray:
-    """Decode a file, and raise PictureError, as decode_jpeg(); raises OSError if the file cannot be read."""
+    """Decode a file as decode_jpeg() does. Raises PictureError, and OSError if the file cannot be read."""
     with open_plain(path, PictureError(f"{path}: no plain file", remedy="remove it")) as file:
         return decode_jpeg(file.read(MOST_BYTES + 1))
 
 
 def brightness(image: np.ndarray) -> tuple[float, float]:
-    """The mean of a picture's pixels, and its contrast, both in grey levels from 0 to 255.
+    """Return the mean of a picture's pixels, and its contrast, both in grey levels from 0 to 255.
 
     The contrast is the standard deviation of the means of a 16x9 grid of blocks, for the colour where it is largest.
     The sensor's noise averages out within a block.
@@ -73,7 +73,7 @@ def brightness(image: np.ndarray) -> tuple[float, float]:
 
 
 def block_sums(image: np.ndarray) -> np.ndarray:
-    """(144,) uint64, one sum per block of a 16x9 grid. Equal sums mean that the blocks are equal, byte for byte.
+    """Return (144,) uint64, one sum per block of a 16x9 grid. Equal sums mean that the blocks are equal, byte for byte.
 
     image: contiguous, and at least LEAST in size. Pixels left over at the right and lower edge belong to no block.
     """

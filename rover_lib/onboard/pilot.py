@@ -1,4 +1,4 @@
-"""Who says what to do at a tick of the control loop: a policy's plans, or a recording's pulses."""
+"""Pilots say what to send at each tick of the control loop: by a policy's plans, or by a recording's pulses."""
 
 import threading
 import time
@@ -17,18 +17,24 @@ from rover_lib.onboard.recording import Controls
 
 FIRST_PLAN_S = 10.0
 MOVING = 0.004  # throttle above which a car moves, so that it matters what it sees
-COASTS_S = 0.5  # a car without throttle moves on for a while
-BEGINS_S = 0.12  # a car that was just told to go may see what it saw; 0.2 s after that it must stand if it still does
+COASTS_S = 0.5  # a car whose throttle is released rolls on for this time
+# A car that is told to go may see the same picture for this time; if it does for longer, it must have stopped 0.2 s
+# after it was told.
+BEGINS_S = 0.12
 LATE_FRAME_S = 0.2  # six frames of a camera
 CAP = "is there a cap or dirt on the lens?"
-SLACK_S = 0.002  # a control of this much later is of the same tick: recordings have the ticks' rate, or close to it
+SLACK_S = 0.002  # a control that is due this much later belongs to this tick: recordings have about the ticks' rate
 HOLE_S = 0.3  # a gap between measured pulses after which a replay stops the car
 LAST_S = 0.1  # how long a replay's last pulses are held
 
 
 @dataclass(frozen=True)
 class Order:
-    """What to send at a tick, and where it comes from. latency_s, age_s and frame: of the plan, if there is one."""
+    """What to send at a tick, and where it comes from.
+
+    plan: number of the plan, 0 without one. age_s, latency_s, fade: of that plan, see plan.Command and plan.Plan.
+    frame: number of the camera's newest frame, 0 without one; a plan may have looked at an older one.
+    """
 
     steering: float
     throttle: float
@@ -42,35 +48,35 @@ class Order:
 
 
 class Pilot(Protocol):
-    """Who says what to do at a tick."""
+    """Something that says what to send at each tick."""
 
     def ready(self, stop: threading.Event) -> None:
-        """Waits until there is something to drive by. Raises RoverError if that does not come."""
+        """Wait until there is something to drive by, or `stop` is set. Raises RoverError if it does not come."""
 
     def order(self, now_s: float) -> Order | None:
-        """For this tick; None when there is nothing more to do. Raises RoverError for what must stop the car."""
+        """Return the order for this tick; None if the drive is done. Raises RoverError for what must stop the car."""
 
     def sent(self, at_s: float, order: Order) -> None:
-        """It went out at that time."""
+        """Take note that the order was sent at that time."""
 
 
 class Sight:
-    """Whether what the camera shows is a reason to drive on. Not for several threads at a time."""
+    """Judges whether the car may drive by what the camera shows. For one thread at a time."""
 
     def __init__(self, camera: Camera, settings: Settings):
         self._camera, self._settings = camera, settings
-        self._moving_s: float | None = None  # since when the car has been driving
-        self._throttle_s = 0.0  # when it was last told to
-        self._blank_s: float | None = None  # since when nothing has been on the picture
+        self._moving_s: float | None = None  # since when the car has been moving
+        self._throttle_s = 0.0  # when it was last told to move
+        self._blank_s: float | None = None  # since when the picture has been blank
 
     def check(self) -> None:
-        """Raises CameraError if the newest frame is no reason to drive: frozen, black or without contrast."""
+        """Raise CameraError if nobody may drive by the newest frame: it is frozen, black or without contrast."""
         frame = self._camera.latest()
         if frame and (fault := frozen(frame, self._settings) or blank(frame, self._settings)):
             raise fault
 
     def sent(self, at_s: float, throttle: float) -> None:
-        """The car was told to drive with that throttle: from then on its pictures must change."""
+        """Take note that this throttle was sent: if it moves the car, the pictures must change from then on."""
         if abs(throttle) > MOVING:
             self._throttle_s = at_s
             self._moving_s = at_s if self._moving_s is None else self._moving_s
@@ -78,7 +84,7 @@ class Sight:
             self._moving_s = None
 
     def watch(self, frame: Frame, now_s: float) -> None:
-        """Raises CameraError for the newest frame: frozen while the car moves, or blank for too long."""
+        """Raise CameraError if the newest frame is frozen while the car moves, or pictures were blank for too long."""
         moves = self._moving_s is not None and now_s - self._moving_s > BEGINS_S
         if moves and (fault := frozen(frame, self._settings)):
             raise fault
@@ -92,7 +98,7 @@ class Sight:
 
 
 class PolicyPilot:
-    """Drives by plans, and watches the camera behind them. rate_hz: of the plans' steps."""
+    """Drives by a policy's plans, and watches the camera that they come from. rate_hz: steps of a plan per second."""
 
     def __init__(
         self,
@@ -108,11 +114,11 @@ class PolicyPilot:
         self._calibration = calibration or PwmCalibration()
         self._follower = Follower(settings, rate_hz)
         self._sight = Sight(camera, settings)
-        self._frame_age_s = self._asking_s = 0.0  # the most, since warnings()
+        self._frame_age_s = self._asking_s = 0.0  # the longest since the last warnings()
 
     @property
     def plan(self) -> tuple[Plan, float] | None:
-        """The one in use, and the rate of its steps."""
+        """The plan in use and its steps per second; None before the first plan."""
         plan = self._follower.plan
         return (plan, self._follower.rate_hz) if plan else None
 
@@ -156,11 +162,11 @@ class PolicyPilot:
         self._sight.sent(at_s, order.throttle)
 
     def check_sight(self) -> None:
-        """As Sight.check()."""
+        """Raise CameraError as Sight.check() does."""
         self._sight.check()
 
     def warnings(self) -> Iterator[str]:
-        """A source of warnings: of camera and policy, since it was asked last."""
+        """Yield sentences about how late camera and policy were since the last call."""
         age_s, asking_s, plan = self._frame_age_s, self._asking_s, self._follower.plan
         self._frame_age_s = self._asking_s = 0.0
         if age_s > LATE_FRAME_S:
@@ -170,7 +176,7 @@ class PolicyPilot:
 
 
 def frozen(frame: Frame, settings: Settings) -> CameraError | None:
-    """Of the pictures alone: whether it matters depends on what the car does."""
+    """Return an error if the pictures have stopped changing. It matters only while the car moves."""
     seen = frame.repeats + 1
     if not settings.frozen_frames or seen < settings.frozen_frames:
         return None
@@ -178,7 +184,7 @@ def frozen(frame: Frame, settings: Settings) -> CameraError | None:
 
 
 def blank(frame: Frame, settings: Settings) -> CameraError | None:
-    """By this frame alone: it is black, or without contrast."""
+    """Return an error if this frame is black or without contrast."""
     if not settings.black_frames:
         return None
     if frame.mean < settings.black_level:
@@ -189,10 +195,10 @@ def blank(frame: Frame, settings: Settings) -> CameraError | None:
 
 
 class ReplayPilot:
-    """Sends a recording's pulses at the times at which they were recorded; no policy, no camera.
+    """Sends a recording's pulses at the times at which they were recorded, without a policy or a camera.
 
-    throttle_limit: of the throttle, in [0, 1], either way. What is outside the range that the Arduino takes is
-    clipped to it.
+    throttle_limit: the largest throttle, forwards or backwards, in [0, 1]. Pulses outside the range that the Arduino
+    takes are clipped to it.
     """
 
     def __init__(self, controls: Controls, *, throttle_limit: float = 1.0, calibration: PwmCalibration | None = None):

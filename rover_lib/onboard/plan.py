@@ -1,10 +1,10 @@
-"""Use an action chunk by time: what the policy meant for now, although it looked at a frame that is 100 ms old.
+"""Follow an action chunk by time: do what the policy meant for now, although its frame is already 100 ms old.
 
     follower = Follower(settings, rate_hz=30)
     follower.add(Plan(1, captured_s, ready_s, actions))
     command = follower.command(now_s)          # at each tick
 
-Nothing here knows a clock, a thread or a device: times come in as arguments, seconds of one monotonic clock.
+Nothing here uses a clock, a thread or a device: times come in as arguments, in seconds of one monotonic clock.
 """
 
 import math
@@ -19,22 +19,24 @@ from rover_lib.onboard.errors import ParamsError, PolicyError
 from rover_lib.onboard.pwm import is_finite
 
 STEERING, THROTTLE = 0, 1
-ROUNDING = 1e-6  # of times, in steps
+ROUNDING = 1e-6  # error of a time, in steps
 LIMITS = np.array([[-1.0, 0.0], [1.0, 1.0]])  # lowest and highest [steering, throttle]
-IN_FORCE_S = 0.15  # of a command: after that the Arduino stops a car that hears no other
-ENSEMBLE_MOST = 10.0  # 64 plans, and exp(709) is the last that a float holds
-OVERSHOOT = 0.25  # a learned action may be a little beyond an end, as a transmitter is: it is clipped
+IN_FORCE_S = 0.15  # how long a command holds: after that, the Arduino stops a car that gets no other
+ENSEMBLE_MOST = 10.0  # times 64 plans; exp(709) is the largest that a float holds
+OVERSHOOT = 0.25  # a learned action may be this far beyond an end, as a transmitter's may: it is clipped
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How plans become commands; the section `drive` of params.yml, which says why. Those that exist are valid.
+    """How plans become commands: the section `drive` of params.yml, which gives the reasons. Raises ParamsError.
 
-    blend_ticks: ticks over which a fresh plan takes over, 0: at once. fade_s, stop_s: ages of a plan from which the
-    throttle fades, and at which the car is stopped. compensate: whether the time since the frame is made up for.
-    ensemble: LeRobot's coefficient of temporal ensembling, None: off. throttle_limit: of the throttle, in [0, 1].
-    frozen_frames, black_frames: how many in a row that show nothing new, or nothing at all, are a fault of the camera.
-    black_level, flat_level: mean of a black one, and contrast of one that shows nothing, in grey levels of 255.
+    blend_ticks: ticks over which a fresh plan takes over; 0: at once. fade_s: age of a plan, in seconds, from which the
+    throttle fades. stop_s: age at which the car is stopped. compensate: whether to skip the steps of a plan whose
+    time had passed when it arrived. ensemble: LeRobot's coefficient of temporal ensembling; None: off.
+    throttle_limit: largest throttle, in [0, 1]. frozen_frames: this many frames in a row with nothing new in them are a
+    fault of the camera; 0: never. black_frames: the same for frames that are black or without contrast. black_level:
+    a frame with a lower mean is black. flat_level: a frame with a lower contrast shows nothing. Both are grey levels,
+    from 0 to 255.
     """
 
     fade_s: float = 0.5
@@ -64,13 +66,13 @@ class Settings:
         must(self.frozen_frames != 1 and self.black_frames != 1, "one frame alone is no fault: 0 (off) or from 2")
         must(type(self.compensate) is bool, f"compensate must be true or false, found {self.compensate!r}")
         if self.ensemble is not None:
-            # Beyond it the weights of a few dozen plans overflow, and what they give is no number.
+            # Beyond it, the weights of a few dozen plans overflow, and their average is not a number.
             holds = is_finite(self.ensemble) and abs(self.ensemble) <= ENSEMBLE_MOST
             must(holds, f"ensemble must be a number within {ENSEMBLE_MOST:g} of 0, found {self.ensemble!r}")
 
     @classmethod
     def of(cls, section: Mapping[str, Any], **overrides: Any) -> "Settings":
-        """From a mapping such as params.yml's; overrides that are not None win. ParamsError for unknown names."""
+        """Make settings of a mapping such as params.yml's; overrides that are not None win. Raises ParamsError."""
         known = {f.name for f in fields(cls)}
         if unknown := sorted(set(section) - known):
             raise ParamsError(f"drive: unknown {unknown}, known are {sorted(known)}", remedy="look at params.yml")
@@ -79,12 +81,12 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """One inference's chunk. actions[i] is meant for captured_s + i / rate.
+    """The action chunk of one inference. actions[i] is meant for captured_s + i / rate.
 
-    number: 1, 2, ... captured_s: of the frame that it looked at. ready_s: when it was here. actions: (chunk, 2)
-    float, clipped to limits, (2, 2): of a car without reverse steering in [-1, 1] and throttle in [0, 1]. Raises
-    PolicyError for what is not finite, or beyond an end by more than OVERSHOOT: this is the last boundary before the
-    servos.
+    number: 1, 2, ... captured_s: when the policy's frame was captured. ready_s: when the plan arrived. actions:
+    (chunk, 2) float [steering, throttle], clipped to limits. limits: (2, 2), the lowest and the highest action; for a
+    car without reverse, steering in [-1, 1] and throttle in [0, 1]. Raises PolicyError for actions of another shape,
+    not finite, or beyond an end by more than OVERSHOOT: this is the last boundary before the servos.
     """
 
     number: int
@@ -111,13 +113,13 @@ class Plan:
 
     @property
     def latency_s(self) -> float:
-        """From the frame to the plan."""
+        """Seconds from the capture of the frame to the arrival of the plan."""
         return self.ready_s - self.captured_s
 
     def at(self, step: float) -> np.ndarray:
-        """(2,) [steering, throttle] meant for `step` steps after the first, between steps in proportion.
+        """Return the (2,) [steering, throttle] meant for `step` steps after the first, interpolated between steps.
 
-        Before the first and after the last it is that one.
+        Before the first action it is the first, and after the last the last.
         """
         step = min(max(step, 0.0), len(self.actions) - 1.0)
         i = min(int(step), len(self.actions) - 2) if len(self.actions) > 1 else 0
@@ -127,9 +129,9 @@ class Plan:
 
 @dataclass(frozen=True)
 class Command:
-    """What to do at a tick. steering in [-1, 1], throttle in [0, 1], or from -1 of a car with reverse.
+    """What to do at a tick: steering in [-1, 1], throttle in [0, 1], or from -1 on a car with reverse.
 
-    fade: the throttle's factor for the plan's age.
+    fade: factor that the throttle was multiplied by because of the plan's age, in [0, 1].
     """
 
     steering: float
@@ -140,22 +142,22 @@ class Command:
 
 
 class Follower:
-    """Turns plans into commands. rate_hz: of the plans' steps. Not for several threads at a time."""
+    """Turns plans into commands. rate_hz: steps of a plan per second. For one thread at a time."""
 
     def __init__(self, settings: Settings, rate_hz: float):
         self.settings = settings
         self.rate_hz = rate_hz
         self._plans: deque[Plan] = deque(maxlen=64)  # more than one is kept for ensembling only
-        self._offset = np.zeros(2)  # of the command from what the newest plan says, when it took over
+        self._offset = np.zeros(2)  # old command minus new plan, when the newest plan took over
         self._blended = 0  # ticks since then
 
     @property
     def plan(self) -> Plan | None:
-        """The newest."""
+        """The newest plan; None before the first."""
         return self._plans[-1] if self._plans else None
 
     def add(self, plan: Plan, now_s: float) -> None:
-        """A fresh plan takes over at this tick. One that looked at an older frame than the newest is left aside."""
+        """Let a fresh plan take over at this tick. It is ignored unless its frame is newer than the last plan's."""
         before = self.plan
         if before and plan.captured_s <= before.captured_s:
             return
@@ -168,27 +170,34 @@ class Follower:
             self._offset, self._blended = old - self._meant(now_s), 0
 
     def stop_s(self) -> float:
-        """Age of the newest plan at which the car is stopped: the settings', or the chunk's end if that is earlier."""
+        """Return the age of the newest plan at which the car is stopped, in seconds; 0 before the first plan.
+
+        It is the settings' stop_s, or the end of the chunk if that is earlier.
+        """
         return min(self.settings.stop_s, len(self._plans[-1].actions) / self.rate_hz) if self._plans else 0.0
 
     def command(self, now_s: float) -> Command | None:
-        """What the newest plan meant for now; None without a plan, or with one that is too old to drive by."""
+        """Return what the newest plan meant for now; None without a plan, or if it is too old to drive by."""
         plan = self.plan
         if plan is None or not (age_s := now_s - plan.captured_s) < self.stop_s():
             return None
         fade = self._fade(age_s)
         steering, throttle = np.clip(self._wanted(now_s) * [1.0, fade], *plan.limits)
         self._blended += 1
-        limit = self.settings.throttle_limit  # either way
+        limit = self.settings.throttle_limit  # forwards and backwards
         return Command(float(steering), max(min(float(throttle), limit), -limit), plan, age_s, fade)
 
     def _fade(self, age_s: float) -> float:
         stop_s = self.stop_s()
         fade_s = min(self.settings.fade_s, stop_s)
-        return 1.0 if age_s <= fade_s else max(0.0, (stop_s - age_s) / (stop_s - fade_s)) if stop_s > fade_s else 0.0
+        if age_s <= fade_s:
+            return 1.0
+        if stop_s <= fade_s:
+            return 0.0
+        return max(0.0, (stop_s - age_s) / (stop_s - fade_s))
 
     def _wanted(self, now_s: float) -> np.ndarray:
-        """The plans' action, on its way from the plan before."""
+        """Return the action of the plans, blended with that of the plan before."""
         left = 1 - (self._blended + 1) / (self.settings.blend_ticks + 1)
         return self._meant(now_s) + self._offset * max(0.0, left)
 
@@ -207,21 +216,22 @@ class Follower:
 
 
 class Commanded:
-    """What was commanded lately, for the policy's state. Not for several threads at a time but one writer."""
+    """The latest commands, for the policy's state. One thread may add commands while others ask for the state."""
 
     def __init__(self, keep_s: float = 3.0, rate_hz: float = 100.0):
         self._sent: deque[tuple[float, float, float]] = deque(maxlen=max(2, int(keep_s * rate_hz)))
 
     def add(self, at_s: float, steering: float, throttle: float) -> None:
-        """A command that was really sent, at that time."""
+        """Add a command that was really sent, at time `at_s`."""
         self._sent.append((at_s, steering, throttle))
 
     def state(self, captured_s: float, rate_hz: float) -> np.ndarray:
-        """(2,) float32 [steering, throttle]: the policy's state for a frame captured then; neutral at the start.
+        """Return the policy's state for a frame captured at that time, (2,) float32 [steering, throttle].
 
-        In training a frame's state is the action of the frame before it, which is the control nearest to that frame
-        in time (episodes.py). So it is the command nearest to one step before the capture, if that was in force then:
-        not more than a step later, and not so old that the Arduino had stopped the car.
+        In training, a frame's state is the action of the frame before it, which is the control nearest to that frame
+        in time (episodes.py). So the state is the command nearest to one step before the capture. It is neutral if no
+        command was in force then: the nearest was sent more than a step later, or so early that the Arduino had stopped
+        the car.
         """
         before_s = captured_s - 1 / rate_hz
         nearest = min(tuple(self._sent), key=lambda c: abs(c[0] - before_s), default=None)

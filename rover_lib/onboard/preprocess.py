@@ -1,4 +1,4 @@
-"""From a camera's frame to the policy's input: one function for training, calibration, comparison and the Pi."""
+"""Turn a camera's frame into the policy's input, in the same way in training, calibration, comparison and on the Pi."""
 
 import cv2
 import numpy as np
@@ -14,10 +14,10 @@ def prepare_frame(frame_bgr: np.ndarray, height: int, width: int) -> np.ndarray:
     """Resize and reorder one camera frame.
 
     frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it.
-    Returns (height, width, 3) uint8 RGB, contiguous. Normalisation is not done here: it is inside the
-    artifact's graph (see `normalise`), so that a Pi moves bytes, not floats.
-    A frame that has the size already is only reordered; a larger one is averaged over areas (no aliasing), a
-    smaller one interpolated. The aspect ratio is not kept, as in the trainer.
+    Returns (height, width, 3) uint8 RGB, contiguous. It is not normalised: the artifact's graph does that (see
+    `normalise`), so that a Pi moves bytes, not floats.
+    A frame of that size is only reordered. One with a larger side is averaged over areas (no aliasing), a smaller one
+    is interpolated. The aspect ratio is not kept, as in the trainer.
     Raises FrameError for anything that is not such a picture.
     """
     if not isinstance(frame_bgr, np.ndarray) or frame_bgr.ndim != 3 or frame_bgr.shape[2] != 3:
@@ -41,7 +41,7 @@ def prepare_frame(frame_bgr: np.ndarray, height: int, width: int) -> np.ndarray:
 def normalise(
     frame_rgb: np.ndarray, mean: tuple[float, ...] = IMAGENET_MEAN, std: tuple[float, ...] = IMAGENET_STD
 ) -> np.ndarray:
-    """What LeRobot's forward expects of a frame from `prepare_frame`.
+    """Normalise a frame from `prepare_frame`, as LeRobot's forward expects it.
 
     frame_rgb: (..., height, width, 3) uint8 RGB. Returns (..., 3, height, width) float32, (pixel / 255 - mean) / std.
     """

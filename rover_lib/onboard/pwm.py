@@ -1,8 +1,8 @@
-"""Actions to servo pulses and back, with the constants that were checked on the recordings to 5e-5.
+"""Convert actions to servo pulses and back. The constants were checked on the recordings, to 5e-5.
 
-A channel's pulse is a share ("duty") of its period: action = (duty% - neutral) / span, clipped to its range.
-Throttle 0 is *stopped*, 120 us, not the middle of the throttle's range. Another car's channels come from its car.yml,
-see car.py; they may have another span on either side of neutral, and be inverted.
+A channel's pulse is a share ("duty") of its period: action = (duty% - neutral) / span, clipped to the channel's range.
+Throttle 0 means *stopped*, 120 us; it is not the middle of the throttle's range. Another car's channels come from its
+car.yml (see car.py). Their spans may differ on the two sides of neutral, and they may be inverted.
 """
 
 import math
@@ -16,7 +16,7 @@ NEUTRAL = (0.0, 0.0)  # (steering, throttle): straight and stopped
 
 
 def is_finite(value: object) -> bool:
-    """Whether it is a number, no boolean, that a float can hold; NaN and infinities are not."""
+    """Return whether `value` is a number that a float can hold: not a boolean, NaN or an infinity."""
     try:
         return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:  # a whole number of 309 digits
@@ -24,7 +24,7 @@ def is_finite(value: object) -> bool:
 
 
 def _finite(value: object, what: str) -> float:
-    """`value` as a float. Raises PwmError for None, strings, booleans, NaN and infinities."""
+    """Return `value` as a float. Raises PwmError for None, strings, booleans, NaN and infinities."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise PwmError(
             f"{what} must be a number", found=f"{type(value).__name__} {value!r}", remedy="send neutral instead"
@@ -40,12 +40,12 @@ def _finite(value: object, what: str) -> float:
 
 @dataclass(frozen=True)
 class Channel:
-    """One servo signal. A channel that exists is valid: PwmError says what is not.
+    """One servo signal. Every Channel is valid: values that make no servo channel raise PwmError.
 
-    period_us: nominal period. neutral_pct: duty in percent of action 0. span_pct: duty in percent per unit of
-    action, below 0 where the signal is inverted. low, high: range of the action, which includes 0.
-    below_pct: the span of actions below 0, of the same sign; None: span_pct. by_pulse: a measured pulse is judged by
-    its microseconds, as a servo does, and not by its share of the measured period.
+    period_us: nominal period. neutral_pct: duty of action 0, in percent. span_pct: duty per unit of action, in
+    percent; negative if the signal is inverted. low, high: range of the action, which includes 0.
+    below_pct: the span for actions below 0, with the same sign as span_pct; None if it is span_pct. by_pulse: judge a
+    measured pulse by its microseconds, as a servo does, and not by its share of the measured period.
     """
 
     name: str
@@ -83,22 +83,22 @@ class Channel:
 
     @property
     def us_per_unit(self) -> float:
-        """Microseconds of pulse per unit of action; of the longer side where they differ."""
+        """Microseconds of pulse per unit of action; if the two sides differ, those of the wider one."""
         return max(abs(self.span_pct), abs(self._span_pct(-1.0))) / 100 * self.period_us
 
     @property
     def ends_us(self) -> tuple[int, int]:
-        """The shortest and the longest pulse of its actions, microseconds."""
+        """The shortest and the longest pulse in the range of the action, in microseconds."""
         first, second = self.pulse_us(self.low), self.pulse_us(self.high)
         return min(first, second), max(first, second)
 
     @property
     def neutral_us(self) -> int:
-        """Pulse of action 0, microseconds."""
+        """The pulse of action 0, in microseconds."""
         return self.pulse_us(0.0)
 
     def pulse_us(self, action: float) -> int:
-        """Pulse for an action, whole microseconds. PwmError outside [low, high], NaN included."""
+        """Return the pulse for an action, in whole microseconds. Raises PwmError for NaN and outside [low, high]."""
         action = _finite(action, self.name)
         if not self.low <= action <= self.high:
             raise PwmError(
@@ -109,7 +109,11 @@ class Channel:
         return round(self._duty_pct(action) / 100 * self.period_us)
 
     def measured(self, pulse_us: float, period_us: float) -> bool:
-        """Whether the firmware saw a pulse: both above 0, and one period at a time, not none or two."""
+        """Return whether the firmware measured a pulse.
+
+        If it did, the pulse is longer than 0 and shorter than its period, and the period is within 25 % of the nominal
+        one: neither 0 nor two periods taken for one. Raises PwmError for what is not a finite number.
+        """
         pulse_us, period_us = (
             _finite(pulse_us, f"{self.name} pulse"),
             _finite(period_us, f"{self.name} period"),
@@ -117,11 +121,11 @@ class Channel:
         return 0 < pulse_us < period_us and 0.75 * self.period_us < period_us < 1.25 * self.period_us
 
     def action(self, pulse_us: float, period_us: float | None = None) -> float | None:
-        """The action that a pulse stands for, in [low, high]; None where no pulse was measured (not 0).
+        """Return the action that a pulse stands for, in [low, high], or None (not 0) if no pulse was measured.
 
-        period_us: the measured period; nominal when left out. Pulses beyond the ends are clipped, as the
-        firmware does (a throttle below 120 us is 0, "stopped"). PwmError for None, strings, NaN and
-        infinities.
+        period_us: the measured period; None: the nominal one. An action beyond an end is clipped to it, as the
+        firmware does (a throttle pulse below 120 us gives 0, "stopped"). Raises PwmError for a pulse that is None, and
+        for strings, NaN and infinities.
         """
         period_us = self.period_us if period_us is None else period_us
         if not self.measured(pulse_us, period_us):
@@ -133,14 +137,17 @@ class Channel:
         return min(max(action, self.low), self.high)
 
     def moves(self, pulse_us: float) -> bool:
-        """Whether a throttle's pulse moves the car: neutral, as an Arduino may have measured it, does not."""
+        """Return whether a throttle pulse moves the car.
+
+        Neutral does not, nor does a pulse within ARDUINO_STEP_US of it: an Arduino may have measured neutral so.
+        """
         away_us = (pulse_us - self.neutral_us) * math.copysign(1, self.span_pct)
         return away_us > ARDUINO_STEP_US or (self.low < 0 and away_us < -ARDUINO_STEP_US)
 
 
 @dataclass(frozen=True)
 class Pulses:
-    """What goes to the servos: whole microseconds."""
+    """The pulses for the servos, in whole microseconds."""
 
     steering_us: int
     throttle_us: int
@@ -148,20 +155,20 @@ class Pulses:
 
 @dataclass(frozen=True)
 class Actions:
-    """What was read from the transmitter; None for a channel of which no pulse was measured."""
+    """The actions read from the transmitter; None for a channel without a measured pulse."""
 
     steering: float | None
     throttle: float | None
 
     @property
     def measured(self) -> bool:
-        """Whether both channels are measurements."""
+        """Whether both channels were measured."""
         return self.steering is not None and self.throttle is not None
 
 
 @dataclass(frozen=True)
 class PwmCalibration:
-    """A car's two channels, with those of the user's car as defaults."""
+    """A car's two channels; by default those of the user's car."""
 
     # (duty% - 6.83) / 2.37 * (2 / 2.2): one unit of steering is 2.37 * 1.1 percent of a 47 Hz period
     steering: Channel = field(default=Channel("steering", 21316, 6.83, 2.37 * 2.2 / 2, -1.0, 1.0))
@@ -169,7 +176,7 @@ class PwmCalibration:
     throttle: Channel = field(default=Channel("throttle", 1016, 11.81, 58.19, 0.0, 1.0))
 
     def channel(self, action_name: str) -> Channel:
-        """The channel of "steering" or "throttle". Raises PwmError for other names."""
+        """Return the channel of "steering" or "throttle". Raises PwmError for other names."""
         if action_name not in ("steering", "throttle"):
             raise PwmError(
                 f"no servo channel for action {action_name!r}", remedy="this rover has steering and throttle"
@@ -177,11 +184,14 @@ class PwmCalibration:
         return getattr(self, action_name)
 
     def pulses(self, steering: float, throttle: float) -> Pulses:
-        """Pulses for steering in [-1, 1] and throttle in [0, 1], from -1 with reverse; PwmError for all else."""
+        """Return the pulses for steering in [-1, 1] and throttle in [0, 1], or from -1 on a car with reverse.
+
+        Raises PwmError for anything else.
+        """
         return Pulses(self.steering.pulse_us(steering), self.throttle.pulse_us(throttle))
 
     def neutral(self) -> Pulses:
-        """Straight and stopped: 1456 us and 120 us on the user's car."""
+        """Return the pulses for "straight and stopped": 1456 us and 120 us on the user's car."""
         return self.pulses(*NEUTRAL)
 
     def actions_from_pulses(
@@ -191,10 +201,10 @@ class PwmCalibration:
         steering_period_us: float | None = None,
         throttle_period_us: float | None = None,
     ) -> Actions:
-        """The actions behind two measured pulses; the nominal periods are taken where none are given.
+        """Return the actions that two measured pulses stand for. A period that is None stands for the nominal one.
 
-        A channel without a measured pulse (0, or a period of 0 or of two at once) is None, not 0.
-        Raises PwmError for None pulses, strings, NaN and infinities.
+        The action is None, not 0, for a channel without a measured pulse (see Channel.measured()).
+        Raises PwmError for pulses that are None, and for strings, NaN and infinities.
         """
         return Actions(
             self.steering.action(steering_us, steering_period_us),
@@ -202,5 +212,5 @@ class PwmCalibration:
         )
 
     def us_per_unit(self, action_name: str) -> float:
-        """Microseconds of pulse per unit of an action: turns an action's error into what the servo feels."""
+        """Return the microseconds of pulse per unit of an action: they turn an action's error into the servo's."""
         return self.channel(action_name).us_per_unit

@@ -38,12 +38,12 @@ _log = logging.getLogger("rover")
 
 
 class Recorder:
-    """Records an episode while a loop runs: the loop hands over controls, a thread takes frames from the camera.
+    """Records an episode while a loop runs. The loop hands over controls, and a thread takes frames from the camera.
 
     folder: where the episode appears on close(), named episode_YYYYMMDD_HHMMSS by its start in local time (a second
-    later if that name is taken). about: description of the episode; its fps is measured here. rate_hz: maximum
-    frames per second. most_bytes: size limit of the episode, see room_for(); None: limited by the disk only.
-    Raises EpisodeError if there is no room to record; later faults are in `failure`.
+    later if that name is taken). about: description of the episode; its fps is set to the lower of rate_hz and the
+    camera's rate. rate_hz: maximum frames per second. most_bytes: size limit of the episode, see room_for(); None:
+    limited by the disk only. Raises EpisodeError if there is no room to record; later faults are in `failure`.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Recorder:
             replace(about, fps=min(rate_hz, camera.wanted_hz)),
         )
         self.folder = self._writer.folder
-        self.path: Path | None = None  # of the episode, once it exists
+        self.path: Path | None = None  # the episode's folder, once it exists
         self.failure: str | None = None
         self._queue: deque[tuple] = deque()
         self._lost = 0
@@ -216,10 +216,10 @@ class Recorder:
 
 
 def room_for(folder: Path | str, most_mb: float) -> int:
-    """Bytes that the next episode may take in a folder whose whole content may take most_mb. Looks at every file.
+    """Return the bytes that the next episode may take in a folder whose whole content may take most_mb.
 
-    The result is at most half of the free disk: an episode is packed on the same disk to be fetched, and a new model
-    needs room as well.
+    It looks at every file in the folder. The result is at most half of the free disk: an episode is packed on the same
+    disk to be fetched, and a new model needs room as well.
     """
     folder = Path(folder)
     taken = sum(path.lstat().st_size for path in folder.rglob("*"))
@@ -335,11 +335,11 @@ def record_episodes(
     notify: Callable[[str], None] = _log.info,
     **options: Any,
 ) -> Iterator[RecordReport]:
-    """Opens camera and Arduino and records one episode after another; for the main thread: signals end them.
+    """Open camera and Arduino, and record one episode after another. Call it in the main thread: it handles signals.
 
-    options: of record(), for each.
-    SIGINT ends an episode; a second one, or one in the pause before the next episode, ends it all, and so do SIGTERM,
-    SIGHUP, SIGQUIT and a fault. Raises RoverError if it cannot be begun.
+    options: further arguments of record(), for each episode. notify: is called with sentences for people. SIGINT ends
+    an episode. A second SIGINT, or one in the pause before the next episode, ends the recording, as SIGTERM, SIGHUP,
+    SIGQUIT and a fault do. Raises RoverError if recording cannot begin.
     """
     stop, leave = SignalEvent(), SignalEvent()
 

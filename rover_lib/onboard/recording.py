@@ -1,14 +1,14 @@
-"""One drive as an episode folder, in the format of the user's recorder: written here, and its controls read again.
+"""Write one drive as an episode folder, in the format of the user's recorder, and read its controls again.
 
 episode_YYYYMMDD_HHMMSS/
   episode_data.json   control_data.csv   frame_data.csv   frames/frame_%06d.jpg
 
-"No pulse" is a flag, not a 0. What is recorded on the car has two more columns for each control, steering_measured and
-throttle_measured: true or false in JSON, True or False in CSV. Where it is false, that channel has no value: its
-normalized, raw_us and period_us are null in JSON and empty in CSV, which pandas reads as NaN and no program takes for
-"stopped". Files without the two columns are the user's recorder's (and the playground's, where nothing is ever lost):
-in them a pulse or period of 0 says "not measured". More columns may follow: driver says who drove, one of DRIVERS. What
-a drive came to, one of OUTCOMES, is metadata.outcome, noted afterwards (outcome.py).
+"No pulse" is a flag, not a 0. A recording made on the car has two more columns for each control, steering_measured and
+throttle_measured: true or false in JSON, True or False in CSV. If one is false, that channel has no values: its
+normalized, raw_us and period_us are null in JSON and empty in CSV, which pandas reads as NaN and no program mistakes
+for "stopped". Files without the two columns come from the user's recorder (or the balloon world, where no pulse is ever
+lost); in them, a pulse or period of 0 means "not measured". More columns may follow: `driver` says who drove, one of
+DRIVERS. Whether a drive succeeded, one of OUTCOMES, is metadata.outcome, noted afterwards (outcome.py).
 """
 
 import contextlib
@@ -47,29 +47,30 @@ CONTROL_FIELDS = (
 )
 FLAG_FIELDS = ("steering_measured", "throttle_measured")
 FRAME_FIELDS = ("frame_id", "timestamp", "image_path")
-# Who drove at a control: a policy; a human, whose pulses went to the servos; or nobody, as the car was held in neutral.
+# Who drove at a control: a policy; a human, whose pulses went to the servos; or nobody, and the car was in neutral.
 POLICY, HUMAN, NOBODY = DRIVERS = ("policy", "human", "nobody")
-HIT, MISSED = OUTCOMES = ("hit", "missed")  # what a drive came to, as metadata.outcome
+HIT, MISSED = OUTCOMES = ("hit", "missed")  # whether a drive succeeded: metadata.outcome
 
-DATA_BYTES = 200_000_000  # of a data file that is read at once: three hours of driving
+DATA_BYTES = 200_000_000  # largest data file that is read: three hours of driving
 LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
-ARDUINO_WRAP_MS = 1 << 32  # its clock starts again after 49.7 days
-BURST_SHARE = 0.3  # arriving within this share of the usual interval means: both were waiting in a buffer
-BURST_MIN = 3  # fewer than this is jitter of the USB line, less than a frame's time, and left alone
-CLOCKS_APART_S = 0.5  # between two controls: more is the system's clock being set
+ARDUINO_WRAP_MS = 1 << 32  # its clock starts at 0 again after 49.7 days
+BURST_SHARE = 0.3  # two controls that arrive within this share of the usual interval had waited in a buffer
+BURST_MIN = 3  # fewer than this in a row are the USB line's jitter, shorter than a frame, and left as they are
+CLOCKS_APART_S = 0.5  # if the clocks differ by more between two controls, the system's clock was set
 
 
 class EpisodeExists(EpisodeError):
-    """A folder of this name is there, or is being recorded."""
+    """A folder of this name exists, or is being recorded."""
 
 
 @dataclass(frozen=True)
 class About:
-    """What a recording says of itself.
+    """The description of a recording.
 
-    label: what was done, e.g. "hit red balloon". fps: the camera's rate. start_time_s, end_time_s: system time of the
-    recording's ends; the first and last sample's when None. arduino_port: through what. source: who drove, None: not
-    noted. car: whose pulses they are, None: the first recordings'; another one's description is in the metadata.
+    label: what was done, e.g. "hit red balloon". fps: the camera's rate. start_time_s, end_time_s: system time at the
+    start and the end; None: that of the first and of the last sample. arduino_port: the port of the Arduino that the
+    controls came through. source: who drove; None: not noted. car: the car that the pulses belong to, described in the
+    metadata if it drives otherwise than the default; None: the default, the car of the first recordings.
     """
 
     label: str = ""
@@ -82,14 +83,14 @@ class About:
 
 
 class EpisodeWriter:
-    """Collect one episode; the folder appears, complete, when the `with` block ends well, and not otherwise.
+    """Write one episode. The complete folder appears when the `with` block ends without an error, and only then.
 
-    Until then all is in a hidden folder beside it, on the disk and not in memory.
+    Until then everything is in a hidden folder beside it, on the disk and not in memory.
 
-    folder: Path to make, e.g. episodes/episode_20251007_144013; its name is the episode's id. Must not exist.
-    resolution: (width, height); None for that of the first frame. flags: write the two columns that say what was
-    measured (see above).
-    Raises EpisodeError for an existing folder, frames of another size, times or pulses that are no finite
+    folder: the folder to make, e.g. episodes/episode_20251007_144013; it must not exist. Its name is the episode's id.
+    resolution: (width, height) of the frames; None: that of the first frame. flags: write the two columns that say what
+    was measured (see above).
+    Raises EpisodeError for an existing folder, frames of another size, times or pulses that are not finite
     numbers, an episode without a frame or a control, or a disk that takes no more.
     """
 
@@ -107,7 +108,7 @@ class EpisodeWriter:
         self.jpeg_quality, self.flags = jpeg_quality, flags
         car = about.car or Car()
         self.pwm = car.pwm
-        self.metadata: dict[str, Any] = {}  # what else is to be noted of this episode
+        self.metadata: dict[str, Any] = {}  # further entries of the episode's metadata
         if not car.drives_like(Car()):
             self.metadata["car"] = car.description()
         if about.source is not None:
@@ -129,7 +130,7 @@ class EpisodeWriter:
             self.discard()
 
     def open(self) -> None:
-        """Starts the episode. Raises EpisodeExists for a folder that is there, or that another program records."""
+        """Begin the episode. Raises EpisodeExists if the folder exists or another program is recording it."""
         self._refuse_existing()
         # beside the target, so that the rename stays within one filesystem; hidden from loaders
         temporary = self.folder.with_name(f".{self.folder.name}.part")
@@ -149,7 +150,7 @@ class EpisodeWriter:
                 for name in ("control", "frame"):
                     self._rows[name] = (temporary / f"{name}.rows").open("ab", buffering=0)
         except BaseException:
-            self.discard()  # nobody finishes what was never open
+            self.discard()  # no __exit__ follows a failed open()
             raise
 
     def control(
@@ -162,10 +163,10 @@ class EpisodeWriter:
         throttle_period_us: int | None,
         **extra: Any,
     ) -> None:
-        """Add one reading of the transmitter, at system time `t_system_s`; `extra` makes further columns.
+        """Add one reading of the transmitter, at system time `t_system_s`. Each name in `extra` becomes a column.
 
-        Pulses and periods of 0 say "not measured"; with flags, None does too. Without flags, the normalised values
-        follow the firmware's rule: 4 decimals, 0 where no pulse was measured.
+        Pulses and periods of 0 mean "not measured"; with flags, None does too. The normalised values have 4 decimals.
+        Without flags they are 0 where no pulse was measured, as the firmware has it.
         """
         self._must_be_open()
         row: dict[str, Any] = dict.fromkeys(CONTROL_FIELDS)
@@ -196,7 +197,7 @@ class EpisodeWriter:
         self.controls += 1
 
     def frame(self, t_s: float, frame_bgr: np.ndarray) -> None:
-        """Add one picture: (height, width, 3) uint8 BGR of that resolution, at system time `t_s`."""
+        """Add one picture, (height, width, 3) uint8 BGR of the episode's resolution, at system time `t_s`."""
         temporary = self._must_be_open()
         t_s = self._time(t_s)
         if self.resolution is None and isinstance(frame_bgr, np.ndarray) and frame_bgr.ndim == 3:
@@ -219,14 +220,14 @@ class EpisodeWriter:
             with self._disk():
                 picture.write_bytes(jpeg.data)
         except EpisodeError:
-            with contextlib.suppress(OSError):  # a part of it is no picture, and the episode may go on without
+            with contextlib.suppress(OSError):  # half a file is no picture, and the episode may go on without it
                 picture.unlink()
             raise
         self._append("frame", {"frame_id": number, "timestamp": t_s, "image_path": relative}, t_s)
         self.frames, self.picture_bytes = number, self.picture_bytes + len(jpeg)
 
     def finish(self) -> Path:
-        """Makes the folder appear and returns it; leaves nothing where that fails, and says why."""
+        """Make the folder appear and return it. If that fails, nothing is left, and EpisodeError says why."""
         try:
             temporary = self._must_be_open()
             with self._disk():
@@ -238,7 +239,7 @@ class EpisodeWriter:
             self.discard()
 
     def discard(self) -> None:
-        """Ends the episode; what is not finished is gone."""
+        """End the episode, and remove it unless it is finished."""
         for file in self._rows.values():
             file.close()
         self._rows = {}
@@ -270,7 +271,7 @@ class EpisodeWriter:
             ) from e
 
     def _must_be_open(self) -> Path:
-        """The hidden folder."""
+        """Return the hidden folder. Raises EpisodeError if there is none."""
         if self._temporary is None:
             raise EpisodeError(f"{self.folder.name}: not open", remedy="use it as `with EpisodeWriter(...) as writer:`")
         return self._temporary
@@ -298,7 +299,7 @@ class EpisodeWriter:
             )
 
     def _write(self, temporary: Path) -> None:
-        """The three files, in the hidden folder."""
+        """Write the three files in the hidden folder."""
         if not self.controls or not self.frames:
             raise EpisodeError(
                 f"{self.folder.name}: {self.controls} controls and {self.frames} frames are no episode",
@@ -365,7 +366,7 @@ def _to_disk(file: IO[str]) -> None:
 
 
 def number_of(value: object) -> float | None:
-    """A finite number from JSON or from a CSV's text; NaN for one that is none or absurd, None for another type."""
+    """Return a number from JSON or from a CSV's text: NaN if not finite or absurdly large, None if not a number."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return None
     try:
@@ -378,16 +379,19 @@ def number_of(value: object) -> float | None:
 
 
 def no_pulse(row: Mapping[str, Any], channel: str) -> bool:
-    """Whether a control of a file says that "steering" or "throttle" was not measured: by its flag, or by no value."""
+    """Return whether a row of a recording says that its channel, "steering" or "throttle", was not measured.
+
+    It says so by its flag, or by having no value for the channel.
+    """
     flag = row.get(f"{channel}_measured")
     values = (row.get(f"{channel}_{part}") for part in ("normalized", "raw_us", "period_us"))
     return str(flag).strip().lower() in ("false", "0") or all(v is None or v == "" for v in values)
 
 
 def driver_of(row: Mapping[str, Any]) -> str | None:
-    """Who drove at a control of a file, one of DRIVERS; None for a word that is none of them.
+    """Return who drove at a row of a recording, one of DRIVERS; None if the row says something else.
 
-    Where nothing is said of it, a policy's recording names its artifact's mode, and all others are a human's.
+    If it says nothing, a policy drove if the row names an artifact's mode, and otherwise a human.
     """
     said = row.get("driver")
     if said is None or said == "":
@@ -396,9 +400,9 @@ def driver_of(row: Mapping[str, Any]) -> str | None:
 
 
 def arduino_step_s(before_s: float, after_s: float) -> float:
-    """Seconds between two readings of the Arduino's clock, over its wrap too; NaN where that says nothing.
+    """Return the seconds between two readings of the Arduino's clock, also if it wrapped between them.
 
-    It says nothing where it stood still or went back (a reset), or is no number (NaN).
+    Returns NaN if the clock stood still or went back (a reset), or if a reading is NaN.
     """
     step_s, wrap_s = after_s - before_s, ARDUINO_WRAP_MS / 1000
     if before_s < wrap_s and -wrap_s < step_s < -wrap_s / 2:
@@ -407,9 +411,9 @@ def arduino_step_s(before_s: float, after_s: float) -> float:
 
 
 def arrived_late(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[bool]:
-    """For each of some controls whether the next one came so soon after it that both had waited in a buffer.
+    """Return for each control whether the next one arrived so soon after it that both had waited in a buffer.
 
-    The Arduino measured them one usual interval apart, by its own clock.
+    The usual interval is the median of the steps of the Arduino's clock. The last control is never late.
     """
     steps = [step for a, b in pairwise(arduino_s) if (step := arduino_step_s(a, b)) < 1]
     usual_s = float(np.median(steps)) if steps else 0.033
@@ -418,9 +422,11 @@ def arrived_late(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[
 
 @dataclass(frozen=True, eq=False)
 class Controls:
-    """What a transmitter sent. times_s: (n,) float64 seconds from the first, which never go back. steering_us,
-    throttle_us: (n,) int64 microseconds, as measured. A hole in the recording is a long step in time. left_out: count
-    of controls that were not usable: no pulse was measured, or nobody drove: the car stood then.
+    """The usable controls of a recording.
+
+    times_s: (n,) float64 seconds from the first control, never decreasing; a hole in the recording is a long step.
+    steering_us, throttle_us: (n,) int64 microseconds, as measured. left_out: number of controls that were not usable,
+    because a time or a pulse was not measured, or nobody drove and the car stood.
     """
 
     times_s: np.ndarray
@@ -430,9 +436,10 @@ class Controls:
 
 
 def recorded_car(folder: Path | str) -> Car:
-    """Whose pulses an episode folder has: what its metadata says, the first recordings' car where they say nothing.
+    """Return the car whose pulses an episode folder contains, from its metadata.
 
-    Raises CarError for a description of no car.
+    If the metadata do not describe one, it is the default, the car of the first recordings. Raises CarError if the
+    description is not that of a car.
     """
     try:
         content = json.loads(_data_of(Path(folder) / "episode_data.json"))
@@ -443,17 +450,21 @@ def recorded_car(folder: Path | str) -> Car:
 
 
 def read_controls(folder: Path | str) -> Controls:
-    """The controls of an episode folder with both pulses measured, from control_data.csv, or else episode_data.json.
+    """Return the controls of an episode folder that have both pulses measured.
 
-    Times are the system's, unless its clock was set meanwhile or controls arrived in a burst: then they are the
-    Arduino's. Raises EpisodeError where no control is left, CarError as recorded_car().
+    They are read from control_data.csv, or from episode_data.json if that gives none. Times are the system's, unless
+    its clock was set meanwhile or controls arrived in a burst; then they are the Arduino's. Raises EpisodeError if no
+    control is usable, CarError as recorded_car() does.
     """
     folder = Path(folder)
     pwm = recorded_car(folder).pwm
     for name, read in (("control_data.csv", _csv_rows), ("episode_data.json", json_controls)):
         rows = read(folder / name)
-        timed = [(row, t_s, arduino) for row in rows if (t_s := _found(row, "system_timestamp")) is not None
-                 and (arduino := _found(row, "arduino_timestamp")) is not None]  # fmt: skip
+        timed = []
+        for row in rows:
+            t_s, arduino_ms = _found(row, "system_timestamp"), _found(row, "arduino_timestamp")
+            if t_s is not None and arduino_ms is not None:
+                timed.append((row, t_s, arduino_ms))
         pulses = [_pulses(row, pwm) for row, _, _ in timed]
         keep = [i for i, found in enumerate(pulses) if found]
         if not keep:
@@ -473,7 +484,7 @@ def _found(row: Mapping[str, Any], name: str) -> float | None:
 
 
 def _pulses(row: Mapping[str, Any], pwm: PwmCalibration) -> tuple[int, int] | None:
-    """Both pulses of a control in whole microseconds, None if one was not measured, or the car did something else."""
+    """Return both pulses of a control, in whole microseconds; None if one was not measured or nobody drove."""
     if driver_of(row) not in (POLICY, HUMAN):
         return None
     pulses = []
@@ -488,7 +499,7 @@ def _pulses(row: Mapping[str, Any], pwm: PwmCalibration) -> tuple[int, int] | No
 
 
 def _times(system_s: list[float], arduino_s: list[float]) -> np.ndarray:
-    """Seconds from the first control, never decreasing, in the order of the file."""
+    """Return the seconds from the first control to each, never decreasing, in the order of the file."""
     steps_s = np.diff(system_s)
     clock_s = np.array([arduino_step_s(a, b) for a, b in pairwise(arduino_s)])
     late = "".join("x" if x else " " for x in arrived_late(system_s, arduino_s))
@@ -500,10 +511,10 @@ def _times(system_s: list[float], arduino_s: list[float]) -> np.ndarray:
 
 
 def _data_of(path: Path) -> bytes:
-    """A data file's bytes, none where it cannot be read, or is larger than any drive's."""
+    """Return a data file's bytes; none if it cannot be read, or is larger than any drive's."""
     try:
         status = path.stat()
-        # opening a pipe would wait for ever
+        # a pipe is not opened: that would wait for ever
         return path.read_bytes() if stat.S_ISREG(status.st_mode) and status.st_size <= DATA_BYTES else b""
     except OSError:
         return b""
@@ -511,13 +522,13 @@ def _data_of(path: Path) -> bytes:
 
 def _csv_rows(path: Path) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
-    with contextlib.suppress(csv.Error):  # what comes before the damage counts
+    with contextlib.suppress(csv.Error):  # the rows before the damage count
         rows.extend(csv.DictReader(_data_of(path).decode("utf-8-sig", errors="replace").splitlines()))
     return rows
 
 
 def json_controls(path: Path) -> list[dict[str, Any]]:
-    """The controls in an episode_data.json, as they are; none where it cannot be read."""
+    """Return the controls in an episode_data.json as they are there; none if it cannot be read."""
     try:
         content = json.loads(_data_of(path))
         return [row for row in content["control_samples"] if isinstance(row, dict)]

@@ -41,20 +41,21 @@ from rover_lib.onboard.stage import open_plain, sha256_of, version_of
 MODELS = Path("/var/lib/rover/models")
 POLICY, DIGEST, ORIGIN = "policy.pt", "policy.pt.sha256", "release.json"
 SIGNATURE = "policy.pt.sig"
-SIGNERS = Path("/etc/rover/allowed_signers")  # of ssh-keygen(1); provision.yml writes it
+SIGNERS = Path("/etc/rover/allowed_signers")  # in the format of ssh-keygen(1); provision.yml writes it
 SIGNER, NAMESPACE = "rover", "rover-policy"  # the principal there, and what a signature is for
-NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # ...-2: a second copy, as the first was damaged in use
+NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # ...-2: a second copy, because the first was damaged while in use
 PART = re.compile(r"part-\d{4,}")
-PART_BYTES = 8 << 20  # what a transfer that was cut off sends again at most
+PART_BYTES = 8 << 20  # the most that is sent again after a transfer was cut off
 MOST_PARTS = 1000
 SPARE_BYTES = 64 << 20  # left free for logs
-JSON_BYTES = 100_000  # of release.json and history.json
+JSON_BYTES = 100_000  # largest release.json or history.json
 HISTORY = 100
 LOCK_TRIES, LOCK_S = 5, 0.05
 SANDBOX = "rover-check@{}.service"
 
 STAGE_MB = 400  # memory that staging may take: until an artifact is staged, it is not trusted
-MAY_DIFFER = ("mode", "chunk", "camera")  # torch, engine and actions may not: this rover could not drive by them
+# What can be allowed to differ. Torch, engine and actions cannot: this rover could not drive with others.
+MAY_DIFFER = ("mode", "chunk", "camera")
 CODE_OF_MODE = {"static": b"ops.quantized.conv2d", "mixed": b"ops.quantized.conv2d", "dynamic": b"linear_dynamic"}
 ONNX_OF_MODE = {"static": b"QuantizeLinear", "mixed": b"QuantizeLinear"}
 OF_MODE: dict[str, dict[str, bytes]] = {"torch": CODE_OF_MODE, "onnxruntime": ONNX_OF_MODE, "hailo": {}}
@@ -76,7 +77,7 @@ class Expected:
     modes: tuple[str, ...] = ("static", "mixed")
 
     def refusals(self, manifest: dict[str, Any]) -> dict[str, str]:
-        """Reasons to refuse an artifact, by kind: "mode", "chunk", "camera", "torch", "engine", "actions"."""
+        """Return reasons to refuse an artifact, by kind: "mode", "chunk", "camera", "torch", "engine", "actions"."""
         refusals = {}
         if manifest["mode"] not in self.modes:
             refusals["mode"] = f"its mode is {manifest['mode']}, which is several times slower than {self.modes[0]}"
@@ -165,7 +166,7 @@ def pack(
 
 
 def _packed_before(artifact: Path, folder: Path) -> list[Path]:
-    """The files of an earlier pack(), release.json first. Raises ReleaseError if the folder holds anything else."""
+    """Return the files of an earlier pack(), release.json first. Raises ReleaseError if there are other files."""
     if not folder.exists():
         return []
     remedy = "pack into a folder of its own"
@@ -233,7 +234,7 @@ def _about(artifact: Path, manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def _file(path: Path) -> str:
-    """Where a file is, in text that can be printed, as a rover takes it: a folder's name may hold a no-break space."""
+    """Return a file's path as printable text, which a rover insists on: a folder's name may hold a no-break space."""
     text = str(path.absolute())
     return text if text.isprintable() else ascii(text)[1:-1]
 
@@ -299,7 +300,7 @@ class Releases:
         return self.current_link / POLICY
 
     def path_of(self, name: str) -> Path:
-        """The path of the policy of a release, or of "current". Raises ReleaseError for an invalid name."""
+        """Return the path of the policy of a release, or of "current". Raises ReleaseError for an invalid name."""
         if name == "current":
             return self.policy
         if not NAME.fullmatch(name):
@@ -309,7 +310,7 @@ class Releases:
         return self.releases / name / POLICY
 
     def wrong_with(self, name: str) -> str:
-        """What is wrong with the bytes of a release, empty if nothing. Needs no torch."""
+        """Return what is wrong with the bytes of a release, "" if nothing. Needs no torch."""
         folder, named = self.releases / name, NAME.fullmatch(name)
         if not named:
             return f"'{name}' is no content hash"
@@ -325,7 +326,7 @@ class Releases:
         return ""
 
     def all(self) -> list[Release]:
-        """All releases: first the one in use, then those used before, the latest first, then those never used."""
+        """Return all releases: the one in use, then those used before, the latest first, then those never used."""
         current, releases = self.current, []
         for name in self._by_use():
             try:
@@ -340,9 +341,10 @@ class Releases:
         return releases
 
     def status(self) -> dict[str, Any]:
-        """The present state: current, healthy, since, releases, disk_free_mb, at_work.
+        """Return the present state: current, mode, since, healthy, trouble, can_roll_back_to, releases, and others.
 
-        healthy: whether the bytes of the release in use are intact. at_work: whether a command holds the lock.
+        healthy: whether the bytes of the release in use are intact; if not, trouble says why. disk_free_mb: free space
+        where the models are. at_work: whether a command holds the lock.
         """
         releases = self.all()
         in_use = next((r for r in releases if r.current), None)
@@ -388,7 +390,7 @@ class Releases:
         """Make a release of an artifact, or of a folder that pack() wrote. The release in use stays in use.
 
         The signature is policy.pt.sig in that folder, or lies beside the artifact with .sig added to its name. sha256:
-        the expected one of the artifact, if it is known. unsigned: accept it without a signature. A release that exists
+        what the artifact's must be, if it is known. unsigned: accept it without a signature. A release that exists
         and is intact is left as it is. A damaged one is replaced; if it is in use, a second copy is made beside it.
         Raises ReleaseError, ArtifactError.
         """
@@ -572,11 +574,11 @@ class Releases:
             )
 
     def _intact(self, content: str) -> str | None:
-        """The name of an intact release with that content, preferably the one in use."""
+        """Return the name of an intact release with that content, preferably the one in use; None if there is none."""
         return next((n for n in self._by_use() if n.startswith(content) and not self.wrong_with(n)), None)
 
     def _new_name(self, content: str) -> str:
-        """A free name for a new release with that content; an old one of that name is removed unless it is in use."""
+        """Return a free name for a release with that content. An old one of the name is removed unless it is in use."""
         name, number = content, 1
         while (self.releases / name).exists():
             if name != self.current:
@@ -593,14 +595,14 @@ class Releases:
         return f"{self.current[:12]} stays in use" if self.current else "no model is in use"
 
     def _since(self) -> str | None:
-        """When `current` was switched, by the clock at that time."""
+        """Return when `current` was switched, by the clock at that time; None if there is none."""
         try:
             return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.current_link.lstat().st_mtime))
         except (OSError, ValueError, OverflowError):
             return None
 
     def _nearest_folder(self) -> Path:
-        """The models' folder, or the nearest parent folder that exists."""
+        """Return the models' folder, or the nearest parent folder that exists."""
         return next(p for p in (self.models, *self.models.absolute().parents) if p.exists())
 
     def _point_current_at(self, name: str | None) -> None:
@@ -610,7 +612,7 @@ class Releases:
         else:
             new = self.models / ".new-current"
             new.symlink_to(Path("releases", name))
-            if self.current_link.is_dir() and not self.current_link.is_symlink():  # not ours, which is a link
+            if self.current_link.is_dir() and not self.current_link.is_symlink():  # not ours: that is a link
                 self.current_link.rename(self.models / ".new-was-current")  # the next command removes it
             new.replace(self.current_link)
         _sync(self.models)
@@ -625,7 +627,7 @@ class Releases:
     def _write_history(self, names: list[str]) -> None:
         """Write the history, if there is room. A full disk must not prevent a rollback or pruning.
 
-        The next command adds what is missing then.
+        If there was no room, the next command adds what is missing.
         """
         new = self.models / ".new-history"
         with contextlib.suppress(OSError):
@@ -634,7 +636,7 @@ class Releases:
             _sync(self.models)
 
     def _used_before(self) -> list[str]:
-        """What was in use before the release that is, newest first, each once, and still there."""
+        """Return the releases that were in use before the present one and still exist: the newest first, each once."""
         history, current = self._history(), self.current
         if current in history:
             history = history[: len(history) - history[::-1].index(current)]
@@ -646,7 +648,7 @@ class Releases:
         return [n for n in used if n in names] + [n for n in names if n not in used]
 
     def _remove(self, folder: Path) -> None:
-        """Remove a folder of releases/; a power cut leaves all of it or nothing."""
+        """Remove a folder of releases/. After a power cut it is there completely, or not at all."""
         away = self.releases / f".gone-{folder.name}"
         folder.rename(away)
         _sync(self.releases)
@@ -656,7 +658,7 @@ class Releases:
 def sandboxed(name: str) -> None:
     """Check a release by `rover release verify NAME` in the service's sandbox, with the unit of provision.yml.
 
-    Raises ReleaseError if it does not pass, with what it said.
+    Raises ReleaseError, with the check's own sentence, if it does not pass.
     """
     unit = SANDBOX.format(name)
     started = subprocess.run(["systemctl", "start", unit], capture_output=True, text=True)
@@ -694,7 +696,7 @@ def _disk_errors_explained() -> Iterator[None]:
             raise ReleaseError(
                 "the disk is full; what was in use still is", remedy="prune releases or old recordings"
             ) from e
-        if e.errno in (errno.EROFS, errno.EIO):  # so a card ends
+        if e.errno in (errno.EROFS, errno.EIO):  # a worn-out card fails like this
             raise ReleaseError(
                 f"the disk cannot be written ({e.strerror}); what was in use still is",
                 remedy="look at dmesg, use another card",
@@ -707,7 +709,7 @@ def _open_file(path: Path | str) -> BinaryIO:
 
 
 def _read_json(path: Path) -> Any:
-    """What a small JSON file holds. Raises ValueError, OSError or ReleaseError."""
+    """Return the content of a small JSON file. Raises ValueError, OSError or ReleaseError."""
     with _open_file(path) as file:
         text = file.read(JSON_BYTES + 1)
     if len(text) > JSON_BYTES:
@@ -719,7 +721,10 @@ def _read_json(path: Path) -> Any:
 
 
 def _join(parts: list[Path], target: Path, most: int) -> str:
-    """One file from parts, synced; its SHA-256. Raises ReleaseError for more than that many bytes."""
+    """Join parts into one new, synced file, and return its SHA-256.
+
+    Raises ReleaseError if a part is missing, or if together they have more than `most` bytes.
+    """
     digest = hashlib.sha256()
     file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
     try:
@@ -757,7 +762,7 @@ def _write_all(file: int, content: bytes) -> None:
 
 
 def _sync(folder: Path) -> None:
-    """A rename lasts once its folder is on the disk."""
+    """Write a folder to the disk: only then does a rename in it survive a power cut."""
     file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(file)

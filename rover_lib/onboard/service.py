@@ -55,11 +55,11 @@ if TYPE_CHECKING:  # asking for the service's state, as every playbook does, mus
 UNIT = "rover-drive.service"
 RUNTIME = Path("/run/rover-drive")  # the unit's RuntimeDirectory=
 CHECK_S = 0.1  # between checks while disarmed
-FEED_S = 0.25  # WatchdogSec is 2 s
+FEED_S = 0.25  # between two looks at whether to feed the watchdog, whose WatchdogSec is 2 s
 FINISH_S = 80.0  # to finish an episode on a slow card; TimeoutStopSec is 90 s then
 STATUS_S = 1.0
-REQUEST_S = 2.0  # how old a request to arm may be: a fresh plan within 0.8 s, an episode's folder, the Arduino's cap
-ARMED_S = 10.0  # a fresh plan comes within 0.8 s, the Arduino answers within 0.5, an episode's folder is made
+REQUEST_S = 2.0  # longest age of a request to arm: a fresh plan takes 0.8 s, then an episode's folder and the cap
+ARMED_S = 10.0  # longest wait for an answer: a fresh plan takes 0.8 s, the Arduino 0.5, and an episode's folder
 QUESTION_BYTES = 4096
 PERSONS = 1000  # user ids from here on belong to people; the service's own is below
 DISARMED, DRIVING, STOPPING = STATES = ("disarmed", "driving", "stopping")
@@ -90,7 +90,7 @@ class Request:
 
 
 def check_age(age_s: float) -> None:
-    """Raises NotArmed for a request to arm that is too old: whoever sent it may no longer be watching the car."""
+    """Raise NotArmed for a request to arm that is too old: whoever sent it may no longer be watching the car."""
     if not age_s <= REQUEST_S:  # also refuses NaN
         raise NotArmed(
             f"{age_s:.1f} s have passed since the car was asked for, at most {REQUEST_S:g} may", remedy="ask again"
@@ -127,7 +127,7 @@ class Service:
         ]
         self._turn = threading.Condition()  # guards the five below
         self._ticket = ""  # for the next attempt; empty: nobody can ask for one now
-        self._request: Request | None = None  # of the present attempt or drive
+        self._request: Request | None = None  # that of the present attempt or drive
         self._asked = False
         self._asked_s = 0.0
         self._answer: dict[str, Any] | None = None
@@ -218,11 +218,11 @@ class Service:
         check_age(self._clock() - self._asked_s)
 
     def alive(self) -> None:
-        """Tell the watchdog that the work after a drive goes on. To be called again and again during that work."""
+        """Tell the watchdog that the work after a drive goes on. Call it again and again during that work."""
         self._rounds += 1
 
     def over(self) -> str | None:
-        """Why the operator's limits end this drive; None if they do not. The loop calls this at each tick."""
+        """Return why the operator's limits end this drive; None if they do not. The loop calls this at each tick."""
         request, now = self._request or Request(), self._clock()
         if request.max_seconds is not None and now - self._armed_s >= request.max_seconds:
             return f"{request.max_seconds:g} s, as requested"
@@ -258,7 +258,10 @@ class Service:
     def _answer_to(
         self, ask: str, model: str = "", ticket: str = "", asked_s: float | None = None, **limits: float | None
     ) -> dict[str, Any]:
-        """asked_s: when the operator sent it, time.monotonic(); this process may have been suspended since then."""
+        """Return the answer to an operator's question.
+
+        asked_s: when the operator sent it, by time.monotonic(): this process may have been suspended since then.
+        """
         if ask == "heartbeat":
             self._heard_s = self._clock()
         if ask != "arm":
@@ -314,9 +317,10 @@ class Service:
 
 
 def state_of(unit: str = UNIT) -> dict[str, Any]:
-    """What systemd knows about the service: active, state (one of STATES, or ""), text, since, restarts, result.
+    """Return what systemd knows about the service.
 
-    Raises ServiceError if there is no systemd.
+    Keys: installed, active, state (one of STATES, or ""), text, since, restarts, result, at_boot. Raises ServiceError
+    if there is no systemd.
     """
     names = ("LoadState", "ActiveState", "StatusText", "ActiveEnterTimestamp", "NRestarts", "Result", "UnitFileState")
     try:

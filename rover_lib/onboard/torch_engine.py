@@ -1,4 +1,4 @@
-"""Artifacts run by torch: TorchScript, with INT8 by the engine that the manifest names."""
+"""Run artifacts in torch: TorchScript, whose INT8 operators run in the engine that the manifest names."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,34 +13,38 @@ from rover_lib.onboard.torchscript import unknown_operators
 
 
 class TorchEngine:
-    """A TorchScript archive. Use `load`."""
+    """A TorchScript archive. Make it with `load`."""
 
     def __init__(self, module: torch.jit.ScriptModule):
         self._module = module
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
-        """As engines.Engine."""
+        """As Engine.run()."""
         # TorchScript re-optimises in its second call (0.37 G instructions on a Cortex-A76); the switch is thread-local.
         with torch.inference_mode(), torch.jit.optimized_execution(False):
             y = self._module(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames_rgb))
         return y.numpy()
 
     def give_back(self) -> bool:
-        """As engines.Engine: the convolutions' original weights."""
+        """As Engine.give_back(). What it frees are the convolutions' original weights."""
         return give_back_packed_weights(self._module) > 0
 
     @property
     def threads(self) -> int:
-        """As engines.Engine."""
+        """As Engine.threads."""
         return torch.get_num_threads()
 
     def set_threads(self, threads: int) -> None:
-        """As engines.Engine."""
+        """As Engine.set_threads()."""
         torch.set_num_threads(threads)
 
 
 def load(path: Path, manifest: dict[str, Any], threads: int | None) -> TorchEngine:
-    """Raises ArtifactError for another torch than the artifact's, or one without its quantization engine."""
+    """Load an artifact.
+
+    Raises ArtifactError if it was made with another torch, needs a quantization engine that this torch lacks, cannot be
+    loaded, or has an operator that no artifact has.
+    """
     made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
     if made_with.split(".")[:2] != here.split(".")[:2]:
         raise ArtifactError(
@@ -57,7 +61,7 @@ def load(path: Path, manifest: dict[str, Any], threads: int | None) -> TorchEngi
     if threads:
         torch.set_num_threads(threads)
     try:
-        str(path).encode()  # torch opens no other names
+        str(path).encode()  # torch cannot open any other name
     except UnicodeEncodeError:
         raise ArtifactError(f"{path}: its name is no text that torch can read", remedy="rename it") from None
     try:

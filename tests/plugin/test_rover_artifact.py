@@ -171,3 +171,5 @@ def test_packing_by_hand(artifact, tmp_path):
     assert done.exit_code == 0 and "packed: " in done.output
     again = CliRunner().invoke(main, [str(artifact), str(tmp_path / "packed")])
     assert again.exit_code == 1 and again.output.startswith("Error: ") and "is there already" in again.output
+    nowhere = CliRunner().invoke(main, [str(artifact), str(artifact / "packed")])  # a file is no folder
+    assert nowhere.exit_code == 1 and nowhere.output.startswith("Error: ") and str(artifact) in nowhere.output
