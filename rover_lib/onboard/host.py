@@ -6,6 +6,7 @@ neither a process's peak memory on Linux nor what a Raspberry Pi's firmware thro
 
 import errno
 import os
+import re
 import resource
 import socket
 import subprocess
@@ -16,6 +17,7 @@ from typing import Any
 
 # Bits of vcgencmd get_throttled: true now, and 16 bits higher: has been true since the start
 THROTTLED_BITS = {0: "under-voltage", 1: "frequency capped", 2: "throttled", 3: "soft temperature limit"}
+THROTTLED_VALUE = re.compile(r"0x[0-9a-fA-F]{1,8}")  # as get_throttled prints the bits
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Host:
         except (OSError, subprocess.SubprocessError):
             return None
         name, _, value = found.stdout.strip().partition("=")
-        return value if found.returncode == 0 and name == "throttled" and value.startswith("0x") else None
+        return value if found.returncode == 0 and name == "throttled" and THROTTLED_VALUE.fullmatch(value) else None
 
     def process_peak_memory_mb(self) -> float | None:
         """Return the largest resident memory that this process has ever had, in MB of 10**6 bytes."""
@@ -80,7 +82,10 @@ def usable_cores() -> int:
 
 
 def throttled_means(value: str | None) -> list[str] | None:
-    """Return the meaning of each bit set in get_throttled's value, as text; None if there was no reading."""
+    """Return the meaning of each bit set in get_throttled's value, as text; None if there was no reading.
+
+    value: as Host.throttled returns it.
+    """
     if value is None:
         return None
     bits = int(value, 16)

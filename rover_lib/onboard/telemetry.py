@@ -38,7 +38,7 @@ import numpy as np
 
 from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import ParamsError, RoverError
-from rover_lib.onboard.host import Host, throttled_means
+from rover_lib.onboard.host import THROTTLED_VALUE, Host, throttled_means
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pwm import is_finite
 from rover_lib.onboard.servo_link import State
@@ -632,7 +632,9 @@ def _json_row(row: dict[str, Any]) -> Event | dict[str, Any]:
             if text == MISSING and not isinstance(fields.get("ticks"), int):
                 raise ValueError("no count")
             return Event(_time_of(row), text, fields)
-        case "machine", {"temperature_c": int() | float() | None as temperature_c, "throttled": str() | None}:
+        case "machine", {"temperature_c": int() | float() | None as temperature_c, "throttled": str() | None as bits}:
+            if bits is not None and not THROTTLED_VALUE.fullmatch(bits):
+                raise ValueError("no bits")
             known = {} if temperature_c is None else {"temperature_c": float(temperature_c)}
             return {**row, "t_s": _time_of(row), **known}
         case "header", _ if isinstance(row.get("drive", {}), dict):

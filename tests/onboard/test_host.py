@@ -22,6 +22,8 @@ def test_broken_readings_are_none(pi_host):
     assert pi_host.temperature_c() == 70.0
     Path(pi_host.vcgencmd).write_text("#!/bin/sh\necho VCHI initialization failed; exit 255\n")
     assert pi_host.throttled() is None
+    Path(pi_host.vcgencmd).write_text("#!/bin/sh\necho throttled=0x\n")
+    assert pi_host.throttled() is None
     assert Host(vcgencmd=str(pi_host.proc_root)).throttled() is None  # no program
 
 

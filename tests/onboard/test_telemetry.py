@@ -304,6 +304,7 @@ ROWS = {  # with a right checksum, and no lines of a flight log all the same
     "a machine without a time": {"kind": "machine"},
     "a temperature in words": {"kind": "machine", "t_s": 1, "temperature_c": "hot", "throttled": None},
     "a temperature beyond all": {"kind": "machine", "t_s": 1, "temperature_c": 10**400, "throttled": None},
+    "throttling in words": {"kind": "machine", "t_s": 1, "temperature_c": None, "throttled": "hot"},
     "an event at no time": {"kind": "event", "t_s": "x", "event": "a", "fields": {}},
     "an event at the end of time": {"kind": "event", "t_s": 10**400, "event": "a", "fields": {}},
     "an event without fields": {"kind": "event", "t_s": 1, "event": "a", "fields": []},
