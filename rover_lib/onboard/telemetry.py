@@ -351,9 +351,11 @@ class _LogFile:
             self._shift()
         done = os.write(self.open(), lines)
         self._size += done
-        # A line that was cut is written again as a whole; read_log() skips the cut one, so no line counts twice.
-        self.unwritten = b"" if done == len(lines) else lines[lines.rfind(b"\n", 0, done) + 1 :]
-        if self.unwritten:
+        self.unwritten = b""
+        if done < len(lines):
+            # A line that was cut is written again as a whole; read_log() skips the cut one, so no line counts twice.
+            # A line that lacks only its line feed is not cut: open() ends it.
+            self.unwritten = lines[lines.rfind(b"\n", 0, done + 1) + 1 :]
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def open(self) -> int:
