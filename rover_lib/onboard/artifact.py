@@ -259,7 +259,7 @@ def check_manifest(manifest: Any, where: str) -> None:
 
 
 def largest_tolerance(mode: str, action: str) -> float:
-    """Return the largest parity tolerance that a manifest may have for an action; infinity for those that no servo obeys."""
+    """Return the largest parity tolerance that a manifest may have for an action; infinity if it moves no servo."""
     return LARGEST_TOLERANCE["fp32" if mode == "fp32" else "int8"] if action in CAR_ACTIONS else math.inf
 
 
