@@ -381,7 +381,7 @@ def _paced(
             if begun.is_set() and not last:
                 break
             yield jpeg, None
-        last |= not count  # an empty file
+        last |= not count  # an empty file has nothing to repeat
 
 
 def _fifo(path: Path, closing: threading.Event) -> Reader:

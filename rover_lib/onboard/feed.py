@@ -64,7 +64,7 @@ class Feed:
     ):
         self._place, self._log, self._title, self._clock, self._sleep = place, log, title, clock, sleep
         self._socket: socket.socket | None = None
-        self._look_s = self._due_s = self._tell_s = 0.0
+        self._look_s = self._due_s = self._tell_s = 0.0  # earliest times: look for a view, send, log a change
         self._ticks: deque[tuple[float, float]] = deque(maxlen=100)  # when, and how late in milliseconds
         self.dropped = 0  # messages for which there was no room
 

@@ -114,9 +114,9 @@ class TakeoverRecorder:
         neutral = link.calibration.neutral()
         held_us = armed.receiver_steering_us if armed else None
         rest_us = neutral.steering_us if held_us is None else held_us, neutral.throttle_us
-        first = link.turned
+        first = link.turned  # the status that ended the policy's turn
         if self._waiting and first and (first.result == IGNORED or first.host_s <= self._waiting[0][0]):
-            self._waiting = None
+            self._waiting = None  # the Arduino did not take the newest command
         self.flush()
 
         def ended(why: str, fault: bool = False) -> Takeover:

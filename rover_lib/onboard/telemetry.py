@@ -195,7 +195,7 @@ class FlightLog:
         self._events: deque[Event] = deque(maxlen=QUEUE_EVENTS if self.path else 0)
         self._messages: deque[tuple[int, Event | str]] = deque(maxlen=QUEUE_EVENTS)
         self._messages_wait = SignalEvent()  # because a signal's handler calls event() too
-        self._last_messages = False  # no more will come
+        self._last_messages = False  # set when no more will come
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
         # Only the writing thread uses these:
@@ -463,7 +463,7 @@ class Flight:
         """
         ticks, period_ms = self.ticks, self.period_ms
         t_s, late_ms, plans = ticks["t_s"], ticks["late_ms"], ticks["plan"]
-        _, first = np.unique(plans, return_index=True)
+        _, first = np.unique(plans, return_index=True)  # the first tick of each plan
         latency_ms = ticks["latency_ms"][first][plans[first] > 0] if len(plans) else plans
         durations_s = np.diff(t_s, append=t_s[-1:] + (period_ms or 0) / 1000)
         states = {s.value: s.name.lower() for s in State} | {"": "not known"}
@@ -550,7 +550,8 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
         raise LogError(f"{path}: cannot be read ({error.strerror})", remedy=NAME_A_LOG) from error
     drives: list[_Drive] = []
     damaged = 0
-    for line in (line for data in files for line in data.split(b"\n") if line):
+    lines = [line for data in files for line in data.split(b"\n") if line]
+    for line in lines:
         row = _row(line)
         if row is None:
             damaged += 1

@@ -93,8 +93,12 @@ def unknown_operators(graph: Any) -> list[str]:
     """Return the kinds of nodes in a torch graph that no artifact has, to compare our list with torch's own reading."""
     known = NODES | {f"aten::{o.removeprefix('torch.')}" for o in OPERATORS}
     known |= {o.removeprefix("ops.").replace(".", "::") for o in OPERATORS}
-    nodes = list(graph.nodes())
-    return sorted({n.kind() for n in nodes} - known | {"a block" for n in nodes if list(n.blocks())})
+    kinds: set[str] = set()
+    for node in graph.nodes():
+        kinds.add(node.kind())
+        if list(node.blocks()):
+            kinds.add("a block")
+    return sorted(kinds - known)
 
 
 def _parsed(source: bytes) -> ast.Module:

@@ -150,17 +150,17 @@ def unfinished_drive(log: Path | str) -> str | None:
             lines = file.read().splitlines()
     except (OSError, LogError):
         return None
-    ticks = False
-    for line in reversed(lines):
+    drove = False
+    for line in reversed(lines):  # back to where the last drive began
         if b'"event":"neutral' in line:
             return None
         if b'"event":"armed' in line:
-            ticks = True
-        elif b'"kind":"header"' not in line:
-            ticks |= line[:1].isdigit()
-            continue
-        break
-    return f"{log}: the drive before this one has no end: killed, or without power or disk" if ticks else None
+            drove = True
+            break
+        if b'"kind":"header"' in line:
+            break
+        drove |= line[:1].isdigit()  # a tick; events are JSON
+    return f"{log}: the drive before this one has no end: killed, or without power or disk" if drove else None
 
 
 class HealthWatch:
@@ -187,7 +187,8 @@ class HealthWatch:
         spent, before = _processors(), self._spent
         self._spent = spent
         if spent and before and spent[1] > before[1]:
-            idle, _, stolen = ((now - then) / (spent[1] - before[1]) for now, then in zip(spent, before, strict=True))
+            total = spent[1] - before[1]
+            idle, stolen = (spent[0] - before[0]) / total, (spent[2] - before[2]) / total
             if idle < IDLE and self._busy % REPEAT_AFTER == 0:
                 yield f"this machine is busy: its processors were idle for {idle:.0%} of the time"
             self._busy = self._busy + 1 if idle < IDLE else 0
