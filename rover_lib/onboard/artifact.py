@@ -68,7 +68,7 @@ def save_artifact(
     """Write an artifact for torch atomically, and return its content hash.
 
     parity: `state` (n, S) float32, `frame_<camera>` (n, height, width, 3) uint8 RGB, `chunk` (n, C, A) float32.
-    Raises ArtifactError as check_manifest().
+    Raises ArtifactError like check_manifest().
     """
     import torch
 
@@ -115,7 +115,7 @@ def content_hash(path: Path | str) -> str:
     """Return the hex SHA-256 of everything in the artifact that has an effect: the same inputs give the same hash.
 
     The bytes of the file may differ, because TorchScript also writes debug tables (source positions), a serial number,
-    and class names with a counter of all classes that the process ever made. Raises ArtifactError as open_archive().
+    and class names with a counter of all classes that the process ever made. Raises ArtifactError like open_archive().
     """
     digest = hashlib.sha256()
     with open_archive(path) as z:

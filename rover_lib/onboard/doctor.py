@@ -150,10 +150,7 @@ def access(name: str, device: Path, group: str) -> Iterator[Check]:
         if os.geteuid() == 0 or group in _groups():
             yield Check(name, "ok", f"{user} is in it" if os.geteuid() else f"{user} needs no group")
             return
-        what, verdict = (
-            f"{user} is not in it",
-            "warning",
-        )  # another check fails for a missing device
+        what, verdict = f"{user} is not in it", "warning"  # another check reports the missing device as a fail
     if _listed(group, user):
         yield Check(name, verdict, f"{what}; {user} was added to it", "log in again (or restart the service)")
     else:

@@ -82,7 +82,7 @@ RESULTS = {
     "t": "refused: the throttle stick is not at rest",
     "w": "refused: nobody has just wiggled the steering stick",
 }
-MISSING = {  # what is missing before the car can be armed: what the human has to do about it
+MISSING = {  # what the Arduino still needs before it can be armed, and what the human does about it
     "s": "switch the transmitter on",
     "t": "let go of the throttle stick",
     "w": "move the steering stick far to both sides and let go of it",
@@ -258,8 +258,8 @@ class ServoLink:
     def open(self) -> Hello:
         """Open the port for this program alone, wait for the hello and a first status, and tell the Arduino of the car.
 
-        The first opening after the Arduino was plugged in resets most boards; a later one does not interrupt it. The
-        Arduino is not told of the default car, which it drives without being told.
+        The first opening after the Arduino was plugged in resets most boards; a later one does not interrupt it. It is
+        told of every car but the default one, and of that too if it now drives its pins for another.
         Raises LinkError if the port cannot be opened or is in use, if nothing there says hello within `boot_s` seconds,
         if the firmware is another one than this program knows, or if it refuses this car.
         """

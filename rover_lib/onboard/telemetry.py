@@ -333,7 +333,7 @@ class FlightLog:
 
 
 class _LogFile:
-    """The file of a flight log, and its older parts. Methods raise OSError if the disk does not accept the data."""
+    """The file of a flight log, and its older parts. write(), open() and sync() raise OSError if the disk fails."""
 
     def __init__(self, path: Path, header: dict[str, Any], max_bytes: int, keep: int):
         self._path, self._header, self._max_bytes, self._keep = path, header, max_bytes, keep
@@ -635,7 +635,7 @@ def _time_of(row: dict[str, Any]) -> float:
 
 
 def _json_row(row: dict[str, Any]) -> Event | dict[str, Any]:
-    """Check the row of a JSON line whose checksum is right. Raises an error that _row() expects if it is of no log."""
+    """Check the row of an undamaged JSON line. Raises an error that _row() catches if no log has such a row."""
     match row["kind"], row:
         case "event", {"event": str(text), "fields": dict(fields)}:
             if text == MISSING and not isinstance(fields.get("ticks"), int):

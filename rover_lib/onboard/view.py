@@ -67,7 +67,7 @@ class Address:
     interface: str = ""
 
     def open(self) -> socket.socket:
-        """Return a listening socket. Raises ViewError if the port is taken or the interface is unknown."""
+        """Return a listening socket. Raises ViewError if the port or the interface cannot be used."""
         wire = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
             wire.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -88,9 +88,9 @@ class Address:
     def is_ours(self, host: str) -> bool:
         """Whether a request's Host: header names this machine.
 
-        Any IP address is accepted if other machines may reach the view, since nobody can make an address lead
-        elsewhere. A name is accepted only if it is this machine's: the owner of another name can make it lead here,
-        and the browser would take their page for ours.
+        A loopback address is accepted, and any other address if other machines may reach the view, since nobody can
+        make an address lead elsewhere. A name must be this machine's: the owner of another name could make it lead
+        here, and the browser would take their page for ours.
         """
         match = HOST.fullmatch(host)
         if not match:
