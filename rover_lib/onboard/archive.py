@@ -22,7 +22,7 @@ from typing import BinaryIO
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.stage import open_plain
 
-# Sizes, each several times what a policy of full size needs; total: 266 MB in FP32
+# Limits, each several times what a policy of full size needs, whose artifact in FP32 has 266 MB
 ARCHIVE_BYTES, DIRECTORY_BYTES, RECORDS = 1_000_000_000, 1_000_000, 5000
 CODE_BYTES, DEBUG_BYTES, PICKLE_BYTES = 250_000, 2_000_000, 1_000_000
 MANIFEST_BYTES, PARITY_BYTES = 100_000, 50_000_000
@@ -34,7 +34,7 @@ REQUIRED = {
 }
 MANIFEST, PARITY, ONNX = "archive/extra/manifest.json", "archive/extra/parity.npz", "archive/model.onnx"
 HEF = "archive/network.hef"
-RECORD_BYTES = {  # by name after "archive/"; None: as large as the file
+RECORD_BYTES = {  # largest size by name after "archive/"; None: limited only by ARCHIVE_BYTES for all
     r"version|byteorder|\.data/serialization_id": 100,
     r"(data|constants)\.pkl": PICKLE_BYTES,
     r"extra/manifest\.json": MANIFEST_BYTES,
@@ -45,7 +45,7 @@ RECORD_BYTES = {  # by name after "archive/"; None: as large as the file
     r"model\.onnx": None,
     r"network\.hef": None,
 }
-# An artifact has hundreds of records, and is opened several times before it drives.
+# Compiled once, because an artifact has hundreds of records and is opened several times before it drives.
 KNOWN_RECORDS = tuple((re.compile(pattern, re.ASCII), limit) for pattern, limit in RECORD_BYTES.items())
 
 
@@ -65,7 +65,7 @@ def open_archive(path: Path | str) -> zipfile.ZipFile:
             raise
     except FileNotFoundError:
         raise ArtifactError(f"{path}: not found", remedy="'rover run' writes artifacts to runs/<name>/") from None
-    # NotImplementedError: zipfile's, for a version of the format that it does not know
+    # NotImplementedError: from zipfile, for an unknown version of the format
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as e:
         raise ArtifactError(f"{path}: not an artifact, or cut short ({e})", remedy="copy the file again") from None
     return z
@@ -92,19 +92,19 @@ def nothing_unknown(path: Path | str, what: str) -> Iterator[None]:
 
 
 def read_record(z: zipfile.ZipFile, name: str) -> bytes:
-    """A record's bytes; never unpacks more than its header announces. Raises as zipfile does."""
+    """Return a record's bytes, and never unpack more than its header announces. Raises like zipfile."""
     with z.open(name) as record:
         return record.read(z.getinfo(name).file_size)
 
 
 def kind_of(records: list[zipfile.ZipInfo]) -> str:
-    """The engine that an archive's policy is for: torch, onnxruntime or hailo."""
+    """Return the engine that an archive's policy is for: torch, onnxruntime or hailo."""
     names = {record.filename for record in records}
     return "hailo" if HEF in names else "onnxruntime" if ONNX in names else "torch"
 
 
 def _check_directory(file: BinaryIO, path: Path | str) -> None:
-    """Check that the file is one zip archive from first byte to last, and its directory small enough for memory.
+    """Raise an error unless the file is one zip archive from first byte to last, with a directory that fits in memory.
 
     Otherwise two readers that look for the directory in different places could see two different archives.
     """
@@ -118,7 +118,7 @@ def _check_directory(file: BinaryIO, path: Path | str) -> None:
         raise zipfile.BadZipFile("it does not end as an archive")
     records, length, start = struct.unpack("<10xHII2x", end)
     after = 22
-    if locator[:4] == b"PK\6\7":  # torch writes the larger form of this, too
+    if locator[:4] == b"PK\6\7":  # torch also writes the larger form of this end, zip64
         if end64[:4] != b"PK\6\6" or struct.unpack("<4xIQI", locator)[1] != size - 98:
             raise zipfile.BadZipFile("its end is not where it says")
         records, length, start = struct.unpack("<32xQQQ", end64)
@@ -134,14 +134,14 @@ def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
     names, total = set(), 0
     for record in records:
         name = record.filename.removeprefix("archive/")
-        if name == ".data/version":  # where torch puts it for an operator that has changed since, as gelu has
+        if name == ".data/version":  # torch moves it there if the program has an operator that changed, as gelu did
             name = "version"
         known = [limit for pattern, limit in KNOWN_RECORDS if pattern.fullmatch(name)]
         if not known or not record.filename.startswith("archive/"):
             raise ArtifactError(
                 f"{path}: a record that no artifact has", found=repr(record.filename)[:80], remedy="quantize again"
             )
-        if name.lower() in names:  # torch finds names without regard to case
+        if name.lower() in names:  # torch ignores case in names
             raise ArtifactError(f"{path}: '{name}' is in it twice", remedy="quantize again")
         if known[0] is not None and record.file_size > known[0]:
             raise ArtifactError(

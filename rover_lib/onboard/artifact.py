@@ -1,7 +1,8 @@
-"""The artifact: one zip with a policy for an engine (see engines.py), its manifest and its parity vectors inside.
+"""The artifact: one zip with a policy for an engine (see engines.py), its manifest and its parity vectors.
 
-Beside TorchScript's own records, or model.onnx: `extra/manifest.json` (what it is, see MANIFEST_KEYS) and
-`extra/parity.npz` (inputs, and the chunks that they must give). No pickled objects, no lerobot.
+Beside the records of the policy itself, TorchScript's, model.onnx or network.hef, it contains `extra/manifest.json`
+(what the artifact is, see MANIFEST_KEYS) and `extra/parity.npz` (inputs, and the chunks that they must give). It
+contains no pickled Python objects, and reading it needs no lerobot.
 """
 
 import hashlib
@@ -23,12 +24,12 @@ from rover_lib.onboard.onnx_file import check_model
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.onboard.torchscript import check_program
 
-if TYPE_CHECKING:  # reading what an artifact says of itself needs neither
+if TYPE_CHECKING:  # reading a manifest needs neither
     import numpy as np
     import torch
 
 SCHEMA = 1
-ONNX_SUFFIX = ".onnx.zip"  # of artifacts for ONNX Runtime, where torch's end in .pt; what reads one looks inside
+ONNX_SUFFIX = ".onnx.zip"  # of artifacts for ONNX Runtime, as .pt is of torch's; readers go by the content instead
 MANGLED = re.compile(rb"___torch_mangle_\d+")
 MANIFEST_KEYS: dict[str, type | tuple[type, ...]] = {
     "schema": int,
@@ -39,24 +40,24 @@ MANIFEST_KEYS: dict[str, type | tuple[type, ...]] = {
     "state_names": list,
     "action_names": list,
     "chunk": int,  # actions per inference
-    "rate_hz": (int, float),  # of those actions
+    "rate_hz": (int, float),  # actions per second
     "normalisation": str,  # where it happens
     "checkpoint": dict,  # {sha256, format}
     "calibration": (dict, type(None)),  # {samples, observer, ...}
     "weights_mb": (int, float),
     "gmac": (int, float),  # multiply-accumulates of one inference, in 1e9
     "parity": dict,  # {tolerance: {action: largest difference}, reason}
-    "versions": dict,  # {torch, rover_lib}, and {onnx, onnxruntime} if it is for that
+    "versions": dict,  # {torch, rover_lib}, and for ONNX Runtime also {onnx, onnxruntime}
 }
 MODES = ("fp32", "dynamic", "static", "mixed")
 SCHEMES = ("float", "dynamic", "symmetric", "affine")
-# What the reader takes, whatever a manifest says; both ends included
+# What the reader accepts, whatever a manifest says; both ends included
 SIDE_PX, CHUNK, RATE_HZ = (16, 8192), (1, 256), (5.0, 120.0)
 WEIGHTS_MB, GMAC = (0.0, 1000.0), (0.0, 1000.0)
 MOST_NAMES, NAME_LENGTH, MOST_DEPTH = 64, 64, 8
 MOST_VECTORS = 16
-# How far parity vectors may differ on a car: FP32 policies by the order of sums, INT8 ones by flipped roundings, which
-# were 0.13 on the worst of those with random weights and 0.03 on trained ones.
+# How far a car's actions may differ from the parity vectors. FP32 policies differ by the order of sums, INT8 ones by
+# flipped roundings: by at most 0.13 with random weights and 0.03 with trained ones, as far as we have seen.
 LARGEST_TOLERANCE = {"fp32": 1e-3, "int8": 0.3}
 CAR_ACTIONS = ("steering", "throttle")
 
@@ -64,14 +65,14 @@ CAR_ACTIONS = ("steering", "throttle")
 def save_artifact(
     path: Path | str, module: "torch.jit.ScriptModule", manifest: dict[str, Any], parity: "dict[str, np.ndarray]"
 ) -> str:
-    """Write the artifact atomically; return its content hash.
+    """Write an artifact for torch atomically, and return its content hash.
 
     parity: `state` (n, S) float32, `frame_<camera>` (n, height, width, 3) uint8 RGB, `chunk` (n, C, A) float32.
-    Raises ArtifactError if the manifest lacks something.
+    Raises ArtifactError like check_manifest().
     """
     import torch
 
-    # Through a buffer, because torch.jit.save names the zip's folder after the file: same inputs, same bytes.
+    # Through a buffer, because torch.jit.save would name the zip's folder after the temporary file.
     buffer = io.BytesIO()
     torch.jit.save(module, buffer, _extra_files=_extra(path, manifest, parity))
     with atomic_path(path) as temporary:
@@ -80,11 +81,11 @@ def save_artifact(
 
 
 def save_onnx(path: Path | str, model: bytes, manifest: dict[str, Any], parity: "dict[str, np.ndarray]") -> str:
-    """As save_artifact(), of an ONNX model's bytes."""
+    """Write an artifact for ONNX Runtime, as save_artifact() does for torch. model: the bytes of an ONNX model."""
     records = {f"archive/extra/{name}": content for name, content in _extra(path, manifest, parity).items()}
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as z:
         for name, content in {ONNX: model, **records}.items():
-            z.writestr(zipfile.ZipInfo(name), content)  # of 1980, so that the same inputs give the same bytes
+            z.writestr(zipfile.ZipInfo(name), content)  # dated 1980, so that the same inputs give the same bytes
     return content_hash(path)
 
 
@@ -98,9 +99,9 @@ def _extra(path: Path | str, manifest: dict[str, Any], parity: "dict[str, np.nda
 
 
 def car_of(manifest: dict[str, Any]) -> Car:
-    """The car whose recordings an artifact was calibrated with, from its manifest; Car() where that names none.
+    """Return the car whose recordings an artifact was calibrated with, from its manifest; Car() if that names none.
 
-    Raises ArtifactError for a description of no car.
+    Raises ArtifactError if the manifest's description is not one of a car.
     """
     if "car" not in manifest:
         return Car()
@@ -111,10 +112,10 @@ def car_of(manifest: dict[str, Any]) -> Car:
 
 
 def content_hash(path: Path | str) -> str:
-    """Hex SHA-256 over everything in the artifact that acts: the same inputs give the same hash.
+    """Return the hex SHA-256 of everything in the artifact that has an effect: the same inputs give the same hash.
 
-    The bytes of the file may differ: TorchScript writes debug tables (source positions), a serial number, and class
-    names with a counter of all classes that the process ever made.
+    The bytes of the file may differ, because TorchScript also writes debug tables (source positions), a serial number,
+    and class names with a counter of all classes that the process ever made. Raises ArtifactError like open_archive().
     """
     digest = hashlib.sha256()
     with open_archive(path) as z:
@@ -130,13 +131,13 @@ def content_hash(path: Path | str) -> str:
 
 
 def read_manifest(path: Path | str) -> dict[str, Any]:
-    """The manifest of an artifact, without running or even loading the policy. Raises ArtifactError."""
+    """Read and check an artifact's manifest, without running or even loading the policy. Raises ArtifactError."""
     with open_archive(path) as z:
         return _manifest_in(z, path)
 
 
 def read_parity(path: Path | str) -> "dict[str, np.ndarray]":
-    """The parity vectors of an artifact, of the shapes that its manifest says. Raises ArtifactError."""
+    """Read an artifact's parity vectors. Raises ArtifactError unless they have the shapes that its manifest says."""
     import numpy as np
 
     with open_archive(path) as z:
@@ -172,9 +173,9 @@ def read_parity(path: Path | str) -> "dict[str, np.ndarray]":
 
 
 def check_artifact(path: Path | str) -> None:
-    """Raise ArtifactError if any byte changed since the artifact was written, or if it has what no artifact has.
+    """Raise ArtifactError if any byte changed since the artifact was written, or if it contains what no artifact has.
 
-    TorchScript looks for neither. Nothing in the artifact is run.
+    TorchScript itself checks neither. Nothing in the artifact is run.
     """
     with open_archive(path) as z:
         try:
@@ -188,12 +189,12 @@ def check_artifact(path: Path | str) -> None:
             )
         if ONNX in z.namelist():
             check_model(z, path)
-        elif kind_of(z.infolist()) == "torch":  # a HEF is a matter between HailoRT and the chip
+        elif kind_of(z.infolist()) == "torch":  # only HailoRT and the chip can read a HEF
             check_program(z, path)
 
 
 def check_manifest(manifest: Any, where: str) -> None:
-    """Raise ArtifactError, naming the key, for a manifest of another schema or with a value that cannot be."""
+    """Raise ArtifactError, naming the key, if the manifest has another schema or an impossible value."""
     if not isinstance(manifest, dict):
         raise ArtifactError(
             f"{where}: its manifest is no JSON object", found=type(manifest).__name__, remedy="quantize again"
@@ -258,13 +259,14 @@ def check_manifest(manifest: Any, where: str) -> None:
 
 
 def largest_tolerance(mode: str, action: str) -> float:
-    """How far an action of parity vectors may differ, whatever a manifest says; infinity if it is no servo's."""
+    """Return the largest parity tolerance that a manifest may have for an action; infinity if it moves no servo."""
     return LARGEST_TOLERANCE["fp32" if mode == "fp32" else "int8"] if action in CAR_ACTIONS else math.inf
 
 
 def _check_values(value: Any, where: str, depth: int) -> None:
-    """Raise ArtifactError for values nested deeper than that, and for text that would act on the terminal it is shown
-    on: whoever reads a manifest says its values in sentences, and keeps some in a release.
+    """Raise ArtifactError for values that are nested more than `depth` deep, and for text with unprintable characters.
+
+    Such characters could control the terminal: a manifest's values appear in sentences, and some stay in a release.
     """
     if isinstance(value, str) and not value.isprintable():
         raise ArtifactError(
@@ -283,7 +285,7 @@ def _is_within(value: Any, limits: tuple[float, float]) -> bool:
 
 
 def is_name(value: Any) -> bool:
-    """Whether a manifest may name a camera, a state or an action so."""
+    """Whether a manifest may give this name to a camera, a state or an action."""
     return isinstance(value, str) and 0 < len(value) <= NAME_LENGTH and "/" not in value
 
 
@@ -296,16 +298,16 @@ def _out_of_range(where: str, manifest: dict[str, Any], key: str, limits: tuple[
 
 
 def distinct_names(paths: Sequence[Path], drop: str = "") -> dict[str, Path]:
-    """Artifacts by the shortest name that tells them apart: the stem, with as many folders before it as that takes.
+    """Give each artifact the shortest name that no other has: its stem, with as many of its folders as that needs.
 
-    drop: a beginning of stems that says nothing, such as "policy_". Raises ArtifactError for a file given twice.
+    drop: a prefix of stems that says nothing, such as "policy_". Raises ArtifactError for a file given twice.
     """
     longest = max((len(path.absolute().parts) for path in paths), default=0)
     names: dict[str, Path] = {}
     for path in paths:
         if any(path.resolve() == other.resolve() for other in names.values()):
             raise ArtifactError(f"{path}: given twice", remedy="name each file once")
-        name = str(path)  # if two files of one folder differ only in what is not in the name
+        name = str(path)  # if two files of one folder differ only in what a name leaves out
         for folders in range(longest):
             candidate = _name(path, folders, drop)
             if [_name(other, folders, drop) for other in paths].count(candidate) == 1:
@@ -316,7 +318,7 @@ def distinct_names(paths: Sequence[Path], drop: str = "") -> dict[str, Path]:
 
 
 def _name(path: Path, folders: int, drop: str) -> str:
-    """The stem of a path after this number of its folders."""
+    """Return the stem of a path, preceded by the last `folders` of its folders."""
     parents = path.absolute().parts[1:-1]
     return "/".join([*parents[max(0, len(parents) - folders) :], path.stem.removeprefix(drop)])
 

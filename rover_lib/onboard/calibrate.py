@@ -3,8 +3,8 @@
     with ServoLink(port) as link:
         car = measure(link, ask=input)
 
-The car is not armed. But the human's pulses go through to the servo and the speed controller. And while several kinds
-of car are tried, these get the neutral of each. So the wheels must be off the ground and the motor unplugged.
+The car is not armed, but the human's pulses go through to the servo and the speed controller, and while several kinds
+of car are tried, these two get the neutral of each. So the wheels must be off the ground and the motor unplugged.
 """
 
 import statistics
@@ -26,9 +26,9 @@ from rover_lib.onboard.errors import CarError
 from rover_lib.onboard.servo_link import Telemetry
 from rover_lib.onboard.stage import atomic_path
 
-LOOK_S = 0.5  # time for both signals to appear with one kind of car; two pulses of 25 ms, or eight, take far less
+LOOK_S = 0.5  # time for both signals to appear with one kind of car; two or even eight pulses of 25 ms take less
 MEASURE_S = 1.0
-STEP_S = 0.02  # of the Arduino's statuses
+STEP_S = 0.02  # between two statuses of the Arduino
 STEADY_US = 24  # a stick held still stays within this; resting sticks in the recordings stay within 16
 RETURNS_US = 40  # if the throttle moves back less than this, the car has no reverse
 NAMES = ("steering", "throttle")
@@ -38,14 +38,14 @@ class Link(Protocol):
     """The part of a ServoLink that is needed here."""
 
     def tell(self, car: Car) -> None:
-        """From now on the Arduino uses its pins as for that car."""
+        """Make the Arduino use its pins as for this car from now on."""
 
     def latest(self) -> Telemetry | None:
-        """The newest status."""
+        """Return the newest status, None before the first."""
 
 
 def _slow(steering_us: int, throttle_us: int) -> Car:
-    """A car with about these periods, used only to receive pulses."""
+    """Return a car with about these periods, used only to receive pulses."""
     return Car.of(
         {
             "name": "any car",
@@ -55,13 +55,13 @@ def _slow(steering_us: int, throttle_us: int) -> Car:
     )
 
 
-# The Arduino accepts periods within a quarter of the car's. Together these cover 3 to 25 ms, the likely ones first.
+# The Arduino accepts periods within a quarter of the car's. Together these cover 3 to 25 ms; the likely come first.
 PERIODS_US = (20000, 12500, 7900, 5000, 3200)
 KINDS = (Car(), *(_slow(us, us) for us in PERIODS_US), *(_slow(a, b) for a in PERIODS_US for b in PERIODS_US if a != b))
 
 
 class Held(NamedTuple):
-    """What both channels did for a while: the middle of each, microseconds."""
+    """The medians of what both channels did while they were measured, microseconds."""
 
     steering_us: int
     throttle_us: int
@@ -81,7 +81,7 @@ def measure(
 
     ask: tells the human what to do, and returns when it is done. notify: is told what was measured. more: entries of
     car.yml that cannot be measured, `name`, `camera` and `wheelbase_m`.
-    Raises CarError, with what was measured and what to do, if the values do not make a car; LinkError as the link does.
+    Raises CarError, with what was measured and what to do, if the values do not make a car; LinkError like the link.
     """
     Car.of({**DEFAULT, **more}, "what was given")  # so that mistakes in it are reported before the human does anything
     ask("Take the wheels off the ground and unplug the motor. Switch the transmitter on, and let go of both sticks.")
@@ -159,7 +159,10 @@ def _goes_back(rest: Held, ends: Mapping[str, int]) -> bool:
 
 
 def _find(link: Link, sleep: Callable[[float], None]) -> None:
-    """Try one kind of car after the other until the Arduino receives both signals."""
+    """Tell the Arduino of one kind of car after the other until it receives both signals.
+
+    Raises CarError if no kind lets it receive both.
+    """
     seen: dict[str, int] = {}
     for kind in KINDS:
         link.tell(kind)
@@ -209,7 +212,7 @@ def _hold(link: Link, where: str, sleep: Callable[[float], None]) -> Held:
 
 
 def refuse_existing(path: Path, force: bool) -> None:
-    """Raise CarError if the car.yml exists, unless it may be replaced (force)."""
+    """Raise CarError if the car.yml exists, unless `force` allows replacing it."""
     if path.exists() and not force:
         raise CarError(f"{path}: exists already", remedy="--force replaces it")
 

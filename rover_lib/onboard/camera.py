@@ -1,4 +1,4 @@
-"""The newest frame of a camera. A thread reads all frames, because no backend of OpenCV can keep only the newest.
+"""Deliver the newest frame of a camera. A thread reads all frames, because no backend of OpenCV keeps only the newest.
 
     with Camera(0) as camera:
         frame = camera.wait(after=0, timeout_s=1)
@@ -28,19 +28,19 @@ from rover_lib.onboard.picture import LEAST, MOST_BYTES, PictureError, block_sum
 
 FIRST_FRAME_S = 5.0
 CLOSE_S = 1.0
-JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"  # FF D9 is not in the data of a JPEG: there FF is followed by 00
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"  # a JPEG's data contains no FF D9: there 00 follows each FF
 PICTURES = (".jpg", ".jpeg")
 MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 MONOTONIC, WALL, NO_CLOCK = "monotonic", "wall", "no"  # the clock that time stamps come from
-REFUSED_MOST = 4  # bad pictures in a row; 0.13 s
-SAME = 0.9  # of a picture's blocks; the sensor's noise alone leaves at most 0.37 of them unchanged
-REMEMBERED = 32  # pictures: a driver has at most that many buffers that it could repeat (VIDEO_MAX_FRAME)
+REFUSED_MOST = 4  # bad pictures in a row mean that the camera has failed; 0.13 s at 30 Hz
+SAME = 0.9  # a picture repeats another if this share of its blocks is equal; a sensor's noise leaves 0.37 at most
+REMEMBERED = 32  # pictures; a driver has at most this many buffers that it could repeat (VIDEO_MAX_FRAME)
 DECIDING = 5  # frames after which it is decided which clock the time stamps come from
-OLD_S = 0.5  # age at which a plan's throttle begins to fade; a frame needs a plan first
-AHEAD_S = 0.01  # a time stamp may be rounded
+OLD_S = 0.5  # a frame this old is of no use: a plan's throttle begins to fade at this age
+AHEAD_S = 0.01  # a time stamp may lie this far in the future, because it may be rounded
 NEAR_S = 600.0  # a time stamp further from a clock than this does not come from that clock
 
-Read = tuple[bytes | np.ndarray, float | None]  # a JPEG or a picture, and when it was captured if the camera says so
+Read = tuple[bytes | np.ndarray, float | None]  # a JPEG or a decoded picture, and its time stamp if there is one
 Reader = Generator[Read, None, None]
 
 
@@ -52,10 +52,11 @@ class CameraError(RoverError):
 class Frame:
     """One picture. Nobody may write into it.
 
-    image: (h, w, 3) uint8 BGR. captured_s: when it was captured, in time.monotonic() (or the clock given to Camera);
-    when it arrived, if the camera does not say. number: 1, 2, ... of this camera. repeats: how many frames in a row, up
-    to this one, repeat nearly all of one of the 32 pictures before them, byte for byte; with a sensor's noise this is
-    0. mean: of its pixels, 0 to 255. contrast: as picture.brightness(). jpeg: as it arrived; None if the camera is raw.
+    image: (h, w, 3) uint8 BGR. captured_s: when it was captured, by time.monotonic() (or the clock given to Camera);
+    when it arrived, if the camera does not tell. number: counts this camera's frames from 1. repeats: how many frames
+    in a row, up to this one, repeat nearly all of one of the 32 pictures before them, byte for byte; a sensor's noise
+    keeps this at 0. mean: of the pixels, 0 to 255. contrast: as in picture.brightness(). jpeg: as it arrived;
+    None if the camera delivers raw pictures.
     """
 
     image: np.ndarray
@@ -70,9 +71,9 @@ class Frame:
 class Camera:
     """A source of frames, open inside its context; a thread reads it and keeps only the newest frame.
 
-    source: a number or /dev/videoN (V4L2), a folder of JPEGs (or of an episode), or a FIFO or .mjpeg file of JPEGs one
+    source: a number or /dev/videoN (V4L2), a folder of JPEGs (or of an episode), or a FIFO or .mjpeg file with one JPEG
     after another. size: (width, height) to request from a V4L2 camera. rate_hz: frames per second to request, and the
-    rate of sources without one of their own. clock, wall_clock: the two clocks that a camera's time stamps may come
+    rate at which folders and files are shown. clock, wall_clock: the two clocks that a camera's time stamps may come
     from. Any thread may call any method.
     """
 
@@ -90,7 +91,7 @@ class Camera:
         self.source = str(source)
         self.size, self.wanted_hz = size, rate_hz
         self._stamps = _Stamps(clock, wall_clock)
-        self._shown = np.zeros((REMEMBERED, 0), np.uint64)  # the newest pictures' blocks, as block_sums()
+        self._shown = np.zeros((REMEMBERED, 0), np.uint64)  # the newest pictures' block_sums(), one row each
         self._remembered = 0  # how many pictures have been stored there in all
         self._refusal: PictureError | None = None
         self._closing, self._begun = threading.Event(), threading.Event()
@@ -110,7 +111,7 @@ class Camera:
         self.close()
 
     def open(self) -> "Camera":
-        """Starts reading. Raises CameraError if there is no such source, or no frame within 5 s."""
+        """Start reading. Raises CameraError if there is no such source, or if no frame comes within 5 s."""
         reader = _reader(self.source, self.size, self.wanted_hz, self._closing, self._begun)
         self._thread = threading.Thread(target=self._read, args=(reader,), name=f"camera {self.source}", daemon=True)
         self._thread.start()
@@ -133,7 +134,7 @@ class Camera:
         self._begun.set()
 
     def close(self) -> None:
-        """Ends reading. A camera that hangs inside its driver is left behind."""
+        """Stop reading. Waits at most 1 s for a camera that hangs inside its driver."""
         self._closing.set()
         with self._changed:
             self._changed.notify_all()
@@ -141,14 +142,17 @@ class Camera:
             self._thread.join(CLOSE_S)
 
     def latest(self) -> Frame | None:
-        """The newest frame, None before the first. Raises CameraError once reading has failed."""
+        """Return the newest frame, None before the first. Raises CameraError once reading has failed."""
         with self._changed:
             if self._failure:
                 raise self._failure
             return self._frame
 
     def wait(self, after: int, timeout_s: float) -> Frame | None:
-        """The newest frame with a number above `after`, None if none comes in time. Raises as latest()."""
+        """Wait for a frame with a number above `after`, and return the newest; None if none comes in time.
+
+        Raises CameraError once reading has failed.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._failure or self._closing.is_set() or self.frames > after, timeout_s)
             if self._failure:
@@ -157,12 +161,12 @@ class Camera:
 
     @property
     def frames(self) -> int:
-        """How many frames have come until now."""
+        """How many frames have come so far."""
         return self._frame.number if self._frame else 0
 
     @property
     def rate_hz(self) -> float | None:
-        """Frames a second, measured since the first; None before the second."""
+        """Frames per second, measured since the first frame; None before the second."""
         with self._changed:
             frame = self._frame
             if frame is None or frame.number < 2 or frame.captured_s <= self._first_s:
@@ -171,7 +175,7 @@ class Camera:
 
     @property
     def time_stamps(self) -> str:
-        """The clock that its time stamps are of: "monotonic", "wall", or "no", where frames count from arrival."""
+        """The clock of the camera's time stamps: "monotonic" or "wall"; "no" if frames get their time of arrival."""
         return self._stamps.kind or NO_CLOCK
 
     def _read(self, reader: Reader) -> None:
@@ -198,7 +202,7 @@ class Camera:
                 )
         except CameraError as error:
             failure = error
-        except Exception as error:  # whatever a driver does, the car must learn of it
+        except Exception as error:  # whatever goes wrong in a driver, the drive must learn of it
             failure = CameraError(
                 f"{self.source}: reading failed ({type(error).__name__}: {error})", remedy="check the camera"
             )
@@ -207,7 +211,7 @@ class Camera:
             self._changed.notify_all()
 
     def _add(self, image: np.ndarray, captured_s: float, jpeg: bytes | None) -> None:
-        """Makes a picture the newest frame. Raises CameraError if it is not like those before it."""
+        """Make a picture the newest frame. Raises CameraError if it is unfit, or has another size than before."""
         before = self._frame
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise CameraError(f"{self.source}: a frame must be (h, w, 3) uint8", found=image.shape)
@@ -250,7 +254,7 @@ class _Stamps:
         self._first: deque[tuple[float, float, float]] = deque(maxlen=DECIDING)  # time stamp, age by either clock
 
     def captured_s(self, stamp_s: float | None) -> float | None:
-        """When a frame that has just arrived was captured, seconds by the clock; None before the decision.
+        """Return when a frame that has just arrived was captured, seconds by `clock`; None before the decision.
 
         A frame without a time stamp counts as captured when it arrived.
 
@@ -275,7 +279,7 @@ class _Stamps:
         return now_s - max(0.0, age_s)
 
     def _decided(self) -> str:
-        """Decide by the majority of the first frames, because one of them may have come late."""
+        """Decide by the medians of the first frames, because one of them may have come late."""
         stamps, *ages = np.array(self._first).T
         stands = float(np.median(np.diff(stamps))) <= 0
         monotonic_s, wall_s = (float(np.median(age)) for age in ages)
@@ -294,7 +298,7 @@ def _bad_stamp(stands: bool, age_s: float) -> PictureError:
 
 
 def path_of(source: str, dev: Path = Path("/dev")) -> Path:
-    """Where a camera's frames come from: a number N is videoN in `dev`."""
+    """Return the path of a camera's source: a number N means videoN in `dev`."""
     return dev / f"video{source}" if source.isdigit() else Path(source)
 
 
@@ -330,7 +334,7 @@ def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
             raise CameraError(
                 f"{source}: cannot be opened", remedy="is the user in group video, and does nobody else use it?"
             )
-        device.set(cv2.CAP_PROP_FOURCC, MJPG)  # raw pictures do not fit USB 2 at 30 Hz
+        device.set(cv2.CAP_PROP_FOURCC, MJPG)  # raw pictures at 30 Hz are too much for USB 2
         device.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
         device.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
         device.set(cv2.CAP_PROP_FPS, rate_hz)
@@ -357,7 +361,7 @@ def _folder(path: Path) -> Callable[[], Iterator[bytes]]:
 
 
 def _contents(path: Path, piece: int = 1 << 20) -> Iterator[bytes]:
-    """A file's bytes, in pieces."""
+    """Yield a file's bytes in pieces."""
     with path.open("rb") as file:
         while data := file.read(piece):
             yield data
@@ -366,7 +370,7 @@ def _contents(path: Path, piece: int = 1 << 20) -> Iterator[bytes]:
 def _paced(
     pictures: Callable[[], Iterable[bytes]], rate_hz: float, closing: threading.Event, begun: threading.Event
 ) -> Reader:
-    """Stored pictures at a camera's rate: again and again until `begun`, and then once."""
+    """Yield stored pictures at a camera's rate: again and again until `begun` is set, and then once."""
     last = False
     while not last:
         last, start, count = begun.is_set(), time.monotonic(), 0
@@ -377,11 +381,11 @@ def _paced(
             if begun.is_set() and not last:
                 break
             yield jpeg, None
-        last |= not count  # an empty file
+        last |= not count  # an empty file has nothing to repeat
 
 
 def _fifo(path: Path, closing: threading.Event) -> Reader:
-    """JPEGs from a FIFO; of those waiting, only the last. The end of the FIFO is the end of the camera."""
+    """Yield JPEGs from a FIFO; of several that wait there, only the last. The camera ends when the FIFO does."""
     for jpeg in _split(_pieces(path, closing), newest=True):
         yield jpeg, None
 
@@ -403,13 +407,13 @@ def _pieces(path: Path, closing: threading.Event) -> Iterator[bytes]:
             elif began:
                 return
             else:
-                closing.wait(0.01)  # nobody writes yet
+                closing.wait(0.01)  # no writer has opened the FIFO yet
     finally:
         os.close(fd)
 
 
 def _split(pieces: Iterator[bytes], newest: bool = False) -> Iterator[bytes]:
-    """Complete JPEGs out of a stream. newest: of several that arrive together, only the last."""
+    """Yield the complete JPEGs in a stream. newest: of several that arrive together, only the last."""
     pending = bytearray()
     for piece in pieces:
         searched = max(0, len(pending) - 1)  # where an end marker may have been cut in two

@@ -1,10 +1,10 @@
-"""Look at everything that driving needs, one line each: what was found, and what to do about it.
+"""Check everything that driving needs, and say in one line each what was found and what to do about it.
 
     for check in examine("policy_static.pt", camera="0", port="/dev/ttyUSB0"):
         print(check)
 
-A fail means that the car would not drive; a warning, that it would drive worse or stop more often than it could. Every
-check stands alone: one that breaks is its own fail, and the others go on.
+"fail" means that the car would not drive, "warning" that it would drive worse or stop more often than it could. The
+checks are independent: one that breaks counts as failed, and the others go on.
 """
 
 import contextlib
@@ -36,30 +36,30 @@ from rover_lib.onboard.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, Serv
 from rover_lib.onboard.telemetry import log_limits
 
 NAME_WIDTH = 15
-RATE_SHARE = 0.9  # of the wanted frame rate
-SETTLE_S, MEASURE_S = 0.5, 1.0  # a camera's first frames come when its exposure is found
+RATE_SHARE = 0.9  # of the requested frame rate must be reached
+SETTLE_S, MEASURE_S = 0.5, 1.0  # a camera first has to find its exposure
 ROUND_TRIPS = 20
 SLOW_MS = 20.0  # an answer takes 3 to 8 ms: 40 bytes at 115200 baud and the USB adapter's 1 ms
 SIGNAL_S = 1.0
-RITUAL_S = 30.0  # for a human to do what is asked
-SAME_US = 16  # pulses of a stick that nobody touches
-REST_US = 32  # the firmware arms with the throttle stick so near to neutral
-HOT_C = 75.0  # a Pi 5 slows down from 80
-MEMORY_MB = 700  # the real policy has 358 resident while predicting, 424 while it is loaded; the loop's process 100
+RITUAL_S = 30.0  # time for a human to do what is asked
+SAME_US = 16  # the pulses of a stick that nobody touches stay within this
+REST_US = 32  # the firmware arms only with the throttle stick this near to neutral
+HOT_C = 75.0  # a Pi 5 slows down from 80 C
+MEMORY_MB = 700  # the real policy needs 358 MB while predicting and 424 while loading, the loop's process 100
 RECORDINGS_MB = 1000  # a quarter of an hour at 30 Hz
 EARLIEST_S = 1_735_689_600  # 2025: a Pi without a network starts in its past
 
-# Of linux/videodev2.h. Three questions to the kernel: linuxpy, which asks them too, would be one more package to pin
-# and hash on every rover, and v4l2-ctl one more to install.
+# From linux/videodev2.h. The kernel is asked these three questions directly: linuxpy, which can ask them too, would be
+# one more package to pin and hash on every rover, and v4l2-ctl one more to install.
 VIDIOC_QUERYCAP, CAPABILITY = 0x80685600, struct.Struct("<16s32s32sIII12x")
 VIDIOC_ENUM_FMT, FORMAT = 0xC0405602, struct.Struct("<III32sI16x")
 VIDIOC_ENUM_FRAMESIZES, FRAME_SIZE = 0xC02C564A, struct.Struct("<III6I8x")
 CAPTURE, CAPTURE_PLANES = 0x1, 0x1000
 BUFFER_CAPTURE, BUFFER_CAPTURE_PLANES = 1, 9
 DISCRETE = 1
-BIG_ENDIAN = 1 << 31  # of a format's four characters
-MOST_SIZES = 64  # asked for
-MOST_FORMATS = 8  # of a check's line; the kernel's test driver has 66
+BIG_ENDIAN = 1 << 31  # the bit of a format's four characters that means big-endian
+MOST_SIZES = 64  # sizes and formats that a camera is asked for
+MOST_FORMATS = 8  # named in a check's line; the kernel's test driver has 66
 
 Verdict = Literal["ok", "warning", "fail"]
 Ioctl = Callable[[int, int, bytearray], int]
@@ -67,7 +67,7 @@ Ioctl = Callable[[int, int, bytearray], int]
 
 @dataclass(frozen=True)
 class Check:
-    """One line: what was looked at, the verdict, what was found, what to do (empty if nothing)."""
+    """The result of one check. name: what was checked. remedy: what to do, empty if nothing."""
 
     name: str
     verdict: Verdict
@@ -90,15 +90,15 @@ def examine(
     dev: Path = Path("/dev"),
     boot_s: float = BOOT_S,
 ) -> Iterator[Check]:
-    """All checks, one after another, each as soon as it is known; some seconds in all. Raises nothing.
+    """Run all checks, and yield each result as soon as it is known. Takes a few seconds in all. Raises nothing.
 
-    artifact: the policy to look at. camera, port: as `rover drive` takes them. log_folder: where flight logs go. host,
-    dev and boot_s: for the tests' sake.
+    artifact: the policy to check. camera, port: as for `rover drive`. log_folder: where flight logs go; None means the
+    current folder. host, dev and boot_s are there for the tests.
     """
     host = host or Host()
     device = path_of(str(camera), dev)
     checks: dict[str, Callable[[], Iterable[Check]]] = {}
-    if device.is_relative_to(dev):  # else a file or a pipe, for which no camera need be there
+    if device.is_relative_to(dev):  # otherwise it is a file or a pipe, and no camera needs to be there
         checks["group video"] = lambda: access("group video", device, "video")
         checks["cameras"] = lambda: cameras(dev)
     checks |= {
@@ -126,12 +126,15 @@ def examine(
 
 
 def _found(error: RoverError) -> str:
-    """An error without its remedy, which a check has apart."""
+    """Return an error's sentence without its remedy, for which a check has a field of its own."""
     return error.what if error.found is None else f"{error.what}, found {error.found}"
 
 
 def access(name: str, device: Path, group: str) -> Iterator[Check]:
-    """Whether this user may use the device: by the device's own group; by the usual one if it is not there."""
+    """Check whether this user may use the device.
+
+    group: the usual one. It counts if the device is not there; otherwise the device's own permissions and group do.
+    """
     user = getpass.getuser()
     if device.exists():
         if os.access(device, os.R_OK | os.W_OK):
@@ -147,7 +150,7 @@ def access(name: str, device: Path, group: str) -> Iterator[Check]:
         if os.geteuid() == 0 or group in _groups():
             yield Check(name, "ok", f"{user} is in it" if os.geteuid() else f"{user} needs no group")
             return
-        what, verdict = f"{user} is not in it", "warning"  # and what is not there is another check's fail
+        what, verdict = f"{user} is not in it", "warning"  # another check reports the missing device as a fail
     if _listed(group, user):
         yield Check(name, verdict, f"{what}; {user} was added to it", "log in again (or restart the service)")
     else:
@@ -155,7 +158,7 @@ def access(name: str, device: Path, group: str) -> Iterator[Check]:
 
 
 def _groups() -> set[str]:
-    """Names of the groups that this process has."""
+    """Return the names of this process's groups."""
     names = set()
     for number in {*os.getgroups(), os.getegid()}:
         try:
@@ -166,7 +169,7 @@ def _groups() -> set[str]:
 
 
 def _listed(group: str, user: str) -> bool:
-    """Whether the user is a member by /etc/group: from the next login on."""
+    """Whether /etc/group lists the user in the group and this process is not in it yet: a new login would help."""
     try:
         return user in grp.getgrnam(group).gr_mem and group not in _groups()
     except KeyError:
@@ -174,7 +177,7 @@ def _listed(group: str, user: str) -> bool:
 
 
 def cameras(dev: Path = Path("/dev"), ioctl: Ioctl = fcntl.ioctl) -> Iterator[Check]:
-    """Each V4L2 node that gives pictures, with its driver, formats and sizes."""
+    """Report each V4L2 node that delivers pictures, with its driver, formats and sizes."""
     nodes = sorted((n for n in dev.glob("video*") if n.name[5:].isdecimal()), key=lambda n: int(n.name[5:]))
     seen = 0
     for node in nodes:
@@ -201,7 +204,7 @@ def cameras(dev: Path = Path("/dev"), ioctl: Ioctl = fcntl.ioctl) -> Iterator[Ch
 
 
 def _capture_node(file: int, ioctl: Ioctl) -> str | None:
-    """Driver, card, formats and sizes of an open node; None if it gives no pictures (metadata, a decoder, ...)."""
+    """Describe an open node: driver, card, formats, sizes. None if it gives no pictures (metadata, a decoder, ...)."""
     data = bytearray(CAPABILITY.size)
     ioctl(file, VIDIOC_QUERYCAP, data)
     driver, card, _, _, capabilities, device_caps = CAPABILITY.unpack(data)
@@ -251,7 +254,7 @@ def camera_rate(
     proc_root: Path = Path("/proc"),
     open_camera: Callable[..., Any] = Camera,
 ) -> Iterator[Check]:
-    """The frames that this camera really gives, over a second: how many, of which size, whether anything is on them."""
+    """Measure for a second what the camera really delivers: frame rate, size, and whether anything can be seen."""
     if not Path(source).exists():
         yield Check("camera", "fail", f"no {source}", "plug it in, or name another with --camera")
         return
@@ -289,7 +292,7 @@ def camera_rate(
 
 
 def users_of(path: Path | str, proc_root: Path = Path("/proc")) -> list[str]:
-    """Other processes that have the file open, as "name (process id)"; only one's own without root."""
+    """List other processes that have the file open, as "name (process id)"; without root, only this user's."""
     target = Path(path).resolve()
     found = []
     for process in proc_root.glob("[0-9]*"):
@@ -298,7 +301,7 @@ def users_of(path: Path | str, proc_root: Path = Path("/proc")) -> list[str]:
         try:
             if any(fd.readlink() == target for fd in (process / "fd").iterdir()):
                 found.append(f"{(process / 'comm').read_text().strip()} ({process.name})")
-        except OSError:  # another user's, or it has ended meanwhile
+        except OSError:  # the process is another user's, or has just ended
             continue
     return found
 
@@ -306,14 +309,14 @@ def users_of(path: Path | str, proc_root: Path = Path("/proc")) -> list[str]:
 def arduino(
     port: str, *, dev: Path = Path("/dev"), proc_root: Path = Path("/proc"), boot_s: float = BOOT_S
 ) -> Iterator[Check]:
-    """The port, who has it, what answers there and how fast, and whether the transmitter is on."""
+    """Check that the port is there and free, what answers on it and how fast, and whether the transmitter is on."""
     if not Path(port).exists():
         others = sorted(str(p) for pattern in ("ttyUSB*", "ttyACM*") for p in dev.glob(pattern))
         remedy = f"--port {others[0]}" if others else "plug it in; dmesg | tail says whether the kernel saw it"
         yield Check("Arduino", "fail", f"no {port}; there is {', '.join(others) or 'no other serial port'}", remedy)
         return
     if users := users_of(port, proc_root):
-        # What we read would be lost to somebody who may be driving.
+        # Whatever we read would be missing for that program, which may be driving.
         yield Check("Arduino", "fail", f"{port}: used by {', '.join(users)}", f"end {users[0]}")
         return
     with ServoLink(port, boot_s=boot_s) as link:
@@ -354,10 +357,10 @@ def _transmitter(link: ServoLink) -> Check:
 
 
 def receiver(port: str, ask: Callable[[str], object], *, boot_s: float = BOOT_S) -> Iterator[Check]:
-    """Leads a human once through what arming takes, and through what the receiver sends without its transmitter.
+    """Lead a human once through the steps of arming, and see what the receiver sends while its transmitter is off.
 
-    ask: tells the human what to do, and returns when it is done. Nothing is armed; the human can drive meanwhile.
-    Raises LinkError as the link does.
+    ask: tells the human what to do, and returns when it is done. Nothing is armed, and the human can drive throughout.
+    Raises LinkError like ServoLink.
     """
     with ServoLink(port, boot_s=boot_s) as link:
         ask("Jack up the car. Switch the transmitter on, and let go of both sticks.")
@@ -380,7 +383,7 @@ def receiver(port: str, ask: Callable[[str], object], *, boot_s: float = BOOT_S)
 
 
 def _soon(link: ServoLink, condition: Callable[[Telemetry], bool], seconds: float) -> Telemetry:
-    """The first status of which that holds, or the newest after `seconds`."""
+    """Wait for a status that meets the condition, and return it; after `seconds`, return the newest one."""
     end = time.monotonic() + seconds
     while True:
         telemetry = link.latest()
@@ -408,18 +411,18 @@ def _failsafe(before: tuple[int | None, ...], after: tuple[int | None, ...], res
 
 
 def car(artifact: Path | str | None = None) -> Iterator[Check]:
-    """Which car this is, and whether the artifact was calibrated for another one. Raises CarError for a bad car.yml."""
+    """Say which car this is, and warn if the artifact was calibrated for another. Raises CarError for a bad car.yml."""
     this, path = this_car(), car_file()
     yield Check("car", "ok", f"{this.name}, of {path}" if path else f"{this.name}: no car.yml is here")
     if artifact and Path(artifact).is_file():
-        with contextlib.suppress(ArtifactError):  # which the artifact's own check tells
+        with contextlib.suppress(ArtifactError):  # the artifact's own check reports it
             if not (meant := car_of(read_manifest(Path(artifact)))).drives_like(this):
                 remedy = "deploy one that was calibrated with recordings of this car, or put its car.yml here"
                 yield Check("car", "warning", f"the artifact was calibrated for {meant.name!r}", remedy)
 
 
 def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:
-    """Whether the one program runs that writes to every new serial port."""
+    """Check whether ModemManager runs, because it writes to every new serial port."""
     for process in proc_root.glob("[0-9]*"):
         try:
             if (process / "comm").read_text().strip() == "ModemManager":
@@ -432,7 +435,7 @@ def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:
 
 
 def engines_here() -> Iterator[Check]:
-    """The engines that are installed, of which one is enough: torch with its quantization engines, ONNX Runtime."""
+    """Report the installed engines: torch with its quantization engines, and ONNX Runtime. One of them is enough."""
     missing = []
     try:
         import torch
@@ -457,7 +460,7 @@ def engines_here() -> Iterator[Check]:
 
 
 def policy(artifact: Path | str | None) -> Iterator[Check]:
-    """The artifact's checksums, manifest and parity vectors, and how long one inference takes."""
+    """Check the artifact's checksums, manifest and parity vectors, and how long one inference takes."""
     if artifact is None:
         yield Check("artifact", "warning", "none was named, so none was looked at", "name it: rover doctor ARTIFACT")
         return
@@ -480,7 +483,7 @@ def policy(artifact: Path | str | None) -> Iterator[Check]:
             times_s.append(time.perf_counter() - start)
     median_s, fade_s = statistics.median(times_s), float(params()["drive"]["fade_s"])
     found = f"{1000 * median_s:.0f} ms"
-    if median_s < fade_s / 2:  # a plan is as old as two inferences before the next one is there
+    if median_s < fade_s / 2:  # just before the next plan is ready, a plan is two inferences old
         yield Check("inference", "ok", found)
     else:
         remedy = "choose a static artifact or a smaller image, cool the processor, end what else runs"
@@ -488,7 +491,7 @@ def policy(artifact: Path | str | None) -> Iterator[Check]:
 
 
 def temperature(host: Host) -> Iterator[Check]:
-    """The processor's, now."""
+    """Check the processor's temperature."""
     celsius = host.temperature_c()
     if celsius is None:
         yield Check("temperature", "ok", "this machine does not tell")
@@ -499,7 +502,7 @@ def temperature(host: Host) -> Iterator[Check]:
 
 
 def power(host: Host) -> Iterator[Check]:
-    """What get_throttled says of now and of the time since the machine's start."""
+    """Check what get_throttled reports about the supply and the clock, now and since the machine started."""
     value = host.throttled()
     means = throttled_means(value)
     if means is None:
@@ -514,7 +517,7 @@ def power(host: Host) -> Iterator[Check]:
 
 
 def governor(sys_root: Path = Path("/sys")) -> Iterator[Check]:
-    """How the cores' clock is chosen."""
+    """Check which frequency governor sets the cores' clock."""
     files = sorted(sys_root.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"))
     found = sorted({f.read_text().strip() for f in files})
     if not found:
@@ -527,7 +530,7 @@ def governor(sys_root: Path = Path("/sys")) -> Iterator[Check]:
 
 
 def disk(log_folder: Path, recordings: Path, usage: Callable[[Path], Any] = shutil.disk_usage) -> Iterator[Check]:
-    """Room for flight logs and recordings."""
+    """Check that there is room for flight logs and recordings, and that their folders can be written."""
     max_bytes, keep = log_limits()
     log_mb = max_bytes / 1e6 * (keep + 1)
     for what, folder, need_mb in (("flight logs", log_folder, log_mb), ("recordings", recordings, RECORDINGS_MB)):
@@ -545,7 +548,7 @@ def disk(log_folder: Path, recordings: Path, usage: Callable[[Path], Any] = shut
 
 
 def memory(proc_root: Path = Path("/proc")) -> Iterator[Check]:
-    """What is left for the policy."""
+    """Check that enough memory is free for the policy."""
     rows = dict(line.split(":", 1) for line in (proc_root / "meminfo").read_text().splitlines() if ":" in line)
     free_mb = int(rows["MemAvailable"].split()[0]) * 1024 / 1e6
     if free_mb >= MEMORY_MB:
@@ -556,7 +559,7 @@ def memory(proc_root: Path = Path("/proc")) -> Iterator[Check]:
 
 
 def clock(now_s: float | None = None, built_s: float | None = None) -> Iterator[Check]:
-    """Whether the date can be true: recordings and logs are named after it."""
+    """Check that the date can be right, because recordings are named after it and flight logs contain it."""
     now_s = time.time() if now_s is None else now_s
     built_s = Path(__file__).stat().st_mtime if built_s is None else built_s
     found = time.strftime("%Y-%m-%d %H:%M", time.localtime(now_s))

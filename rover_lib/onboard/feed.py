@@ -39,9 +39,9 @@ from rover_lib.onboard.telemetry import FlightLog, Tick
 EVERY_S = 0.1  # between two messages
 AGAIN_S = 1.0  # between two checks whether a view listens
 TOLD_S = 5.0  # between two lines of the log, which a view that comes and goes must not fill
-LAST_S = 0.2  # for the last message of a drive; the car has stopped by then
-ASKED_MOST = 8  # of the view's messages are read at a tick
-STOP = re.compile(rb"stop ([0-9a-f.:]{1,45})", re.ASCII)  # and the address that asked
+LAST_S = 0.2  # for delivering the last message of a drive; the car has stopped by then
+ASKED_MOST = 8  # messages of the view that are read at a tick
+STOP = re.compile(rb"stop ([0-9a-f.:]{1,45})", re.ASCII)  # with the address that asked
 RAW_BYTES = 120_000  # of a picture that is not a JPEG
 MOST_BYTES = 400_000  # of a message; a larger one is sent without its picture
 DRIVING, WAITING, TAKEN, ENDED = "driving", "waiting", "taken over", "ended"
@@ -64,7 +64,7 @@ class Feed:
     ):
         self._place, self._log, self._title, self._clock, self._sleep = place, log, title, clock, sleep
         self._socket: socket.socket | None = None
-        self._look_s = self._due_s = self._tell_s = 0.0
+        self._look_s = self._due_s = self._tell_s = 0.0  # earliest times: look for a view, send, log a change
         self._ticks: deque[tuple[float, float]] = deque(maxlen=100)  # when, and how late in milliseconds
         self.dropped = 0  # messages for which there was no room
 
@@ -168,7 +168,7 @@ class Feed:
                 message["plan"] = {"captured_s": plan.captured_s, "rate_hz": rate_hz, "actions": actions}
             shown, picture = self._picture(camera)
             return self._send(message | shown, picture)
-        except Exception as error:  # whatever it is: a drive goes on without a view
+        except Exception as error:  # whatever fails here, the drive goes on without a view
             self._lost(f"the view is not fed any more: {type(error).__name__}: {error}")
             self._look_s = float("inf")
             return False
@@ -192,7 +192,7 @@ class Feed:
 
     def _picture(self, camera: Camera | None) -> tuple[dict[str, Any], bytes]:
         frame: Frame | None = None
-        with contextlib.suppress(RoverError):  # as above
+        with contextlib.suppress(RoverError):  # whoever needs the camera reports that it is gone
             frame = camera.latest() if camera else None
         if frame is None:
             return {}, b""

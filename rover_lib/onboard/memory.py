@@ -1,4 +1,4 @@
-"""Give back memory: weights that torch holds twice, and what malloc keeps after loading.
+"""Give memory back to the kernel: weights that torch holds twice, and what malloc keeps after loading.
 
 XNNPACK packs the weights of an INT8 convolution when it runs for the first time, and computes with the packed copy from
 then on. torch keeps the original for as long as the policy exists, so that it can be saved, which nobody does on a
@@ -11,10 +11,10 @@ import mmap
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # only policies that torch runs hold anything twice
+if TYPE_CHECKING:  # imported only for types: other engines hold nothing twice
     import torch
 
-DONT_NEED = 4  # MADV_DONTNEED of Linux: the pages are the kernel's again, and read as zeros
+DONT_NEED = 4  # Linux's MADV_DONTNEED: the kernel takes the pages back, and they read as zeros
 PACKED = "__torch__.torch.classes.quantized.Conv2dPackedParamsBase"
 
 
@@ -31,7 +31,7 @@ def give_back_packed_weights(module: "torch.jit.ScriptModule") -> int:
     given = 0
     for weight in _originals(module.graph):
         start, size = weight.untyped_storage().data_ptr(), weight.untyped_storage().nbytes()
-        first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE  # only whole pages, which nothing else shares
+        first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE  # only whole pages, because others may share the rest
         length = (start + size) // mmap.PAGESIZE * mmap.PAGESIZE - first
         if length > 0 and libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(length), DONT_NEED) == 0:
             given += length
@@ -39,14 +39,14 @@ def give_back_packed_weights(module: "torch.jit.ScriptModule") -> int:
 
 
 def give_back_freed() -> None:
-    """Give the kernel the memory that malloc keeps for later: after loading and checking an artifact, tens of MB."""
+    """Give the kernel the memory that malloc keeps for later. After loading an artifact, that is tens of MB."""
     libc = ctypes.CDLL(None)
-    if hasattr(libc, "malloc_trim"):  # of glibc
+    if hasattr(libc, "malloc_trim"):  # glibc has it
         libc.malloc_trim(0)
 
 
 def _originals(block: Any) -> "Iterator[torch.Tensor]":
-    """The original weights, still held by the packed parameters that are constants of a frozen graph."""
+    """Yield the original weights, which the packed parameters among a frozen graph's constants still hold."""
     import torch
 
     for node in block.nodes():

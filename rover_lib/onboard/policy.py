@@ -1,4 +1,4 @@
-"""Run an artifact: a frame and a state in, a chunk of actions out, whichever engine computes it."""
+"""Run an artifact, with whichever engine it needs: it turns a frame and a state into a chunk of actions."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,13 +16,16 @@ from rover_lib.onboard.preprocess import prepare_frame
 
 
 def action_limits(names: Sequence[str], car: Car) -> np.ndarray:
-    """(2, A) float32: the least and the most that a pulse of a car can express; of other actions the infinities."""
+    """Return (2, A) float32: the least and the greatest action that the car's pulses can express.
+
+    The limits of actions other than steering and throttle are infinite.
+    """
     known = dict(zip(("steering", "throttle"), car.limits.T.tolist(), strict=True))
     return np.array([known.get(name, (-np.inf, np.inf)) for name in names], np.float32).T
 
 
 class Policy:
-    """A loaded artifact, as `load_policy` returns it. car: the one whose actions it plans."""
+    """A loaded artifact, as `load_policy` returns it. car: the car for which it plans."""
 
     def __init__(self, path: Path, engine: Engine, manifest: dict[str, Any]):
         self.path = path
@@ -38,20 +41,20 @@ class Policy:
         self._low, self._high = action_limits(self.action_names, self.car)
 
     def predict_chunk(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
-        """Next actions for one observation.
+        """Predict the next actions for one observation.
 
         frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it; a mapping by camera name if there are several.
-        state: (S,) float, for this car [steering, throttle] as last commanded.
+        state: (S,) float, for the rover [steering, throttle] as last commanded.
         Returns (chunk, A) float32; steering in [-1, 1], throttle in [0, 1] (from -1 if its car has reverse), other
         actions as predicted. Raises as predict_unclipped().
         """
         return np.clip(self.predict_unclipped(frame_bgr, state), self._low, self._high)
 
     def predict_unclipped(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
-        """As predict_chunk(), for who wants to know how far beyond an end a prediction was.
+        """Predict like predict_chunk(), but without clipping, to show how far a prediction was beyond a limit.
 
-        Raises FrameError for a frame that is no picture, PolicyError for a state that is not finite or of another
-        shape, and for a prediction that is not finite: nobody gets a number that must not drive a car.
+        Raises FrameError for a frame that is no picture, PolicyError for frames of other cameras, for a state that is
+        not finite or has another shape, and for a prediction that is not finite, which must never drive a car.
         """
         frames = self._frames(frame_bgr)
         state = np.asarray(state, np.float32)
@@ -73,9 +76,9 @@ class Policy:
         return [(frame_bgr[c["name"]], c) for c in cameras]
 
     def run(self, state: np.ndarray, frames_rgb: list[np.ndarray]) -> np.ndarray:
-        """The bare graph: (S,) float32 and prepared frames in, (chunk, A) float32 out, not clipped.
+        """Run the bare graph on a state, (S,) float32, and prepared frames. Return (chunk, A) float32, not clipped.
 
-        Raises PolicyError for an answer of another shape or type than the manifest says.
+        Raises PolicyError if the answer has another shape or type than the manifest says.
         """
         y = self._engine.run(state, frames_rgb)
         if y.dtype != np.float32 or y.shape != (1, self.chunk, len(self.action_names)):
@@ -88,18 +91,18 @@ class Policy:
 
     @property
     def threads(self) -> int:
-        """How many threads compute an inference."""
+        """The number of threads that compute an inference."""
         return self._engine.threads
 
     def set_threads(self, threads: int) -> None:
-        """Compute with that many threads from now on. Some engines load the artifact again for it."""
+        """Compute with this number of threads from now on. Some engines have to load the artifact again."""
         self._engine.set_threads(threads)
 
 
 def import_engine(path: Path | str) -> str:
-    """Import what an artifact needs to run, which takes seconds and memory; the name of its engine.
+    """Import the engine that an artifact needs, which takes seconds and memory, and return the engine's name.
 
-    Raises ArtifactError for an engine that is not known, or not installed.
+    Raises ArtifactError if the engine is unknown or not installed.
     """
     name = read_manifest(path)["engine"]
     try:
@@ -117,12 +120,12 @@ def import_engine(path: Path | str) -> str:
 
 
 def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
-    """Load an artifact and prove that it computes here what it computed where it was made.
+    """Load an artifact, and prove that it computes the same here as where it was made.
 
-    threads: for the engine's kernels (torch's are those of this process); None leaves them as they are.
-    Checks the file's checksums, that its program is of the form and the operators that artifacts have, the manifest,
-    the engine and the parity vectors (which also warm the kernels). Raises ArtifactError, in one sentence, if any of
-    these fails, and for root, who has too much to lose.
+    threads: for the engine's kernels (with torch, of the whole process); None leaves their number unchanged.
+    The file's checksums are checked, the form and the operators of its program, the manifest, the engine, and the
+    parity vectors (which also warm the kernels). Raises ArtifactError with one sentence if any of these fails, and
+    if root calls it, who has too much to lose.
     """
     path = Path(path)
     refuse_root()
@@ -143,7 +146,7 @@ def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
 
 
 def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(n, chunk, A) float32: the policy's answers to the parity vectors."""
+    """Return the policy's answers to the parity vectors, (n, chunk, A) float32."""
     frames = [vectors[f"frame_{c}"] for c in policy.cameras]
     try:
         return np.stack([policy.run(s, [f[i] for f in frames]) for i, s in enumerate(vectors["state"])])
@@ -157,15 +160,15 @@ def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _check_differences(policy: Policy, chunks: np.ndarray, vectors: Mapping[str, np.ndarray]) -> None:
-    """Raise ArtifactError where the answers, (n, chunk, A), are further from the vectors' than the manifest tolerates.
+    """Raise ArtifactError if the answers, (n, chunk, A), differ more from the vectors' than the manifest tolerates.
 
-    FP32 differs between processors by the order of sums only. INT8 differs more, because its float parts (exp,
+    Between processors, FP32 differs only by the order of sums. INT8 differs more, because its float parts (exp,
     LayerNorm) round differently and each flipped rounding grows over the layers.
     """
     difference = np.abs(chunks - vectors["chunk"]).max((0, 1))
     tolerance = policy.manifest["parity"]["tolerance"]
     for name, d in zip(policy.action_names, difference.tolist(), strict=True):
-        if not d <= tolerance[name]:  # NaN is not within
+        if not d <= tolerance[name]:  # so that NaN fails too
             raise ArtifactError(
                 f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}, "
                 f"at most {tolerance[name]:.3g} is rounding",

@@ -1,8 +1,8 @@
 """The serial link to the rover's Arduino: commands out, telemetry in, by the protocol of firmware/README.md.
 
-The Arduino is the one that keeps the car safe: it stops by itself 150 ms after the last valid command, takes none that
-waited in the link for longer, and hands over to the human at the first move of a stick. What is here adds: nothing out
-of range is sent, leaving the link sends neutral, and what the Arduino says is known with the time at which it came.
+The Arduino is what keeps the car safe: it stops the car 150 ms after the last valid command, rejects a command that
+waited in the link for longer than that, and hands over to the human at the first move of a stick. This module adds
+three things: it sends nothing out of range, it sends neutral when the link is left, and it notes when each status came.
 """
 
 import contextlib
@@ -28,29 +28,29 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.pwm import Channel, Pulses
 
 PROTOCOL_VERSION = 3
-FIRMWARE_VERSION = "3.0.0"  # what is known of an Arduino is known of this one; firmware/rover/protocol.h has the same
+FIRMWARE_VERSION = "3.0.0"  # open() accepts no other; firmware/rover/protocol.h has the same
 BAUD = 115200
-LINE_MAX = 128  # of the Arduino's lines
+LINE_MAX = 128  # bytes of a line from the Arduino
 SEQUENCES = 1 << 32
-BOOT_S = 4.0  # a boot loader gives the sketch its turn after 1 to 2 s
-SILENT_S = 0.3  # nothing may be asked before: an Arduino that is being reset has its boot loader listening
+BOOT_S = 4.0  # a boot loader starts the sketch after 1 to 2 s
+SILENT_S = 0.3  # nothing may be sent before: while an Arduino resets, its boot loader listens
 HELLO_EVERY_S = 0.5
 REPEAT_S = 0.05
 ANSWER_S = 0.5
-SIGNALS_MS = 250  # from the Arduino's start; it knows the transmitter's signals after two pulses of each
-STALE_S = 0.5  # the Arduino speaks every 20 ms
-LATE_S = 0.150  # the Arduino takes no command that is older, and a link that is so slow is none to drive by
-DATED = (">A", ">D")  # commands that say what the host had heard when it sent them
+SIGNALS_MS = 250  # after its start; until then the Arduino may not have seen enough pulses for a signal
+STALE_S = 0.5  # a status that is older means silence: the Arduino sends one every 20 ms
+LATE_S = 0.150  # the Arduino rejects older commands, and a link as slow as this is unfit for driving
+DATED = (">A", ">D")  # commands that carry the time of the newest status that the host had read
 READ_TIMEOUT_S = 0.05
 
-# serial.SerialException is an OSError, termios.error is not; TypeError is pyserial's of a port just closed elsewhere.
+# serial.SerialException is an OSError, termios.error is not; TypeError: pyserial's, if another thread closed it.
 PORT_ERRORS = (OSError, termios.error, TypeError)
 
 _log = logging.getLogger(__name__)
 
 
 class LinkError(RoverError):
-    """An Arduino that is not there, speaks another protocol, refused to be armed, or no longer answers."""
+    """The Arduino is missing, speaks another protocol, refuses to be armed, or no longer answers."""
 
 
 class State(Enum):
@@ -82,7 +82,7 @@ RESULTS = {
     "t": "refused: the throttle stick is not at rest",
     "w": "refused: nobody has just wiggled the steering stick",
 }
-MISSING = {  # before the car can be armed, and what the human does about it
+MISSING = {  # what the Arduino still needs before it can be armed, and what the human does about it
     "s": "switch the transmitter on",
     "t": "let go of the throttle stick",
     "w": "move the steering stick far to both sides and let go of it",
@@ -93,9 +93,10 @@ RESETS = {"p": "power-on", "e": "reset pin", "b": "brown-out", "w": "watchdog", 
 
 @dataclass(frozen=True)
 class Hello:
-    """What the Arduino says after each reset, and when asked. boot: number of this start, 0 to 65535.
+    """What the Arduino says after each reset, and when asked.
 
-    car: the id of the one that its pins are for.
+    boot: number of this start, 0 to 65535. sequence: of the last command that it accepted as new. car: the id of the
+    car that it drives its pins for.
     """
 
     protocol: int
@@ -108,14 +109,14 @@ class Hello:
 
 @dataclass(frozen=True)
 class Telemetry:
-    """One status of the Arduino. Pulses and periods in whole microseconds; None is "no pulse", never 0.
+    """One status of the Arduino. Pulses and periods are whole microseconds; None means "no pulse", and 0 never does.
 
-    host_s: time.monotonic() (or the link's clock) at which its line was complete here; uptime_ms: the Arduino's
-    clock, which wraps at 2^32. sequence: of the last command that it took as new; result: what became of the last one,
-    a key of RESULTS. missing: before it can be armed, a key of MISSING. steering_us, throttle_us: what its pins do.
-    cap_us: the most throttle that the host gets; as far on the other side of neutral. receiver_*: the transmitter's
-    pulses. The counters stay at 65535: lines that were no command, commands that were replayed, late or another
-    start's, pulses out of range, bytes lost.
+    host_s: time.monotonic() (or the link's clock) when the whole line had arrived here. uptime_ms: the Arduino's clock,
+    which wraps at 2^32. sequence: of the last command that it accepted as new. result: what became of the last command,
+    a key of RESULTS. missing: what is missing before the car can be armed, a key of MISSING. steering_us, throttle_us:
+    the pulses on its pins. cap_us: the pulse of the most throttle that the host gets; with reverse, the same distance
+    from neutral limits it there. receiver_*: the transmitter's pulses. The last four are counters, which stop at 65535:
+    lines that were no command; replayed or late commands, and those for another start; pulses out of range; bytes lost.
     """
 
     host_s: float
@@ -150,7 +151,7 @@ class Telemetry:
 
 
 def frame(body: str) -> bytes:
-    """The line that a body is sent as, with its CRC-32 and its end."""
+    """Return the line for a body: the body, its CRC-32 and the line feed."""
     return f"{body}*{zlib.crc32(body.encode('ascii')):08X}\n".encode("ascii")
 
 
@@ -165,7 +166,7 @@ _STATUS = re.compile(
 
 
 def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
-    """What a line of the Arduino says; None if it is garbled or not one. line: without its end."""
+    """Parse a line of the Arduino, without its line feed. Return None if it is garbled or not of the protocol."""
     if len(line) > LINE_MAX or not line.startswith(b"<"):
         return None
     body, star, crc = line.rpartition(b"*")
@@ -179,7 +180,7 @@ def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
         protocol, firmware, boot, sequence, reset, car = found.groups()
         if int(protocol) == PROTOCOL_VERSION and boot is None:
             return None
-        # Of another protocol only the first two are known to mean the same.
+        # In another protocol only the first two fields are sure to mean the same.
         return Hello(int(protocol), firmware, int(boot or 0), int(sequence or 0), RESETS[reset or "-"], int(car or 0))
     if not (found := _STATUS.fullmatch(text)):
         return None
@@ -189,12 +190,12 @@ def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
 
 
 def _reached(telemetry: Telemetry, sequence: int) -> bool:
-    """Whether the Arduino has taken the command of that number, or a later one."""
+    """Whether the Arduino has accepted the command with this number, or a later one."""
     return (telemetry.sequence - sequence) % SEQUENCES < SEQUENCES // 2
 
 
 def _keep(port: serial.Serial) -> None:
-    """Nobody else opens it meanwhile, and closing it leaves DTR as it is: its edge is what resets an Arduino."""
+    """Keep others from opening the port, and closing it from changing DTR, whose edge resets an Arduino."""
     fcntl.ioctl(port.fileno(), termios.TIOCEXCL)  # for programs that know nothing of pyserial's lock
     attributes = termios.tcgetattr(port.fileno())
     attributes[2] &= ~termios.HUPCL
@@ -202,7 +203,7 @@ def _keep(port: serial.Serial) -> None:
 
 
 class ServoLink:
-    """The Arduino on `port`, from entering the context until leaving it, which sends neutral first, by any door.
+    """The link to the Arduino on `port`. Leaving its context, for whatever reason, sends neutral before it closes.
 
         with ServoLink("/dev/ttyUSB0") as link:
             link.arm()
@@ -211,8 +212,8 @@ class ServoLink:
 
     Any thread may call any method. Nothing is reconnected behind the caller's back: when the port fails, each call
     raises LinkError, the Arduino stops by itself, and the caller decides whether to open a new link, whose Arduino is
-    then in manual and has to be armed again. An Arduino that reset itself meanwhile is talked to again under its new
-    number, but it ignores all commands until arm().
+    then in manual and has to be armed again. If the Arduino resets itself, the link goes on with the number of its new
+    start, but the Arduino ignores drive commands until arm().
     """
 
     def __init__(
@@ -223,11 +224,11 @@ class ServoLink:
         boot_s: float = BOOT_S,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """car: None: this machine's. Raises CarError where that cannot be read."""
+        """car: None means this machine's. Raises CarError if its car.yml cannot be read."""
         self.port = port
         self.car = car or this_car()
         self.calibration = self.car.pwm
-        self._told_boot: int | None = None  # the start of the Arduino that knows the car
+        self._told_boot: int | None = None  # the start in which the Arduino learned of the car
         self.boot_s = boot_s
         self._clock = clock
         self._serial: serial.Serial | None = None
@@ -239,12 +240,12 @@ class ServoLink:
         self._telemetry: Telemetry | None = None
         self._turned: Telemetry | None = None
         self._failure: LinkError | None = None
-        self._unanswered: deque[tuple[int, float]] = deque(maxlen=256)  # commands: number, and when it was sent
+        self._unanswered: deque[tuple[int, float]] = deque(maxlen=256)  # number of a command, and when it was sent
         self._sending = threading.RLock()  # guards the two below, and keeps lines whole; never taken inside _heard
         self._boot = 0
         self._sequence = 0
         self._asked = 0.0
-        self.resets = 0  # of the Arduino, while it was open
+        self.resets = 0  # of the Arduino while the link was open
         self.garbled = 0  # lines of the Arduino that were dropped
 
     def __enter__(self) -> "ServoLink":
@@ -255,19 +256,19 @@ class ServoLink:
         self.close()
 
     def open(self) -> Hello:
-        """Opens the port, for nobody else meanwhile, and waits for the hello and a first status.
+        """Open the port for this program alone, wait for the hello and a first status, and tell the Arduino of the car.
 
-        The first time after it was plugged in, that resets most Arduinos; from then on it goes on with what it does.
-        Then it is told of the car, unless it is the one that it drives by itself.
-        Raises LinkError if the port cannot be opened, is in use, nothing there says hello within `boot_s` seconds, it
-        has another firmware than this program knows, or does not take this car.
+        The first opening after the Arduino was plugged in resets most boards; a later one does not interrupt it. It is
+        told of every car but the default one, and of that too if it now drives its pins for another.
+        Raises LinkError if the port cannot be opened or is in use, if nothing there says hello within `boot_s` seconds,
+        if the firmware is another one than this program knows, or if it refuses this car.
         """
         if self._serial:
             raise LinkError(f"{self.port}: the link is open already", remedy="close it first")
         try:
             self._serial = serial.Serial(self.port, BAUD, timeout=READ_TIMEOUT_S, exclusive=True)
             _keep(self._serial)
-            self._serial.reset_input_buffer()  # what came before
+            self._serial.reset_input_buffer()  # drop what came earlier
         except (*PORT_ERRORS, ValueError) as error:
             self._release()
             raise LinkError(
@@ -308,7 +309,7 @@ class ServoLink:
                     f"{self.port}: no hello from an Arduino within {self.boot_s:g} s",
                     remedy=f"is it the rover's, and is the firmware on it (make flash PORT={self.port})?",
                 )
-            # It was not reset by opening its port if it goes on talking; a boot loader must not be talked to.
+            # If it goes on talking, opening the port did not reset it. A boot loader must not be talked to.
             due = SILENT_S if running and running.host_s - opened > SILENT_S / 2 else self.boot_s / 2
             if now - opened > due and now - self._asked > HELLO_EVERY_S / 2:
                 self._asked = now
@@ -326,13 +327,13 @@ class ServoLink:
         return hello
 
     def tell(self, car: Car) -> None:
-        """The Arduino's pins are that car's from now on. Raises LinkError if it does not take it."""
+        """Make the Arduino drive its pins for this car from now on. Raises LinkError if it refuses the car."""
         self.car, self.calibration = car, car.pwm
         if hello := self.hello:
             self._tell_car(replace(hello, car=0))
 
     def _tell_car(self, hello: Hello) -> None:
-        """So that the pins' neutral, the receiver's pulses and the cap are this car's; before that nothing is armed."""
+        """Tell the Arduino this car's neutral, pulses and cap; until it knows them, it refuses to arm."""
         if self.car.is_default and hello.car == self.car.id:
             self._told_boot = hello.boot
             return
@@ -348,7 +349,7 @@ class ServoLink:
         raise LinkError(f"{self.port}: the Arduino was not told of the car; {self._last_words()}")
 
     def close(self) -> None:
-        """Neutral first, then the port. Raises nothing: an Arduino that cannot be reached stops by itself."""
+        """Send neutral, then close the port. Raises nothing: an Arduino that cannot be reached stops by itself."""
         if not self._serial:
             return
         try:
@@ -367,15 +368,15 @@ class ServoLink:
             if self._reader and self._reader is not threading.current_thread():
                 self._reader.join(1.0)
             with contextlib.suppress(*PORT_ERRORS):
-                port.reset_output_buffer()  # else the kernel waits up to 30 s for a line that is stuck
+                port.reset_output_buffer()  # or the kernel would wait up to 30 s for a line that is stuck
             with contextlib.suppress(*PORT_ERRORS):
-                fcntl.ioctl(port.fileno(), termios.TIOCNXCL)  # a pseudo-terminal would stay so
+                fcntl.ioctl(port.fileno(), termios.TIOCNXCL)  # a pseudo-terminal would stay exclusive
             with contextlib.suppress(*PORT_ERRORS):
                 port.close()
         self._reader = None
 
     def arm(self) -> Telemetry:
-        """Hands the car to the host: from here on, commands have to come. Returns the status that says so.
+        """Hand the car to the host, which must send commands from then on. Return the status that confirms it.
 
         Raises LinkError if the Arduino refuses, with what is missing as its remedy, or does not answer within 0.5 s.
         """
@@ -386,7 +387,7 @@ class ServoLink:
             if telemetry.state is State.AUTONOMOUS:
                 return telemetry
             if telemetry.result == "s" and telemetry.uptime_ms < SIGNALS_MS:
-                continue  # it has just started, and nothing can have come yet
+                continue  # it has just started, and cannot have seen the signals yet
             if telemetry.result == "c":
                 raise LinkError(f"{self.port}: arming was {RESULTS['c']}", remedy="start again, which tells it")
             if telemetry.result in MISSING and telemetry.result != "-":
@@ -397,7 +398,7 @@ class ServoLink:
         raise LinkError(f"{self.port}: no answer to arming within {ANSWER_S:g} s; {self._last_words()}")
 
     def neutral(self) -> Telemetry:
-        """Stops the car if the host drives it, until arm(); a human at the wheel goes on. Returns the status.
+        """Stop the car until arm() if the host drives it; a human who drives goes on. Return the confirming status.
 
         Raises LinkError if the Arduino does not answer within 0.5 s; it stops by itself then.
         """
@@ -407,9 +408,9 @@ class ServoLink:
         raise LinkError(f"{self.port}: no answer to neutral within {ANSWER_S:g} s; {self._last_words()}")
 
     def lower_cap(self, throttle_us: int) -> Telemetry:
-        """Lowers the most throttle that the host gets, until the Arduino's next reset. Returns the status that says so.
+        """Lower the host's throttle limit until the Arduino's next reset. Return the status that confirms it.
 
-        With reverse, it is as far from neutral there.
+        With reverse, the same distance from neutral limits it there.
 
         Raises LinkError for a pulse out of range, while the car is armed, or without an answer within 0.5 s.
         """
@@ -423,7 +424,7 @@ class ServoLink:
         raise LinkError(f"{self.port}: no answer to the throttle's cap within {ANSWER_S:g} s; {self._last_words()}")
 
     def _ask(self, kind: str, *values: int) -> Iterator[Telemetry]:
-        """Sends a command, again and again; yields what the Arduino says about it, until ANSWER_S are over."""
+        """Send a command every REPEAT_S until ANSWER_S is over; yield each status that the Arduino sends after it."""
         first = None
         end = self._clock() + ANSWER_S
         while self._clock() < end:
@@ -437,14 +438,14 @@ class ServoLink:
                     if self._failure:
                         raise self._failure
                     seen = self._telemetry
-                # A status from before the command says nothing about it.
+                # An earlier status says nothing about the command.
                 if seen and _reached(seen, first) and seen.boot == self._boot:
                     yield seen
 
     def send(self, steering_us: int, throttle_us: int) -> int:
-        """Sends two pulses, whole microseconds; returns the command's number. Waits for nothing.
+        """Send two pulses, whole microseconds, without waiting for an answer. Return the command's number.
 
-        Raises LinkError for pulses outside the calibration's range, and if the port failed; nothing is sent then.
+        Raises LinkError for pulses outside the calibration's range, which are not sent, and if the port failed.
         """
         steering_us = self._whole(self.calibration.steering, steering_us)
         throttle_us = self._whole(self.calibration.throttle, throttle_us)
@@ -463,15 +464,18 @@ class ServoLink:
         return whole_us
 
     def send_action(self, steering: float, throttle: float) -> int:
-        """Sends steering in [-1, 1] and throttle in [0, 1], or from -1 with reverse, as pulses.
+        """Send steering in [-1, 1] and throttle in [0, 1] (from -1 with reverse) as pulses, like send().
 
-        PwmError for all else; otherwise as send().
+        Raises PwmError for other values, and LinkError like send().
         """
         pulses = self.calibration.pulses(steering, throttle)
         return self.send(pulses.steering_us, pulses.throttle_us)
 
     def latest(self) -> Telemetry | None:
-        """The newest status, None before the first. Raises LinkError if the port failed, or 0.5 s passed without."""
+        """Return the newest status, None before the first.
+
+        Raises LinkError if the port failed, or if the newest status is more than 0.5 s old.
+        """
         with self._heard:
             if self._failure:
                 raise self._failure
@@ -482,20 +486,21 @@ class ServoLink:
 
     @property
     def turned(self) -> Telemetry | None:
-        """The first status that said of who drives what the newest one says; None before the first."""
+        """The status with which the present state or start of the Arduino began; None before the first status."""
         with self._heard:
             return self._turned
 
     def unacknowledged_s(self, now_s: float) -> float:
-        """Age of the oldest command that the Arduino has not acknowledged, nor any after it; 0 if there is none.
+        """Return the age in seconds of the oldest command that the Arduino has not acknowledged; 0 if there is none.
 
-        now_s: by the link's clock. Above LATE_S the car obeys what is over: stop it.
+        An acknowledged command acknowledges all before it. now_s: by the link's clock. Stop the car if the age is
+        above LATE_S, because it then obeys commands from the past.
         """
         with self._heard:
             return now_s - self._unanswered[0][1] if self._unanswered else 0.0
 
     def round_trip_s(self) -> float:
-        """Seconds from a question to its answer. Raises LinkError if none comes within 0.5 s."""
+        """Ask for a hello, and return the seconds until it came. Raises LinkError if none comes within 0.5 s."""
         with self._heard:
             before = self._hellos
         start = self._clock()
@@ -530,7 +535,7 @@ class ServoLink:
             values = (heard.uptime_ms, *values)
         with self._sending:
             self._sequence = number = (self._sequence + 1) % SEQUENCES
-            with self._heard:  # before it is written: the answer may be here before this thread has its turn again
+            with self._heard:  # before writing: the answer may arrive before this thread runs again
                 self._unanswered.append((number, self._clock()))
             self._write(frame(" ".join([kind, *map(str, (self._boot, number, *values))])))
             return number
@@ -541,15 +546,15 @@ class ServoLink:
             raise LinkError(f"{self.port}: the link is closed")
         try:
             with self._sending:
-                # Not pyserial's write: with a timeout it also gives up on a line that is wholly out, when this process
-                # had to wait for its turn meanwhile; without one it waits for ever. The port is non-blocking.
+                # Not pyserial's write: without a timeout it may wait for ever, and with one it may report a line as
+                # failed that went out whole while this process waited for the processor. The port is non-blocking.
                 try:
                     taken = os.write(port.fileno(), line)
                 except BlockingIOError:
                     taken = 0
                 if taken == len(line):
                     return
-                # What waits there is old by the time it gets through: the next command must be the newest.
+                # What waits in the buffer would be old when it got through: the next line sent must be the newest.
                 with contextlib.suppress(*PORT_ERRORS):
                     port.reset_output_buffer()
         except PORT_ERRORS as error:
@@ -563,7 +568,7 @@ class ServoLink:
             return self._failure
 
     def _read(self, port: serial.Serial) -> None:
-        """The reader thread: drains the port as fast as it fills."""
+        """Drain the port as fast as it fills. The reader thread runs this."""
         pending, skipping = b"", False
         while not self._closing.is_set():
             try:
@@ -594,7 +599,7 @@ class ServoLink:
                 if not self._hello or message.boot != self._boot:
                     self._boot, self._sequence = message.boot, message.sequence
         elif self._hello and message.boot != self._boot and now - self._asked > HELLO_EVERY_S:
-            self._asked = now  # it was reset, and that hello was lost
+            self._asked = now  # it was reset, and the hello of its new start was lost
             with contextlib.suppress(LinkError):
                 self._write(frame(">Q"))
         with self._heard:

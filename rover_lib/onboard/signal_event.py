@@ -1,4 +1,4 @@
-"""An event that a signal's handler may set."""
+"""An event that the handler of a signal may set."""
 
 import queue
 import threading
@@ -6,16 +6,16 @@ import time
 
 
 class SignalEvent(threading.Event):
-    """threading.Event that a signal's handler may set, whatever its thread is doing.
+    """A threading.Event that the handler of a signal may set, whatever the interrupted thread is doing.
 
-    Python's own takes a lock in wait() and in set(), one that its owner cannot take twice: a handler that runs while
-    its thread has the lock would wait for itself, and Ctrl-C would hang the program. Here nothing is locked but in
-    SimpleQueue, whose put() may interrupt itself.
+    Python's own Event takes a lock in wait() and set() that a thread cannot take twice: if a handler interrupted a
+    thread that holds the lock, it would wait for itself, and Ctrl-C would hang the program. This one takes no lock
+    except inside SimpleQueue, whose put() may interrupt itself.
     """
 
     def __init__(self) -> None:
         self._is_set = False
-        self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()  # has something in it while it is set
+        self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()  # not empty while the event is set
 
     def is_set(self) -> bool:
         return self._is_set
@@ -36,7 +36,7 @@ class SignalEvent(threading.Event):
             if left_s is not None and left_s <= 0:
                 break
             if self._take(left_s) and self._is_set:
-                self._wake.put(None)  # for whoever waits too
+                self._wake.put(None)  # for other threads that wait
         return self._is_set
 
     def _take(self, timeout: float | None) -> bool:

@@ -1,4 +1,4 @@
-"""The one contract between the stages: a JSON file per stage in a run's folder.
+"""The contract between the stages: each stage writes one JSON file into the run's folder.
 
 {"schema": 1, "stage": ..., "params": {...}, "metrics": {...}, "inputs": {file: sha256}, "env": {...}}
 Metric keys end in their unit (_ms _mb _us _pct _hz _c _g). Papermill, pytest, Ansible and the plots read these.
@@ -28,15 +28,15 @@ PARTS = ("params", "metrics", "inputs", "env")
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """A temporary path beside `path`; renamed onto it when the block ends well, removed when it does not.
+    """Yield a temporary path beside `path`. It is renamed to `path` if the block succeeds, and removed if it fails.
 
-    Raises RoverError where torch.save has no room.
+    Raises RoverError if torch.save cannot write the whole file.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{path.suffix}")
-    # Not mkstemp, whose mode of 0600 would hide the file from the service's user: here the kernel applies the umask,
-    # which a process can ask for only by setting it, for all of its threads.
+    # Not mkstemp, whose mode of 0600 would hide the file from the service's user. Here the kernel applies the umask;
+    # a process can learn its umask only by setting it, which would affect all of its threads.
     os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
         yield temporary
@@ -44,7 +44,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             os.fsync(f.fileno())  # a power cut after the rename must not leave an empty file
         temporary.replace(path)
     except RuntimeError as error:
-        if "inline_container" not in str(error):  # torch's writer of files, which drops the system's error
+        if "inline_container" not in str(error):  # torch's file writer, which hides the system's error
             raise
         raise RoverError(f"{path}: cannot be written whole", remedy="is the disk full?") from error
     finally:
@@ -52,9 +52,9 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 
 def open_plain(path: Path | str, refusal: RoverError) -> BinaryIO:
-    """A file to read from. Raises OSError, and `refusal` for what is no plain file.
+    """Open a plain file for reading. Raises OSError, and `refusal` if it is no plain file.
 
-    A FIFO would be waited for, by Path.open() too, and a device never ends.
+    Path.open() would wait for a writer of a FIFO, and reading a device might never end.
     """
     file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -64,13 +64,13 @@ def open_plain(path: Path | str, refusal: RoverError) -> BinaryIO:
 
 
 def sha256_of(path: Path | str) -> str:
-    """Hex SHA-256 of a file's bytes."""
+    """Return the hex SHA-256 of a file's bytes."""
     with Path(path).open("rb") as f:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
 
 def version_of(package: str) -> str | None:
-    """The version of an installed package, None if it is not installed."""
+    """Return the version of an installed package, None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -78,7 +78,10 @@ def version_of(package: str) -> str | None:
 
 
 def environment() -> dict[str, Any]:
-    """Where a figure comes from: host, machine, processor, torch, ONNX Runtime, engine, commit; None: not there."""
+    """Describe where a figure comes from: host, processor, cores, versions of Python and the engines, and commit.
+
+    A value is None if it is unknown or not installed. `engine` is also None if this process has not loaded torch.
+    """
     try:
         git = subprocess.run(
             ["git", "rev-parse", "--short", "HEAD"],
@@ -90,7 +93,7 @@ def environment() -> dict[str, Any]:
         commit = git.stdout.strip() or None
     except (OSError, subprocess.SubprocessError):
         commit = None
-    torch = sys.modules.get("torch")  # what did not load it is not about it
+    torch = sys.modules.get("torch")  # not imported for this
     return {
         "host": socket.gethostname(),
         "machine": platform.machine(),
@@ -104,7 +107,7 @@ def environment() -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """JSON's types from numpy's, torch's and pathlib's; a float that JSON cannot hold becomes None."""
+    """Convert values of numpy, torch and pathlib to JSON's types; NaN and infinities become None."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
@@ -126,7 +129,7 @@ def write_stage(
     metrics: dict[str, Any],
     inputs: dict[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Write one stage's result atomically and return it as it was written."""
+    """Write one stage's result atomically, and return it as it was written."""
     content = plain(
         {
             "schema": SCHEMA,
@@ -143,16 +146,16 @@ def write_stage(
 
 
 def read_stage(path: Path | str, stage: str | None) -> dict[str, Any]:
-    """Read what `write_stage` wrote. stage: None for any.
+    """Read what `write_stage` wrote. stage: the expected stage, or None for any.
 
-    Raises RoverError if the file is missing, damaged, not whole or of another stage.
+    Raises RoverError if the file is missing, damaged, incomplete or of another stage.
     """
     path = Path(path)
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError:
         raise RoverError(f"{path}: not found", remedy=f"run the notebook of stage '{stage}' first") from None
-    except (ValueError, OSError, RecursionError) as e:  # RecursionError: brackets nested without end
+    except (ValueError, OSError, RecursionError) as e:  # RecursionError: too many nested brackets
         raise RoverError(f"{path}: not readable as JSON ({e})", remedy="delete it and run its stage again") from None
     found = (content.get("schema"), content.get("stage")) if isinstance(content, dict) else type(content).__name__
     if not isinstance(content, dict) or found != (SCHEMA, stage or content.get("stage")):

@@ -1,4 +1,4 @@
-"""The status line, for people. It never holds up who drives: a thread of its own writes it."""
+"""The status line, for people. A thread of its own writes it, so that it never holds up the drive."""
 
 import contextlib
 import logging
@@ -14,13 +14,14 @@ QUEUE_LINES = 256
 
 
 class StatusLine:
-    """One line for people on a stream, from a thread of its own, from entering the context until leaving it.
+    """One line of status on a stream, written by a thread of its own inside the context.
 
         with StatusLine(lambda: f"{speed} m/s") as status:
             logging.getLogger("rover").addHandler(status.handler)
 
-    A terminal has one line that is written over 4 times a second; anything else gets a line every 10 s. What goes to
-    `handler` is written above that line, and waits for nothing: a terminal that was stopped gets it later, or never.
+    callback: returns the status. On a terminal the line is overwritten 4 times a second; any other stream gets a new
+    line every 10 s. Log records that go to `handler` appear above the status. Whoever logs them waits for nothing: if
+    the terminal was stopped, they appear later or never.
     """
 
     def __init__(
@@ -53,12 +54,12 @@ class StatusLine:
         self.close()
 
     def say(self, text: str) -> None:
-        """Write a line that stays. Waits for nothing."""
+        """Write a line that stays, above the status. Waits for nothing."""
         self._lines.append(text)
         self._wake.set()
 
     def close(self) -> None:
-        """Write what is left, and end. Waits half a second at most."""
+        """Write what is left and end the thread. Waits half a second at most."""
         self._closing = True
         self._wake.set()
         self._thread.join(0.5)
@@ -77,7 +78,7 @@ class StatusLine:
                 due_s = time.monotonic() + self._every_s
             try:
                 self._write(text)
-            except (OSError, ValueError):  # nobody is there to read
+            except (OSError, ValueError):  # nobody reads the stream any more
                 return
             if closing:
                 return
@@ -101,7 +102,7 @@ class StatusLine:
             self._stream.write(text)
             self._stream.flush()
             return
-        # Not through the stream's buffer: its lock, held by a thread that is stuck, would hang the program's end.
+        # Not through the stream's buffer: if this thread got stuck with its lock, the program could not end.
         data = text.encode(errors="replace")
         while data:
             data = data[os.write(self._fd, data) :]
@@ -115,5 +116,5 @@ class _StatusHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         try:
             self._status.say(self.format(record))
-        except Exception:  # as logging asks of a handler: a record that cannot be formatted ends nothing
+        except Exception:  # logging expects of a handler that a bad record does not end the program
             self.handleError(record)

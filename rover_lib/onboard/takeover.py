@@ -7,8 +7,8 @@
 
 After the takeover the human has the car: until they let go, this module only reads and records the Arduino's statuses,
 and sends nothing. Each control has a column `driver`, one of recording.DRIVERS. A human's pulses are those of the
-receiver, as the Arduino measures them. Where the Arduino's pins differ from the receiver (the throttle is blocked until
-it has been at rest once, or the signal was lost), the driver is "nobody".
+receiver, as the Arduino measures them. If the Arduino's pins differ from the receiver (because the throttle is blocked
+until it has been at rest once, or because the signal was lost), the driver is "nobody".
 
 Who drove is exact to one tick: the Arduino's first status after the takeover says whether it still took the policy's
 last command. A command that it did not take is not recorded.
@@ -26,18 +26,18 @@ from rover_lib.onboard.recorder import SILENT_S, Recorder
 from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY
 from rover_lib.onboard.servo_link import ServoLink, State, Telemetry
 
-LET_GO_S = 2.0  # with both sticks at rest for this time, the human has let go
-MOST_S = 300.0  # a transmitter that was put down with a stick held would fill the disk
+LET_GO_S = 2.0  # after both sticks have been at rest for this time, the human has let go
+MOST_S = 300.0  # or a transmitter that was put down with a stick off its rest would fill the disk
 # As in the firmware (vehicle.h): within these, a stick has not moved, or the throttle is at rest.
 STEERING_REST_US, THROTTLE_REST_US = 48, 32
-IGNORED = "i"  # the Arduino's word for a command that was not for who drives now
+IGNORED = "i"  # the Arduino's result for a command that came while the host was not driving
 
 
 @dataclass(frozen=True)
 class Takeover:
     """The recording of a human after a takeover.
 
-    controls: their number, by who drove. ended: why it ended. fault: whether a fault ended it.
+    controls: how many were recorded, by who drove. ended: why the recording ended. fault: whether a fault ended it.
     """
 
     seconds: float
@@ -51,7 +51,7 @@ class Takeover:
 
 
 def driver_by(telemetry: Telemetry) -> str:
-    """Who drives according to a status, one of DRIVERS. A human drives if the pins do what the receiver says."""
+    """Return who drives by a status, one of DRIVERS. A human drives if the pins' pulses are the receiver's."""
     if telemetry.state is State.AUTONOMOUS:
         return POLICY
     pins = telemetry.steering_us, telemetry.throttle_us
@@ -63,24 +63,27 @@ def driver_by(telemetry: Telemetry) -> str:
 
 
 class TakeoverRecorder:
-    """Hands controls to a recorder, with who drove at each. Only the loop's thread may use it.
+    """Hands controls to a recorder, and says of each who drove. Only the loop's thread may use it.
 
-    mode: of the artifact that drives.
+    mode: the mode of the artifact that drives.
     """
 
     def __init__(self, recorder: Recorder, mode: str):
         self.recorder = recorder
         self._mode = mode
-        self._waiting: tuple[tuple, dict[str, Any]] | None = None  # the newest command, not yet known to be taken
-        self._last_s = float("-inf")  # of the newest control that was handed over
+        self._waiting: tuple[tuple, dict[str, Any]] | None = None  # the newest command, perhaps not taken
+        self._last_s = float("-inf")  # time of the newest control that was handed over
 
     def command(self, *row: Any, **columns: Any) -> None:
-        """For the loop's hooks: a command was sent; arguments as of Recorder.control(). Never waits, never raises."""
+        """Note that a command was sent; a hook of the loop. Never waits, never raises.
+
+        Takes the arguments of Recorder.control().
+        """
         self.flush()
         self._waiting = row, columns
 
     def flush(self) -> None:
-        """Record the newest command: the Arduino took it."""
+        """Record the newest command, because the Arduino took it."""
         if self._waiting:
             row, columns = self._waiting
             self._waiting, self._last_s = None, row[0]
@@ -98,10 +101,12 @@ class TakeoverRecorder:
     ) -> Takeover:
         """Record the Arduino's newest status at each tick of rate_hz until the human lets go.
 
-        armed: the status with which the car was armed; its sticks were at rest. None: rest is neutral. stop: ends the
-        recording. over: called at each tick; may return another reason to end it. clock: the link's and the recorder's.
-        It also ends after MOST_S, if the receiver has no signal, the link no status, the Arduino was reset, or the
-        recorder takes no more. Sends nothing to the Arduino, and raises nothing if the link fails.
+        armed: the status with which the car was armed, when both sticks were at rest; None takes neutral as rest. stop:
+        ends the recording when it is set. over: called at each tick; may return another reason to end the recording.
+        clock: the clock of the link and the recorder.
+        The recording also ends after MOST_S, or if the receiver loses its signal, the link has no new status, the
+        Arduino was reset, another program has armed the car, or the recorder can record no more. Sends nothing to the
+        Arduino, and raises nothing if the link fails.
         """
         start_s = heard_s = signal_s = clock()
         rest_s: float | None = None  # since when both sticks have been at rest
@@ -109,9 +114,9 @@ class TakeoverRecorder:
         neutral = link.calibration.neutral()
         held_us = armed.receiver_steering_us if armed else None
         rest_us = neutral.steering_us if held_us is None else held_us, neutral.throttle_us
-        first = link.turned
+        first = link.turned  # the status that ended the policy's turn
         if self._waiting and first and (first.result == IGNORED or first.host_s <= self._waiting[0][0]):
-            self._waiting = None
+            self._waiting = None  # the Arduino did not take the newest command
         self.flush()
 
         def ended(why: str, fault: bool = False) -> Takeover:

@@ -1,18 +1,18 @@
-"""The flight log, one line per control tick. It never holds up the loop.
+"""The flight log: one line per control tick, written without ever holding up the loop.
 
     with FlightLog(path, header={"hz": 30, "fade_s": 0.5, "stop_s": 1.0}, max_bytes=10_000_000, keep=3) as log:
         log.tick(Tick(t_s=time.monotonic() - log.start_s, ...))
         log.event("camera unplugged", level=logging.WARNING, frame=812)
     flight = read_log(path)
 
-A log is text. Each file begins with a header, a line of JSON that names the columns of the ticks; a tick is a line of
-values between commas, an empty one where there is none; events, and what the machine says of itself once a second,
-are lines of JSON. All end in a checksum (CRC-16 of what stands before it): a line that a power cut or a full disk
-damaged is skipped, not believed.
+A log is text. Each file begins with a header, a line of JSON that names the columns of the ticks. A tick is a line of
+values between commas; an unknown value is empty. Events, and the machine's temperature and throttling once a second,
+are lines of JSON. Every line ends with a checksum, the CRC-16 of what stands before it, so that a line that a power cut
+or a full disk has damaged is recognized and skipped.
 
-`tick` and `event` put their row into a bounded queue, nothing else. Two threads do what can take long or fail: one
-reads the machine, writes the file and syncs it; one passes events on to `logging` (logger "rover"), whose stream may
-be a terminal that somebody stopped.
+`tick` and `event` only put a row into a bounded queue. Two threads do everything that may take long or fail: one reads
+the machine's state, writes the file and syncs it; the other passes events on to `logging` (logger "rover"), whose
+stream may be a terminal that somebody stopped.
 """
 
 import binascii
@@ -46,41 +46,41 @@ from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.stage import open_plain, plain
 
 SCHEMA = 1
-QUEUE_TICKS = 2048  # a minute at 30 Hz that a disk may do without; 1 MB
+QUEUE_TICKS = 2048  # the disk may stall for a minute at 30 Hz; 1 MB
 QUEUE_EVENTS = 256
-BATCH_LINES = 16  # formatted between two writes, each of which lets the other threads run
-RETRY_S = 1.0
-MACHINE_S = 1.0
-CLOSE_S = 2.0
+BATCH_LINES = 16  # formatted between two writes; each write lets the other threads run
+RETRY_S = 1.0  # from a failed write to the next attempt
+MACHINE_S = 1.0  # between two readings of the machine's state
+CLOSE_S = 2.0  # close() waits no longer
 MIN_BYTES = 20_000
 EVENT_CHARACTERS = 800
 RECENT = 8
-ARMED = "armed"  # the loop's event, with which a drive begins
+ARMED = "armed"  # the loop's event with which a drive begins
 NAME_A_LOG = "name a file that rover drive wrote"
 MISSING = "ticks are missing before this one"
-BACK_S = 1.0  # a tick that is so much older than the one before it belongs to another drive
+BACK_S = 1.0  # a tick that is this much older than the one before it belongs to another drive
 
 _log = logging.getLogger("rover")
 
 
 class LogError(RoverError):
-    """A flight log that is not there, or in which nothing can be read."""
+    """The flight log is missing, or nothing in it can be read."""
 
 
 class Tick(NamedTuple):
-    """One control tick. None says "not known" or "none yet"."""
+    """One control tick. None means "not known" or "none yet"."""
 
     t_s: float  # since FlightLog.start_s, by the same clock
     late_ms: float  # how long after its deadline the command went out
-    state: str  # who drives: M, A, S as the Arduino says, "" not known
+    state: str  # who drives: M, A or S as the Arduino says, "" if not known
     reason: str  # why, a key of servo_link.REASONS
     steering: float  # commanded, [-1, 1]
     throttle: float  # commanded, [0, 1]
     steering_us: int  # commanded pulses
     throttle_us: int
-    pins_steering_us: int | None  # what the Arduino last said that its pins do
+    pins_steering_us: int | None  # the pulses on the Arduino's pins, by its newest status
     pins_throttle_us: int | None
-    plan: int  # number of the plan in use, 0: none
+    plan: int  # number of the plan in use, 0 for none
     plan_age_ms: float | None  # since the capture of that plan's frame
     latency_ms: float | None  # of that plan, from capture to ready
     fade: float  # how much throttle the plan's age allows, 1 to 0
@@ -102,7 +102,7 @@ _TEXTS = ("state", "reason")
 
 
 class Event(NamedTuple):
-    """Something that happened: when (seconds since the start), what, and what belongs to it."""
+    """Something that happened. t_s: seconds since the log's start. fields: details."""
 
     t_s: float
     text: str
@@ -113,7 +113,7 @@ class Event(NamedTuple):
 
 
 def _sealed(row: dict[str, Any]) -> bytes:
-    """A line of JSON with its checksum as the last member."""
+    """Return a line of JSON with its checksum as the last member."""
     body = json.dumps(plain(row), separators=(",", ":"), default=str)[:-1].encode()
     return b'%s,"crc":"%04X"}\n' % (body, binascii.crc_hqx(body, 0))
 
@@ -126,14 +126,14 @@ def _tick_line(tick: Tick) -> bytes:
 
 def _event_line(event: Event) -> bytes:
     fields = event.fields
-    if len(whole := repr(fields)) > EVENT_CHARACTERS:  # files are bounded, a traceback is not
+    if len(whole := repr(fields)) > EVENT_CHARACTERS:  # a log file is bounded, a traceback is not
         fields = {"cut": whole[:EVENT_CHARACTERS]}
     text = event.text[:EVENT_CHARACTERS]
     return _sealed({"kind": "event", "t_s": round(event.t_s, 4), "event": text, "fields": fields})
 
 
 def log_limits() -> tuple[int, int]:
-    """FlightLog's max_bytes and keep, by params.yml. Raises ParamsError for what is no size, and no count."""
+    """Return FlightLog's max_bytes and keep from params.yml. Raises ParamsError if they are not a size and a count."""
     section = params()["flight_log"]
     max_mb, keep = section["max_mb"], section["keep"]
     if not is_finite(max_mb) or type(keep) is not int:
@@ -146,14 +146,14 @@ def log_limits() -> tuple[int, int]:
 
 
 class FlightLog:
-    """The flight log of one drive, from entering the context until leaving it.
+    """The flight log of one drive. It is written inside its context.
 
-    path: the file; None only passes events on to logging. Drives that are there already are kept: a new one is
-    appended. header: what the drive was started with; the figure looks for hz, fade_s and stop_s in it. max_bytes: a
-    file that would grow beyond is renamed to path.1, path.1 to path.2 and so on, and only `keep` such older files
-    stay. flush_s: pause between two syncs to the disk. Raises ParamsError for limits that make no sense, at once;
-    afterwards nothing: a disk that is full or gone is logged once, counted in `failures`, and tried again every second.
-    Ticks come from one thread; events from any.
+    path: the file, to which the drive is appended; None only passes events on to logging. header: what the drive was
+    started with; the figure of a log looks for hz, fade_s and stop_s in it. max_bytes: before the file grows beyond
+    this, it is renamed to path.1, path.1 to path.2 and so on, and only `keep` older files stay. flush_s: pause between
+    two syncs to the disk. Raises ParamsError for limits that make no sense, and nothing later: if the disk is full or
+    gone, this is logged once, counted in `failures`, and tried again every second. Ticks must come from one thread;
+    events may come from any.
     """
 
     def __init__(
@@ -178,8 +178,8 @@ class FlightLog:
         self.failures = 0
         self.last_error: str | None = None
         self.dropped = 0  # ticks for which the queue had no room
-        self.recent: deque[Event] = deque(maxlen=RECENT)  # the newest events
-        self.machine: dict[str, Any] = {}  # what it last said of itself: temperature_c, throttled
+        self.recent: deque[Event] = deque(maxlen=RECENT)
+        self.machine: dict[str, Any] = {}  # its newest state: temperature_c, throttled
         self._header = {
             "schema": SCHEMA,
             "kind": "header",
@@ -194,11 +194,11 @@ class FlightLog:
         self._ticks: deque[tuple[int, Tick]] = deque(maxlen=QUEUE_TICKS if self.path else 0)
         self._events: deque[Event] = deque(maxlen=QUEUE_EVENTS if self.path else 0)
         self._messages: deque[tuple[int, Event | str]] = deque(maxlen=QUEUE_EVENTS)
-        self._messages_wait = SignalEvent()  # event() is called by a signal's handler too
-        self._last_messages = False  # no more will come
+        self._messages_wait = SignalEvent()  # because a signal's handler calls event() too
+        self._last_messages = False  # set when no more will come
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
-        # Of the writing thread alone:
+        # Only the writing thread uses these:
         self._written = 0  # number of the last tick
         self._failed_since: float | None = None
         self._retry_s = self._machine_s = 0.0
@@ -220,22 +220,22 @@ class FlightLog:
         self.close()
 
     def tick(self, row: Tick) -> None:
-        """Put a row in. Takes a microsecond, waits for nothing, raises nothing."""
+        """Log a tick. Takes a microsecond, waits for nothing, raises nothing."""
         self._ticked += 1
         self._ticks.append((self._ticked, row))
 
     def event(self, text: str, *, level: int = logging.INFO, **fields: Any) -> None:
-        """Note that something happened, with what belongs to it, in the file and in `logging`. As harmless as tick."""
+        """Log an event with its details, in the file and through `logging`. Waits for nothing, raises nothing."""
         event = Event(self._clock() - self.start_s, text, fields)
         self._events.append(event)
         self.recent.append(event)
         self._pass_on(level, event)
 
     def close(self) -> None:
-        """Write what is left. Waits 2 s at most: a disk or a terminal that is stuck is left behind."""
+        """Write what is left. Waits 2 s at most, and then gives up on a disk or a terminal that is stuck."""
         end = time.monotonic() + CLOSE_S
         self._closing.set()
-        for thread in reversed(self._threads):  # the one of the messages last: the writer may have some
+        for thread in reversed(self._threads):  # the messages' thread last: the writer may still add some
             self._last_messages = thread is self._threads[0]
             self._messages_wait.set()
             thread.join(max(0.0, end - time.monotonic()))
@@ -247,8 +247,8 @@ class FlightLog:
     def _run_messages(self) -> None:
         """The thread that passes messages on to logging.
 
-        Not logging's QueueListener: its stop() waits for ever for a stream that is stuck, and would hold up a drive's
-        end.
+        It is not logging's QueueListener, because that one's stop() would wait for ever for a stream that is stuck,
+        and so hold up the end of a drive.
         """
         while True:
             self._messages_wait.wait()
@@ -256,14 +256,14 @@ class FlightLog:
             closing = self._last_messages
             while self._messages:
                 level, event = self._messages.popleft()
-                with contextlib.suppress(Exception):  # a handler that fails must not end this thread
+                with contextlib.suppress(Exception):  # a failing handler must not end this thread
                     _log.log(level, "%s", event)
             if closing:
                 return
 
     def _run_writer(self, file: "_LogFile") -> None:
-        """The thread that writes."""
-        self._vcgencmd = shutil.which(self._host.vcgencmd) is not None  # a program that is not there is not started
+        """The thread that writes the file."""
+        self._vcgencmd = shutil.which(self._host.vcgencmd) is not None  # never start a program that is not there
         while True:
             closing = self._closing.wait(self._flush_s)
             try:
@@ -277,7 +277,7 @@ class FlightLog:
                 return
 
     def _write_all(self, file: "_LogFile") -> None:
-        """Empty the queues into the file and sync it. OSError if the disk does not take it."""
+        """Empty the queues into the file and sync it. Raises OSError if the disk does not accept it."""
         file.open()
         if self._failed_since is not None:
             failed_s = round(time.monotonic() - self._failed_since, 1)
@@ -288,7 +288,7 @@ class FlightLog:
             self._machine_s = time.monotonic() + MACHINE_S
             file.write(self._machine_line())
         for queue, line in ((self._ticks, self._tick_lines), (self._events, _event_line)):
-            left = len(queue)  # what comes in meanwhile is the next turn's
+            left = len(queue)  # rows that arrive meanwhile are left for the next turn
             while left > 0:
                 rows = [queue.popleft() for _ in range(min(left, BATCH_LINES))]
                 left -= len(rows)
@@ -333,16 +333,16 @@ class FlightLog:
 
 
 class _LogFile:
-    """The file of a flight log, and its older parts. OSError comes where the disk does not take what is written."""
+    """The file of a flight log, and its older parts. write(), open() and sync() raise OSError if the disk fails."""
 
     def __init__(self, path: Path, header: dict[str, Any], max_bytes: int, keep: int):
         self._path, self._header, self._max_bytes, self._keep = path, header, max_bytes, keep
         self._fd: int | None = None
         self._size = self._header_end = self._part = 0
-        self.unwritten = b""  # of a batch that the disk did not take
+        self.unwritten = b""  # the lines of a batch that the disk did not accept
 
     def write(self, lines: bytes) -> None:
-        """Append whole lines; what was not taken is in `unwritten` afterwards."""
+        """Append whole lines. Those that the disk did not accept are in `unwritten` afterwards."""
         self.unwritten = lines
         if not lines:
             return
@@ -351,13 +351,15 @@ class _LogFile:
             self._shift()
         done = os.write(self.open(), lines)
         self._size += done
-        # From the start of a line that was cut: whatever file is next has it whole, and none has it twice.
-        self.unwritten = b"" if done == len(lines) else lines[lines.rfind(b"\n", 0, done) + 1 :]
-        if self.unwritten:
+        self.unwritten = b""
+        if done < len(lines):
+            # A line that was cut is written again as a whole; read_log() skips the cut one, so no line counts twice.
+            # A line that lacks only its line feed is not cut: open() ends it.
+            self.unwritten = lines[lines.rfind(b"\n", 0, done + 1) + 1 :]
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def open(self) -> int:
-        """The open file, with a header if it is a new part."""
+        """Return the open file. Opening it writes a header and starts a new part of the log."""
         if self._fd is not None:
             return self._fd
         path = self._path
@@ -368,7 +370,7 @@ class _LogFile:
         fd = self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
         self._size = os.fstat(fd).st_size
         if self._size and os.pread(fd, 1, self._size - 1) != b"\n":
-            header = b"\n" + header  # ends what a power cut, or a full disk, left of a line
+            header = b"\n" + header  # ends a line that a power cut or a full disk has cut
         if os.write(fd, header) != len(header):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._size += len(header)
@@ -376,7 +378,7 @@ class _LogFile:
         self._part += 1
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
-            os.fsync(folder)  # the name of a new file is to survive a power cut too
+            os.fsync(folder)  # so that the name of a new file survives a power cut too
         finally:
             os.close(folder)
         return fd
@@ -392,7 +394,7 @@ class _LogFile:
                 os.close(fd)
 
     def _shift(self) -> None:
-        """Make room for a new file."""
+        """Rename the files so that `path` is free, and delete those beyond `keep`."""
         for old in _older(self._path):
             if int(old.suffix[1:]) >= self._keep:
                 old.unlink()
@@ -409,19 +411,19 @@ def _numbered(path: Path, number: int) -> Path:
 
 
 def _older(path: Path) -> list[Path]:
-    """path.N, ..., path.2, path.1: the oldest first."""
+    """Return path.N, ..., path.2, path.1: the oldest first."""
     found = [p for p in path.parent.glob(f"{glob.escape(path.name)}.*") if p.suffix[1:].isdecimal()]
     return sorted((p for p in found if p.stem == path.name), key=lambda p: -int(p.suffix[1:]))
 
 
 @dataclass(frozen=True)
 class Flight:
-    """One drive, as its log tells it.
+    """One drive, as read from its log.
 
-    header: empty if it was damaged; header["drive"] is what the drive was started with. ticks: a column per field of
-    Tick, (n,) float64 with NaN for "not known", text for state and reason. machine: t_s and temperature_c, (m,)
-    float64, and throttled, a list of texts and None. drive: its index among the `drives` of these files. damaged:
-    lines that were skipped, of all drives.
+    header: empty if it was damaged; header["drive"] is what the drive was started with. ticks: an array per field of
+    Tick, (n,) float64 with NaN for "not known"; state and reason are text. machine: t_s and temperature_c, (m,)
+    float64, and throttled, a list of texts and None. drive: its index among the `drives` of these files. damaged: how
+    many lines were skipped in these files, of all drives together.
     """
 
     path: Path
@@ -435,7 +437,10 @@ class Flight:
 
     @property
     def period_ms(self) -> float | None:
-        """Between two ticks, by the header's hz, else as the ticks were; None if nothing tells."""
+        """Time between two ticks by the header's hz, or else the median time between the ticks.
+
+        None if the header has no hz and there are fewer than two ticks.
+        """
         hz = self.header.get("drive", {}).get("hz")
         if isinstance(hz, (int, float)) and hz > 0:
             return 1000 / hz
@@ -443,22 +448,22 @@ class Flight:
 
     @property
     def car(self) -> Car:
-        """The car that was driven, by the header; the original recordings' car if the header names none.
+        """The car that was driven, from the header; if that names none, the car of the original recordings.
 
-        Raises CarError for a description of no car.
+        Raises CarError if the header's description is not one of a car.
         """
         described = self.header.get("drive", {}).get("car")
         return Car.of(described, f"{self.path}: its car") if described else Car()
 
     def summary(self) -> dict[str, Any]:
-        """The drive in figures; None where nothing was measured.
+        """Return the drive in figures; a figure is None if nothing was measured.
 
-        jitter: by how much commands were late. missed: deadlines for which there was no tick, other than those whose
-        line the disk did not take. plan_age is over the ticks that had a plan, latency over the plans.
+        jitter: how late commands were. missed: deadlines without a tick; ticks that happened but are missing from the
+        log do not count. plan_age is over the ticks that had a plan, latency over the plans.
         """
         ticks, period_ms = self.ticks, self.period_ms
         t_s, late_ms, plans = ticks["t_s"], ticks["late_ms"], ticks["plan"]
-        _, first = np.unique(plans, return_index=True)
+        _, first = np.unique(plans, return_index=True)  # the first tick of each plan
         latency_ms = ticks["latency_ms"][first][plans[first] > 0] if len(plans) else plans
         durations_s = np.diff(t_s, append=t_s[-1:] + (period_ms or 0) / 1000)
         states = {s.value: s.name.lower() for s in State} | {"": "not known"}
@@ -510,14 +515,17 @@ class _Drive:
         self.machine: list[dict[str, Any]] = []
 
     def begins(self, header: dict[str, Any]) -> bool:
-        """Whether `header` is another drive's, and not that of this one's next file."""
+        """Whether `header` begins another drive, and not just the next file of this one."""
         return any(header.get(key) != self.header.get(key) for key in ("start", "start_monotonic_s"))
 
     def goes_on(self, t_s: float) -> bool:
         return not self.ticks or t_s > self.ticks[-1][0] - BACK_S
 
     def split(self) -> "list[_Drive]":
-        """A service's drives, one from each arming to the next; what was before the first belongs to it."""
+        """Split the log of a service into its drives, from each arming to the next.
+
+        What came before the first arming belongs to the first drive.
+        """
         armed_s = [e.t_s for e in self.events if e.text == ARMED][1:]
         parts = []
         for since_s, until_s in pairwise([-math.inf, *sorted(armed_s), math.inf]):
@@ -532,8 +540,8 @@ class _Drive:
 def read_log(path: Path | str, drive: int = -1) -> Flight:
     """Read a flight log, with the older files path.1, path.2, ... that belong to it.
 
-    drive: which of the drives in these files, as an index: -1 is the last one, 0 the first. Raises LogError if the
-    file is not there or none, holds no line of a flight log, has no such drive, or is of another version.
+    drive: index of the drive in these files: 0 is the first, -1 the last. Raises LogError if the file is missing or not
+    a plain file, holds no line of a flight log, has no such drive, or was written in another version of the format.
     """
     path = Path(path)
     try:
@@ -542,7 +550,8 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
         raise LogError(f"{path}: cannot be read ({error.strerror})", remedy=NAME_A_LOG) from error
     drives: list[_Drive] = []
     damaged = 0
-    for line in (line for data in files for line in data.split(b"\n") if line):
+    lines = [line for data in files for line in data.split(b"\n") if line]
+    for line in lines:
         row = _row(line)
         if row is None:
             damaged += 1
@@ -595,7 +604,7 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _row(line: bytes) -> list[Any] | Event | dict[str, Any] | None:
-    """What a line says: the values of a tick, an event, or a header's or the machine's members; None if damaged."""
+    """Parse a line: a tick's values, an event, or the members of another JSON row. Return None if it is damaged."""
     try:
         if line.startswith(b"{"):
             body, _, crc = line.rpartition(b',"crc":"')
@@ -613,7 +622,7 @@ def _row(line: bytes) -> list[Any] | Event | dict[str, Any] | None:
 
 
 def _number_of(text: str) -> float:
-    """Of a tick's column; NaN for "not known"."""
+    """Parse a tick's value; NaN means "not known"."""
     value = float(text) if text else math.nan
     return value if math.isfinite(value) else math.nan
 
@@ -626,7 +635,7 @@ def _time_of(row: dict[str, Any]) -> float:
 
 
 def _json_row(row: dict[str, Any]) -> Event | dict[str, Any]:
-    """A line of JSON whose checksum is right. Raises as _row() expects if it is no line of a log."""
+    """Check the row of an undamaged JSON line. Raises an error that _row() catches if no log has such a row."""
     match row["kind"], row:
         case "event", {"event": str(text), "fields": dict(fields)}:
             if text == MISSING and not isinstance(fields.get("ticks"), int):
@@ -641,4 +650,4 @@ def _json_row(row: dict[str, Any]) -> Event | dict[str, Any]:
             return row
         case "event" | "machine" | "header", _:
             raise ValueError("its members are others")
-    return row  # of a kind that a later version may write
+    return row  # a kind that a later version may write

@@ -1,12 +1,13 @@
-"""What a TorchScript archive would run, read without running any of it: such a file is code, and anybody can write one.
+"""Check what a TorchScript archive would run, without running it: such a file is code, and anybody can write one.
 
     with open_archive("policy_static.pt") as z:
         check_program(z, "policy_static.pt")
 
 The graphs of this project have one form: one class without attributes, one method without a branch, a few dozen
-operators on tensors, constants and numbers. The archive is read as that and as nothing else, before torch sees it:
-torch.jit.load calls __setstate__ of every class that it finds in a pickle, and takes from the pickle how large a tensor
-is, without looking whether its bytes are there (torch 2.8, tests/onboard/test_hostile_artifacts.py shows both).
+operators on tensors, constants and numbers. This module accepts that form and nothing else, and it does so before torch
+sees the archive. For torch.jit.load calls __setstate__ of every class that it finds in a pickle, and believes what the
+pickle says about a tensor's size without checking that its bytes are there (torch 2.8;
+tests/onboard/test_hostile_artifacts.py shows both).
 """
 
 import ast
@@ -23,9 +24,9 @@ from typing import Any
 
 from rover_lib.onboard.archive import DEBUG_BYTES, Unknown, nothing_unknown, read_record
 
-LARGEST_NUMBER = 10_000_000  # of a size or an index in the program
-PARSED = 5  # times, of a program that Python fails to parse by a fault of its own
-TO_THE_END = 2**63 - 1  # of a slice
+LARGEST_NUMBER = 10_000_000  # for a size or an index in the program
+PARSED = 5  # attempts to parse a program, because Python may fail by a fault of its own
+TO_THE_END = 2**63 - 1  # the end of a slice that has none
 MOST_DIMENSIONS = 8  # of a tensor
 
 OPERATORS = frozenset({
@@ -36,21 +37,22 @@ OPERATORS = frozenset({
     "torch.transpose", "torch.unflatten", "torch.unsqueeze",
     "ops.quantized.add_relu", "ops.quantized.conv2d", "ops.quantized.conv2d_relu", "ops.quantized.linear_dynamic",
 })  # fmt: skip
-# What torch makes of the program beside calls of operators.
+# The nodes that torch makes of the program besides operators.
 NODES = frozenset({"prim::Constant", "prim::ListConstruct", "prim::GetAttr"})
 RESERVED = frozenset({"torch", "ops", "CONSTANTS", "self", "Tensor", "Module"})
-# No strings, comments or escapes, in which Python and torch could read different things.
+# No strings, comments or escapes, which Python and torch could read differently.
 SOURCE = re.compile(rb"[\w \n().,:=>\[\]-]*", re.ASCII)
 
-# What a pickle of such an archive consists of
+# The opcodes that a pickle in such an archive consists of
 OPCODES = frozenset({
     "PROTO", "STOP", "MARK", "GLOBAL", "REDUCE", "NEWOBJ", "BUILD", "BINPERSID", "BINUNICODE", "BININT", "BININT1",
     "BININT2", "BINFLOAT", "LONG1", "NONE", "NEWTRUE", "NEWFALSE", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3",
     "EMPTY_LIST", "APPEND", "APPENDS", "EMPTY_DICT", "SETITEM", "SETITEMS", "BINPUT", "LONG_BINPUT", "BINGET",
     "LONG_BINGET",
 })  # fmt: skip
-# A value that holds another one twice, which holds another one twice and so on, is small to store, but never done with
-# by who writes it as text or looks it up as a key. So the module holds nothing twice, and the constants have no keys.
+# A value that contains another one twice, which contains another one twice and so on, takes little room in a file, but
+# writing it as text or hashing it as a key takes for ever. So the module may contain nothing twice, and the constants
+# may have no keys.
 TWICE, KEYS = frozenset({"BINGET", "LONG_BINGET"}), frozenset({"SETITEM", "SETITEMS"})
 ITEM_BYTES = {
     "torch.FloatStorage": 4, "torch.DoubleStorage": 8, "torch.LongStorage": 8, "torch.IntStorage": 4,
@@ -75,7 +77,7 @@ def check_program(z: zipfile.ZipFile, path: Path | str) -> None:
         name = _Program(read_record(z, f"archive/{programs[0]}")).name
         module = programs[0].removeprefix("code/").removesuffix(".py").replace("/", ".")
         positions = [n for n in sizes if n.endswith(".debug_pkl")]
-        if (total := sum(sizes[n] for n in positions)) > DEBUG_BYTES:  # each may be that large, and reading takes time
+        if (total := sum(sizes[n] for n in positions)) > DEBUG_BYTES:  # of all together, as reading takes time
             raise Unknown(f"{total} bytes of source positions")
         for record in positions:
             _check_opcodes(read_record(z, f"archive/{record}"), OPCODES, {"torch.jit._pickle.build_intlist"})
@@ -88,18 +90,23 @@ def check_program(z: zipfile.ZipFile, path: Path | str) -> None:
 
 
 def unknown_operators(graph: Any) -> list[str]:
-    """Kinds of nodes in a torch graph that no artifact has: the closed list, held against torch's own reading."""
+    """Return the kinds of nodes in a torch graph that no artifact has, to compare our list with torch's own reading."""
     known = NODES | {f"aten::{o.removeprefix('torch.')}" for o in OPERATORS}
     known |= {o.removeprefix("ops.").replace(".", "::") for o in OPERATORS}
-    nodes = list(graph.nodes())
-    return sorted({n.kind() for n in nodes} - known | {"a block" for n in nodes if list(n.blocks())})
+    kinds: set[str] = set()
+    for node in graph.nodes():
+        kinds.add(node.kind())
+        if list(node.blocks()):
+            kinds.add("a block")
+    return sorted(kinds - known)
 
 
 def _parsed(source: bytes) -> ast.Module:
-    """Raises as ast.parse does, SystemError only if it does so each time.
+    """Parse a program. Raises like ast.parse(), but SystemError only if each of PARSED attempts does.
 
-    Python 3.11 counts the depth of a tree for the whole process: another thread's, or one that garbage collection comes
-    between, makes "AST constructor recursion depth mismatch" of a program that is right (python/cpython#106905).
+    Python 3.11 counts a tree's depth for the whole process. If another thread parses at the same time, or if garbage
+    collection interrupts, a correct program fails with "AST constructor recursion depth mismatch"
+    (python/cpython#106905).
     """
     for _ in range(PARSED - 1):
         with contextlib.suppress(SystemError):
@@ -108,7 +115,7 @@ def _parsed(source: bytes) -> ast.Module:
 
 
 class _Program:
-    """A program in the text of TorchScript. Raises Unknown if it is not of the one form that artifacts have."""
+    """A program in TorchScript's text form. Raises Unknown unless it has the one form that artifacts have."""
 
     def __init__(self, source: bytes):
         if not SOURCE.fullmatch(source):
@@ -193,7 +200,10 @@ class _Program:
 
 
 def _check_opcodes(raw: bytes, opcodes: frozenset[str], names: set[str] | None = None) -> None:
-    """Raise Unknown for an opcode that is not among opcodes, or for a global that is not among names."""
+    """Raise Unknown for an opcode that is not in `opcodes`, or for a global that is not in `names`.
+
+    names: None allows any global here.
+    """
     count = 0
     try:
         for count, (opcode, argument, _) in enumerate(pickletools.genops(raw)):
@@ -201,7 +211,7 @@ def _check_opcodes(raw: bytes, opcodes: frozenset[str], names: set[str] | None =
                 raise Unknown(f"a pickle with {opcode.name}")
             if opcode.name == "GLOBAL" and names is not None and (name := str(argument).replace(" ", ".")) not in names:
                 raise Unknown(f"a pickle with {name[:80]}")
-            # Python's reader and torch's make room for as many entries as such a number says.
+            # The readers of Python and torch would reserve room for as many entries as this number.
             if "PUT" in opcode.name and isinstance(argument, int) and argument > count:
                 raise Unknown(f"a pickle with {opcode.name} {argument}")
     except ValueError as e:
@@ -209,25 +219,26 @@ def _check_opcodes(raw: bytes, opcodes: frozenset[str], names: set[str] | None =
 
 
 def _read_pickle(raw: bytes, storages: dict[str, int], module: str = "") -> Any:
-    """What a pickle of the archive describes; nothing that it names is called. storages: bytes by name of record.
+    """Return what a pickle of the archive describes, without calling anything that it names.
 
-    module: its name, if the pickle describes the module and not its constants.
+    storages: the sizes in bytes of the archive's tensors, by the name of their record. module: the module's name, if
+    the pickle describes the module and not its constants.
     """
     _check_opcodes(raw, OPCODES - (TWICE if module else KEYS))
     try:
         return _Reader(raw, storages, module).load()
     except Unknown:
         raise
-    except Exception as e:  # whatever hinders Python from reading it
+    except Exception as e:  # whatever keeps Python from reading it
         raise Unknown(f"a pickle that cannot be read ({type(e).__name__})") from None
 
 
 class _Storage(tuple):
-    """(bytes of an item, items) of the memory behind a tensor."""
+    """The memory behind a tensor: (bytes of an item, number of items)."""
 
 
 class _Tensor(tuple):
-    """The sizes of a tensor whose bytes are there."""
+    """The dimensions of a tensor whose bytes are in the archive."""
 
 
 class _Module:
@@ -239,7 +250,7 @@ class _Module:
 
 
 class _Conv2d:
-    """Weights of a convolution, as torch packs them: ("2", [config, weight], [bias or None])."""
+    """The weights of a convolution as torch packs them: ("2", [config, weight], [bias or None])."""
 
     def __setstate__(self, state: Any) -> None:
         match state:
@@ -250,7 +261,7 @@ class _Conv2d:
 
 
 class _Linear:
-    """Weights of a linear layer: (weight, bias or None)."""
+    """The weights of a linear layer: (weight, bias or None)."""
 
     def __setstate__(self, state: Any) -> None:
         match state:
@@ -260,7 +271,7 @@ class _Linear:
 
 
 class _Reader(pickle.Unpickler):
-    """Makes values of this module of what a pickle describes, and refuses what it does not know."""
+    """Turns what a pickle describes into values of this module, and refuses everything else."""
 
     def __init__(self, raw: bytes, storages: dict[str, int], module: str):
         super().__init__(io.BytesIO(raw))
@@ -291,7 +302,7 @@ class _Reader(pickle.Unpickler):
                     return _Storage((ITEM_BYTES[kind], items))
         raise Unknown(f"a tensor without its bytes, {reprlib.repr(pid)[:80]}")
 
-    # Methods all, of which a pickle cannot set a default or anything else, as it can of functions.
+    # These are methods because a pickle could change the defaults and other attributes of functions.
 
     def _hooks(self) -> dict[str, Any]:
         return {}

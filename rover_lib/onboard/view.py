@@ -1,14 +1,14 @@
-"""The view: a page in a browser that shows a drive, and can stop it. A process of its own, which no drive imports.
+"""The view: a page in a browser that shows a drive and can stop it. It runs in its own process; no drive imports it.
 
     asyncio.run(View(Address(), token).run(lambda url: print(url)))
 
-It listens twice. At a Unix socket, for drives, which send what feed.py says; and for browsers, over HTTP: a page, and
-for each page a WebSocket. Through that the page gets the newest message, and another one only once it has said that it
-shows the one before, so that nothing waits in between and a slow page simply gets fewer. What a page may say is
-"shown N" and "stop", and a stop is all that ever goes to a drive.
+It listens in two places. Drives connect to a Unix socket and send the messages that feed.py describes. Browsers get the
+page over HTTP, and each page opens a WebSocket. Through it the page receives the newest message, and the next one only
+after the page has confirmed that it shows the previous one: so no messages queue up, and a slow page gets fewer. A page
+may send only "shown N" and "stop", and the view never sends a drive anything but a stop.
 
-Who has the token may look and stop. A request must name this machine as its host, and a WebSocket come from our own
-page, so that no other page in the same browser can use it.
+Whoever has the token may watch the drive and stop it. A request must name this machine as its host, and a WebSocket
+must come from our own page, so that no other page in the same browser can use the view.
 """
 
 import asyncio
@@ -41,10 +41,10 @@ from rover_lib.onboard.host import is_listened_at, throttled_means
 from rover_lib.onboard.pwm import ARDUINO_STEP_US
 
 PORT = 8470
-MESSAGE_BYTES = 1 << 20  # more than a drive's socket takes
+MESSAGE_BYTES = 1 << 20  # no message of a drive is larger (MOST_BYTES in feed.py)
 PAGES = 32
 ACCEPT_AGAIN_S = 0.5
-BEAT_S = 5.0  # a page that does not answer for that long is gone
+BEAT_S = 5.0  # between two pings; a page that does not answer one is gone
 GONE = "gone"
 PAGE = Path(__file__).with_name("view.html")
 HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]{1,253})(:\d{1,5})?", re.ASCII)
@@ -52,19 +52,22 @@ SHOWN = re.compile(r"shown (\d{1,12})", re.ASCII)
 
 
 class ViewError(RoverError):
-    """A view that cannot be opened here."""
+    """The view cannot be opened here."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where browsers find the view. port: 0 takes any that is free. interface: a network's that may reach it, such as
-    wlan0; "": this machine alone."""
+    """Where browsers find the view.
+
+    port: 0 means any free one. interface: browsers reach the view only through this network interface, such as wlan0;
+    "" means only from this machine.
+    """
 
     port: int = PORT
     interface: str = ""
 
     def open(self) -> socket.socket:
-        """A listening socket. Raises ViewError."""
+        """Return a listening socket. Raises ViewError if the port or the interface cannot be used."""
         wire = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
             wire.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -83,8 +86,12 @@ class Address:
         return wire
 
     def is_ours(self, host: str) -> bool:
-        """Whether a request's Host: header names this machine. An address cannot be made to lead elsewhere; a name that
-        somebody else owns can, and then their page would be taken for ours."""
+        """Whether a request's Host: header names this machine.
+
+        A loopback address is accepted, and any other address if other machines may reach the view, since nobody can
+        make an address lead elsewhere. A name must be this machine's: the owner of another name could make it lead
+        here, and the browser would take their page for ours.
+        """
         match = HOST.fullmatch(host)
         if not match:
             return False
@@ -96,12 +103,12 @@ class Address:
 
 
 def new_token() -> str:
-    """A token that nobody guesses."""
+    """Return a new token that nobody can guess."""
     return secrets.token_urlsafe(16)
 
 
 def read_token(path: Path) -> str:
-    """A file's. Raises ViewError for one that is not there, or that could be guessed."""
+    """Read the token from a file. Raises ViewError if it cannot be read, or if the token could be guessed."""
     try:
         token = path.read_text(errors="replace").strip()
     except OSError as error:
@@ -114,10 +121,10 @@ def read_token(path: Path) -> str:
 class View:
     """The web server of the view.
 
-    address: where browsers reach it. place: the socket to which drives connect, None if a replay is shown instead.
-    drive_user: another user whose drives are accepted besides this user's. replay: whether a past drive is shown. car:
-    the car whose drives are shown, None: this machine's. Raises ViewError for an unknown user, CarError as this_car(),
-    ParamsError as CarShape.of.
+    address: where browsers reach it. place: the socket to which drives connect; None if a replay is shown instead.
+    drive_user: another user whose drives are accepted, besides this user's and root's. replay: whether a past drive is
+    shown. car: the car whose drives are shown; None means this machine's. Raises ViewError for an unknown user, and
+    CarError and ParamsError like this_car() and CarShape.of().
     """
 
     def __init__(
@@ -136,10 +143,10 @@ class View:
                 self._users.add(pwd.getpwnam(drive_user).pw_uid)
             except KeyError:
                 raise ViewError(f"no user {drive_user!r} is known here", remedy="provision the rover") from None
-        self._open_to_all = drive_user is not None  # the socket; who comes is looked at
+        self._open_to_all = drive_user is not None  # the socket; _accept() checks who connects
         car = car or this_car()
         self._shape, self._pwm = CarShape.of(car), car.pwm
-        self._drives: list[socket.socket] = []  # the newest last, which is the one that is shown
+        self._drives: list[socket.socket] = []  # the last one, the newest, is shown
         self._number = 0
         self._head: dict[str, Any] = {"phase": "no drive", "text": "no drive has come yet", "replay": replay}
         self._picture = b""
@@ -150,7 +157,10 @@ class View:
     async def run(
         self, opened: Callable[[str], object], beside: Callable[["View"], Awaitable[object]] | None = None
     ) -> None:
-        """Until SIGINT or SIGTERM. opened: is told the page's URL. beside: what goes on meanwhile."""
+        """Serve the view until SIGINT or SIGTERM.
+
+        opened: called with the page's URL. beside: runs at the same time; an error in it ends the view and is raised.
+        """
         ended = asyncio.Event()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -166,7 +176,7 @@ class View:
                 task.result()
 
     async def open(self, stack: contextlib.AsyncExitStack) -> str:
-        """Serves until the stack is closed; the page's URL."""
+        """Start serving, until the stack is closed, and return the page's URL. Raises ViewError."""
         app = web.Application(middlewares=[self._guard], client_max_size=1024)
         app.router.add_get("/", self._give_page)
         app.router.add_get("/ws", self._talk)
@@ -185,7 +195,7 @@ class View:
         return f"http://{name}:{wire.getsockname()[1]}/?token={self._token}"
 
     def show(self, head: dict[str, Any], picture: bytes) -> None:
-        """From now on the pages show this: a message of feed.py, whose picture is a JPEG, or none."""
+        """Show this on the pages from now on. head: a message as in feed.py. picture: a JPEG, or empty for none."""
         self._number += 1
         pins: list[Any] | None = head.get("pins")
         pins = pins if pins and None not in pins else None
@@ -210,16 +220,16 @@ class View:
         self._news = asyncio.Event()
 
     def stop(self, who: str) -> int:
-        """Asks each drive for a stop; how many were asked. who: an IP address."""
+        """Ask each drive to stop, and return how many were asked. who: the IP address that asks."""
         asked = 0
         for drive in tuple(self._drives):
-            with contextlib.suppress(OSError):  # one that does not listen any more
+            with contextlib.suppress(OSError):  # this drive no longer reads
                 drive.send(f"stop {who}".encode())
                 asked += 1
         return asked
 
     def _actions(self, pins: list[Any] | None) -> list[float] | None:
-        """What the pins' pulses stand for."""
+        """Return the actions that the pins' pulses stand for."""
         if not pins:
             return None
         channels = self._pwm.steering, self._pwm.throttle
@@ -235,7 +245,7 @@ class View:
                 raise ViewError(f"{place}: another view listens there", remedy="end that one first")
             if place.exists() and not place.is_socket():
                 raise ViewError(f"{place}: is there, and is no socket", remedy="name another with --feed")
-            place.unlink(missing_ok=True)  # of one that was killed
+            place.unlink(missing_ok=True)  # left by a view that was killed
             wire.bind(str(place))
             place.chmod(0o666 if self._open_to_all else 0o600)
             wire.listen(4)
@@ -252,7 +262,7 @@ class View:
         while True:
             try:
                 drive, _ = await loop.sock_accept(wire)
-            except OSError:  # no file is left, for as long as somebody opens one connection after the other
+            except OSError:  # no file descriptor is free, perhaps because somebody keeps opening connections
                 await asyncio.sleep(ACCEPT_AGAIN_S)
                 continue
             _, uid, _ = struct.unpack("3i", drive.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
@@ -267,7 +277,7 @@ class View:
         self._drives.append(drive)
         phase = ""
         try:
-            with contextlib.suppress(Exception):  # whatever its nonsense breaks, it ends with that
+            with contextlib.suppress(Exception):  # a message that makes no sense ends this connection, nothing else
                 while data := await _received(loop, drive):
                     line, _, picture = data.partition(b"\n")
                     head = json.loads(line)
@@ -346,7 +356,12 @@ class View:
 
 
 class _Page:
-    """What one page has: sent: number of the last message. delay_ms: from that one's capture until it was shown."""
+    """The state of one page.
+
+    sent: number of the last message. captured_s: when its picture was captured. delay_ms: time from the capture of the
+    last picture that the page showed until it said so; None if unknown. showing: set while the page shows the last
+    message.
+    """
 
     def __init__(self) -> None:
         self.sent = -1
@@ -361,7 +376,7 @@ class _Page:
 
 
 def _parts(html: bytes) -> tuple[bytes, bytes]:
-    """Its style and its script, which are all that a browser may take from it."""
+    """Return the page's style and script; the browser may apply and run no others."""
     style, script = (re.search(rb"<%s>(.*?)</%s>" % (tag, tag), html, re.S) for tag in (b"style", b"script"))
     assert style and script, "view.html has one of each"
     return style[1], script[1]
@@ -372,18 +387,18 @@ def _refused(why: str) -> web.Response:
 
 
 def _jpeg_of(picture: bytes, shape: list[int]) -> bytes:
-    """Of a camera that gives none. Raises ValueError for bytes that are no such picture."""
-    import numpy as np  # few cameras need it
+    """Compress the raw BGR picture of a camera that delivers no JPEGs. Raises ValueError if it has another size."""
+    import numpy as np  # imported here because few cameras need it
     import simplejpeg
 
     return simplejpeg.encode_jpeg(np.frombuffer(picture, np.uint8).reshape(shape), 80, "BGR")
 
 
 async def _received(loop: asyncio.AbstractEventLoop, drive: socket.socket) -> bytes:
-    """The next message, b"" at the end."""
+    """Return the drive's next message, b"" at the end."""
     try:
         return await loop.sock_recv(drive, MESSAGE_BYTES)
-    except ConnectionResetError:  # it has closed without reading a second stop; its last message is still there
+    except ConnectionResetError:  # the drive closed without reading a second stop; its last message is still here
         return await loop.sock_recv(drive, MESSAGE_BYTES)
 
 

@@ -1,6 +1,6 @@
-"""What stands around the control loop: its priority, its signals, its end when it hangs, and warnings.
+"""What surrounds the control loop: its priority, signals that end it, an exit if it hangs, and sources of warnings.
 
-The loop knows none of these. A source of warnings is called once a second, and gives sentences for the log.
+The loop itself knows none of these. It calls each source of warnings once a second, and logs the sentences it gets.
 """
 
 import contextlib
@@ -22,34 +22,34 @@ from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.stage import open_plain
 from rover_lib.onboard.telemetry import FlightLog, LogError
 
-SWITCH_S = 0.0005  # at the latest, other threads give the interpreter back to the loop; not Python's 5 ms
-PRIORITY = 2  # of real time: above what stands in for a car in the balloon world
-HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before
+SWITCH_S = 0.0005  # after this, other threads give the interpreter back to the loop; Python's default is 5 ms
+PRIORITY = 2  # real-time; above that of the balloon world's stand-in for a car
+HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before that
 LATE_COMMAND_MS = 5.0
-OFTEN = 5  # commands of a second that were sent again
-IDLE = 0.05  # of the processors' time; with less, somebody waits
-STOLEN = 0.03  # of the same
-REPEAT_AFTER = 3  # seconds after which a warning that still holds is repeated
-CLOCK_SET_S = 1.0
-SETTLED_S = 60.0  # memory is watched for growth from here on
-TAIL_BYTES = 1 << 16
-# All that ask a program to end. A script's & starts it with SIGINT and SIGQUIT ignored; such a drive must still end.
+OFTEN = 5  # commands that were sent again within a second
+IDLE = 0.05  # of the processors' time; if less is idle, some process has to wait
+STOLEN = 0.03  # of the processors' time, taken by the host of a virtual machine
+REPEAT_AFTER = 3  # seconds after which the warning of a busy machine is repeated
+CLOCK_SET_S = 1.0  # a smaller step of the system's clock is ignored
+SETTLED_S = 60.0  # from then on, the growth of memory is measured
+TAIL_BYTES = 1 << 16  # of a flight log, read for the end of its last drive
+# All that ask a program to end. A script's & starts a drive with SIGINT and SIGQUIT ignored; they must still end it.
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 
 
 @contextlib.contextmanager
 def real_time(priority: int) -> Iterator[bool]:
-    """Inside, all threads of this process have a real-time priority; gives whether this user may ask for that.
+    """Give all threads of this process a real-time priority inside the context. Yields False if the user may not.
 
-    All of them, because one that waits for its turn while it holds the interpreter keeps the others waiting too.
+    All threads get it, because one that waits for the processor while it holds the interpreter makes the others wait.
     """
     gc.collect()
-    gc.freeze()  # what is here now need not be looked through again meanwhile
+    gc.freeze()  # so that garbage collection skips all objects that exist now
     before, granted = sys.getswitchinterval(), True
     sys.setswitchinterval(SWITCH_S)
     try:
         schedule(os.SCHED_RR | os.SCHED_RESET_ON_FORK, priority)
-    except (OSError, AttributeError):  # AttributeError: no Linux
+    except (OSError, AttributeError):  # AttributeError: this is not Linux
         granted = False
     try:
         yield granted
@@ -62,10 +62,10 @@ def real_time(priority: int) -> Iterator[bool]:
 
 @contextlib.contextmanager
 def boosted_priority(log: FlightLog) -> Iterator[None]:
-    """Inside, this process goes before all that is not as urgent, if its user may ask for that.
+    """Inside the context, let this process go before less urgent ones, if its user may ask for that.
 
-    With four busy processes on two cores the loop's lateness at p99 was 0.7 ms so, 4 to 9 with the loop's thread alone
-    at that priority, and 14 to 19 without (measured on an x86-64 workstation).
+    With four busy processes on two cores, the loop's lateness at p99 was 0.7 ms; it was 4 to 9 ms with only the loop's
+    thread at that priority, and 14 to 19 ms without (measured on an x86-64 workstation).
     """
     with real_time(PRIORITY) as granted:
         if granted:
@@ -76,7 +76,10 @@ def boosted_priority(log: FlightLog) -> Iterator[None]:
 
 
 def schedule(policy: int, priority: int) -> None:
-    """Puts all threads that this process has now under a policy of the kernel's scheduler. OSError: not allowed."""
+    """Put all present threads of this process under a policy of the kernel's scheduler.
+
+    Raises OSError if that is not allowed.
+    """
     for thread in Path("/proc/self/task").iterdir():
         with contextlib.suppress(ProcessLookupError):  # it has just ended
             os.sched_setscheduler(int(thread.name), policy, os.sched_param(priority))
@@ -84,7 +87,10 @@ def schedule(policy: int, priority: int) -> None:
 
 @contextlib.contextmanager
 def stopped_by_signals(stop: SignalEvent, log: FlightLog) -> Iterator[None]:
-    """SIGNALS set `stop` inside; a second one does what it did before. For the main thread."""
+    """Inside the context, each of SIGNALS sets `stop`; the second time, the same signal does what it did before.
+
+    Only the main thread may use this.
+    """
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         log.event(f"{signal.Signals(number).name}: stopping")
@@ -97,7 +103,7 @@ def stopped_by_signals(stop: SignalEvent, log: FlightLog) -> Iterator[None]:
 
 @contextlib.contextmanager
 def signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[dict[int, Any]]:
-    """SIGNALS go to `handler` inside, and where they went before afterwards; gives the latter."""
+    """Send SIGNALS to `handler` inside the context, and to their former handlers afterwards. Yields the former ones."""
     before: dict[int, Any] = {number: signal.signal(number, handler) for number in SIGNALS}
     try:
         yield before
@@ -108,10 +114,10 @@ def signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[dict[i
 
 @contextlib.contextmanager
 def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
-    """Inside, this process ends (exit code 3) when its loop has begun, has not ended, and ticks no more.
+    """Inside the context, end this process (exit code 3) if its loop has begun, has not ended, and no longer ticks.
 
-    Nobody else would end it, and camera, port and memory would stay taken. Counted in turns of its own, so that a
-    process that was stopped as a whole has its time to go on.
+    Nobody else would end it, and camera, port and memory would stay in use. The watching thread counts its own turns
+    instead of reading a clock, so that a process that was stopped as a whole gets the time to go on.
     """
 
     def watch() -> None:
@@ -134,33 +140,33 @@ def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
 
 
 def unfinished_drive(log: Path | str) -> str | None:
-    """A sentence if the last drive in a flight log was armed, and never came to its end; to be asked before a new one.
+    """Return a sentence if the last drive in a flight log was armed but has no end. Call this before a new drive.
 
-    A process that is killed, or has no power any more, cannot say so itself.
+    A process that was killed, or lost its power, could not log its own end.
     """
     try:
-        with open_plain(log, LogError(f"{log}: no plain file")) as file:  # a FIFO would be waited for
+        with open_plain(log, LogError(f"{log}: no plain file")) as file:  # opening a FIFO would wait
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
             lines = file.read().splitlines()
     except (OSError, LogError):
         return None
-    ticks = False
-    for line in reversed(lines):
+    drove = False
+    for line in reversed(lines):  # back to where the last drive began
         if b'"event":"neutral' in line:
             return None
         if b'"event":"armed' in line:
-            ticks = True
-        elif b'"kind":"header"' not in line:
-            ticks |= line[:1].isdigit()
-            continue
-        break
-    return f"{log}: the drive before this one has no end: killed, or without power or disk" if ticks else None
+            drove = True
+            break
+        if b'"kind":"header"' in line:
+            break
+        drove |= line[:1].isdigit()  # a tick; events are JSON
+    return f"{log}: the drive before this one has no end: killed, or without power or disk" if drove else None
 
 
 class HealthWatch:
-    """What was out of the ordinary since it was asked last, a sentence for each: `warnings` of loop.Hooks.
+    """A source of warnings, for loop.Hooks: a sentence for each thing that was unusual since the last call.
 
-    link: None drives no motor.
+    link: None if no motor is driven.
     """
 
     def __init__(self, report: Report, link: ServoLink | None):
@@ -168,20 +174,21 @@ class HealthWatch:
         self._ticks = 0
         self._counted: tuple[int, ...] | None = None
         self._spent = _processors()
-        self._busy = 0  # seconds in a row in which the machine was
+        self._busy = 0  # in how many seconds in a row the machine was busy
         self._clock_s = time.time() - time.monotonic()
 
     def __call__(self) -> Iterator[str]:
         late_ms, self._ticks = max(self._report.late_ms[self._ticks :], default=0.0), len(self._report.late_ms)
         if late_ms > LATE_COMMAND_MS:
             yield f"commands were up to {late_ms:.1f} ms late"
-        with contextlib.suppress(LinkError):  # the next tick looks at it
+        with contextlib.suppress(LinkError):  # the next tick handles it
             if self._link and (telemetry := self._link.latest()):
                 yield from self._of_the_link(self._link.garbled, telemetry)
         spent, before = _processors(), self._spent
         self._spent = spent
         if spent and before and spent[1] > before[1]:
-            idle, _, stolen = ((now - then) / (spent[1] - before[1]) for now, then in zip(spent, before, strict=True))
+            total = spent[1] - before[1]
+            idle, stolen = (spent[0] - before[0]) / total, (spent[2] - before[2]) / total
             if idle < IDLE and self._busy % REPEAT_AFTER == 0:
                 yield f"this machine is busy: its processors were idle for {idle:.0%} of the time"
             self._busy = self._busy + 1 if idle < IDLE else 0
@@ -204,9 +211,12 @@ class HealthWatch:
 
 
 def _processors() -> tuple[int, int, int] | None:
-    """Of all processors' time, in the kernel's ticks: idle, all, and taken by a host; None where it does not say."""
+    """Return the processors' time in the kernel's ticks: idle, total, and taken by the host of a virtual machine.
+
+    Returns None if the kernel does not tell.
+    """
     try:
-        with open("/proc/stat") as file:  # noqa: PTH123  # faster, once a second while driving
+        with open("/proc/stat") as file:  # noqa: PTH123  # faster than Path; this runs once a second while driving
             spent = [int(value) for value in file.readline().split()[1:9]]
         return spent[3] + spent[4], sum(spent), spent[7]
     except (OSError, ValueError, IndexError):
@@ -214,11 +224,11 @@ def _processors() -> tuple[int, int, int] | None:
 
 
 def artifact_changes(path: Path | str) -> Callable[[], Iterable[str]]:
-    """A source of warnings: says once when the file that was loaded is another one, or gone."""
+    """Return a source of warnings that says once when the loaded file has changed or is gone."""
 
     def signature() -> tuple[int, ...] | None:
         try:
-            s = os.stat(path)  # noqa: PTH116  # its fields are what is compared
+            s = os.stat(path)  # noqa: PTH116  # only some of its fields are compared
         except OSError:
             return None
         return s.st_ino, s.st_size, s.st_mtime_ns
@@ -235,7 +245,7 @@ def artifact_changes(path: Path | str) -> Callable[[], Iterable[str]]:
 
 
 class MemoryWatch:
-    """A source of no warnings, which keeps the report's memory up to date. pids: of the processes that count."""
+    """A source that gives no warnings, but keeps the report's memory up to date. pids: the processes that count."""
 
     def __init__(self, report: Report, pids: Iterable[int], clock: Callable[[], float] = time.monotonic):
         self._report, self._pids, self._clock = report, tuple(pids), clock
@@ -254,7 +264,7 @@ class MemoryWatch:
 
 
 def memory_mb(pids: Iterable[int]) -> float | None:
-    """Resident memory of processes together; None where /proc does not say."""
+    """Return the resident memory of processes together, in MB; None if /proc does not tell."""
     try:
         pages = sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in pids)
     except (OSError, ValueError, IndexError):

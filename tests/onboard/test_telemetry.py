@@ -385,6 +385,27 @@ def test_a_disk_that_takes_half_a_line(path, monkeypatch):
     assert (flight.drives, flight.damaged) == (1, 1)
 
 
+@pytest.mark.parametrize("end", ["first", "last"])
+def test_a_disk_that_takes_a_line_without_its_end(path, monkeypatch, end):
+    monkeypatch.setattr(telemetry, "RETRY_S", 0.02)
+    whole_write, cut = os.write, []
+
+    def cut_write(fd, data):
+        if not cut and b",A,a," in data:
+            cut.append(data)
+            data = data[: data.index(b"\n") if end == "first" else -1]
+        return whole_write(fd, data)
+
+    monkeypatch.setattr(os, "write", cut_write)
+    with FlightLog(path, header=HEADER, **LIMITS, flush_s=0.1) as log:
+        for k in range(10):
+            log.tick(tick(k))
+        until(lambda: log.failures == 1)
+    flight = read_log(path)
+    assert flight.ticks["frame"].tolist() == list(range(10))  # none lost, none twice
+    assert (flight.drives, flight.damaged) == (1, 0)
+
+
 def test_a_long_failure_loses_the_oldest_and_marks_the_gap(path, monkeypatch):
     monkeypatch.setattr(telemetry, "QUEUE_TICKS", 50)
     monkeypatch.setattr(telemetry, "RETRY_S", 0.02)
