@@ -67,7 +67,7 @@ def _pictures(replay: Replay, rate_hz: float, width: int, progress: Progress) ->
     times_s = np.array([m.t_s for m in replay.moments])
     shape = CarShape.of(replay.car)
     size: tuple[int, int] | None = None
-    for at_s in progress(np.arange(0.0, times_s[-1] + 1e-9, 1 / rate_hz), "drawing"):
+    for at_s in progress(np.arange(0.0, times_s[-1] + 1e-9, 1 / rate_hz), desc="drawing"):
         moment = replay.moments[int(np.searchsorted(times_s, at_s + 1e-9, side="right")) - 1]
         frame = moment.frame_bgr()
         if frame is None:

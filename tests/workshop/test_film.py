@@ -128,7 +128,7 @@ def test_a_film_is_of_the_car_that_was_driven(tmp_path):
 
 
 def test_a_replayed_recording_has_its_own_cars_pulses(tmp_path):
-    with EpisodeWriter(tmp_path / "episode_20260101_000000", About("a test", car=OTHER), (64, 36)) as writer:
+    with EpisodeWriter(tmp_path / "episode_20260101_000000", About("a test", car=OTHER), resolution=(64, 36)) as writer:
         for n in range(60):
             pulses = OTHER.pwm.pulses(0.5, 0.1)
             writer.control(n / 30, n * 33, pulses.steering_us, pulses.throttle_us, 20000, 20000)
