@@ -126,10 +126,9 @@ def load_recordings(
 ) -> Recordings:
     """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset, also from the Hub.
 
-    chunk: actions per sample. sync_s: largest distance in time between a frame and its control. pwm: instead of the
-    calibration that each recording states. Faults are counted, and what they affect is skipped. Here only the two ends
-    of each picture are checked; `Sample.frame_bgr` decodes it. Raises EpisodeError if nothing usable is left, with the
-    most frequent reasons.
+    chunk: actions per sample. sync_s: largest distance in time between a frame and its control. Faults are counted, and
+    what they affect is repaired or skipped. Here only the two ends of each picture are checked; `Sample.frame_bgr`
+    decodes it. Raises EpisodeError if nothing usable is left, with the most frequent reasons.
     """
     source = Source.of(root)
     root = source.path

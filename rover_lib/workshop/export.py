@@ -245,7 +245,7 @@ def _manifest(
 
 
 def _car_of(samples: Sequence[Sample]) -> Car:
-    """Return the car that the samples were recorded with. Raises QuantizeError if there are several."""
+    """Of whose recordings they are. Raises QuantizeError if several."""
     cars: list[Car] = []
     for folder in {s.frame_path.parent.parent for s in samples if isinstance(s, Sample)}:
         car = recorded_car(folder)

@@ -103,7 +103,7 @@ class Sample:
 
     time_s: seconds since the episode's first frame. state: (S,) float32, in our recordings the previous frame's
     [steering, throttle]. chunk: (chunk, A) float32, this frame's action and the following ones. is_pad: (chunk,)
-    bool, True where the chunk reaches past the end. driver: who drove at this frame, one of onboard.recording.DRIVERS.
+    bool, True past the end. driver: who drove at this frame, one of onboard.recording.DRIVERS.
     """
 
     episode: str
