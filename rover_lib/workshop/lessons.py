@@ -61,7 +61,7 @@ class BatchedPolicy(nn.Module):
             self.register_buffer(f"{name}_shift", torch.tensor(norm.shift), persistent=False)
 
     def thaw(self) -> None:
-        """Make the scale and shift of the batch norms trainable, which LeRobot freezes; their statistics stay frozen."""
+        """Make the scale and shift of the batch norms trainable, which LeRobot freezes; the statistics stay frozen."""
         from torchvision.ops.misc import FrozenBatchNorm2d  # importing it takes three seconds
 
         for norm in self.backbone.modules():
