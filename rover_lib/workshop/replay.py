@@ -10,6 +10,7 @@ which the log names. It has no plans either, only what became of them: "plan" is
 
 import asyncio
 import csv
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -192,15 +193,17 @@ def _head(title: str, now_s: float, ahead: Sequence[Sequence[float]], rate_hz: f
 def pictures_of(episode: Path) -> list[tuple[float, Path]]:
     """Return when each picture of an episode was taken, in seconds by the system's clock, and its file, in that order.
 
-    A file outside the episode's folder is left out. Raises EpisodeError if the list of pictures cannot be read.
+    A file outside the episode's folder, and a picture without a finite time, are left out. Raises EpisodeError if the
+    list of pictures cannot be read.
     """
     try:
         with (episode / "frame_data.csv").open(newline="") as file:
             rows = [(float(row["timestamp"]), episode / row["image_path"]) for row in csv.DictReader(file)]
-    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
+        inside = episode.resolve()
+        rows = [(t_s, path) for t_s, path in rows if math.isfinite(t_s) and path.resolve().is_relative_to(inside)]
+    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:  # ValueError: also a zero byte in a path
         raise EpisodeError(f"{episode}: its list of pictures cannot be read ({error})") from None
-    inside = episode.resolve()
-    return sorted((t_s, path) for t_s, path in rows if path.resolve().is_relative_to(inside))
+    return sorted(rows)
 
 
 def _plain(value: Any) -> Any:

@@ -181,6 +181,18 @@ def test_pictures_of_another_drive_are_refused(tmp_path):
         r.load_replay(log, drive=3)
 
 
+def test_a_damaged_time_in_the_list_costs_its_picture_alone(tmp_path):
+    log = drive(tmp_path)
+    whole = r.load_replay(log).moments
+    listed = tmp_path / "episodes/episode_1/frame_data.csv"
+    sound = listed.read_text()
+    listed.write_text(f"{sound}100,nan,frames/frame_000003.jpg\n101,inf,frames/frame_000003.jpg\n")
+    assert r.load_replay(log).moments == whole
+    listed.write_text(f"{sound}100,1,frames/frame\0.jpg\n")
+    with pytest.raises(EpisodeError, match="its list of pictures cannot be read"):
+        r.load_replay(log)
+
+
 def test_a_view_shows_it_again_and_again_in_its_own_time(tmp_path, monkeypatch):
     shown, slept = [], []
 
