@@ -61,11 +61,11 @@ from rover_lib.workshop.samples import ACTION_NAMES, Episode, Fault, Recordings,
 from rover_lib.workshop.untrusted import listed, shown
 
 DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
-HOLE_INTERVALS = 2.5  # one dropped frame is bridged, two in a row are a hole in time
-HOLE_S = 0.5  # and so is this, whatever is usual: no camera of a moving car is that slow
+HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
+HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 Item = TypeVar("Item")
-DISAGREES = 1e-3  # recorded action against the one computed from its pulse; the recordings hold 5e-5
+DISAGREES = 1e-3  # largest difference of an action from what its pulse says; recorded actions are within 5e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,11 +328,11 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
         nan = [name for name, value in values.items() if math.isnan(value)]
         if bad:
             faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {shown(row.get(bad[0]))}")
-            continue  # such a row was not written by the recorder: nothing in it can be trusted
+            continue  # the recorder did not write such a row, so nothing in it can be trusted
         if nan:
             faults.add(path, "not_finite", f"control {i}: {nan[0]} is {shown(row.get(nan[0]))}")
         if "system_timestamp" in nan:
-            continue  # without a time it can be no frame's action
+            continue  # without a time it cannot be the action of a frame
         for name in lost:
             faults.add(path, f"{name}_no_pulse", f"control {i}: not measured; such values are missing, not 0")
         steering, throttle = (

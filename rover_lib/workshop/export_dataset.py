@@ -163,7 +163,7 @@ def _write(
     with SuppressProgressBars(), warnings.catch_warnings():
         warnings.filterwarnings(
             "ignore", "Converting input from bool"
-        )  # numpy's, of LeRobot's statistics of yes and no
+        )  # numpy warns when LeRobot computes statistics of yes and no
         for episode in progress(recordings.episodes, desc="exporting", total=len(recordings.episodes)):
             for run in _runs(episode.samples):
                 for rows, unread in _readable(run, size, recorded):

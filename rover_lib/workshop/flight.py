@@ -24,7 +24,7 @@ STATES = {
     "": ("not known", "#F2F2F2"),
 }
 EVENTS_LISTED = 14
-LABEL_SHARE = 0.05  # of the width: events that are closer share one label
+LABEL_SHARE = 0.05  # events that are closer than this share of the width have one label together
 TEXT_LENGTH = 105
 DIGIT_SPACE = "\u2007"  # as wide as a digit
 

@@ -32,7 +32,7 @@ RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of th
 
 # Bounds, each far above what a policy of full size has, and low enough to be read in a second.
 JSON_BYTES = 1_000_000  # LeRobot's config.json: 3 kB
-HEADER_BYTES = 1_000_000  # of model.safetensors: 100 bytes for each of some 300 tensors
+HEADER_BYTES = 1_000_000  # the header of model.safetensors needs 100 bytes for each of some 300 tensors
 STATISTICS_BYTES = 16_000_000  # LeRobot's: a few kB
 
 # What LeRobot calls its files. STEPS: for each processor's file, how the names of its statistics began among the

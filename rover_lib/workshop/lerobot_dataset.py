@@ -286,7 +286,7 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     if isinstance(names, dict) and names and all(type(v) is int for v in names.values()):
         if len(set(names.values())) < len(names):
             return ()  # two names for one column
-        names = sorted(names, key=names.__getitem__)  # by column
+        names = sorted(names, key=names.__getitem__)  # in the order of their columns
     elif isinstance(names, dict) and len(names) == 1:
         (names,) = names.values()  # {"motors": [...]}
     if isinstance(names, list) and names and all(isinstance(n, str) for n in names):
@@ -397,7 +397,7 @@ def _check_rate(root: Path, columns: Mapping[str, np.ndarray], fps: float) -> No
     """Raise EpisodeError for frames that do not come `fps` times a second: a plan's steps would last another time."""
     times_s, number = columns["timestamp"].astype(np.float64), columns["episode_index"]
     steps_s = np.diff(times_s)[number[1:] == number[:-1]]
-    if len(odd := steps_s[~(np.abs(steps_s * fps - 1) <= UNEVEN)]):  # so that NaN is odd
+    if len(odd := steps_s[~(np.abs(steps_s * fps - 1) <= UNEVEN)]):  # written so that NaN counts as odd
         raise EpisodeError(
             f"{root}: meta/info.json says {fps:g} frames a second, but {len(odd)} frames come at another rate",
             found=f"{odd[0]:.4f} s after the one before",

@@ -67,7 +67,7 @@ def write_mcap(path: Path, flight: Flight, episode: Path | None = None) -> dict[
     that is damaged is left out. Raises LogError if the log does not say when it began, and EpisodeError if the
     episode's list of pictures cannot be read.
     """
-    from mcap.writer import Writer  # here, so that only this export needs it
+    from mcap.writer import Writer  # imported here, so that only this export needs it
 
     messages = list(_of_flight(flight))
     if episode is None:

@@ -1,7 +1,7 @@
 """Refit a layer that reads fewer inputs than before to the output that all of them gave.
 
 gram = Gram()
-gram.add(rows)                                        # what the layer reads, as often as wanted
+gram.add(rows)                                        # what the layer reads; may be called repeatedly
 weight, errors = refitted(whole, gram.mean(), kept)
 """
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 RIDGE = 1e-4  # times an input's mean square: it keeps the weights as they were where the rows say nothing
-ROWS = 4096  # so many are multiplied at once: they become double, and memory is small
+ROWS = 4096  # rows that are multiplied at once; few, because they become double and memory is small
 
 
 class Gram:

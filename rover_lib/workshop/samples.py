@@ -112,7 +112,7 @@ class Sample:
     state: np.ndarray
     chunk: np.ndarray
     is_pad: np.ndarray
-    row: int  # of the frame: in its episode, or in the whole of a LeRobotDataset
+    row: int  # the frame's number in its episode, or in the whole of a LeRobotDataset
     driver: str = HUMAN
 
     @property
@@ -172,7 +172,7 @@ class Episode:
     frames: int
     controls: int
     samples: tuple[Sample, ...]
-    files: tuple[Path, ...]  # that the numbers came from
+    files: tuple[Path, ...]  # those that the numbers came from
     outcome: str | None = None
 
     @cached_property

@@ -34,7 +34,7 @@ OF_BENCHMARKS = {  # the original's acceptance table
 PREFERRED = ("fp32", "static", "mixed", "dynamic")  # between equals: the policy as trained, then the simplest
 COUNTED = "counted on an emulated Cortex-A76"
 NEXT_COMMANDS = 3
-MOST_EPISODES = 3  # named for a remedy
+MOST_EPISODES = 3  # a remedy names at most this many
 
 Stages = Mapping[str, Mapping[str, Any]]
 
