@@ -167,7 +167,7 @@ def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) 
 
 
 def faults(recordings: Recordings) -> Figure | Note:
-    """Draw what was wrong in the recordings, by kind. Most of it was left out, some of it repaired while reading."""
+    """Draw what was wrong in the recordings, by kind. Reading them left it out, or repaired it as `episodes` says."""
     counts: dict[str, int] = {}
     for fault in recordings.faults:
         counts[fault.kind] = counts.get(fault.kind, 0) + fault.count
@@ -182,7 +182,7 @@ def faults(recordings: Recordings) -> Figure | Note:
     ax.set_yticks(range(len(kinds)), [k.replace("_", " ") for k in kinds])
     ax.invert_yaxis()
     ax.set_xlabel("times")
-    claim(fig, f"{used}; {sum(counts.values())} faults were skipped")
+    claim(fig, f"{used}; {sum(counts.values())} faults were left out or repaired")
     return fig
 
 
