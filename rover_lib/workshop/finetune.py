@@ -279,10 +279,9 @@ def _parted(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Material:
     held_out += [_HeldOut(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (driven[i] for i in judges)]
     for recordings in read:
         own = [e for i, (r, e) in enumerate(driven) if r is recordings and i not in judges]
-        for kind in (ADDITIONS, CORRECTIONS):
-            taught.append(
-                (kind, tuple(s for e in own if e.by_policy == (kind == CORRECTIONS) for s in human_samples(e)))
-            )
+        demonstrated, corrected = [e for e in own if not e.by_policy], [e for e in own if e.by_policy]
+        for kind, of_kind in ((ADDITIONS, demonstrated), (CORRECTIONS, corrected)):
+            taught.append((kind, tuple(s for e in of_kind for s in human_samples(e))))
     every = [*old, *(e for _, e in new)]
     left_out = sum(s.driver != HUMAN for e in every for s in e.samples)
     return _Material(
@@ -477,7 +476,7 @@ class _Room:
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """The samples of one step. parts: (kind, lessons, rows (b,), views (b,)) for each lessons that has any."""
+    """The samples of one step. parts: (kind, lessons, rows (b,), views (b,)) for each Lessons with any of them."""
 
     parts: list[tuple[str, Lessons, np.ndarray, np.ndarray]]
     rng: np.random.Generator

@@ -121,9 +121,9 @@ def networks(policy: ACT) -> tuple[Network, Network, onnx.ModelProto]:
     features = {f"features_{n}": torch.zeros(*g, config.dim) for n, g in zip(config.cameras, grids, strict=True)}
     state = torch.zeros(1, len(config.state_names))
     macs, weights = multiply_accumulates(policy), parameters_by_block(policy)
-    looks = {b for b in macs if b.startswith("backbone") or b == "image_project"}
+    of_front = {b for b in macs if b.startswith("backbone") or b == "image_project"}
     front = _network(
-        "backbone", Front(policy), pictures, list(features), [{b: n[b] for b in looks} for n in (macs, weights)]
+        "backbone", Front(policy), pictures, list(features), [{b: n[b] for b in of_front} for n in (macs, weights)]
     )
     whole = _network(
         "whole", Whole(policy), {"state": state[:, :, None, None], **pictures}, ["actions"], [macs, weights]
@@ -140,7 +140,7 @@ def _network(
     biases = {i.name for i in model.graph.initializer if len(i.dims) == 1}
     sums = [node for node in model.graph.node if node.op_type == "Add" and not biases & set(node.input)]
     normalised = {node.input[0] for node in model.graph.node if node.op_type == "LayerNormalization"}
-    macs, parameters = (sum(of.values()) for of in counts)
+    macs, parameters = (sum(by_block.values()) for by_block in counts)
     return Network(
         name,
         model,
