@@ -1,9 +1,9 @@
-"""ACT for inference only: LeRobot's Action Chunking Transformer with everything left out that only training needs.
+"""ACT for inference only: LeRobot's Action Chunking Transformer without what only training needs.
 
-The same function as `lerobot.policies.act` in eval mode (tests compare the two), with all that does not depend on the
-observation computed once: batch norm is folded into the convolutions; the VAE encoder is gone (its latent is zero when
-driving, so its projection is its bias); positions are constants; and the first decoder layer's self-attention, which
-acts on zeros, is a constant too, with the query behind it.
+It computes the same function as `lerobot.policies.act` in eval mode (tests compare the two). Everything that does not
+depend on the observation is computed once: batch norm is folded into the convolutions; the VAE encoder is left out (its
+latent is zero when driving, so the latent's projection is its bias); positions are constants; and so are the first
+decoder layer's self-attention, which acts on zeros, and the query that follows from it.
 
 Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions, C chunk, h and w of the feature map.
 """
@@ -43,21 +43,21 @@ EMBEDDINGS = {
 
 
 def backbone_blocks(backbone: str) -> list[str]:
-    """LeRobot's names of a backbone's residual blocks, in the order of the data."""
+    """Return LeRobot's names of a backbone's residual blocks, in the order in which data passes them."""
     _, depths, _ = BACKBONES[backbone]
     return [f"backbone.layer{stage}.{block}" for stage, depth in enumerate(depths, 1) for block in range(depth)]
 
 
 @dataclass(frozen=True)
 class Affine:
-    """x * scale + shift, per channel: all of LeRobot's normalisation modes are of this form."""
+    """x * scale + shift, per channel. All of LeRobot's normalisation modes have this form."""
 
     scale: tuple[float, ...]
     shift: tuple[float, ...]
 
 
 def imagenet() -> Affine:
-    """The normalisation of pixels in [0, 1] that torchvision's weights were trained with."""
+    """Return the normalisation of pixels in [0, 1] that torchvision's weights were trained with."""
     return Affine(
         tuple(1 / s for s in IMAGENET_STD),
         tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True)),
@@ -66,7 +66,7 @@ def imagenet() -> Affine:
 
 @dataclass(frozen=True)
 class ActConfig:
-    """The shape of one policy. Made by `checkpoint`, which has checked it against the weights."""
+    """The shape of one policy. `checkpoint` makes it, and checks it against the weights."""
 
     cameras: tuple[str, ...] = ("cam_front",)
     image_sizes: tuple[tuple[int, int], ...] = ((360, 640),)  # (height, width), one per camera
@@ -79,7 +79,7 @@ class ActConfig:
     encoder_layers: int = 4
     decoder_layers: int = 7
     latent: int = 32
-    vae_layers: int = 4  # 0: trained without a VAE
+    vae_layers: int = 4  # 0 if it was trained without a VAE
     backbone: str = "resnet18"
     dilation: bool = False
     pre_norm: bool = False
@@ -90,14 +90,14 @@ class ActConfig:
     action_unnorm: Affine | None = None
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """(h, w) of the feature map of a picture of that size."""
+        """Return (h, w) of the feature map for a picture of this size."""
         stride = 16 if self.dilation else 32
         return -(-height // stride), -(-width // stride)
 
 
 def lerobot_act(c: ActConfig) -> "ACTPolicy":
-    """LeRobot's own ACTPolicy of this shape, with fresh weights and nothing normalised. Downloads nothing."""
-    # here, because it takes ten seconds that what only reads or quantizes a checkpoint need not wait for
+    """Make LeRobot's own ACTPolicy of this shape, with random weights and no normalisation. It downloads nothing."""
+    # Imported here, because it takes ten seconds, and code that only reads or quantizes a checkpoint does not need it.
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy
@@ -128,12 +128,12 @@ def lerobot_act(c: ActConfig) -> "ACTPolicy":
 
 
 def positions_2d(dim: int, h: int, w: int) -> Tensor:
-    """LeRobot's 2-d sinusoidal positions of an (h, w) feature map: (h * w, dim)."""
+    """Return LeRobot's 2-d sinusoidal positions of an (h, w) feature map: (h * w, dim)."""
     half = dim // 2
     frequency = 10000 ** (2 * (torch.arange(half, dtype=torch.float32) // 2) / half)
 
     def axis(n: int) -> Tensor:  # (n, half)
-        # In LeRobot's order of float operations, so that the constants are the same to the last bit.
+        # The operations are in LeRobot's order, so that the constants are the same to the last bit.
         p = torch.arange(1, n + 1, dtype=torch.float32)
         p = (p / (p[-1:] + 1e-6) * (2 * math.pi))[:, None] / frequency
         return torch.stack((p[:, 0::2].sin(), p[:, 1::2].cos()), -1).flatten(1)
@@ -144,7 +144,7 @@ def positions_2d(dim: int, h: int, w: int) -> Tensor:
 
 
 class Weights:
-    """A view into a checkpoint's tensors below one prefix."""
+    """The tensors of a checkpoint whose names begin with one prefix, as float32."""
 
     def __init__(self, tensors: dict[str, Tensor], prefix: str = ""):
         self.tensors, self.prefix = tensors, prefix
@@ -180,31 +180,31 @@ def conv(weight: Tensor, bias: Tensor, stride: int, padding: int, dilation: int 
 
 
 def folded_conv(w: Weights, bn: Weights, stride: int, padding: int) -> nn.Conv2d:
-    """A convolution without bias and the frozen batch norm behind it, as one convolution."""
+    """Merge a convolution without bias and the frozen batch norm behind it into one convolution."""
     return conv(*folded(w, bn), stride, padding)
 
 
 def norm_gain(bn: Weights) -> Tensor:
-    """What a frozen batch norm multiplies each channel by, (channels,)."""
+    """Return the factor by which a frozen batch norm multiplies each channel, (channels,)."""
     return bn["weight"] * (bn["running_var"] + 1e-5).rsqrt()  # eps of torchvision's FrozenBatchNorm2d
 
 
 def folded(w: Weights, bn: Weights) -> Pair:
-    """Weight and bias of `folded_conv`."""
+    """Return the weight and bias of `folded_conv`."""
     gain = norm_gain(bn)
     return w["weight"] * gain[:, None, None, None], bn["bias"] - bn["running_mean"] * gain
 
 
 def folded_block(w: Weights, kind: str) -> list[Pair]:
-    """Weight and bias of a ResNet block's convolutions, without the channels inside it that are always zero.
+    """Return the weight and bias of a ResNet block's convolutions, without the channels inside it that are always zero.
 
-    Such a channel has no weight that is not zero and no positive bias, so that ReLU leaves nothing of it whatever the
-    block sees: without it the block is the same function. `channels` makes them.
+    All weights of such a channel are zero and its bias is not positive, so after ReLU it is zero whatever the block
+    sees, and the block without it computes the same function. The module `channels` makes such channels.
     """
     pairs = [folded(w.at(f"conv{i}"), w.at(f"bn{i}")) for i in range(1, (2 if kind == "basic" else 3) + 1)]
     for i, (weight, bias) in enumerate(pairs[:-1]):
         alive = (weight != 0).flatten(1).any(1) | (bias > 0)
-        alive[0] |= not alive.any()  # a convolution has one channel at least
+        alive[0] |= not alive.any()  # a convolution needs at least one channel
         if not alive.all():
             reader, reader_bias = pairs[i + 1]
             pairs[i : i + 2] = [(weight[alive], bias[alive]), (reader[:, alive], reader_bias)]
@@ -212,11 +212,11 @@ def folded_block(w: Weights, kind: str) -> list[Pair]:
 
 
 class Pixels(nn.Module):
-    """A frame, (height, width, 3) uint8 RGB, as the stem's input in floats: (1, 3, height, width), normalised."""
+    """Turns a frame, (height, width, 3) uint8 RGB, into the stem's float input: (1, 3, height, width), normalised."""
 
     def __init__(self, norm: Affine):
         super().__init__()
-        # pixels are 0..255 here: the division by 255 is in the scale
+        # Pixels are 0..255 here, so the division by 255 is part of the scale.
         self.norm = Normalise(Affine(tuple(s / 255 for s in norm.scale), norm.shift), (1, 3, 1, 1))
 
     def forward(self, frame: Tensor) -> Tensor:
@@ -224,12 +224,13 @@ class Pixels(nn.Module):
 
 
 class Columns(nn.Module):
-    """A frame, (height, width, 3) uint8 RGB, as the INT8 input of a stem over columns: the pixels themselves.
+    """Turns a frame, (height, width, 3) uint8 RGB, into the INT8 input of a stem over columns: the pixels themselves.
 
-    For each second pixel, the 8 pixels around it in its row: (1, 24, rows, width / 2), padded with the colour that
-    normalises to zero. The stem's 7x7 convolution with stride 2 over 3 channels is a 7x1 convolution over these 24
-    (`column_conv`), which has half the instructions: XNNPACK's kernels want at least 8 channels. Normalisation is in
-    that convolution's weights, so a pixel is its own quantized value: nothing is computed in float, nothing rounded.
+    The result has, for each second pixel, the 8 pixels around it in its row: (1, 24, rows, width / 2), padded with the
+    colour that normalises to zero. The stem's 7x7 convolution with stride 2 over 3 channels becomes a 7x1 convolution
+    over these 24 (`column_conv`), which needs half the instructions, because XNNPACK's kernels are made for at least 8
+    channels. Normalisation is in that convolution's weights, so a pixel is its own quantized value, and nothing is
+    computed in float or rounded.
     """
 
     WINDOW = 8  # pixels: the kernel's 7, and one with weight 0 that fills the kernel's lanes
@@ -237,7 +238,7 @@ class Columns(nn.Module):
     def __init__(self, norm: Affine, height: int, width: int):
         super().__init__()
         self.scale, self.zero_pixel = column_scale(norm)
-        self.dtype: torch.dtype | None = None  # of the quantized output; None: float
+        self.dtype: torch.dtype | None = None  # of the quantized output; None if the output is float
         self.out_width = (width - 1) // 2 + 1
         self.rows = 2 * ((height - 1) // 2) + 7
         self.pitch = 2 * (self.out_width - 1) + self.WINDOW  # padded pixels in a row
@@ -270,17 +271,20 @@ class Columns(nn.Module):
 
 
 def zero_colour(norm: Affine) -> tuple[float, ...]:
-    """The pixel, 0..255 per channel, that normalises to zero: what the stem's padding means."""
+    """Return the pixel, 0..255 per channel, that normalises to zero. The stem pads with it."""
     return tuple(-255 * shift / scale for scale, shift in zip(norm.scale, norm.shift, strict=True))
 
 
 def column_scale(norm: Affine) -> tuple[float, int]:
-    """(scale, zero pixel) of columns: one for all channels, near their normalisation; the weights have the rest."""
+    """Return (scale, zero pixel) of columns, the same for all channels: the mean of the channels' normalisation.
+
+    `of_columns` puts the difference to each channel's own normalisation into the weights.
+    """
     return sum(norm.scale) / len(norm.scale) / 255, round(sum(zero_colour(norm)) / len(norm.scale))
 
 
 def column_conv(conv: nn.Conv2d, norm: Affine) -> nn.Conv2d:
-    """The stem's convolution of normalised pixels, as one of `Columns`."""
+    """Turn the stem's convolution over normalised pixels into one over `Columns`."""
     assert conv.bias is not None
     weight, bias = of_columns(conv.weight, conv.bias, norm)
     out_channels, in_channels, _, _ = weight.shape
@@ -288,7 +292,7 @@ def column_conv(conv: nn.Conv2d, norm: Affine) -> nn.Conv2d:
 
 
 def of_columns(weight: Tensor, bias: Tensor, norm: Affine) -> tuple[Tensor, Tensor]:
-    """Weight and bias of `column_conv`."""
+    """Return the weight and bias of `column_conv`."""
     scale, zero_pixel = column_scale(norm)
     pixel_scale = torch.tensor(norm.scale) / 255
     offset = pixel_scale * zero_pixel + torch.tensor(norm.shift)
@@ -298,7 +302,7 @@ def of_columns(weight: Tensor, bias: Tensor, norm: Affine) -> tuple[Tensor, Tens
 
 
 def fits_columns(config: ActConfig) -> bool:
-    """Whether frames can be columns: one normalisation for all cameras, whose zero is a colour."""
+    """Whether frames can be columns: all cameras have one normalisation, and there is a colour that becomes zero."""
     norm = config.image_norm[0]
     return all(n == norm for n in config.image_norm) and all(-0.5 < c < 255.5 for c in zero_colour(norm))
 
@@ -308,7 +312,7 @@ class Residual(nn.Module):
 
     def __init__(self, w: Weights, kind: str, stride: int, dilation: int):
         super().__init__()
-        plans = {  # stride, padding and dilation of each
+        plans = {  # stride, padding and dilation of each convolution
             "basic": [(stride, 1, 1), (1, 1, 1)],
             "bottleneck": [(1, 0, 1), (stride, dilation, dilation), (1, 0, 1)],
         }
@@ -327,7 +331,7 @@ class Residual(nn.Module):
 
 
 class Backbone(nn.Module):
-    """ResNet up to its last feature map: frames from Pixels, or from Columns -> (1, channels, h, w)."""
+    """ResNet up to its last feature map: (1, channels, h, w) from what Pixels or Columns make of a frame."""
 
     def __init__(self, w: Weights, config: ActConfig, columns: bool):
         super().__init__()
@@ -356,12 +360,12 @@ class Backbone(nn.Module):
         return self.layer4(self.layer3(self.layer2(self.layer1(self.stem(x)))))
 
 
-# Buffers have their types in __init__: torch.jit would read those of a class body, and want to compile them.
+# Buffers are annotated in __init__, because torch.jit reads annotations in a class body and tries to compile them.
 class Pointwise(nn.Module):
-    """Where token projections live: as linears over (1, T, D), or as 1x1 convolutions over (1, D, 1, T).
+    """A module with token projections, which are linears over (1, T, D) or 1x1 convolutions over (1, D, 1, T).
 
-    In channels-last the two are the same memory and XNNPACK runs the same GEMM, but only a convolution may have one
-    weight scale per output channel with qint8 activations (a per-channel linear raises there).
+    In channels-last both have the same memory and XNNPACK runs the same GEMM, but only a convolution may have one
+    weight scale per output channel with qint8 activations (a per-channel linear raises an error there).
     """
 
     def __init__(self, as_conv: bool):
@@ -384,10 +388,10 @@ class Pointwise(nn.Module):
 class Attention(Pointwise):
     """Multi-head attention added to the residual stream.
 
-    Channel scales (buffers, all None until `quantize` sets them) make the INT8 tensors inside even, and cancel exactly:
-    q_in, k_in and v_in multiply the inputs, q_out, v_out and o_out the outputs; the keys' output scale is merged into
-    q_out (the scores only see products), the output projection's input scale into v_out. Where the decoder looks at
-    the encoder's memory, `Memory` has applied k_in and v_in, once for all layers.
+    Channel scales (buffers, all None until `quantize` sets them) give the channels of the INT8 tensors inside similar
+    ranges, and cancel exactly: q_in, k_in and v_in multiply the inputs, q_out, v_out and o_out the outputs. The scale
+    of the keys' output is merged into q_out (the scores contain only products of the two), and the scale of the output
+    projection's input into v_out. In cross-attention `Memory` has applied k_in and v_in already, once for all layers.
     """
 
     def __init__(self, w: Weights, config: ActConfig, as_conv: bool, *, cross: bool = False):
@@ -410,7 +414,7 @@ class Attention(Pointwise):
             self.register_buffer(name, None)
 
     def fix_query(self, query: Tensor) -> None:
-        """query, (1, T, D), does not depend on the observation: its projection becomes a constant."""
+        """Replace the query's projection by a constant. query: (1, T, D), the same for every observation."""
         self.constant_q = self.leave(self.q(self.enter(query)))
         del self.q
 
@@ -422,7 +426,7 @@ class Attention(Pointwise):
             q = self.constant_q
         else:
             assert query is not None
-            # Self-attention asks and answers with one tensor: one scale and one quantized input for Q and K.
+            # In self-attention query and key are one tensor, so Q and K share one scale and one quantized input.
             q = k if query is key else self.enter(_times(query, self.q_in))
             q = _times(self.leave(self.q(q)), self.q_out)
         k = self.leave(self.k(k))
@@ -433,7 +437,7 @@ class Attention(Pointwise):
 
 
 class Memory(Pointwise):
-    """The encoder's output, (1, T, D), as all decoder layers' cross-attentions take it: keys' and values' input."""
+    """Turns the encoder's output, (1, T, D), into the inputs of keys and values, shared by all cross-attentions."""
 
     def __init__(self, as_conv: bool):
         super().__init__(as_conv)
@@ -462,7 +466,7 @@ class FeedForward(Pointwise):
 
     def forward(self, residual: Tensor, x: Tensor) -> Tensor:
         h = self.act(self.up(self.enter(_times(x, self.up_in))))
-        if self.down_in is not None:  # only for activations that a scale does not pass through (not ReLU)
+        if self.down_in is not None:  # only if a scale cannot be moved through the activation, as it can through ReLU
             h = self.enter(self.leave(h) * self.down_in)
         return _plus_scaled(residual, self.leave(self.down(h)), self.down_out)
 
@@ -495,7 +499,10 @@ class EncoderLayer(nn.Module):
 
 
 class DecoderLayer(nn.Module):
-    """The first layer's input is zeros, so its self-attention, and the query behind it, are computed here, once."""
+    """Self-attention, cross-attention and feed-forward.
+
+    The first layer's input is zeros, so its self-attention and the query that follows are computed once, in __init__.
+    """
 
     def __init__(self, w: Weights, config: ActConfig, as_conv: bool, q_pos: Tensor, first: bool):
         super().__init__()
@@ -519,7 +526,7 @@ class DecoderLayer(nn.Module):
         return x if self.pre_norm else self.norm1(x)
 
     def forward(self, x: Tensor | None, q_pos: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """x, q_pos: (1, C, D), x None for the first layer; key, value: from `Memory`."""
+        """x, q_pos: (1, C, D); x is None for the first layer. key, value: from `Memory`. Returns (1, C, D)."""
         x = self.start if x is None else self._self_attend(x, q_pos)
         y = self.norm2(x) if self.pre_norm else x
         x = self.cross_attention(x, None if self.first else y + q_pos, key, value)
@@ -530,7 +537,7 @@ class DecoderLayer(nn.Module):
 
 
 class Normalise(nn.Module):
-    """x * scale + shift with constants in the graph; the identity when there is nothing to do."""
+    """Computes x * scale + shift with constants in the graph, or returns x if there is no normalisation."""
 
     def __init__(self, affine: Affine | None, shape: tuple[int, ...]):
         super().__init__()
@@ -548,11 +555,12 @@ class Normalise(nn.Module):
 class ACT(nn.Module):
     """The policy, for one observation at a time.
 
-    weights: LeRobot's names without the leading `model.`; config: checked against them (see `checkpoint`).
-    for_int8: arranged as static INT8 wants it: token projections as 1x1 convolutions instead of linears, and frames
-    as columns of pixels (see Columns) where their normalisation allows it, padded with a colour of whole numbers.
-    forward(state (1, S) float32, *frames (height, width, 3) uint8 RGB, one per camera) -> (1, C, A) float32:
-    raw state in, raw actions out, all normalisation inside.
+    weights: by LeRobot's names without the leading `model.`. config: checked against them (see `checkpoint`).
+    for_int8: arrange the policy as static INT8 needs it, with token projections as 1x1 convolutions instead of linears,
+    and frames as columns of pixels (see Columns) if their normalisation allows it, padded with a colour of whole
+    numbers.
+    forward(state (1, S) float32, *frames (height, width, 3) uint8 RGB, one per camera) -> (1, C, A) float32: it takes a
+    raw state and returns raw actions, with all normalisation inside.
     """
 
     def __init__(self, config: ActConfig, weights: dict[str, Tensor], *, for_int8: bool = False):
@@ -573,7 +581,7 @@ class ACT(nn.Module):
         self.image_project = _load(nn.Conv2d(in_channels, out_channels, 1, device="meta"), weight, project["bias"])
         state = w.at("encoder_robot_state_input_proj")
         self.state_project = linear(state["weight"], state["bias"])
-        # The latent is zero when driving, so what its projection gives is its bias.
+        # The latent is zero when driving, so its projection gives the bias alone.
         self.latent: Tensor
         self.pos: Tensor
         self.q_pos: Tensor
@@ -597,15 +605,16 @@ class ACT(nn.Module):
 
     def forward(self, state: Tensor, *frames: Tensor) -> Tensor:
         tokens = [self.latent, self.state_project(self.state_norm(state))[:, None]]
-        for i, image_input in enumerate(self.image_input):  # by index: FX cannot iterate over frames while it traces
+        for i, image_input in enumerate(self.image_input):  # frames by index, because FX cannot trace an iteration
             x = self.image_project(self.backbone(image_input(frames[i])))  # (1, D, h, w)
             tokens.append(x.flatten(2).transpose(1, 2))  # (1, h * w, D)
         return self.action_unnorm(transform(self, torch.cat(tokens, 1)))
 
 
 def transform(parts: Any, x: Tensor) -> Tensor:
-    """Tokens (1, T, D) -> actions (1, C, A) before their normalisation is undone. parts: what ACT calls encoder,
-    encoder_norm, memory, decoder, norm, head, pos and q_pos.
+    """Run the transformer: tokens (1, T, D) -> actions (1, C, A), still normalised.
+
+    parts: an object with the attributes encoder, encoder_norm, memory, decoder, norm, head, pos and q_pos of ACT.
     """
     for layer in parts.encoder:
         x = layer(x, parts.pos)
@@ -617,7 +626,7 @@ def transform(parts: Any, x: Tensor) -> Tensor:
 
 
 def blocks(config: ActConfig) -> list[str]:
-    """Names of the parts that can be INT8 or float as one, in the order of the data."""
+    """Return the names of the parts that are INT8 or float as a whole, in the order in which data passes them."""
     names = ["backbone.stem", *(f"backbone.layer{i}" for i in (1, 2, 3, 4)), "image_project"]
     for i in range(config.encoder_layers):
         names += [f"encoder.{i}.attention", f"encoder.{i}.feed_forward"]
@@ -627,13 +636,13 @@ def blocks(config: ActConfig) -> list[str]:
 
 
 def block_of(module_name: str) -> str:
-    """The block that a module belongs to; its own name for those that stay float (head, state_project)."""
+    """Return the block that a module belongs to, or its own name if it stays float (head, state_project)."""
     parts = module_name.split(".")
     return ".".join(parts[: {"backbone": 2, "encoder": 3, "decoder": 3}.get(parts[0], 1)])
 
 
 def multiply_accumulates(model: ACT) -> dict[str, int]:
-    """Multiply-accumulates of one inference, by block, attention's two products counted with their block."""
+    """Count the multiply-accumulates of one inference by block. Attention's two products count for its block."""
     counts: dict[str, int] = {}
 
     def add(name: str, n: int) -> None:
@@ -660,7 +669,7 @@ def multiply_accumulates(model: ACT) -> dict[str, int]:
 
 
 def parameters_by_block(model: ACT) -> dict[str, int]:
-    """Weights and biases per block, blocks named as in `act.multiply_accumulates`."""
+    """Count weights and biases by block, with the names of `multiply_accumulates`."""
     counts: dict[str, int] = {}
     for name, tensor in model.named_parameters():
         block = block_of(name)
@@ -669,13 +678,13 @@ def parameters_by_block(model: ACT) -> dict[str, int]:
 
 
 def example_inputs(config: ActConfig) -> tuple[Tensor, ...]:
-    """A neutral observation of the right shapes: zero state, grey frames."""
+    """Return an observation of the right shapes: a state of zeros and grey frames."""
     frames = (torch.full((h, w, 3), 128, dtype=torch.uint8) for h, w in config.image_sizes)
     return torch.zeros(1, len(config.state_names)), *frames
 
 
 def inputs_of(sample: Sample, config: ActConfig) -> tuple[Tensor, ...]:
-    """A recorded sample as the graph's inputs: (1, S) float32, and (height, width, 3) uint8 RGB of each camera."""
+    """Return a sample as the graph's inputs: state (1, S) float32, then (height, width, 3) uint8 RGB of each camera."""
     seen: Any = sample.frame_bgr()
     frames = seen if isinstance(seen, Mapping) else {config.cameras[0]: seen}
     prepared = (prepare_frame(frames[n], *size) for n, size in zip(config.cameras, config.image_sizes, strict=True))
@@ -685,5 +694,5 @@ def inputs_of(sample: Sample, config: ActConfig) -> tuple[Tensor, ...]:
 
 @torch.inference_mode()
 def predictions(module: nn.Module, inputs: Iterable[tuple[Tensor, ...]]) -> Tensor:
-    """(n, C, A) of raw, unclipped actions."""
+    """Return the raw, unclipped actions for n inputs, (n, C, A)."""
     return torch.cat([module(*x) for x in inputs])

@@ -1,6 +1,6 @@
-"""Checkpoints in: the trainer's best_model.pth or what `lerobot-train` leaves, checked before they are used.
+"""Read a checkpoint, the trainer's best_model.pth or what `lerobot-train` leaves, and check it before it is used.
 
-Nothing in a file is ever executed, and nothing is built from a number that a file only claims: `trainer_checkpoint` and
+Nothing in a file is ever executed, and nothing is built to a size that a file merely claims. `trainer_checkpoint` and
 `lerobot_checkpoint` read the two formats.
 """
 
@@ -24,7 +24,7 @@ from rover_lib.workshop.trainer_checkpoint import read_trainer
 from rover_lib.workshop.untrusted import listed, shown
 
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
-SQUEEZED = 0.05  # of the aspect ratio: 432x240 for 640x360 is 0.013
+SQUEEZED = 0.05  # largest relative change of the aspect ratio; 432x240 instead of 640x360 is 0.013
 
 
 @dataclass(frozen=True)
@@ -40,22 +40,22 @@ class Checkpoint:
 
     @property
     def identity(self) -> str:
-        """Hex digits of all that it computes by: the sha256 of a trainer's file, which holds everything.
+        """A hash, in hex digits, of everything that decides what the policy computes.
 
-        Beside the weights of LeRobot's folder lie its config and its statistics, in files of their own: who puts other
-        statistics there has another policy of the same sha256.
+        A trainer's file holds all of it, so its sha256 is the answer. In LeRobot's folder the config and the statistics
+        are separate files beside the weights: with other statistics it is another policy, but `sha256` stays the same.
         """
         if self.format == "trainer":
             return self.sha256
-        said = json.dumps([self.sha256, asdict(self.config)], sort_keys=True)
-        return hashlib.sha256(said.encode()).hexdigest()
+        content = json.dumps([self.sha256, asdict(self.config)], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()
 
     def at_size(self, height: int, width: int) -> "Checkpoint":
-        """The same weights for images of another size, in pixels: none of ACT's weights depends on it.
+        """Return the same weights for images of another size, in pixels: none of ACT's weights depends on it.
 
-        Positions are normalised to the feature map, so the policy runs at any size; how well it still drives is to be
-        measured. Raises CheckpointError for several cameras, for less than one feature (32 pixels) a side, and for
-        another aspect ratio (by more than 5 %), because the picture would be squeezed.
+        Positions are normalised to the feature map, so the policy runs at any size; how well it still drives must be
+        measured. Raises CheckpointError for several cameras, for a side of less than one feature (32 pixels), and if
+        the aspect ratio changes by more than 5 %, because the picture would be squeezed.
         """
         if len(self.config.cameras) != 1:
             raise CheckpointError(
@@ -82,15 +82,15 @@ class Checkpoint:
         return replace(self, config=replace(self.config, image_sizes=((height, width),)))
 
     def recorded_as(self, layout: Layout) -> "Checkpoint":
-        """The same policy, speaking of states and actions as the recordings do.
+        """Return the same policy with the recordings' names, order and rate of states and actions.
 
-        LeRobot's checkpoints say neither what their numbers are, nor in what order, nor how many plans' steps make a
-        second: the dataset that they were trained on does. So their weights are put into the recordings' order. The
-        trainer's files, and what we write, are always of [steering, throttle] and of a known rate, the trainer's 30 a
-        second.
+        LeRobot's checkpoints do not say what their numbers mean, in what order they come, or how many steps of a plan
+        make a second; only the dataset that they were trained on does. So their weights are put into the recordings'
+        order. The trainer's files, and those that we write, always have [steering, throttle] and a known rate, the
+        trainer's being 30 Hz.
 
-        Raises CheckpointError for another count of cameras, states or actions than recorded, and for one of those
-        policies if the recordings have another rate or other names.
+        Raises CheckpointError if the policy's number of cameras, states or actions is not the recordings', and, for the
+        trainer's files and ours, if the recordings have another rate or other names.
         """
         c, rate_hz = self.config, layout.rate_hz
         has = len(c.cameras), len(c.state_names), len(c.action_names)
@@ -119,7 +119,7 @@ class Checkpoint:
                 )
             return self
 
-        def taken(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
+        def reordered(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
             return norm and Affine(tuple(norm.scale[i] for i in order), tuple(norm.shift[i] for i in order))
 
         states, actions = list(layout.state_order), list(layout.action_order)
@@ -139,8 +139,8 @@ class Checkpoint:
             state_names=layout.state_names,
             action_names=layout.action_names,
             rate_hz=rate_hz,
-            state_norm=taken(c.state_norm, layout.state_order),
-            action_unnorm=taken(c.action_unnorm, layout.action_order),
+            state_norm=reordered(c.state_norm, layout.state_order),
+            action_unnorm=reordered(c.action_unnorm, layout.action_order),
         )
         return replace(
             self, config=config, weights=weights, report=self.report | {"normalisation": normalisation(config)}
@@ -148,12 +148,14 @@ class Checkpoint:
 
 
 def load_checkpoint(path: Path | str) -> Checkpoint:
-    """Read and check a checkpoint: a trainer's .pth file, or a LeRobot folder with config.json and model.safetensors,
-    which may also be given by the output folder of `lerobot-train` (its last checkpoint is read), a checkpoint of it,
-    or the Hub's id user/name@revision.
+    """Read and check a checkpoint.
 
-    Raises CheckpointError, in one sentence, for a file that is missing, damaged, needs to run code, or whose config and
-    weights do not agree, and for policies that this project cannot run.
+    path: a trainer's .pth file; a LeRobot folder with config.json and model.safetensors; the output folder of
+    `lerobot-train`, of which the last checkpoint is read, or one of its checkpoints; or the Hub's id
+    user/name@revision.
+
+    Raises CheckpointError, in one sentence, for a file that is missing or damaged, that would have to run code, or
+    whose config and weights do not agree, and for a policy that this project cannot run.
     """
     path = hub.fetched(path, "model", CheckpointError) if hub.is_hub_id(path) else Path(path)
     if path.is_dir():
@@ -169,19 +171,19 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
 
 
 def normalisation(c: ActConfig) -> dict[str, str]:
-    """What happens to each input before the policy sees it, and to its output before it is an action, in words."""
+    """Say in words what is done to each input before the policy sees it, and to its output to make it an action."""
 
     def numbers(values: Iterable[float]) -> str:
         return f"({', '.join(f'{v:.4g}' for v in values)})"
 
-    def taken(name: str, norm: Affine | None) -> str:
+    def described(name: str, norm: Affine | None) -> str:
         if norm is None or (set(norm.scale), set(norm.shift)) == ({1.0}, {0.0}):
             return f"{name}, as it is"
         centre = numbers(-b / a for a, b in zip(norm.scale, norm.shift, strict=True))
         return f"({name} - {centre}) / {numbers(1 / a for a in norm.scale)}"
 
-    words = {name: taken("pixel / 255", norm) for name, norm in zip(c.cameras, c.image_norm, strict=True)}
-    words["state"] = taken("state", c.state_norm)
+    words = {name: described("pixel / 255", norm) for name, norm in zip(c.cameras, c.image_norm, strict=True)}
+    words["state"] = described("state", c.state_norm)
     out = c.action_unnorm
     words["action"] = "output, as it is" if out is None else f"output * {numbers(out.scale)} + {numbers(out.shift)}"
     return words

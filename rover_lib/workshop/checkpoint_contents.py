@@ -1,6 +1,6 @@
-"""What both formats of a checkpoint hold: the config's numbers and the weights, checked before they are used.
+"""Check what both formats of a checkpoint hold, the config's numbers and the weights, before it is used.
 
-Every size is bounded first, by what the file's own bytes can hold or by what no policy reaches.
+Every size is bounded first: by what the file's own bytes can hold, or by a limit that no policy reaches.
 """
 
 import re
@@ -21,9 +21,9 @@ FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)  # what w
 # Bounds, each far above what a policy of full size has.
 LARGEST_SIZE = 1_000_000  # a whole number in a config
 LARGEST_SIDE_PX = 8192  # the largest picture of a Pi's cameras has 4608 pixels a side
-MOST_ACTIONS = 1000  # and numbers in a state
+MOST_ACTIONS = 1000  # actions, numbers in a state, and numbers in the latent
 
-# What helps most often.
+# The remedies that help most often.
 COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
 IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole?"
@@ -31,7 +31,7 @@ IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole?"
 
 @dataclass(frozen=True)
 class Contents:
-    """What a file or folder says of its policy. `weights` have LeRobot's names without the leading `model.`."""
+    """What a file or folder holds. `weights` have LeRobot's names without the leading `model.`."""
 
     format: str  # "trainer" or "lerobot"
     config: ActConfig
@@ -42,7 +42,11 @@ class Contents:
 
 
 def named_weights(path: Path, state: dict[Any, Any], file_bytes: int) -> dict[str, Tensor]:
-    """The weights by LeRobot's names without `model.`: dense floats that together fit into the file."""
+    """Return the weights by LeRobot's names without `model.`.
+
+    Raises CheckpointError unless all names begin with `model.` and all weights are dense floats that together fit into
+    the file.
+    """
     odd = [k for k, v in state.items() if not isinstance(k, str) or not isinstance(v, Tensor)]
     if odd:
         raise CheckpointError(
@@ -66,7 +70,7 @@ def named_weights(path: Path, state: dict[Any, Any], file_bytes: int) -> dict[st
 
 
 def _unusable(weight: Tensor) -> str | None:
-    """Why a tensor is no weight."""
+    """Say why a tensor cannot be a weight; None if it can."""
     if weight.device.type == "meta":
         return "without values, on torch's meta device"
     if weight.is_quantized:
@@ -115,7 +119,10 @@ def _names(count: int, stem: str) -> tuple[str, ...]:
 
 
 def config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActConfig:
-    """Add to what the config says what only the weights' shapes say, and refuse what cannot be run."""
+    """Make an ActConfig from what the config says (`known`) and what only the shapes of the weights say.
+
+    Raises CheckpointError for a policy that cannot be run here.
+    """
     for key, choices in (("backbone", BACKBONES), ("activation", ACTIVATIONS)):
         value = known.get(key, "relu")
         if not isinstance(value, str) or value not in choices:
@@ -150,7 +157,7 @@ def config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActConf
         return size
 
     for part in ("encoder", "decoder"):
-        # each layer has many weights: what builds the expected shapes cannot be made to build for a minute
+        # Each layer has many weights. With this bound nobody can make expected_shapes run for minutes.
         if (count := known[f"{part}_layers"]) > len(weights):
             raise CheckpointError(
                 f"{path}: config and weights do not agree ({count} {part} layers, {len(weights)} weights in all)",
@@ -167,7 +174,7 @@ def config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActConf
 
 
 def expected_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
-    """Every weight that LeRobot's ACT of this config has, and its shape."""
+    """Return the name and shape of every weight that LeRobot's ACT of this config has."""
     d, states, actions = c.dim, len(c.state_names), len(c.action_names)
     shapes: dict[str, tuple[int, ...]] = {}
 
@@ -216,7 +223,10 @@ def expected_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
 
 
 def _resnet_shapes(name: str) -> dict[str, tuple[int, ...]]:
-    """torchvision's ResNet without its classifier, with frozen batch norm (importing that takes three seconds)."""
+    """Return the weights' shapes of torchvision's ResNet without its classifier and with frozen batch norm.
+
+    They are written out here, because importing torchvision takes three seconds.
+    """
     kind, depths, _ = BACKBONES[name]
     shapes: dict[str, tuple[int, ...]] = {}
 
@@ -242,7 +252,10 @@ def _resnet_shapes(name: str) -> dict[str, tuple[int, ...]]:
 
 
 def tensor_bytes(value: Any) -> int:
-    """Bytes of all tensors in dicts, lists and tuples, each object counted once: lists can hold themselves."""
+    """Return the bytes of all tensors in nested dicts, lists and tuples.
+
+    Each object is counted once, because a list can contain itself.
+    """
     total, seen, waiting = 0, set(), [value]
     while waiting:
         value = waiting.pop()
@@ -259,7 +272,7 @@ def tensor_bytes(value: Any) -> int:
 
 
 def is_plain(value: Any) -> bool:
-    """Whether it is a tensor of numbers in memory: neither sparse, nor quantized, nor on torch's meta device."""
+    """Whether a value is a tensor of numbers in memory: neither sparse, nor quantized, nor on torch's meta device."""
     return (
         isinstance(value, Tensor)
         and value.layout == torch.strided

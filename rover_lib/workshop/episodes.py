@@ -1,30 +1,29 @@
-"""Recorded drives as training and calibration samples: the user's episode folders, with all their faults.
+"""Read recorded drives, the user's episode folders with all their faults, as training and calibration samples.
 
     recordings = load_recordings("episodes")
     parts = split(recordings)
     samples, note = choose_calibration(parts.calibration, 200, seed=0)
 
 How a recording becomes samples:
-- A control is a measurement, per channel, only if the firmware saw a pulse (`pwm.Channel.measured`). Where
-  it did not, the file says so by a flag and no value, or by the old recorder's 0 (onboard/recording.py); such
-  a value is missing here, never 0. Throttle and
-  steering of a frame are each the nearest *measured* control within `sync_s`: one lost reading between two
-  good ones costs nothing (controls come every 33 ms), a longer hole leaves its frames without an action.
-- Controls that waited in the serial buffer arrive in one burst, with system times that say nothing. They are
-  put where the Arduino's clock says, counted back from the first control that arrived live after them
-  (backwards and from close by, because that clock drifts). Those that the clock cannot place are dropped.
-- Where the system's clock was set back in the middle of a drive (frames' numbers and the Arduino's clock go on), what
-  follows is left out: its times are those of other moments of the same drive, whose actions it would be given.
-- A frame's action is its control; its state is the previous frame's action; its chunk is its own action and
-  the following frames' (LeRobot's delta indices range(chunk)), padded at the end with the last one and
-  masked.
-- A picture that is missing or damaged costs its own sample only: time and action of that frame are known, so
-  its neighbours keep their state and chunk. A frame without an action, or a hole in time, ends the chunks
-  before it, and the frame after it is no sample: its state would be invented. Only the episode's first frame
-  starts neutral.
-- Where nobody drove, the pulses are those of a human whose car did something else: it was held. They are samples, with
-  that driver, but no chunk goes from there to where somebody drove, or back, and no state.
-- A drive that failed is as good a recording as another: its outcome is noted, and nothing is left out for it.
+- A control measures a channel only if the firmware saw a pulse there (`pwm.Channel.measured`). If it saw none, the file
+  has a flag and no value, or the old recorder's 0 (onboard/recording.py); here such a value is missing, never 0. A
+  frame takes its throttle and its steering each from the nearest *measured* control within `sync_s`. So one lost
+  reading between two good ones costs nothing (controls come every 33 ms), and a longer hole leaves its frames without
+  an action.
+- Controls that waited in the serial buffer arrive in one burst, so their system times say nothing. They get the times
+  of the Arduino's clock, counted back from the first control after them that arrived live (backwards and from close by,
+  because that clock drifts). Those that the clock cannot place are dropped.
+- If the system's clock was set back in the middle of a drive, which shows because the frames' numbers and the Arduino's
+  clock go on, everything after that is left out. Its times belong to other moments of the same drive, and it would be
+  given their actions.
+- A frame's action is its control. Its state is the previous frame's action. Its chunk is its own action and those of
+  the following frames (LeRobot's delta indices range(chunk)), padded at the end with the last one and masked.
+- A picture that is missing or damaged costs only its own sample: that frame's time and action are known, so its
+  neighbours keep their state and chunk. A frame without an action, or a hole in time, ends the chunks before it, and
+  the frame after it is no sample, because its state would be invented. Only an episode's first frame starts neutral.
+- If nobody drove, the pulses are those of a human whose car did something else, because it was held. Such frames are
+  samples with that driver, but no chunk and no state reaches from them to frames at which somebody drove, or back.
+- A drive that failed is as good a recording as any other: its outcome is noted, and nothing is left out because of it.
 """
 
 import csv
@@ -63,19 +62,19 @@ from rover_lib.workshop.samples import ACTION_NAMES, Episode, Fault, Recordings,
 from rover_lib.workshop.untrusted import listed, shown
 
 DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
-HOLE_INTERVALS = 2.5  # one dropped frame is bridged, two in a row are a hole in time
-HOLE_S = 0.5  # and so is this, whatever is usual: no camera of a moving car is that slow
+HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
+HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 Item = TypeVar("Item")
-DISAGREES = 1e-3  # recorded action against the one computed from its pulse; the recordings hold 5e-5
+DISAGREES = 1e-3  # largest difference of an action from what its pulse says; recorded actions are within 5e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Three parts that share no episode, or, where `note` says so, no moment in time.
+    """Three parts that share no episode, or, if `note` says so, no moment in time.
 
-    calibration: for the observers. choosing: picks observers and mixed blocks. held_out: judges; nothing
-    else may look at it. episodes: part -> episode ids.
+    calibration: for the observers. choosing: to pick observers and mixed blocks. held_out: to judge the result; it must
+    be used for nothing else. episodes: the ids of each part's episodes.
     """
 
     calibration: tuple[Sample, ...]
@@ -87,7 +86,7 @@ class Split:
 
 @dataclass
 class _Faults:
-    """Counts faults by file and kind, and keeps the first one's words."""
+    """Counts faults by file and kind, and keeps the note of the first."""
 
     root: Path
     counted: dict[tuple[str, str], list] = field(default_factory=dict)
@@ -103,9 +102,7 @@ class _Faults:
 
 @dataclass(frozen=True)
 class _Control:
-    """One reading. arduino_s is NaN where that clock was no number; an action is None where nothing was
-    measured.
-    """
+    """One reading. arduino_s is NaN if that clock was no number; an action is None if nothing was measured."""
 
     system_s: float
     arduino_s: float
@@ -127,11 +124,11 @@ def load_recordings(
     sync_s: float = 0.05,
     progress: Progress = silent,
 ) -> Recordings:
-    """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset, also of the Hub.
+    """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset, also from the Hub.
 
-    chunk: actions per sample. sync_s: how far a control may be from its frame. Faults are counted and skipped;
-    pictures are only checked for their ends here and decoded in `Sample.frame_bgr`. Raises EpisodeError when
-    nothing usable is left, with the most frequent reasons.
+    chunk: actions per sample. sync_s: largest distance in time between a frame and its control. Faults are counted, and
+    what they affect is repaired or skipped. Here only the two ends of each picture are checked; `Sample.frame_bgr`
+    decodes it. Raises EpisodeError if nothing usable is left, with the most frequent reasons.
     """
     source = Source.of(root)
     root = source.path
@@ -150,7 +147,7 @@ def load_recordings(
     root = root if root.name else root.resolve()  # "." has no name to give an episode
     try:
         if any((root / name).exists() for name in DATA_FILES):
-            root, folders = root.parent, [root]  # faults and hashes then still name the episode
+            root, folders = root.parent, [root]  # so that faults and hashes name the episode here too
         else:
             folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and p.is_dir())
     except OSError as e:
@@ -182,7 +179,7 @@ def load_recordings(
 
 
 def _load_episode(folder: Path, chunk: int, sync_s: float, faults: _Faults) -> Episode | None:
-    """One folder's episode, or None with a fault that says why."""
+    """Read one folder's episode. None if it has no usable sample; a fault then says why."""
     try:
         present = any((folder / name).exists() for name in DATA_FILES)
     except OSError as e:
@@ -226,8 +223,9 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: _Faults) -> E
 
 
 def _read_tables(folder: Path, faults: _Faults) -> tuple[tuple[str, str | None], dict[str, tuple[Path, list]]]:
-    """Label and outcome, and for controls and frames the file that they came from and its rows: JSON if it has
-    them, else CSV.
+    """Return (label, outcome), and for controls and frames the file that they came from and its rows.
+
+    The rows are those of the JSON file if it has any, else those of the CSV file.
     """
     content = _read_json(folder / "episode_data.json", faults)
     label = content.get("action_label", "")
@@ -253,8 +251,9 @@ def _read_tables(folder: Path, faults: _Faults) -> tuple[tuple[str, str | None],
 
 
 def _read_bytes(path: Path, faults: _Faults) -> bytes | None:
-    """A data file's bytes; None, counted, if it is absent, empty, unreadable, too large, or a link that leaves its
-    folder.
+    """Return a data file's bytes.
+
+    None, with a fault, if it is absent, empty, unreadable, too large, or a link that leaves its folder.
     """
     try:
         status = path.stat()
@@ -299,7 +298,7 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict
     data = _read_bytes(path, faults)
     if data is None:
         return []
-    # What a cut row lacks is not "no pulse", which is empty.
+    # In a row that was cut, a missing field must not look like an empty one, which means "no pulse".
     table = csv.DictReader(data.decode("utf-8-sig", errors="replace").splitlines(), restval="missing")
     rows: list[dict[str, Any]] = []
     try:
@@ -313,7 +312,7 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict
 
 
 def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults) -> list[_Control]:
-    """Usable readings, ordered by system time."""
+    """Return the usable readings, ordered by system time."""
     controls = []
     for i, row in enumerate(rows):
         if not isinstance(row, dict):
@@ -327,11 +326,11 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
         nan = [name for name, value in values.items() if math.isnan(value)]
         if bad:
             faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {shown(row.get(bad[0]))}")
-            continue  # such a row was not written by the recorder: nothing in it can be trusted
+            continue  # the recorder did not write such a row, so nothing in it can be trusted
         if nan:
             faults.add(path, "not_finite", f"control {i}: {nan[0]} is {shown(row.get(nan[0]))}")
         if "system_timestamp" in nan:
-            continue  # without a time it can be no frame's action
+            continue  # without a time it cannot be the action of a frame
         for name in lost:
             faults.add(path, f"{name}_no_pulse", f"control {i}: not measured; such values are missing, not 0")
         steering, throttle = (
@@ -349,10 +348,10 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
 def _read_action(
     name: str, values: dict[str, float], i: int, path: Path, pwm: PwmCalibration, faults: _Faults
 ) -> float | None:
-    """The recorded action of one channel, or None (counted) where it is no measurement."""
+    """Return one channel's recorded action, or None, with a fault, if it was not measured."""
     action, pulse_us, period_us = (values[f"{name}_{part}"] for part in ("normalized", "raw_us", "period_us"))
     if any(math.isnan(v) for v in (action, pulse_us, period_us)):
-        return None  # counted by the caller, with the field's name
+        return None  # the caller has counted it, with the field's name
     channel = pwm.channel(name)
     expected = channel.action(pulse_us, period_us)
     if expected is None:
@@ -372,10 +371,10 @@ def _read_action(
 def _in_order(
     timed: list[tuple[float, Item]], went_on: list[bool], path: Path, what: str, faults: _Faults
 ) -> list[Item]:
-    """The items by time, stable; the steps back are counted. What follows on a clock that was set back is left out.
+    """Sort the items by time, keeping the order of equal times, and count the steps back in time.
 
-    timed: (time in seconds, item), as they lie in the file. went_on: whether each but the first was made after the one
-    before it, whatever their times say.
+    If the clock was set back, everything from there on is left out. timed: (time in seconds, item), in the file's
+    order. went_on: for each item but the first, whether it was made after the one before it, whatever their times say.
     """
     times_s = [time_s for time_s, _ in timed]
     end = next((i for i in range(2, len(timed)) if went_on[i - 1] and _was_set_back(times_s, i)), len(timed))
@@ -387,7 +386,10 @@ def _in_order(
 
 
 def _was_set_back(times_s: list[float], i: int) -> bool:
-    """Whether the two before `i` are both later than those at and after it: one wrong time alone is no clock's."""
+    """Whether the two times before `i` are both later than those at `i` and `i + 1`.
+
+    A single wrong time does not mean that the clock was set back.
+    """
     return min(times_s[i - 2 : i]) > max(times_s[i : i + 2])
 
 
@@ -399,7 +401,7 @@ def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list
     farthest_s = 0.0
     end = len(controls)
     while end:
-        # one burst and the live control that ends it: late[start..end-2] and not late[end-1]
+        # A burst and the live control that ends it: late[start..end-2] are true, late[end-1] is not.
         start = end - 1
         while start and late[start - 1]:
             start -= 1
@@ -433,7 +435,7 @@ def _inside(path: Path, folder: Path) -> bool:
 
 
 def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[_Frame]:
-    """The listed frames with a time, ordered by it; `usable` says whether there is a whole picture."""
+    """Return the listed frames that have a time, ordered by it. `usable` says whether the picture is whole."""
     frames: list[_Frame] = []
     numbers: set[float] = set()
     for i, row in enumerate(rows):
@@ -470,7 +472,7 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
 
 
 def _check_picture(folder: Path, picture: Path, name: str, path: Path, faults: _Faults) -> bool:
-    """Whether a listed picture is there, within the episode, and whole. Cheap: reads its two ends only."""
+    """Whether a listed picture is there, inside the episode's folder, and whole. Only its two ends are read."""
     try:
         if Path(name).is_absolute() or not _inside(picture, folder):
             faults.add(path, "path_leaves_folder", f"{shown(name)} is outside of the episode")
@@ -492,7 +494,10 @@ def _check_picture(folder: Path, picture: Path, name: str, path: Path, faults: _
 
 
 def _jpeg_problem(head: bytes, tail: bytes) -> str | None:
-    """What is wrong with a JPEG's ends; cv2 gives a picture for a file that was cut short, and only warns."""
+    """Say what is wrong with the two ends of a JPEG, None if nothing is.
+
+    cv2 would only warn of a file that was cut short, and return a picture.
+    """
     if head != b"\xff\xd8":
         return "no JPEG: its start marker is missing"
     if not tail.rstrip(b"\0").endswith(b"\xff\xd9"):
@@ -503,7 +508,9 @@ def _jpeg_problem(head: bytes, tail: bytes) -> str | None:
 def _actions_of(
     frames: list[_Frame], controls: list[_Control], sync_s: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """Each frame's action, (n, 2) float32; whether it has one, (n,); whether any control is near, (n,); who drove."""
+    """Return for each frame its action, (n, 2) float32, whether it has one, (n,), whether any control is near, (n,),
+    and who drove.
+    """
     times_s = np.array([f.time_s for f in frames])
     actions = np.zeros((len(frames), len(ACTION_NAMES)), np.float32)
     known = np.ones(len(frames), bool)
@@ -518,7 +525,7 @@ def _actions_of(
 
 
 def _nearest(times_s: np.ndarray, sorted_s: np.ndarray, within_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """For each time the index of the nearest in `sorted_s`, and whether it is near enough."""
+    """For each time, return whether the nearest of `sorted_s` is within `within_s`, and the index of that one."""
     if not len(sorted_s):
         return np.zeros(len(times_s), bool), np.zeros(len(times_s), int)
     after = np.searchsorted(sorted_s, times_s).clip(1, max(len(sorted_s) - 1, 1)).clip(0, len(sorted_s) - 1)
@@ -579,7 +586,7 @@ def _make_samples(
 
 
 def _segments(known: np.ndarray, holes: set[int]) -> list[list[int]]:
-    """Runs of frames with actions, none of which but the first is in `holes`, as lists of indices."""
+    """Return runs of consecutive frames with actions, as lists of indices. A new run begins at an index in `holes`."""
     runs: list[list[int]] = []
     for i in np.flatnonzero(known).tolist():
         if runs and runs[-1][-1] == i - 1 and i not in holes:
@@ -590,12 +597,12 @@ def _segments(known: np.ndarray, holes: set[int]) -> list[list[int]]:
 
 
 def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -> Split:
-    """Part the samples by whole episodes, at random by `seed`; half of the held-out share chooses, half
-    judges.
+    """Split the samples by whole episodes, drawn at random with `seed`. Half of the held-out share is for choosing, the
+    other half judges.
 
-    With fewer than three episodes, each is parted along its time instead (calibration first), with a gap of
-    one chunk between the parts, so that no action is in two of them; `note` says so. Raises EpisodeError for
-    a share outside (0, 1) or recordings too short to be parted.
+    With fewer than three episodes, each is split along its time instead, calibration first, with a gap of one chunk
+    between the parts, so that no action is in two of them; `note` says so. Raises EpisodeError for a share outside
+    (0, 1), and for recordings too short to be split.
     """
     if not 0 < held_out_share < 1:
         raise EpisodeError("held_out_share must be between 0 and 1", found=held_out_share)
@@ -626,7 +633,7 @@ def _split_by_time(episodes: tuple[Episode, ...], held_out_share: float) -> Spli
         gap = len(samples[0].chunk)
         left = len(samples) - 2 * gap
         if left < 3:
-            continue  # too short to give anything away between the parts
+            continue  # too short to leave a gap of one chunk between the parts
         held = min(max(round(left * held_out_share), 2), left - 1)
         first, second = left - held, held // 2
         parts["calibration"] += samples[:first]
@@ -648,13 +655,12 @@ def _split_by_time(episodes: tuple[Episode, ...], held_out_share: float) -> Spli
 def choose_calibration(
     samples: tuple[Sample, ...], count: int = 200, seed: int = 0
 ) -> tuple[tuple[Sample, ...], str | None]:
-    """At most `count` samples that cover the recorded actions, in the order given; the same ones for the
-    same seed.
+    """Choose at most `count` samples that cover the recorded actions, in the given order; the same for the same seed.
 
-    Half are farthest points of (state, actions along the chunk), each action divided by its own spread: an
-    observer must see the extremes, and throttle's are a tenth of steering's. The other half is drawn at
-    random from the rest: it must also see what is usual. The note says when there were fewer than asked.
-    Raises EpisodeError for no samples or a count below 1.
+    One half is chosen by farthest points over (state, four actions along the chunk), each action divided by its own
+    spread, because an observer must see the extremes, and throttle's are a tenth of steering's. The other half is drawn
+    at random from the rest, because an observer must also see what is usual. The second value returned is a note if
+    there were fewer than asked for, else None. Raises EpisodeError for no samples or a count below 1.
     """
     if not samples or count < 1:
         raise EpisodeError(

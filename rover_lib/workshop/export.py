@@ -1,4 +1,4 @@
-"""The artifact: one file with the graph, its manifest and its parity vectors, which is all that a rover needs.
+"""Write the artifact: one file with the graph, its manifest and its parity vectors, which is all that a rover needs.
 
 export(quantized, checkpoint, "policy_static.pt", samples, calibration)
 export(quantized, checkpoint, "policy_static.onnx.zip", samples, calibration)    # the same, for ONNX Runtime
@@ -29,16 +29,19 @@ from rover_lib.workshop.samples import ACTION_NAMES, Sample, car_of
 
 
 class Form(Protocol):
-    """A policy as one engine takes it. inputs: of each sample (state, frames...), as `inputs_of` gives them."""
+    """A policy in the form that one engine runs."""
 
     engine: str
     versions: dict[str, str]
 
     def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
-        """(n, C, A) float32: actions of n inputs, not clipped."""
+        """Return the actions for n inputs, (n, C, A) float32, not clipped.
+
+        inputs: (state, frames...) of each sample, as `inputs_of` gives them.
+        """
 
     def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
-        """Write the artifact; returns its content hash."""
+        """Write the artifact, and return its content hash."""
 
 
 class TorchScript:
@@ -47,7 +50,7 @@ class TorchScript:
     engine = TORCH
 
     def __init__(self, module: nn.Module, config: ActConfig):
-        self.versions: dict[str, str] = {}  # torch's is in every manifest
+        self.versions: dict[str, str] = {}  # empty, because torch's version is in every manifest anyway
         with warnings.catch_warnings(), torch.inference_mode():
             warnings.simplefilter("ignore")
             self.traced = torch.jit.freeze(torch.jit.trace(module, example_inputs(config), check_trace=False).eval())
@@ -66,7 +69,7 @@ class Onnx:
     engine = ONNXRUNTIME
 
     def __init__(self, module: nn.Module, config: ActConfig):
-        # here, because only who wants this form needs its packages
+        # Imported here, because only this form needs these packages.
         import onnx
         import onnxruntime
 
@@ -89,12 +92,12 @@ class Onnx:
 
 @dataclass(frozen=True)
 class Parity:
-    """What an artifact must answer when it is loaded elsewhere, and how far its answers may differ.
+    """How far an artifact's answers may differ when it is loaded elsewhere, and how many questions it is asked.
 
-    tolerance: of FP32, in action units, or of the largest planned where that is above 1. int8_errors: INT8 may differ
-    by at least `tolerance`, and by this many times its own largest error against FP32, because flipped roundings are of
-    the size of quantization itself; steering and throttle by no more than `artifact.largest_tolerance`. vectors: how
-    many samples are stored in the artifact.
+    tolerance: how far FP32 may differ, in action units; relative to the largest planned action if that is above 1.
+    int8_errors: INT8 may differ by this many times its own largest error against FP32 if that is more than `tolerance`,
+    because a flipped rounding is as large as the quantization error itself. Steering and throttle may never differ by
+    more than `artifact.largest_tolerance`. vectors: how many samples are stored in the artifact.
     """
 
     tolerance: float = 1e-4
@@ -103,10 +106,10 @@ class Parity:
 
 
 class Exporter:
-    """Writes artifacts of one checkpoint; what FP32 answers to the samples is asked once for all of them.
+    """Writes artifacts of one checkpoint. FP32's answers to the samples are computed once for all artifacts.
 
-    samples: recorded observations, of which `parity.vectors`, evenly chosen, become the parity vectors; INT8's largest
-    error is that over all of them. Raises QuantizeError without samples.
+    samples: recorded observations. `parity.vectors` of them, evenly spaced, become the parity vectors; INT8's largest
+    error is taken over all of them. Raises QuantizeError without samples, and for samples of several cars.
     """
 
     def __init__(self, checkpoint: Checkpoint, samples: Sequence[Sample], parity: Parity | None = None):
@@ -130,28 +133,28 @@ class Exporter:
         return sum(multiply_accumulates(self.float_policy).values()) / 1e9
 
     def export(self, policy: ACT | QuantizedPolicy, path: Path | str, calibration: Calibration | None = None) -> str:
-        """Write the artifact, for ONNX Runtime if the path ends in ONNX_SUFFIX; return its content hash.
+        """Write the artifact, for ONNX Runtime if the path ends in ONNX_SUFFIX, and return its content hash.
 
-        calibration: of a quantized policy, for the manifest. Raises QuantizeError if what was written does not give
-        what the policy gave, or anything that is not finite.
+        calibration: a quantized policy's, for the manifest. Raises QuantizeError, and writes nothing, if the engine's
+        form of the policy does not compute what the policy computes, or gives anything that is not finite.
         """
         checkpoint, config = self.checkpoint, self.checkpoint.config
         module: nn.Module = policy.module if isinstance(policy, QuantizedPolicy) else policy
         form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(module, config)
-        # A slow engine's eager form is not asked more than tells whether the writing went well.
+        # The eager policy can be slow, so it answers only the stored samples: enough to see that the form is right.
         expected = predictions(module, [self.inputs[i] for i in self.stored])
         actions = form.predict(self.inputs)
         if not torch.isfinite(actions).all():
             raise QuantizeError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
-        # By the policy's own error: by what was written, the limit would grow with what went wrong in writing.
+        # The limit follows from the policy's own error. Taken from the form, it would grow with the form's mistakes.
         limits = self._tolerance(policy, expected, self.stored)
         gaps = (actions[self.stored] - expected).abs().amax((0, 1)).tolist()
         for (name, most), gap in zip(limits.items(), gaps, strict=True):
-            if not gap <= most:  # NaN is not within
+            if not gap <= most:  # written so that NaN fails
                 raise QuantizeError(
                     f"{path}: {name} of the written graph differs from the policy's by {gap:.3g}; nothing was written"
                 )
-        # What INT8 loses is for the gates to judge; a rover takes no tolerance that would let another plan pass.
+        # The gates judge what INT8 loses. A rover refuses a tolerance so large that another plan would pass.
         allowed = {
             name: min(most, artifact.largest_tolerance(_mode(policy), name))
             for name, most in self._tolerance(policy, actions, np.arange(len(actions))).items()
@@ -178,9 +181,9 @@ class Exporter:
         return form.save(path, manifest, vectors)
 
     def _tolerance(self, policy: ACT | QuantizedPolicy, actions: Tensor, rows: np.ndarray) -> dict[str, float]:
-        """How far another computation of a policy's actions may be off, by action, in its units.
+        """Return for each action, in its units, how far another computation of it may be off.
 
-        actions: (n, C, A), of the policy; rows: of the samples that they answer, (n,).
+        actions: (n, C, A), what the policy computes. rows: (n,), the indices of the samples that it computed them for.
         """
         # Float rounds in proportion: an arm's degrees are a hundred times a car's shares.
         sizes = actions.abs().amax((0, 1)).clamp(min=1).tolist()
@@ -199,7 +202,7 @@ def export(
     calibration: Calibration | None = None,
     parity: Parity | None = None,
 ) -> str:
-    """Write one artifact as `Exporter.export` does; returns its content hash."""
+    """Write one artifact as `Exporter.export` does, and return its content hash."""
     return Exporter(checkpoint, samples, parity).export(policy, path, calibration)
 
 
@@ -210,7 +213,7 @@ def _mode(policy: ACT | QuantizedPolicy) -> str:
 def _manifest(
     policy: ACT | QuantizedPolicy, checkpoint: Checkpoint, calibration: Calibration | None, form: Form
 ) -> dict[str, Any]:
-    """What the artifact says of itself, apart from what only its graph can tell."""
+    """Return the part of the manifest that follows from the policy, its checkpoint and the form."""
     config = checkpoint.config
     scheme = policy.scheme if isinstance(policy, QuantizedPolicy) else None
     mode = _mode(policy)
@@ -242,13 +245,13 @@ def _manifest(
 
 
 def _in_blocks(frame: Tensor, size: int = 4) -> Tensor:
-    """The frame in squares of one colour: as good a question, and a twentieth of the bytes in the artifact."""
+    """Return the frame in squares of one colour: it tests as much, in a twentieth of the artifact's bytes."""
     height, width, _ = frame.shape
     return frame[::size, ::size].repeat_interleave(size, 0).repeat_interleave(size, 1)[:height, :width].contiguous()
 
 
 def _weights_mb(module: nn.Module) -> float:
-    """Weights and biases alone: INT8 weights at a byte, the rest at four."""
+    """Return the size of weights and biases alone, with one byte for an INT8 weight and four for all others."""
     total = sum(p.numel() * 4 for p in module.parameters())
     for m in int8_layers(module).values():
         total += m.weight().numel() + (m.bias().numel() * 4 if m.bias() is not None else 0)

@@ -1,17 +1,18 @@
-"""Our recordings as a LeRobotDataset v3, for `lerobot-train` and LeRobot's own tools.
+"""Export our recordings as a LeRobotDataset v3, for `lerobot-train` and LeRobot's own tools.
 
     report = export_dataset("episodes", "my_dataset")
 
 A row of that format is a picture, the state before it and the action at it, at a fixed rate; an episode has no holes.
-So what our reader repairs (readings that came in a burst, single lost pulses) is repaired in it, and where a frame must
-be left out (a picture that is not whole, a hole in time, no measured pulse), the episode ends and another begins. Each
-is counted in the report, which stays in the dataset's folder. Read again, it gives the samples of the recordings.
+What our reader repairs (readings that came in a burst, single lost pulses) is therefore repaired in the dataset. Where
+a frame must be left out (a damaged picture, a hole in time, no measured pulse), the episode ends and another begins.
+The report counts each of these, and stays in the dataset's folder. Read back, the dataset gives the samples of the
+recordings.
 
-Where a policy drove in one of the recordings, each frame says whether a human had taken over from it: `intervention`,
-as `lerobot-rollout` writes it when it collects corrections. A demonstration is no intervention. Frames at which nobody
-drove are left out, as a hole is: the car did something else than the pulses beside its picture say, and who trains on
-a LeRobotDataset trains on all of it. Where every recording was labelled, the last frame of each episode says how its
-drive came out, by LeRobot's `next.success`, `next.reward` and `next.done`.
+If a policy drove in one of the recordings, each frame says in `intervention` whether a human had taken over from it, as
+`lerobot-rollout` writes it when it collects corrections. A demonstration is no intervention. Frames at which nobody
+drove are left out like a hole: the car did not do what the pulses beside its picture say, and whoever trains on a
+LeRobotDataset trains on all of it. If every recording was labelled, the last frame of each episode says how its drive
+ended, in LeRobot's `next.success`, `next.reward` and `next.done`.
 """
 
 import json
@@ -54,10 +55,10 @@ from rover_lib.workshop.samples import (
     is_another_rate,
 )
 
-NAME = "cam_front"  # of the camera, as in the trainer's policies
+NAME = "cam_front"  # the camera's name, as in the trainer's policies
 REWARD, DONE = "next.reward", "next.done"
-SIDES_PX = 16, 8192  # of a picture, as an artifact takes them
-SHORTEST = 2  # rows of an episode: of one there is no spread to normalise by
+SIDES_PX = 16, 8192  # smallest and largest side of a picture that an artifact takes
+SHORTEST = 2  # rows in the shortest episode: a single row has no spread to normalise by
 
 
 def export_dataset(
@@ -70,10 +71,13 @@ def export_dataset(
 ) -> dict[str, Any]:
     """Write all usable samples below `episodes` to `out`, a new folder, and return what was written and left out.
 
-    video: AV1, LeRobot's usual, far smaller and not equal to the last bit; else PNG in parquet, which is. size:
-    (height, width) of the pictures, resized as a rover resizes what its camera gives; None: as recorded. The folder
-    appears when it is whole. Raises EpisodeError for recordings that cannot be used, of several cars or rates or,
-    without a size, of several picture sizes, and for a folder that is there; RoverError while another process makes it.
+    video: True writes AV1, LeRobot's default, which is far smaller but loses detail; False writes PNG inside parquet,
+    which loses nothing. size: (height, width) to which the pictures are resized, as a rover resizes what its camera
+    gives; None keeps the recorded size. The folder appears only when it is complete.
+
+    Raises EpisodeError for recordings that cannot be used, that are of several cars or rates or, without `size`, have
+    several picture sizes, for a size that no artifact takes, and if `out` exists; RoverError while another process
+    makes `out`.
     """
     out = Path(out)
     if out.exists() or out.is_symlink():
@@ -96,7 +100,7 @@ def export_dataset(
 
 
 def _rate_hz(recordings: Recordings) -> int:
-    """Frames a second, by the usual time between two; a rate belongs to a whole dataset."""
+    """Return the frames per second of all episodes. Raises EpisodeError if they differ: a dataset has only one rate."""
     rates = {e.id: found for e in recordings.episodes if (found := frame_rate_hz(e.samples)) is not None}
     if not rates:
         raise EpisodeError(f"{recordings.root}: no episode of two frames", remedy="record longer ones")
@@ -112,9 +116,9 @@ def _rate_hz(recordings: Recordings) -> int:
 
 
 def _runs(samples: tuple[Sample, ...]) -> Iterator[list[Sample]]:
-    """Samples whose frames follow each other without one left out, and whose chunks know of each other.
+    """Yield runs of samples at which somebody drove, with no frame left out between two of them.
 
-    Of frames at which somebody drove.
+    A run also ends where a sample's chunk does not reach into the next frame.
     """
     driven = [sample for sample in samples if sample.driver != NOBODY]
     if not driven:
@@ -137,20 +141,20 @@ def _write(
     size: tuple[int, int] | None,
     progress: Progress,
 ) -> dict[str, Any]:
-    os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder tells its settings otherwise, once an episode
-    # here, because it takes seconds that nothing else of the command line need wait for
+    os.environ.setdefault("SVT_LOG", "1")  # without it the AV1 encoder prints its settings at every episode
+    # Imported here, because it takes seconds that no other command should wait for.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.datasets.utils import SuppressProgressBars
 
     recorded = recordings.samples[0].frame_bgr().shape
     shape = (*size, 3) if size else recorded
     numbers = {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)}
-    said = _Said.of(recordings)
+    extra = _ExtraColumns.of(recordings)
     picture = {"dtype": "video" if video else "image", "shape": shape, "names": ["height", "width", "channels"]}
     dataset = LeRobotDataset.create(
         repo_id=f"local/{root.name}",
         fps=rate_hz,
-        features={f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers, **said.features},
+        features={f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers, **extra.features},
         root=root,
         robot_type="rover",
         use_videos=video,
@@ -163,7 +167,7 @@ def _write(
     with SuppressProgressBars(), warnings.catch_warnings():
         warnings.filterwarnings(
             "ignore", "Converting input from bool"
-        )  # numpy's, of LeRobot's statistics of yes and no
+        )  # numpy warns when LeRobot computes statistics of yes and no
         for episode in progress(recordings.episodes, desc="exporting", total=len(recordings.episodes)):
             for run in _runs(episode.samples):
                 for rows, unread in _readable(run, size, recorded):
@@ -178,7 +182,7 @@ def _write(
                                 STATE: sample.state,
                                 ACTION: sample.chunk[0],
                                 "task": episode.label or "drive",
-                                **said.of_frame(episode, sample, last=sample is rows[-1][0]),
+                                **extra.of_frame(episode, sample, last=sample is rows[-1][0]),
                             }
                         )
                     dataset.save_episode()
@@ -208,19 +212,22 @@ def _write(
 
 
 @dataclass(frozen=True)
-class _Said:
-    """Which columns more there are. intervention: a policy drove; outcome: each recording was labelled."""
+class _ExtraColumns:
+    """Which extra columns the dataset has.
+
+    intervention: there because a policy drove in some recording. outcome: there because every recording was labelled.
+    """
 
     intervention: bool
     outcome: bool
 
     @classmethod
-    def of(cls, recordings: Recordings) -> "_Said":
+    def of(cls, recordings: Recordings) -> "_ExtraColumns":
         return cls(any(e.by_policy for e in recordings.episodes), all(e.outcome for e in recordings.episodes))
 
     @property
     def features(self) -> dict[str, Any]:
-        """The features that a dataset has of this, as LeRobot's own commands make them."""
+        """Return the features that declare these columns, as LeRobot's own commands declare them."""
 
         def one(dtype: str) -> dict[str, Any]:
             return {"dtype": dtype, "shape": (1,), "names": None}
@@ -229,7 +236,7 @@ class _Said:
         return features | ({REWARD: one("float32"), DONE: one("bool"), SUCCESS: one("bool")} if self.outcome else {})
 
     def of_frame(self, episode: Episode, sample: Sample, last: bool) -> dict[str, Any]:
-        """What a frame has of them. last: whether it is the last of its episode in the dataset."""
+        """Return one frame's values of these columns. last: whether its episode in the dataset ends with it."""
         row: dict[str, Any] = {}
         if self.intervention:
             row[INTERVENTION] = np.array([sample.driver == HUMAN and episode.by_policy])
@@ -242,7 +249,10 @@ class _Said:
 def _readable(
     run: list[Sample], size: tuple[int, int] | None, recorded: tuple[int, ...]
 ) -> Iterator[tuple[list[tuple[Sample, np.ndarray]], int]]:
-    """The run in parts between pictures that cannot be decoded, with RGB frames; and how many those were."""
+    """Yield the parts of a run between pictures that cannot be decoded, each as samples with their RGB frames.
+
+    The number beside each part is 1 if such a picture ends it, and 0 for the last.
+    """
     rows: list[tuple[Sample, np.ndarray]] = []
     for sample in run:
         try:

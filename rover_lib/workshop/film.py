@@ -1,6 +1,6 @@
-"""A drive as a film: its pictures with all that is known of each moment drawn in. `rover log FILE --video out.mp4`.
+"""Make a film of a drive, its pictures with all that is known of each moment: `rover log FILE --video out.mp4`.
 
-An .mp4 is encoded by PyAV; a .webp, small enough for a page, by Pillow.
+PyAV encodes an .mp4; Pillow encodes a .webp, which is small enough for a page.
 """
 
 import functools
@@ -23,7 +23,7 @@ from rover_lib.workshop.replay import AHEAD, Replay
 
 WIDTH = 640
 PANEL = 118  # rows below the picture
-FULL_THROTTLE = 0.25  # of the bar
+FULL_THROTTLE = 0.25  # the throttle that fills the bar
 WHO = {"M": "the human drives", "A": "the policy drives", "S": "stopped", "": ""}
 GREEN_BGR = (113, 204, 46)
 INK, FAINT, BAR, FILL, PIN = (232, 232, 232), (154, 164, 173), (42, 47, 52), (59, 143, 212), (255, 255, 255)
@@ -51,7 +51,7 @@ def write_film(
     if path.suffix not in KINDS:
         raise FilmError(f"{path}: a film ends in {' or '.join(KINDS)}", found=path.suffix or "no ending")
     with atomic_path(path) as temporary:
-        # The encoders tell the kind by the name, and the temporary one has another.
+        # The encoders are told the kind, because they would tell it by the name, and the temporary file has another.
         encode = _write_mp4 if path.suffix == ".mp4" else functools.partial(_write_webp, quality=quality)
         count = encode(temporary, _pictures(replay, rate_hz, width, progress), rate_hz)
         if not count:
@@ -60,11 +60,14 @@ def write_film(
 
 
 def _pictures(replay: Replay, rate_hz: float, width: int, progress: Progress) -> Iterator[np.ndarray]:
-    """One for each time of the film, (h, w, 3) uint8 RGB with even sides, all of one size."""
+    """Yield a picture for each time step of the film, (h, w, 3) uint8 RGB with even sides, all of one size.
+
+    A step whose picture is damaged is left out.
+    """
     times_s = np.array([m.t_s for m in replay.moments])
     shape = CarShape.of(replay.car)
     size: tuple[int, int] | None = None
-    for at_s in progress(np.arange(0.0, times_s[-1] + 1e-9, 1 / rate_hz), "drawing"):
+    for at_s in progress(np.arange(0.0, times_s[-1] + 1e-9, 1 / rate_hz), desc="drawing"):
         moment = replay.moments[int(np.searchsorted(times_s, at_s + 1e-9, side="right")) - 1]
         frame = moment.frame_bgr()
         if frame is None:
@@ -101,9 +104,9 @@ def _write_webp(path: Path, pictures: Iterator[np.ndarray], rate_hz: float, qual
 
 
 def drawn(head: dict[str, Any], frame_bgr: np.ndarray, shape: CarShape, pwm: PwmCalibration) -> np.ndarray:
-    """A moment's picture, (h, WIDTH, 3) uint8 RGB: the planned path is drawn into it, and the commands are below it.
+    """Return a moment's picture, (h, WIDTH, 3) uint8 RGB, with the planned path drawn into it and the commands below.
 
-    head: of a Moment. frame_bgr: (h, w, 3) uint8. shape, pwm: of the car that was driven.
+    head: a Moment's. frame_bgr: (h, w, 3) uint8. shape, pwm: of the car that was driven.
     """
     height = round(WIDTH * frame_bgr.shape[0] / frame_bgr.shape[1] / 2) * 2
     picture = cv2.resize(frame_bgr, (WIDTH, height), interpolation=cv2.INTER_AREA)
@@ -158,7 +161,10 @@ def _draw_panel(draw: ImageDraw.ImageDraw, head: dict[str, Any], top: int, pwm: 
 
 
 def _draw_bar(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], name: str, value: Any, pin: Any) -> None:
-    """Commanded as a bar, the pin as a line. Steering goes from the middle, positive to the left."""
+    """Draw what was commanded as a bar, and what the pin did as a line.
+
+    Steering starts in the middle of the bar, and positive steering goes to the left.
+    """
     left, top, right, bottom = box
 
     def column(action: float) -> float:

@@ -1,16 +1,16 @@
-"""A policy that goes on learning: from what it was trained on, and from what a human did where it drove wrong.
+"""Let a policy go on learning, from what it was trained on and from what a human did where it drove wrong.
 
     folder = finetune("best_model.pth", ["episodes", "corrected"], "better")
 
-It learns what humans did, and nothing else. A human's frames of an episode in which a policy drove too are corrections:
-they show what to do in places to which only that policy goes, and are drawn more often. What a policy or nobody drove
-is not imitated, and a plan ends where its human let go. Nor is the second before a takeover: the human's answer there
-is to what the policy had done by then, so a plan that began earlier would have to make the same mistake first. The
-published practice is the same: HG-DAgger learns from the human's states alone, Sirius gives the moments before an
-intervention no weight.
+The policy learns what humans did, and nothing else. If a policy drove in an episode too, the human's frames in it are
+corrections: they show what to do in places that only that policy reaches, so they are drawn more often. Frames that a
+policy or nobody drove are not imitated, and a plan ends where its human let go. The second before a takeover is not
+imitated either: the human answers what the policy has done by then, so a plan that begins earlier would have to make
+the same mistake first. Published methods do the same: HG-DAgger learns from the human's states alone, and Sirius gives
+no weight to the moments before an intervention.
 
-It learns in phases, as a student does (see `distill`): the transformer on what its backbone sees, then all together at
-a fiftieth of the rate. The run's folder gets best_model.pth, pretrained_model/ and finetune.json.
+It learns in phases, as a student does (see `distill`): first the transformer on what its backbone sees, then everything
+together at a fiftieth of the rate. The run's folder gets best_model.pth, pretrained_model/ and finetune.json.
 
 Letters: n samples, B batch, C chunk, A actions.
 """
@@ -62,23 +62,23 @@ from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 from rover_lib.workshop.untrusted import numbers
 
 OLD, NEW = "old", "new"
-TOGETHER_SLOWER = 50  # times the first phase's rate: a backbone that sees is not to be unlearned
-FADED = (0.1, 1.0)  # shares of new recordings' steering that stay in their states
+TOGETHER_SLOWER = 50  # the second phase's rate is this much smaller, so that the backbone does not unlearn to see
+FADED = (0.1, 1.0)  # the state of a new recording keeps a share of its steering, drawn from this range
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonstrations", "corrections")
 
 
 @dataclass(frozen=True)
 class FinetuneRecipe:
-    """How a policy learns on: params.yml's section `finetune`.
+    """How a policy goes on learning: the section `finetune` of params.yml.
 
-    samples: frames at most of each folder's demonstrations, and of its corrections. rate: of the first phase; the
-    second has a fiftieth. correction_weight: a correction's frame is drawn as often as that many of a demonstration.
-    focus: of new frames those are drawn more often on which the policy planned something else than the human did, by
-    this power of how far off it was; 0: all alike.
-    to_parent: of an old demonstration's loss, the share that is distance to what the policy planned there before it
-    learned on; the rest is distance to what was recorded, as all of it is elsewhere.
-    held_out_share: of the new episodes, to judge by; the old ones are parted as for everything else. judged_frames: of
-    one held-out episode at most. seed: of all that is drawn.
+    samples: at most this many frames of each folder's demonstrations, and as many of its corrections. rate: learning
+    rate of the first phase; the second has a fiftieth of it. correction_weight: a frame of a correction is drawn this
+    many times as often as one of a demonstration. focus: new frames on which the policy planned something else than the
+    human did are drawn more often, in proportion to this power of how far off it was; with 0 all are drawn alike.
+    to_parent: the share of an old demonstration's loss that is the distance to what the policy planned there before;
+    the rest, and all of the loss elsewhere, is the distance to what was recorded. held_out_share: the share of new
+    episodes that judge; the old ones are split as for everything else. judged_frames: at most this many of each
+    held-out episode. seed: of everything that is drawn at random.
     """
 
     samples: int
@@ -106,12 +106,12 @@ class FinetuneRecipe:
 
     @classmethod
     def of(cls, params: dict[str, Any], **given: Any) -> "FinetuneRecipe":
-        """That of params.yml, with what is not None in its place. Raises FinetuneError."""
+        """Take the recipe of params.yml, with each given value that is not None instead. Raises FinetuneError."""
         values = params["finetune"] | {name: value for name, value in given.items() if value is not None}
         return numbers(cls, values, "params.yml: finetune", FinetuneError)
 
     def of_steps(self, steps: int) -> "FinetuneRecipe":
-        """The same with that many steps in all, at least one in each phase."""
+        """Return the same recipe with this many steps in all, shared between the phases, at least one in each."""
         planned = self.transformer_steps + self.together_steps
         transformer = max(1, round(steps * self.transformer_steps / max(planned, 1)))
         return replace(self, transformer_steps=transformer, together_steps=max(1, steps - transformer))
@@ -127,15 +127,15 @@ def finetune(
     device: str | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Let a checkpoint learn on, from old and new recordings. Returns the run's folder.
+    """Let a checkpoint go on learning from old and new recordings, and return the run's folder.
 
-    episodes: folders of recordings. The first has the old ones, which the checkpoint was trained on, the others the
-    new ones; an episode in which a policy drove is new wherever it is. recipe: params.yml's if None. device: 'cpu',
-    'cuda' or None for the best there is.
-    Ended at any moment and started again with the same arguments, it goes on and gives the same policy; the folder
-    appears when all is there.
-    Raises FinetuneError for a name, a device or recordings that cannot be; CheckpointError, EpisodeError,
-    TrainingError; RoverError while another process makes a run of that name.
+    episodes: folders of recordings. The first has the old ones, which the checkpoint was trained on; the others have
+    the new ones. An episode in which a policy drove is new in whichever folder it is. recipe: None takes that of
+    params.yml. device: 'cpu', 'cuda', or None for the best that there is.
+
+    If it is ended at any moment and started again with the same arguments, it goes on and gives the same policy. The
+    folder appears only when it is complete. Raises FinetuneError for a name, a device or recordings that cannot be
+    used; CheckpointError, EpisodeError, TrainingError; RoverError while another process makes a run of that name.
     """
     folder, where = run_folder(runs_dir, name, FinetuneError), training_device(device, FinetuneError)
     if folder.exists():
@@ -147,13 +147,13 @@ def finetune(
         made_beside(folder) as new,
         threads(1 if gmac(parent.config) < SMALL_GMAC else torch.get_num_threads()),
     ):
-        if folder.exists():  # by another process, just now
+        if folder.exists():  # another process has just made it
             raise _is_there(folder)
         taught = _taught(work)
         _leave(new, name, work, taught)
-        if folder.exists():  # by another command meanwhile; what was learned is kept for another name
+        if folder.exists():  # another command made it meanwhile; what was learned is kept for another name
             raise _is_there(folder)
-    shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
+    shutil.rmtree(taught.folder, ignore_errors=True)  # a process that learns the same may have removed it already
     return folder
 
 
@@ -165,15 +165,16 @@ def _is_there(folder: Path) -> FinetuneError:
 
 
 def human_samples(episode: Episode) -> tuple[Sample, ...]:
-    """An episode's samples that a human drove; their chunks are padded from where that human no longer drove.
+    """Return an episode's samples that a human drove. Their chunks are padded from where that human stopped driving.
 
-    A frame of which nobody knows who drove it, because its picture is damaged, ends a chunk too, where others drove.
+    If somebody else drove in the episode too, a frame without a sample, such as one whose picture is damaged, also ends
+    a chunk, because nobody knows who drove there.
     """
     drivers = {s.row: s.driver for s in episode.samples}
     if set(drivers.values()) == {HUMAN}:
         return episode.samples
     first, last = min(drivers), max(drivers)
-    lasts = np.zeros(last - first + 2, int)  # of how many frames on, from each one, a human drives
+    lasts = np.zeros(last - first + 2, int)  # for how many frames from each one on a human drives
     for i in range(last - first, -1, -1):
         lasts[i] = lasts[i + 1] + 1 if drivers.get(first + i) == HUMAN else 0
     return tuple(
@@ -185,7 +186,7 @@ def human_samples(episode: Episode) -> tuple[Sample, ...]:
 
 @dataclass(frozen=True, eq=False)
 class _HeldOut:
-    """An episode that judges. kind: OLD or NEW. samples: a human's."""
+    """An episode that judges. kind: OLD or NEW. samples: those that a human drove."""
 
     name: str
     kind: str
@@ -194,10 +195,11 @@ class _HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class _Material:
-    """What is learned from, and what judges.
+    """What the policy learns from, and what judges it.
 
-    taught: (kind, a human's frames) of each of the recordings, thinned; the kinds are DEMONSTRATIONS, ADDITIONS, new
-    ones of those, and CORRECTIONS. held_out: episodes. left_out: frames that nobody shall imitate.
+    taught: (kind, a human's frames) of each of the recordings, thinned. The kinds are DEMONSTRATIONS (old), ADDITIONS
+    (new demonstrations) and CORRECTIONS. held_out: the episodes that judge. left_out: how many frames are not imitated,
+    because a policy or nobody drove.
     """
 
     recordings: tuple[Recordings, ...]
@@ -206,11 +208,11 @@ class _Material:
     left_out: int
 
     def count(self, kind: str) -> int:
-        """Frames of that kind."""
+        """Count the frames of this kind."""
         return sum(len(samples) for each, samples in self.taught if each == kind)
 
     def action_range(self) -> dict[str, tuple[float, float]]:
-        """Smallest and largest value of each action in all recordings."""
+        """Return the smallest and largest value of each action in all recordings."""
         ranges = [r.action_range() for r in self.recordings]
         return {name: (min(r[name][0] for r in ranges), max(r[name][1] for r in ranges)) for name in ranges[0]}
 
@@ -218,7 +220,7 @@ class _Material:
 def _opened(
     checkpoint: Path | str, episodes: Sequence[Path | str | Source], recipe: FinetuneRecipe, progress: Progress
 ) -> tuple[Checkpoint, _Material]:
-    """The checkpoint and what it learns from, in proof that they belong together."""
+    """Read the checkpoint and the recordings, and check that they belong together."""
     if str(checkpoint).endswith((".pt", ".onnx.zip")):
         raise FinetuneError(
             f"{checkpoint}: is an artifact, whose weights are for driving and not for training",
@@ -248,7 +250,7 @@ def _opened(
 
 
 def _parted(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Material:
-    """Old and new episodes, and of each what is learned from and what judges."""
+    """Split the old and the new episodes into those to learn from and those that judge."""
     p = params()["calibration"]
     old = [e for e in read[0].episodes if not e.by_policy]
     new = [(r, e) for r in read for e in r.episodes if r is not read[0] or e.by_policy]
@@ -277,10 +279,9 @@ def _parted(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Material:
     held_out += [_HeldOut(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (driven[i] for i in judges)]
     for recordings in read:
         own = [e for i, (r, e) in enumerate(driven) if r is recordings and i not in judges]
-        for kind in (ADDITIONS, CORRECTIONS):
-            taught.append(
-                (kind, tuple(s for e in own if e.by_policy == (kind == CORRECTIONS) for s in human_samples(e)))
-            )
+        demonstrated, corrected = [e for e in own if not e.by_policy], [e for e in own if e.by_policy]
+        for kind, of_kind in ((ADDITIONS, demonstrated), (CORRECTIONS, corrected)):
+            taught.append((kind, tuple(s for e in of_kind for s in human_samples(e))))
     every = [*old, *(e for _, e in new)]
     left_out = sum(s.driver != HUMAN for e in every for s in e.samples)
     return _Material(
@@ -292,7 +293,7 @@ def _parted(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Material:
 
 
 def _driven_by_humans(samples: Sequence[Sample], episodes: Sequence[Episode]) -> tuple[Sample, ...]:
-    """Those of the samples that a human drove, as `human_samples` has them."""
+    """Return those of the samples that a human drove, with chunks as `human_samples` pads them."""
     wanted = {(s.episode, s.row) for s in samples}
     names = {s.episode for s in samples}
     return tuple(s for e in episodes if e.id in names for s in human_samples(e) if (s.episode, s.row) in wanted)
@@ -320,7 +321,7 @@ def _refuse_another_car(read: Sequence[Recordings]) -> None:
 
 
 def _refuse_another_camera(read: Sequence[Recordings]) -> None:
-    """Of each set of recordings the first picture: a camera's shape is its recordings' whole."""
+    """Compare the first picture of each set of recordings, because all pictures of a set have one shape."""
     shapes = [r.episodes[0].samples[0].frame_bgr().shape[:2] for r in read]
     height, width = shapes[0]
     for recordings, (own_height, own_width) in zip(read, shapes, strict=True):
@@ -347,7 +348,7 @@ def _refuse_another_rate(read: Sequence[Recordings], plans_hz: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """What is to be done."""
+    """Everything that a training needs."""
 
     parent: Checkpoint
     material: _Material
@@ -356,14 +357,16 @@ class _Work:
     progress: Progress
 
     def rng(self, phase: str) -> np.random.Generator:
-        """Random numbers of a phase, the same in every process."""
+        """Return a phase's source of random numbers, the same in every process."""
         return np.random.default_rng([self.recipe.seed, zlib.crc32(phase.encode())])
 
 
 @dataclass(frozen=True, eq=False)
 class _Taught:
-    """A policy that has learned. weights: by LeRobot's names without the leading `model.`, the VAE's as they were.
-    folder: where its phases are saved.
+    """A policy that has learned.
+
+    weights: by LeRobot's names without the leading `model.`; the VAE's are unchanged. losses: by phase. folder: where
+    the phases are saved.
     """
 
     weights: dict[str, Tensor]
@@ -372,7 +375,7 @@ class _Taught:
 
 
 def _taught(work: _Work) -> _Taught:
-    """Both phases. What the policy sees of each of the recordings stays in the cache, for the next time it learns."""
+    """Train both phases. What the policy sees in each of the recordings stays in the cache, for its next training."""
     sources = [lessons_module, training, preprocess, act]
     recipe, material = work.recipe, work.material
     every = []
@@ -395,7 +398,7 @@ def _taught(work: _Work) -> _Taught:
 
 
 def _refuse_strangers(work: _Work, lessons: Lessons) -> None:
-    """Raise FinetuneError if the policy knows nothing of the old recordings: then it is another car's, or camera's."""
+    """Raise FinetuneError if the policy knows nothing of the old recordings, so that it is of another car or camera."""
     if found := lessons.stranger(judged_ranges(work.material.action_range()), work.parent.config.action_names):
         raise FinetuneError(
             f"{work.parent.path}: on the old recordings its plans are worse than one action for all frames",
@@ -405,7 +408,7 @@ def _refuse_strangers(work: _Work, lessons: Lessons) -> None:
 
 
 def _sees(work: _Work, kind: str, samples: Sequence[Sample]) -> dict[str, Any]:
-    """What lessons depend on."""
+    """Return everything that the lessons depend on, as the key of their cache."""
     return {
         "parent": work.parent.identity,
         "pictures": [(s.episode, s.frame_name, s.row, s.frame_path.stat().st_size) for s in samples],
@@ -419,7 +422,7 @@ def _sees(work: _Work, kind: str, samples: Sequence[Sample]) -> dict[str, Any]:
 
 
 def _asked(work: _Work, kind: str, samples: tuple[Sample, ...], folder: Path) -> Lessons:
-    """What the policy sees of these samples before it learns."""
+    """Make or complete the lessons: what the policy sees and plans on these samples before it learns."""
     config = work.parent.config
     channels = work.parent.weights["encoder_img_feat_input_proj.weight"].shape[1]
     with Resumable(folder, work.progress) as saved:
@@ -429,7 +432,7 @@ def _asked(work: _Work, kind: str, samples: tuple[Sample, ...], folder: Path) ->
 
 
 class _Room:
-    """Where a policy learns: batches of all lessons, and the loss."""
+    """Draws batches from all lessons, and computes the loss."""
 
     def __init__(self, work: _Work, lessons: Sequence[tuple[str, Lessons]]):
         self.work, self.lessons = work, lessons
@@ -441,7 +444,7 @@ class _Room:
         self.rows = np.concatenate([np.arange(count) for count in counts])
 
     def _weights(self, kind: str, lessons: Lessons) -> np.ndarray:
-        """(n,): how often each sample is drawn."""
+        """Return how often each sample is drawn, relative to a demonstration's 1, (n,)."""
         recipe = self.work.recipe
         if kind == DEMONSTRATIONS:
             return np.ones(len(lessons))
@@ -451,7 +454,7 @@ class _Room:
         return (recipe.correction_weight if kind == CORRECTIONS else 1.0) * off / max(off.mean(), 1e-9) + 1e-6
 
     def batch(self, rng: np.random.Generator) -> "_Batch":
-        """The next samples, each from its lessons, and their views."""
+        """Draw the next samples, each with one of its views."""
         count = len(self.rows)
         chosen = rng.choice(count, min(self.work.recipe.batch, count), replace=False, p=self.shares)
         views = rng.integers(2, size=len(chosen))
@@ -463,7 +466,7 @@ class _Room:
         return _Batch(parts, rng, self.work.device)
 
     def loss(self, plans: Tensor, batch: "_Batch") -> Tensor:
-        """plans: (B, C, A). Mean absolute error, in units of the recorded range."""
+        """Return the mean absolute error, in units of the recorded range. plans: (B, C, A)."""
         share, driven = batch.to_parent(self.work.recipe.to_parent), batch.driven()
         to_parent = ((plans - batch.planned()).abs() * self.units * share).sum()
         to_recorded = ((plans - batch.recorded()).abs() * self.units * driven * (1 - share)).sum()
@@ -473,7 +476,7 @@ class _Room:
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """parts: of each kind its lessons, rows (b,) and views (b,)."""
+    """The samples of one step. parts: (kind, lessons, rows (b,), views (b,)) for each Lessons with any of them."""
 
     parts: list[tuple[str, Lessons, np.ndarray, np.ndarray]]
     rng: np.random.Generator
@@ -483,20 +486,21 @@ class _Batch:
         return torch.from_numpy(np.concatenate(each)).to(self.device)
 
     def features(self) -> Tensor:
-        """(B, D, h, w): the frozen backbone's."""
+        """The feature maps that the backbone gave before it learned, (B, D, h, w)."""
         return self._together([lessons.maps[2 * rows + views] for _, lessons, rows, views in self.parts]).float()
 
     def pictures(self) -> Tensor:
-        """(B, height, width, 3) uint8 RGB, in another light."""
+        """The pictures in another light, (B, height, width, 3) uint8 RGB."""
         frames = np.concatenate([lessons.pictures(rows, views) for _, lessons, rows, views in self.parts])
         return torch.from_numpy(in_another_light(frames, self.rng)).to(self.device)
 
     def states(self) -> Tensor:
-        """(B, 2). Of old demonstrations half are another frame's, as in training, so that they do not give the action
-        away.
+        """The states, (B, 2).
 
-        What is new keeps its side, and a share of its size: where nothing is in sight to steer to, only the state says
-        to which side it was, and a human steers more than the policy does that comes there later.
+        Half of the old demonstrations have another frame's state, as in training, so that it does not give the action
+        away. New recordings keep the side of their steering and a random share of its size: if nothing to steer to is
+        in sight, only the state says on which side it was, and the human in the recording steers more than the policy
+        will when it comes there.
         """
         each = []
         for kind, lessons, rows, views in self.parts:
@@ -509,25 +513,29 @@ class _Batch:
         return self._together(each)
 
     def to_parent(self, share: float) -> Tensor:
-        """(B, 1, 1): that share for an old demonstration, 0 for what is new."""
+        """The given share for old demonstrations, 0 for new recordings, (B, 1, 1)."""
         each = [np.full(len(rows), share if kind == DEMONSTRATIONS else 0.0) for kind, _, rows, _ in self.parts]
         return self._together(each).float()[:, None, None]
 
     def planned(self) -> Tensor:
-        """(B, C, A), by the policy before it learned."""
+        """What the policy planned before it learned, (B, C, A)."""
         return self._together([lessons.plans[2 * rows + views] for _, lessons, rows, views in self.parts])
 
     def recorded(self) -> Tensor:
-        """(B, C, A), by the human."""
+        """What the human did, (B, C, A)."""
         return self._together([lessons.recorded(rows, views) for _, lessons, rows, views in self.parts])
 
     def driven(self) -> Tensor:
-        """(B, C, 1), true where the human drove."""
+        """Whether the human drove, (B, C, 1)."""
         return self._together([~lessons.data.is_pad[rows] for _, lessons, rows, _ in self.parts])[..., None]
 
 
 def _train(room: _Room, policy: BatchedPolicy, saved: Resumable, phase: str) -> None:
-    """'transformer': all but the backbone, on what that sees. 'together': all, slowly, in any light."""
+    """Train one phase.
+
+    'transformer' trains all but the backbone, on the backbone's stored feature maps. 'together' trains everything,
+    slowly, with pictures in another light.
+    """
     recipe = room.work.recipe
     whole = phase == "together"
     module = policy if whole else policy.model
@@ -548,7 +556,7 @@ def _train(room: _Room, policy: BatchedPolicy, saved: Resumable, phase: str) -> 
 
 
 def _judged(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
-    """Each held-out episode, before and after."""
+    """Judge each held-out episode with the policy as it was before and after."""
     action_range = work.material.action_range()
     policies = [BatchedPolicy(work.parent.config, each).to(work.device) for each in (work.parent.weights, weights)]
     judged = []
@@ -567,7 +575,7 @@ def _judged(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
 
 
 def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
-    """Judge the policy, and write its files and finetune.json into a folder that will be the run's of that name."""
+    """Judge the policy, and write its files and finetune.json into `new`, which becomes the run's folder."""
     parent, material, recipe = work.parent, work.material, work.recipe
     judged = _judged(work, taught.weights)
     errors = [e for each in judged if each.kind == OLD for e in each.after.values() if e is not None]

@@ -1,4 +1,4 @@
-"""The figure of a flight log: what was commanded, what the pins did, how old the plans were, how late the loop was.
+"""Draw a flight log: what was commanded, what the pins did, how old the plans were, how late the loop was.
 
 flight_figure(read_log("flight.log")).savefig("flight.log.png")
 """
@@ -24,13 +24,13 @@ STATES = {
     "": ("not known", "#F2F2F2"),
 }
 EVENTS_LISTED = 14
-LABEL_SHARE = 0.05  # of the width: events that are closer share one label
+LABEL_SHARE = 0.05  # events that are closer than this share of the width have one label together
 TEXT_LENGTH = 105
 DIGIT_SPACE = "\u2007"  # as wide as a digit
 
 
 def flight_figure(flight: Flight) -> Figure:
-    """Draw one drive, all panels over the same seconds."""
+    """Draw one drive, with all panels over the same seconds."""
     ticks, summary = flight.ticks, flight.summary()
     listed = list(enumerate(flight.events, 1))[-EVENTS_LISTED:]  # the last ones say why it ended
     rows = ("who", "steering", "throttle", "plan", "late", "temperature")
@@ -42,7 +42,7 @@ def flight_figure(flight: Flight) -> Figure:
     t_s, calibration = ticks["t_s"], flight.car.pwm
     times_s = [t_s, flight.machine["t_s"], np.array([e.t_s for e in flight.events])]
     end_s = max((float(t.max()) for t in times_s if len(t)), default=1.0) or 1.0
-    start_s = float(t_s[0]) if len(t_s) else 0.0  # what was made ready before is listed, not drawn
+    start_s = float(t_s[0]) if len(t_s) else 0.0  # events before the first tick are listed, not drawn
     start_s = max(0.0, start_s - 0.02 * (end_s - start_s))
 
     _who(panel["who"], ticks, (flight.period_ms or 0) / 1000)
@@ -50,7 +50,7 @@ def flight_figure(flight: Flight) -> Figure:
     _pulses(panel["throttle"], calibration.throttle, ticks, COLOURS["throttle"])
     if (ticks["fade"] < 1).any():
         ax = panel["throttle"]
-        # Hanging from the top: the share of the height is the share of the throttle that is taken away.
+        # The area hangs from the top: its share of the height is the share of the throttle that is taken away.
         options = {"step": "post", "transform": ax.get_xaxis_transform(), "color": RED, "alpha": 0.18, "lw": 0}
         ax.fill_between(t_s, ticks["fade"], 1, label="faded for the plan's age", **options)
     _plan(panel["plan"], ticks, flight.header.get("drive", {}))
@@ -80,14 +80,14 @@ def _title(flight: Flight, summary: Mapping[str, Any]) -> str:
 
 
 def _legend_above(ax: Axes) -> None:
-    """Over the axes, where no line can run through it."""
+    """Put the legend above the axes, where no line can run through it."""
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="lower left", bbox_to_anchor=(0, 0.98), ncols=4, frameon=False, fontsize=9, borderaxespad=0,
                   columnspacing=1.5, handlelength=1.6)  # fmt: skip
 
 
 def _who(ax: Axes, ticks: Mapping[str, np.ndarray], period_s: float) -> None:
-    """Who drove, as bands."""
+    """Draw who drove, as coloured bands."""
     state, t_s = ticks["state"], ticks["t_s"]
     starts = np.flatnonzero(np.r_[True, state[1:] != state[:-1]]) if len(state) else np.array([], int)
     for i, at in enumerate(starts):
@@ -102,7 +102,7 @@ def _who(ax: Axes, ticks: Mapping[str, np.ndarray], period_s: float) -> None:
 
 
 def _pulses(ax: Axes, channel: Channel, ticks: Mapping[str, np.ndarray], colour: str) -> None:
-    """One channel's pulses, commanded and on the pin; the action on the right is the same line on another scale."""
+    """Draw one channel's pulses, commanded and on the pin. The axis on the right shows the same lines as actions."""
     t_s, commanded, pins = ticks["t_s"], ticks[f"{channel.name}_us"], ticks[f"pins_{channel.name}_us"]
     ax.plot(t_s, commanded, color=colour, lw=2.2, alpha=0.7, label="commanded", drawstyle="steps-post")
     ax.plot(t_s, pins, color=BLACK, lw=0.9, label="the Arduino's pin", drawstyle="steps-post")
@@ -164,7 +164,7 @@ def _temperature(ax: Axes, machine: Mapping[str, Any], summary: Mapping[str, Any
 
 
 def _event_numbers(ax: Axes, events: Sequence[tuple[int, Event]], seconds: float) -> None:
-    """The events' numbers over their lines; neighbours share one label."""
+    """Write the events' numbers above their lines. Events that are close together share one label."""
     groups: list[list[tuple[int, Event]]] = []
     for number, event in events:
         if groups and event.t_s - groups[-1][0][1].t_s < LABEL_SHARE * seconds:

@@ -58,7 +58,7 @@ class Benchmarks:
 
 
 def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
-    """All benchmark-<host>.json of a run's folder, and of the folder where Ansible puts those of the rovers.
+    """Read all benchmark-<host>.json of a run's folder, and of the folder where Ansible puts those of the rovers.
 
     A rover is named as in the inventory; the name is part of the file's name. If two benchmarks have the same name, the
     fetched one is used. A file that cannot be used is left out and reported in `unusable`.
@@ -81,10 +81,10 @@ def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
 
 
 def benchmark_of(run_dir: Path | str, made: Mapping[str, Mapping[str, Any]]) -> Path | None:
-    """The benchmark of a run's own artifacts, this machine's before another's; None if there is none.
+    """Return the benchmark of a run's own artifacts, preferably of this machine; None if there is none.
 
-    made: quantize.json's modes. A run that is made again keeps the benchmarks of other hosts, which are of what it was
-    before. Raises RoverError for a damaged file.
+    made: quantize.json's modes. A run that is made again keeps the benchmarks of other hosts, which measured its
+    earlier artifacts. Raises RoverError for a damaged file.
     """
     paths = sorted(Path(run_dir).glob("benchmark-*.json"))
     for path in sorted(paths, key=lambda p: p.stem != f"benchmark-{socket.gethostname()}"):
@@ -126,7 +126,7 @@ def _mode(name: str) -> str:
 
 
 def _named(content: Mapping[str, Any], ours: Mapping[str, str]) -> dict[str, Any]:
-    """A benchmark with its artifacts named by mode. On a rover the file in use is always called policy.pt.
+    """Return a benchmark with its artifacts named by mode. On a rover the file in use is always called policy.pt.
 
     ours: {sha256: mode} of the run's artifacts.
     """

@@ -17,22 +17,22 @@ FILES = {"model": ("*.json", "*.safetensors"), "dataset": ("meta/*", "data/*", "
 
 
 def is_hub_id(path: Path | str) -> bool:
-    """Whether it has the form user/name@revision, and no such file or folder is on this machine."""
+    """Whether `path` has the form user/name@revision, and is not a file or folder on this machine."""
     return bool(ID.fullmatch(str(path))) and not Path(path).exists()
 
 
 def absolute(path: Path | str) -> str:
-    """A path that stays valid in another working folder. An id of the Hub is returned as it is."""
+    """Return a path that stays valid in another working folder. An id of the Hub is returned as it is."""
     return str(path) if is_hub_id(path) else str(Path(path).resolve())
 
 
 def fetched(hub_id: Path | str, kind: str, error: type[RoverError], files: Sequence[str] | None = None) -> Path:
-    """The folder that holds these files; they are fetched if they are not in the cache yet.
+    """Fetch files of the Hub unless they are in the cache, and return the folder that holds them.
 
-    kind: "model" or "dataset". files: patterns; None: all that we read of such a repository. Raises `error`, in one
-    sentence, if there is no network, if the Hub does not have it, or if its owner restricts access.
+    kind: "model" or "dataset". files: patterns; None takes all that we read of such a repository. Raises `error`, in
+    one sentence, if there is no network, if the Hub does not have it, or if its owner restricts access.
     """
-    # here, because importing it takes a second, which a local path does not need
+    # Imported here, because it takes a second, and a local path does not need it.
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RevisionNotFoundError
 

@@ -1,4 +1,4 @@
-"""The folder that `lerobot-train` leaves: config.json, model.safetensors, and how each feature is normalised."""
+"""Read the folder that `lerobot-train` leaves: config.json, model.safetensors, and how each feature is normalised."""
 
 import json
 import stat
@@ -28,16 +28,17 @@ from rover_lib.workshop.checkpoint_contents import (
 from rover_lib.workshop.samples import camera_names
 from rover_lib.workshop.untrusted import listed, shown
 
-RATE_HZ = 30.0  # of a plan's steps, where nothing says it: the trainer's recordings
+RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
 
 # Bounds, each far above what a policy of full size has, and low enough to be read in a second.
 JSON_BYTES = 1_000_000  # LeRobot's config.json: 3 kB
-HEADER_BYTES = 1_000_000  # of model.safetensors: 100 bytes for each of some 300 tensors
+HEADER_BYTES = 1_000_000  # the header of model.safetensors needs 100 bytes for each of some 300 tensors
 STATISTICS_BYTES = 16_000_000  # LeRobot's: a few kB
 
-# What LeRobot calls its files. By a processor's: where its statistics lay before 0.4, and the step that normalises.
+# What LeRobot calls its files. STEPS: for each processor's file, how the names of its statistics began among the
+# weights before LeRobot 0.4, and the name of the step that normalises.
 PRETRAINED = "pretrained_model"
-ORIGIN = "origin.json"  # which we leave in a folder of that format: its config.json refuses what it does not know
+ORIGIN = "origin.json"  # our own notes in such a folder, because LeRobot refuses a config.json with unknown keys
 ADAPTER = "adapter_config.json"
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 STEPS = {
@@ -48,9 +49,9 @@ BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 
 
 def lerobot_folder(path: Path) -> Path | None:
-    """The folder with a policy's config that `path` is or holds, as `lerobot-train` arranges them; None without one.
+    """Find the folder with a policy's config: `path` itself, or one inside, as `lerobot-train` arranges them.
 
-    Raises CheckpointError for an output folder that has steps but none that is said to be the last.
+    None if there is none. Raises CheckpointError for an output folder that has checkpoints, but no link to the last.
     """
     for inner in ("", PRETRAINED, f"last/{PRETRAINED}", f"checkpoints/last/{PRETRAINED}"):
         if any((path / inner / name).exists() for name in ("config.json", ADAPTER)):
@@ -66,7 +67,7 @@ def lerobot_folder(path: Path) -> Path | None:
 
 
 def _act_config(folder: Path) -> dict[str, Any]:
-    """config.json of a whole ACT policy. Raises CheckpointError for an adapter and for other policies."""
+    """Read the config.json of a whole ACT policy. Raises CheckpointError for an adapter and for other policies."""
     raw = {} if (folder / ADAPTER).exists() else _read_json(folder / "config.json")
     if not raw or raw.get("use_peft"):
         raise CheckpointError(
@@ -85,7 +86,7 @@ def _act_config(folder: Path) -> dict[str, Any]:
 
 
 def _picture_sizes(folder: Path, inputs: Mapping[str, tuple[str, list[int]]]) -> dict[str, tuple[int, int]]:
-    """(height, width) by camera. Raises CheckpointError for inputs that no camera car has."""
+    """Return (height, width) by camera. Raises CheckpointError for inputs that a car with cameras does not have."""
     sizes: dict[str, tuple[int, int]] = {}
     for name, (kind, shape) in inputs.items():
         if kind == "VISUAL":
@@ -109,7 +110,10 @@ def _picture_sizes(folder: Path, inputs: Mapping[str, tuple[str, list[int]]]) ->
 
 
 def read_lerobot(folder: Path) -> Contents:
-    """Raises CheckpointError for what is missing or damaged, and for policies that this project cannot run."""
+    """Read a LeRobot folder.
+
+    Raises CheckpointError for missing or damaged files, and for policies that this project cannot run.
+    """
     raw = _act_config(folder)
     file = folder / "model.safetensors"
     _refuse_shards(folder, file)
@@ -173,12 +177,12 @@ def read_lerobot(folder: Path) -> Contents:
 
 
 def read_origin(folder: Path) -> dict[str, Any]:
-    """What we noted in a folder of LeRobot's format that we wrote, {} in another's. Raises CheckpointError."""
+    """Return what we noted in a folder of LeRobot's format that we wrote; {} for any other. Raises CheckpointError."""
     return _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}
 
 
 def _own_rate_hz(folder: Path) -> float:
-    """Steps of a plan in a second: what we noted in a folder that we wrote, else the usual."""
+    """Return the steps of a plan in a second: what we noted in a folder that we wrote, else RATE_HZ."""
     rate_hz = read_origin(folder).get("rate_hz", RATE_HZ)
     if isinstance(rate_hz, bool) or not isinstance(rate_hz, (int, float)) or not 0 < rate_hz <= 1000:
         raise CheckpointError(
@@ -188,7 +192,7 @@ def _own_rate_hz(folder: Path) -> float:
 
 
 def _features(folder: Path, raw: Mapping[str, Any], key: str) -> dict[str, tuple[str, list[int]]]:
-    """Type and shape of each of the config's features, by name."""
+    """Return the type and shape of each of the config's features, by name."""
     features = raw.get(key) or {}
     if not isinstance(features, dict):
         raise CheckpointError(
@@ -224,20 +228,20 @@ def _refuse_shards(folder: Path, file: Path) -> None:
 
 
 class Normaliser:
-    """What LeRobot does to each feature, in or out, as an Affine.
+    """Says how LeRobot normalises each input, or each output, as an Affine.
 
-    A processor file says it; before LeRobot 0.4 the config and buffers beside the weights did. A feature whose mode is
-    not IDENTITY and that has no statistics is refused: LeRobot 0.4 then normalised nothing, without a word, and what a
-    policy gives in standard deviations would have become a servo's pulse.
+    A processor file has it; before LeRobot 0.4 the config and buffers beside the weights had it. A feature that has no
+    statistics and whose mode is not IDENTITY is refused: LeRobot 0.4 silently leaves it as it is, and an output in
+    standard deviations would become a servo's pulse.
 
-    asked: the config's normalization_mapping. buffers: the weights' names that begin with BUFFERS.
+    asked: the config's normalization_mapping. buffers: the tensors of the weights' file whose names begin with BUFFERS.
     """
 
     def __init__(self, folder: Path, file: str, asked: Any, buffers: Mapping[str, Tensor]):
         self.where = folder / file
         self.modes, self.eps = asked, 1e-8
         self.stats: dict[str, Tensor] = {}
-        self.features: list[str] | None = None  # those that the processor's step names; the others it leaves alone
+        self.features: list[str] | None = None  # those that the processor's step names; it leaves all others alone
         prefix, step_name = STEPS[file]
         self.old = not self.where.exists()
         if self.old:
@@ -286,7 +290,7 @@ class Normaliser:
             raise CheckpointError(f"{self.where}: normalises {count} times", remedy="train with one such step")
 
     def _steps(self) -> list[dict[str, Any]]:
-        """The processor's steps, each with a name and a config."""
+        """Return the processor's steps, each with a name and a config."""
         steps = _read_json(self.where).get("steps", [])
         named = isinstance(steps, list) and all(
             isinstance(s, dict) and isinstance(s.get("registry_name"), str) and isinstance(s.get("config") or {}, dict)
@@ -307,7 +311,11 @@ class Normaliser:
         return _read_safetensors(folder / name, STATISTICS_BYTES)
 
     def affine(self, key: str, kind: str, size: int, inverse: bool = False) -> Affine | None:
-        """LeRobot's _apply_transform as scale and shift; None where it leaves the feature alone."""
+        """Return LeRobot's _apply_transform as scale and shift; None if it leaves the feature as it is.
+
+        key: the feature's name. kind: its type, for which the config has a mode. size: how many numbers it has.
+        inverse: undo the normalisation, as for an output. Raises CheckpointError for missing or wrong statistics.
+        """
         mode = self.modes.get(kind)
         if mode == "IDENTITY":
             return None
@@ -349,12 +357,12 @@ class Normaliser:
             span = torch.where(a == b, torch.full_like(a, self.eps), b - a)
             if self.old:
                 span = b - a if inverse else b - a + self.eps
-            # LeRobot makes -1 of a feature that never changed, by taking `a` away first. By scale and shift it is that
-            # only while a * scale is a float32 whose unit is far below 1: a larger scale gave anything within 16 of it.
+            # LeRobot subtracts `a` first, so a feature that never changes becomes -1. With scale and shift that is only
+            # so while the last digit of a * scale in float32 is far below 1; a larger scale was off by up to 16.
             most = torch.exp2((21 - a.abs().log2()).floor())
             scale = most.minimum(2 / span)
             scale, shift = (span / 2, a + span / 2) if inverse else (scale, -a * scale - 1)
-        if not (torch.isfinite(scale.float()).all() and torch.isfinite(shift.float()).all()):  # as they are used
+        if not (torch.isfinite(scale.float()).all() and torch.isfinite(shift.float()).all()):  # used as float32
             raise CheckpointError(f"{self.where}: statistics of '{key}' are not finite", remedy="compute them again")
         if (wrong := b < 0 if mode == "MEAN_STD" else b < a).any():
             what = "a negative std" if mode == "MEAN_STD" else f"a {pairs[mode][0]} above its {pairs[mode][1]}"
@@ -366,7 +374,7 @@ class Normaliser:
         return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
 
     def _would_be_raw(self, key: str, kind: str, mode: str | None, stats: Mapping[str, Tensor]) -> CheckpointError:
-        """What to say of a feature that LeRobot would leave as it is without having been told to."""
+        """Return the error for a feature that LeRobot would leave as it is although the config does not say so."""
         remedy = (
             "copy the folder again from where it was trained, with all policy_preprocessor* and policy_postprocessor* "
             "files, or say IDENTITY where it was trained on raw values"
@@ -381,7 +389,7 @@ class Normaliser:
 
 
 def _of_folder(path: Path, most_bytes: int | None = None) -> Path:
-    """The path of a file of a LeRobot folder, once it is known to be one, and not larger than it can sensibly be."""
+    """Return `path` if it is a plain file of at most `most_bytes`, else raise CheckpointError."""
     try:
         status = path.stat()
     except OSError as e:
@@ -401,7 +409,7 @@ def _of_folder(path: Path, most_bytes: int | None = None) -> Path:
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(_of_folder(path, JSON_BYTES).read_bytes())
-    except (ValueError, OSError, RecursionError) as e:  # RecursionError: brackets nested without end
+    except (ValueError, OSError, RecursionError) as e:  # RecursionError comes from brackets nested too deep
         raise CheckpointError(f"{path}: not readable as JSON ({e})", remedy=COPY_AGAIN) from None
     if not isinstance(content, dict):
         raise CheckpointError(f"{path}: expected a JSON object", found=type(content).__name__, remedy=COPY_AGAIN)
@@ -421,5 +429,5 @@ def _read_safetensors(path: Path, most_bytes: int | None = None) -> dict[str, Te
         return load_file(path)
     except CheckpointError:
         raise
-    except Exception as e:  # whatever its Rust or torch says of a header that lies
+    except Exception as e:  # whatever safetensors or torch raise for a wrong header
         raise CheckpointError(f"{path}: not readable as safetensors ({shown(str(e))})", remedy=COPY_AGAIN) from None

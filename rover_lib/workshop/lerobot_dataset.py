@@ -1,4 +1,4 @@
-"""LeRobotDataset v3 as recordings: read by LeRobot's own loader, images or video, and checked before it is used.
+"""Read a LeRobotDataset v3, with images or video, by LeRobot's own loader, and check it before it is used.
 
     recordings = load_dataset(Source(Path("my_dataset"), ("throttle", "steering")), chunk=32)
 
@@ -52,7 +52,7 @@ DRIVEN_BY, OUTCOMES = (
 )  # who drove where nobody intervened; what the drive came to, or null
 CAR = "car"  # and of them all, the content of their car.yml
 COPY_AGAIN = "copy the whole dataset again"
-UNEVEN = 0.1  # of the time between two frames
+UNEVEN = 0.1  # the time between two frames may differ by this share
 
 
 def is_dataset(root: Path) -> bool:
@@ -62,7 +62,7 @@ def is_dataset(root: Path) -> bool:
 
 @dataclass(frozen=True)
 class _Camera:
-    """name: as the policy calls it; key: as the dataset does. size: (height, width)."""
+    """name: what the policy calls the camera. key: what the dataset calls it. size: (height, width)."""
 
     name: str
     key: str
@@ -77,11 +77,11 @@ class _Pictures:
     cameras: tuple[_Camera, ...]
 
     def frames_bgr(self, row: int, path: Path) -> dict[str, np.ndarray]:
-        """By camera's name, (h, w, 3) uint8 BGR each."""
+        """Read one frame's pictures by the cameras' names, (h, w, 3) uint8 BGR each."""
         with _said_of(path, f"its frame {row} cannot be decoded"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of torchvision, about the decoder that LeRobot has chosen
+            warnings.simplefilter("ignore")  # torchvision warns of the decoder that LeRobot has chosen
             item = self.dataset[row]
-            # (3, h, w) float32 in [0, 1] each; uint8 / 255 times 255 is exact
+            # Each is (3, h, w) float32 in [0, 1]. Dividing a uint8 by 255 and multiplying by 255 again is exact.
             pixels = [(item[camera.key] * 255).round().byte().permute(1, 2, 0).numpy() for camera in self.cameras]
         frames = {}
         for camera, frame in zip(self.cameras, pixels, strict=True):
@@ -98,7 +98,7 @@ class _Pictures:
 
 @dataclass(frozen=True, eq=False)
 class LerobotSample(Sample):
-    """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file (of several cameras the first's)."""
+    """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file (that of the first camera)."""
 
     pictures: _Pictures = field(kw_only=True)
 
@@ -107,7 +107,7 @@ class LerobotSample(Sample):
         return f"frame {self.row}"
 
     def frame_bgr(self) -> Any:
-        """The picture, (h, w, 3) uint8 BGR: LeRobot's own item; where there are several cameras, a dict by their names.
+        """Read the picture, (h, w, 3) uint8 BGR, by LeRobot's loader; of several cameras, a dict by their names.
 
         Raises EpisodeError if it cannot be decoded.
         """
@@ -118,11 +118,11 @@ class LerobotSample(Sample):
 def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Recordings:
     """Read a LeRobotDataset v3 folder.
 
-    chunk: actions per sample, padded at an episode's end with its last one. Each frame is a sample, with the state
-    that was recorded with it. In a dataset that marks interventions a human drove in those frames, and a policy in all
-    others, unless our own export says otherwise; where nothing is marked, a human did. Raises EpisodeError, in one
-    sentence, for another version, for what is damaged or missing, for numbers that no rover can mean, and where it is
-    not said which camera and which numbers are the car's.
+    chunk: actions per sample, padded at an episode's end with its last one. Each frame is a sample, with the state that
+    was recorded with it. If the dataset marks interventions, a human drove in the marked frames and a policy in all
+    others, unless our own export says otherwise; if it marks none, a human drove. Raises EpisodeError, in one sentence,
+    for another version, for damaged or missing files, for numbers that no rover can have, and if nothing says which
+    camera and which numbers are the car's.
     """
     root = source.path
     info = _read_info(root)
@@ -143,7 +143,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
         who, outcome = exported.drivers[i], exported.outcomes[i]
         episodes.append(_episode(root, pictures, columns, rows, chunk, exported.car, who, outcome))
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
-    for sample in last.values():  # a file that was cut lacks its end
+    for sample in last.values():  # the last picture of each file, because a file that was cut lacks its end
         sample.frame_bgr()
     return Recordings(root, tuple(episodes), faults, source, layout)
 
@@ -189,7 +189,10 @@ def _exported(root: Path, episodes: int, marked: bool) -> tuple[_Exported, tuple
 
 
 def fetched(source: Source) -> Source:
-    """The same source, with a dataset of the Hub fetched to a local folder. Its version is checked before gigabytes."""
+    """Fetch a dataset of the Hub, and return the same source with its local folder.
+
+    The version is checked first, before gigabytes are fetched.
+    """
     given = source.path, "dataset", EpisodeError
     _read_info(hub.fetched(*given, files=("meta/*",)))
     return replace(source, path=hub.fetched(*given))
@@ -254,12 +257,15 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
 
 
 def _state_names(features: Mapping[str, Any], said: tuple[str, ...]) -> tuple[str, ...]:
-    """The state's own names; the user's names of the actions if it has none, or if the actions had the same names."""
+    """Return the state's own names.
+
+    If it has none, or the same as the dataset gives its actions, return the user's names of the actions.
+    """
     own = _names(features[STATE])
     if own and not (said and own == _names(features[ACTION])):
         return own
     (size,) = features[STATE]["shape"]
-    if said and size != len(said):  # what such numbers are called matters nowhere: they are no actions
+    if said and size != len(said):  # such numbers are not actions, and their names matter nowhere
         return tuple(f"state_{i}" for i in range(size))
     return said
 
@@ -267,7 +273,7 @@ def _state_names(features: Mapping[str, Any], said: tuple[str, ...]) -> tuple[st
 def _named(
     root: Path, features: Mapping[str, Any], key: str, said: tuple[str, ...]
 ) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Names of a feature's numbers, and their columns: a car's as [steering, throttle], others as they lie."""
+    """Return the names of a feature's numbers, and their columns: [steering, throttle] for a car, else as they lie."""
     (size,) = features[key]["shape"]
     names = said or _names(features[key])
     if not names:
@@ -287,12 +293,12 @@ def _named(
 
 
 def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
-    """The names in a feature, in each of the forms in which LeRobot's users write them; none where there are none."""
+    """Return the names in a feature, in any of the forms that LeRobot's users write; () if there are none."""
     names = feature.get("names")
     if isinstance(names, dict) and names and all(type(v) is int for v in names.values()):
         if len(set(names.values())) < len(names):
-            return ()  # two names of one column
-        names = sorted(names, key=names.__getitem__)  # by column
+            return ()  # two names for one column
+        names = sorted(names, key=names.__getitem__)  # in the order of their columns
     elif isinstance(names, dict) and len(names) == 1:
         (names,) = names.values()  # {"motors": [...]}
     if isinstance(names, list) and names and all(isinstance(n, str) for n in names):
@@ -308,11 +314,11 @@ def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int
 
 
 def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> None:
-    """Raise EpisodeError for tables that are not there, and for frames that lack a feature which is read.
+    """Raise EpisodeError for missing tables, and for tables of frames without a column that is read.
 
-    LeRobot's loader fills such a column with nothing: who drove, say, would be nobody's mark instead of a human's.
+    LeRobot's loader would fill such a column with nothing, so that, for example, an intervention would lose its mark.
     """
-    from pyarrow import parquet  # here, because our own recordings need not wait for it
+    from pyarrow import parquet  # imported here, so that our own recordings do not wait for it
 
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
         if not list(root.glob(pattern)):
@@ -326,8 +332,8 @@ def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> No
 
 
 def _opened(root: Path) -> "LeRobotDataset":
-    """LeRobot's own loader on a local folder. It would fetch what is missing there: here that is an error."""
-    # here, because it takes seconds that our own recordings need not wait for
+    """Open a local folder by LeRobot's own loader. The loader would fetch missing files; here they are an error."""
+    # Imported here, because it takes seconds, and our own recordings do not need it.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
 
     class Local(LeRobotDataset):
@@ -337,7 +343,7 @@ def _opened(root: Path) -> "LeRobotDataset":
     given = {"repo_id": f"local/{root.resolve().name}", "root": root, "revision": "local"}
     with _said_of(root, "LeRobot cannot read it"):
         meta = LeRobotDatasetMetadata(**given)
-        if meta.total_episodes > len(meta.episodes):  # LeRobot lists them all before it looks at one
+        if meta.total_episodes > len(meta.episodes):  # LeRobot would list as many as the file claims
             raise EpisodeError(
                 f"{root}: {INFO} says {shown(meta.total_episodes)} episodes",
                 found=f"{len(meta.episodes)} in meta/episodes",
@@ -352,13 +358,13 @@ def _opened(root: Path) -> "LeRobotDataset":
 
 @contextmanager
 def _said_of(path: Path, what: str) -> Iterator[None]:
-    """Turn any error of a loader into an EpisodeError of one sentence."""
+    """Turn any error of a loader inside the block into an EpisodeError of one sentence. what: what went wrong."""
     try:
         yield
     except EpisodeError:
         raise
-    except Exception as e:  # of parquet, mp4, datasets and LeRobot, each with types of its own
-        cause = e.__cause__ or e  # datasets wraps what pyarrow said
+    except Exception as e:  # parquet, mp4, datasets and LeRobot each raise types of their own
+        cause = e.__cause__ or e  # datasets wraps pyarrow's error
         reason = " ".join(str(cause).split())[:160]
         text = f"{type(cause).__name__}: {reason}" if reason else type(cause).__name__
         raise EpisodeError(f"{path}: {what} ({text})", remedy=COPY_AGAIN) from None
@@ -399,15 +405,15 @@ def _check_numbers(root: Path, columns: Mapping[str, np.ndarray], layout: Layout
 
 
 def _is_mark(feature: Any) -> bool:
-    """Whether a feature is one yes or no for each frame."""
+    """Whether a feature has one yes or no for each frame."""
     return bool(feature) and feature["dtype"] == "bool" and list(feature["shape"]) == [1]
 
 
 def _check_rate(root: Path, columns: Mapping[str, np.ndarray], fps: float) -> None:
-    """Raise EpisodeError for frames that do not come `fps` a second: the steps of a plan would not be what they say."""
+    """Raise EpisodeError for frames that do not come `fps` times a second: a plan's steps would last another time."""
     times_s, number = columns["timestamp"].astype(np.float64), columns["episode_index"]
     steps_s = np.diff(times_s)[number[1:] == number[:-1]]
-    if len(odd := steps_s[~(np.abs(steps_s * fps - 1) <= UNEVEN)]):  # so that NaN is odd
+    if len(odd := steps_s[~(np.abs(steps_s * fps - 1) <= UNEVEN)]):  # written so that NaN counts as odd
         raise EpisodeError(
             f"{root}: meta/info.json says {fps:g} frames a second, but {len(odd)} frames come at another rate",
             found=f"{odd[0]:.4f} s after the one before",
@@ -416,14 +422,14 @@ def _check_rate(root: Path, columns: Mapping[str, np.ndarray], fps: float) -> No
 
 
 def _check_episodes(root: Path, dataset: "LeRobotDataset", number: np.ndarray) -> None:
-    """Raise EpisodeError where the table of episodes is not that of the frames, whose episodes are `number`, (n,).
+    """Raise EpisodeError if the table of episodes does not fit the frames. number: (n,), the frames' episode numbers.
 
-    LeRobot takes the row of that number, whatever episode it is of, and finds an episode's pictures by it.
+    LeRobot finds an episode's pictures by the table's row of that number, whichever episode the row is for.
     """
     with _said_of(root, "its table of episodes cannot be read"):
         table = dataset.meta.episodes.select_columns(["episode_index", "length"]).with_format("numpy")[:]
         index, lengths = (np.asarray(table[key]) for key in ("episode_index", "length"))
-        # what the lengths come to is asked first: as many numbers are made of them
+        # Their sum is checked first, because np.repeat makes as many numbers.
         agree = np.array_equal(index, np.arange(len(index))) and lengths.sum() == len(number)
         agree = agree and np.array_equal(number, np.repeat(index, lengths))
     if not agree:

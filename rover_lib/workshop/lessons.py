@@ -1,11 +1,12 @@
-"""What a student learns from: recorded frames, and what its teacher sees and plans on them, on disk.
+"""Keep on disk what a student learns from: recorded frames, and what its teacher sees and plans on them.
 
     lessons = Lessons.open(folder, samples, config, channels, rng)
     lessons.ask(saved, teacher, rng, device)          # or go on where that was interrupted
     frames = lessons.pictures(rows, views)
 
-Every sample is there twice, as it is and mirrored with steering negated, and the teacher is asked both times. Half of
-the states are another sample's, and the teacher is asked with those: a plan is the answer to a picture and a state.
+Every sample is there twice, as it is and mirrored with its steering negated, and the teacher plans on both. Half of the
+states in motion are replaced by another sample's, and the teacher plans with those, because a plan answers a picture
+and a state.
 
 Letters: B batch, C chunk, A actions, D channels of the feature map, h and w of it.
 """
@@ -27,16 +28,16 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import Sample, car_of
 from rover_lib.workshop.training import Frames, Given, Resumable, RowFile, frames_of, swapped_states
 
-BLOCK = 8  # samples that a policy is asked about at once
+BLOCK = 8  # a policy plans on this many samples at once
 VIEWS = PLAIN, MIRRORED = 0, 1
-MIRROR = np.array([-1, 1], np.float32)  # of steering and throttle
-LIGHT, COLOUR = (0.8, 1.25), (0.9, 1.1)  # what pictures are multiplied by: all of one, and each of its colours
-SMALLEST_RANGE = 0.02  # of an action that hardly changes: errors are a share of its range, which must not be nothing
-STRANGER = 2.0  # times the error of one action for all frames: a policy that is worse was not trained for this car
+MIRROR = np.array([-1, 1], np.float32)  # a mirrored view multiplies steering and throttle by this
+LIGHT, COLOUR = (0.8, 1.25), (0.9, 1.1)  # a picture is multiplied by the first as a whole, by the second per colour
+SMALLEST_RANGE = 0.02  # at least, for an action that hardly changes: errors are divided by the range
+STRANGER = 2.0  # a policy with more than this many times the error of one constant action is not of this car
 
 
 class BatchedPolicy(nn.Module):
-    """LeRobot's own policy for many observations at once: raw states in, raw actions out, no dropout, no latent."""
+    """LeRobot's own policy for many observations at once: raw states in, raw actions out, no dropout, latent zero."""
 
     def __init__(self, config: ActConfig, weights: dict[str, Tensor]):
         super().__init__()
@@ -59,7 +60,7 @@ class BatchedPolicy(nn.Module):
             self.register_buffer(f"{name}_shift", torch.tensor(norm.shift), persistent=False)
 
     def thaw(self) -> None:
-        """Make what LeRobot freezes trainable: scale and shift of the batch norms; their statistics stay."""
+        """Make the scale and shift of the batch norms trainable, which LeRobot freezes; the statistics stay frozen."""
         from torchvision.ops.misc import FrozenBatchNorm2d  # importing it takes three seconds
 
         for norm in self.backbone.modules():
@@ -70,21 +71,21 @@ class BatchedPolicy(nn.Module):
                     norm.register_parameter(name, nn.Parameter(value))
 
     def named_weights(self) -> dict[str, Tensor]:
-        """By LeRobot's names without the leading `model.`, as they are trained."""
+        """Return the weights being trained, by LeRobot's names without the leading `model.`."""
         of_model, of_backbone = (m.state_dict(keep_vars=True) for m in (self.model, self.backbone))
         return {**of_model, **{f"backbone.{name}": value for name, value in of_backbone.items()}}
 
     def weights(self) -> dict[str, Tensor]:
-        """The same on the processor, each with its own memory."""
+        """Return a copy of `named_weights` on the CPU, each with its own memory."""
         return {name: value.detach().cpu().clone() for name, value in self.named_weights().items()}
 
     def features(self, frames: Tensor) -> Tensor:
-        """frames: (B, height, width, 3) uint8 RGB -> (B, D, h, w)."""
+        """Return the feature maps, (B, D, h, w), of frames, (B, height, width, 3) uint8 RGB."""
         x = frames.float() / 255 * self.image_scale + self.image_shift
         return self.backbone(x.permute(0, 3, 1, 2))["feature_map"]
 
     def plan(self, features: Tensor, states: Tensor) -> Tensor:
-        """features: from `features`; states: (B, 2) float32 -> (B, C, A) raw actions."""
+        """Return raw actions, (B, C, A), for feature maps as `features` gives them and states, (B, 2) float32."""
         states = states * self.state_scale + self.state_shift
         actions, _ = self.model({"observation.images": [features], "observation.state": states})
         return actions * self.action_scale + self.action_shift
@@ -95,7 +96,7 @@ class BatchedPolicy(nn.Module):
 
 @torch.inference_mode()
 def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progress = silent) -> np.ndarray:
-    """(n, C, A) float32 of what a policy would drive on the samples: clipped to what a pulse can express."""
+    """Return what a policy would drive on the samples, (n, C, A) float32, clipped to what a pulse can express."""
     device, (size,) = policy.image_scale.device, policy.config.image_sizes
     plans = []
     firsts = range(0, len(samples), BLOCK)
@@ -113,25 +114,26 @@ def as_driven(plans: np.ndarray, action_names: Sequence[str], samples: Sequence[
 
 
 def judged_ranges(action_range: Mapping[str, tuple[float, float]]) -> np.ndarray:
-    """(A,) float32: each action's recorded range, in which errors are counted."""
+    """Return each action's recorded range, (A,) float32, at least SMALLEST_RANGE. Errors are divided by it."""
     ends = np.array(list(action_range.values()), np.float32)
     return np.maximum(ends[:, 1] - ends[:, 0], SMALLEST_RANGE)
 
 
 def in_another_light(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """frames: (B, height, width, 3) uint8. The same, each lighter or darker, and tinted."""
+    """Return the frames, (B, height, width, 3) uint8, each made lighter or darker, and tinted."""
     gain = rng.uniform(*LIGHT, (len(frames), 1, 1, 1)) * rng.uniform(*COLOUR, (len(frames), 1, 1, 3))
     return np.minimum(frames * gain.astype(np.float32) + 0.5, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class Lessons:
-    """n samples, each seen in two views. Files have a row per sample, or two: 2 * sample + view.
+    """n samples, each seen in two views.
 
-    data: what was recorded of them. asked: (2 n, 2) float32, the states that the teacher is asked with. frames: rows of
-    (height, width, 3) uint8 RGB at the student's size, one per sample, as they are. maps: two rows of (D, h, w)
-    float16, the teacher's feature map pooled to the student's grid. plans: two rows of (C, A) float32. tokens: two rows
-    of (D, h, w) float16, the student's own map; empty until `see`.
+    A file has a row for each sample, or for each view the row 2 * sample + view. data: the recorded samples. asked:
+    (2 n, 2) float32, the states with which the teacher plans. frames: a row for each sample, (height, width, 3) uint8
+    RGB at the student's size, not mirrored. maps: a row for each view, (D, h, w) float16, the teacher's feature map
+    pooled to the student's grid. plans: a row for each view, (C, A) float32, the teacher's. tokens: a row for each
+    view, (D, h, w) float16, the student's own feature map; empty until `see`.
     """
 
     samples: tuple[Sample, ...]
@@ -146,7 +148,10 @@ class Lessons:
     def open(
         cls, folder: Path, samples: tuple[Sample, ...], config: ActConfig, channels: int, rng: np.random.Generator
     ) -> "Lessons":
-        """folder: of these very arguments alone. config: the student's. channels: D. rng: draws the states."""
+        """Open the lessons in a folder, which must be used with these arguments only.
+
+        config: the student's. channels: D. rng: draws the states.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         (size,) = config.image_sizes
         data = frames_of(samples, *size)
@@ -168,32 +173,35 @@ class Lessons:
         return len(self.data)
 
     def pictures(self, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
-        """(B, height, width, 3) uint8 of these samples, mirrored where views, (B,), says so."""
+        """Return the pictures of these samples, (B, height, width, 3) uint8, mirrored where views, (B,), says so."""
         frames = self.frames[rows]
         return np.where((views == MIRRORED)[:, None, None, None], frames[:, :, ::-1], frames)
 
     @property
     def blocks(self) -> int:
-        """How often a policy is asked about all of them, a few at once."""
+        """The number of blocks of BLOCK samples."""
         return _blocks(len(self))
 
     def each_once(self) -> Iterator[np.ndarray]:
-        """(B, height, width, 3) uint8: every sample's picture, each second one mirrored, a few at once."""
+        """Yield every sample's picture once, each second one mirrored, in blocks of (B, height, width, 3) uint8."""
         for block in range(self.blocks):
             rows = _rows(block, len(self))
             yield self.pictures(rows, rows % len(VIEWS))
 
     def apart(self, folder: Path) -> "Lessons":
-        """The same with tokens of their own, still empty, in a folder: of a student that sees like no other."""
+        """Return the same lessons with tokens of their own, still empty, in a folder.
+
+        A student whose backbone differs from all others needs them.
+        """
         return replace(self, tokens=RowFile(folder / "tokens", self.tokens.shape, np.float16))
 
     def recorded(self, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
-        """(B, C, A) float32, what the driver did next, mirrored where views says so."""
+        """Return what the driver did next, (B, C, A) float32, mirrored where views says so."""
         return self.data.chunks[rows] * np.where((views == MIRRORED)[:, None], MIRROR, 1)[:, None].astype(np.float32)
 
     @torch.inference_mode()
     def ask(self, saved: Resumable, teacher: Checkpoint, rng: np.random.Generator, device: torch.device) -> None:
-        """Ask the teacher about every sample, or about those that are left. Raises EpisodeError for a lost picture."""
+        """Let the teacher see and plan on every sample that is missing. Raises EpisodeError if a picture is lost."""
         policy: BatchedPolicy | None = None
         blocks = saved.steps("teacher", self.blocks, rng, frames=self.frames, maps=self.maps, plans=self.plans)
         for block in blocks:
@@ -209,13 +217,13 @@ class Lessons:
             self.plans.append(policy.plan(seen, states).cpu())
 
     def stranger(self, ranges: np.ndarray, action_names: Sequence[str]) -> str | None:
-        """How far off a teacher's plans are that knows nothing of what was driven, None if it does know.
+        """Say how far off the teacher's plans are if it knows nothing of these drives; None if it does.
 
-        ranges: (A,), as of `judged_ranges`. Such a teacher is another car's, or another camera's.
+        Such a teacher was trained for another car or camera. ranges: (A,), from `judged_ranges`.
         """
         actions, driven = self.data.chunks, ~self.data.is_pad
         constant = (np.abs(actions - np.median(actions[driven], axis=0)) / ranges)[driven].mean(0)
-        as_recorded = (self.asked[::2] == self.data.states).all(1)  # not with another sample's state
+        as_recorded = (self.asked[::2] == self.data.states).all(1)  # planned with the sample's own state
         plans = self.plans[2 * np.arange(len(self))]
         planned = (np.abs(plans - actions) / ranges)[driven & as_recorded[:, None]].mean(0)
         if not (planned > STRANGER * constant).all():
@@ -225,7 +233,7 @@ class Lessons:
 
     @torch.inference_mode()
     def see(self, saved: Resumable, student: BatchedPolicy, rng: np.random.Generator) -> None:
-        """The student's own feature maps, of every sample in both views."""
+        """Compute the student's own feature maps of every sample in both views, as far as they are missing."""
         device = student.image_scale.device
         for block in saved.steps("tokens", self.blocks, rng, tokens=self.tokens):
             frames = torch.from_numpy(self.frames[_rows(block, len(self))]).to(device)

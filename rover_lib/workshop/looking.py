@@ -38,7 +38,7 @@ class Looking:
     apart: np.ndarray
 
     def summary(self) -> dict[str, Any]:
-        """The same by action and unit, for compare.json; the percentages of an action that is not judged are None."""
+        """Return the changes by action and unit, for compare.json. The percentages of an unjudged action are None."""
         summary: dict[str, Any] = {"frames": self.frames}
         for i, action in enumerate(self.report.action_names):
             for name, moved in (("by_picture", self.by_picture), ("by_state", self.by_state), ("apart", self.apart)):
@@ -48,7 +48,7 @@ class Looking:
         return summary
 
     def table(self) -> Table:
-        """The same as a table for people to read."""
+        """Return the changes as a table for people."""
         found, rows = self.summary(), []
         for action in self.report.action_names:
             pct = (shown_pct(found[f"{action}_{name}_pct"]).strip() for name in ("by_picture", "by_state", "apart"))
@@ -56,7 +56,7 @@ class Looking:
         return Table(("a plan moves by", "another picture", "another state", "both"), rows)
 
     def warnings(self) -> list[str]:
-        """A warning to read before anybody drives with this policy, if an action does not follow the camera."""
+        """Return what to know before anybody drives with this policy, if an action does not follow the camera."""
         judged = [(i, a) for i, a in enumerate(self.report.action_names) if self.report.pct(a) is not None]
         if judged and all(self.apart[i] == 0 for i, _ in judged):
             return ["this policy plans the same whatever it is shown"]

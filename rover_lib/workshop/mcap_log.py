@@ -1,10 +1,11 @@
-"""A flight log as MCAP, the file of Foxglove and Rerun: `rover log FILE --mcap out.mcap`.
+"""Write a flight log as MCAP, the file format of Foxglove and Rerun: `rover log FILE --mcap out.mcap`.
 
     counts = write_mcap(Path("out.mcap"), read_log("flight.log"))
 
-Every message is JSON with its schema in the file. Its time is the system's clock at which it happened, by which the
-pictures of the drive's episode are there too, and its controls, which go on after a takeover when the log's ticks do
-not. A picture is Foxglove's CompressedImage, an event its Log.
+Every message is JSON, and its schema is in the file. A message's time is what the system's clock showed when it
+happened. If an episode was recorded with the drive, the file also has its pictures and controls, by the same clock; the
+controls continue after a takeover, when the log's ticks do not. A picture is Foxglove's CompressedImage, an event its
+Log.
 """
 
 import base64
@@ -23,7 +24,7 @@ from rover_lib.workshop.replay import began_s, pictures_of, recorded_with
 
 TICK, EVENT, MACHINE, CONTROL, PICTURE = TOPICS = ("/tick", "/event", "/machine", "/control", "/camera")
 INFO = 2  # a level of foxglove.Log
-MOST_S = 1.8e10  # of a time, which has 64 bits of nanoseconds
+MOST_S = 1.8e10  # the latest time: MCAP counts nanoseconds in 64 bits
 _NUMBER = {"type": ["number", "null"]}
 _TEXT = {"type": ["string", "null"]}
 _TIME = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
@@ -34,7 +35,7 @@ def _object(**properties: Any) -> dict[str, Any]:
 
 
 _TICK_TEXTS = ("state", "reason")
-SCHEMAS = {  # by topic: its name, and what a message is
+SCHEMAS = {  # by topic: the schema's name, and the schema
     TICK: ("rover.Tick", _object(**{name: _TEXT if name in _TICK_TEXTS else _NUMBER for name in Tick._fields})),
     EVENT: (
         "foxglove.Log",
@@ -52,7 +53,7 @@ SCHEMAS = {  # by topic: its name, and what a message is
 
 
 class _Message(NamedTuple):
-    """When, in nanoseconds of the system's clock; on which topic; what, or of a picture its file."""
+    """at_ns: nanoseconds by the system's clock. content: the message, or for a picture its file."""
 
     at_ns: int
     topic: str
@@ -60,13 +61,13 @@ class _Message(NamedTuple):
 
 
 def write_mcap(path: Path, flight: Flight, episode: Path | None = None) -> dict[str, int]:
-    """Writes a drive as MCAP, in order of time; how many messages of each topic.
+    """Write a drive as MCAP, in order of time, and return how many messages each topic has, without the empty ones.
 
-    episode: that was recorded with it; None: the one that the log names, where it is there. A picture that is not whole
-    is left out. Raises LogError for a log whose beginning is not known, EpisodeError for a named episode without a list
-    of pictures.
+    episode: the one that was recorded with the drive; None takes the one that the log names, if it is there. A picture
+    that is damaged is left out. Raises LogError if the log does not say when it began, and EpisodeError if the
+    episode's list of pictures cannot be read.
     """
-    from mcap.writer import Writer  # here, so that only this export needs it
+    from mcap.writer import Writer  # imported here, so that only this export needs it
 
     messages = list(_of_flight(flight))
     if episode is None:
@@ -125,7 +126,7 @@ def _of_episode(episode: Path) -> Iterator[_Message]:
 
 
 def _picture(at_ns: int, file: Path) -> dict[str, Any] | None:
-    """As recorded; None where it is damaged or gone."""
+    """Return the message with a picture, whose JPEG is as recorded; None if it is damaged or gone."""
     try:
         read_jpeg(file)
         data = file.read_bytes()
@@ -135,7 +136,7 @@ def _picture(at_ns: int, file: Path) -> dict[str, Any] | None:
 
 
 def _ns(at_s: float) -> int:
-    return round(at_s * 1e6) * 1000  # a float of today's seconds has no nanoseconds
+    return round(at_s * 1e6) * 1000  # to the microsecond: a float of today's seconds is no more precise
 
 
 def _time(at_ns: int) -> dict[str, int]:

@@ -1,16 +1,16 @@
-"""A policy, or a part of one, as an ONNX graph: FX's graph of it, written node by node.
+"""Write a policy, or a part of one, as an ONNX graph: FX traces it, and each node is written in turn.
 
     model = onnx_model(graph_of(ACT(config, weights)), {"state": state, "frame_front": frame}, ("chunk",))
     model = onnx_model(quantized.module, {"state": state, "frame_front": frame}, ("chunk",))
 
-What `quantize` made comes out as QDQ with the very scales, zero points, INT8 weights and INT32 biases of the static
-artifact, so that another engine computes the same numbers wherever its arithmetic is exact. torch's own exporter was
-the other way: it goes through TorchScript, which torch is retiring, knows nothing of columns of pixels, and rounds
-biases anew. Every module that FX can trace and that consists of what ACT consists of can be written, so a part of a
-policy (for an accelerator, say) is a module of its own given to `graph_of`, with as many inputs and outputs as it has.
+A policy that `quantize` made is written as QDQ with exactly the scales, zero points, INT8 weights and INT32 biases of
+the static artifact, so another engine computes the same numbers wherever its arithmetic is exact. torch's own exporter
+is not used: it goes through TorchScript, which torch is retiring, does not know columns of pixels, and rounds biases
+again. Any module that FX can trace and that is built of ACT's parts can be written. So a part of a policy, for example
+for an accelerator, is a module of its own given to `graph_of`, with any number of inputs and outputs.
 
 The graph has static shapes, one domain and operators of opset 17, which ONNX Runtime and the parsers of accelerators
-know; weights are initializers inside. Same module, same bytes.
+know; weights are initializers inside. The same module always gives the same bytes.
 """
 
 import itertools
@@ -35,7 +35,7 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import Columns
 
 OPSET = 17  # the first with LayerNormalization, the last that Hailo's parser documents
-IR_VERSION = 8  # of that opset
+IR_VERSION = 8  # the version of ONNX's file format that belongs to that opset
 ONNX_TYPES = {torch.float32: TensorProto.FLOAT, torch.uint8: TensorProto.UINT8, torch.int8: TensorProto.INT8}
 
 
@@ -45,16 +45,16 @@ class _Leaves(Tracer):
 
 
 def graph_of(module: nn.Module) -> GraphModule:
-    """FX's graph of a float module of ours. A converted policy's module is one already."""
+    """Trace a float module of ours with FX. The module of a quantized policy is a graph already."""
     return module if isinstance(module, GraphModule) else GraphModule(module, _Leaves().trace(module))
 
 
 def onnx_model(graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequence[str]) -> onnx.ModelProto:
-    """The graph as ONNX, checked by onnx.checker.
+    """Write a graph as an ONNX model, checked by onnx.checker.
 
-    inputs: examples by the names they get, in the order of the graph's arguments; their shapes and dtypes become the
-    model's. outputs: names of what the graph returns, a tensor or a tuple of them. Raises QuantizeError for a part that
-    has no form in ONNX here, naming it.
+    inputs: examples keyed by the names of the model's inputs, in the order of the graph's arguments; the model takes
+    their shapes and dtypes. outputs: names for what the graph returns, a tensor or a tuple of tensors. Raises
+    QuantizeError for a part that this module cannot write, and names it.
     """
     writer = _Writer(graph, inputs, outputs)
     with torch.inference_mode():
@@ -65,20 +65,20 @@ def onnx_model(graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequen
 
 
 class _Writer(Interpreter):
-    """Runs a graph once, for its shapes and quantization parameters, and writes what each node does."""
+    """Runs a graph once, to learn its shapes and quantization parameters, and writes each node as ONNX."""
 
     def __init__(self, graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequence[str]):
         super().__init__(graph)
         self._inputs, self._outputs = dict(inputs), list(outputs)
-        self._names: dict[Node, Any] = {}  # of the ONNX value, or a list of names for several
+        self._names: dict[Node, Any] = {}  # each node's ONNX value, or a list of names for several
         self._nodes: list[onnx.NodeProto] = []
         self._constants: dict[str, onnx.TensorProto] = {}
         self._made: list[Tensor] = []  # what the graph returned
-        self._taken = 0
-        self.calls: Counter[Any] = Counter()  # of each INT8 convolution
+        self._taken = 0  # inputs that have been given to placeholders
+        self.calls: Counter[Any] = Counter()  # how often each INT8 convolution was called
 
     def model(self) -> onnx.ModelProto:
-        """The ONNX model of what has run."""
+        """Return the ONNX model of the graph that has run."""
         used = {name for node in self._nodes for name in node.input}
         graph = helper.make_graph(
             self._nodes,
@@ -141,7 +141,7 @@ class _Writer(Interpreter):
         return self._constant(name, np.array(values, np.int64))
 
     def _value(self, n: Any) -> Tensor:
-        """What a node gave in this run."""
+        """Return the tensor that a node gave in this run."""
         return self.env[n]
 
     def _name(self, n: Any) -> str:
@@ -151,7 +151,7 @@ class _Writer(Interpreter):
         return n.op == "call_module" and isinstance(self.fetch_attr(n.target), Columns)
 
     def _float(self, n: Any, user: str = "output") -> str:
-        """The value as floats; each user of an INT8 one gets a DequantizeLinear of its own, as QDQ wants it."""
+        """Return the name of a value in floats. Each user of an INT8 value gets its own DequantizeLinear, as in QDQ."""
         value = self._value(n)
         if not value.is_quantized:
             return self._name(n)
@@ -159,13 +159,13 @@ class _Writer(Interpreter):
         return self._add("DequantizeLinear", [self._name(n), *self._steps(self._name(n), value)], output)
 
     def _steps(self, name: str, value: Tensor) -> tuple[str, str]:
-        """Constants of an INT8 value's scale and zero point."""
+        """Return the names of the constants for an INT8 value's scale and zero point."""
         dtype = value.int_repr().numpy().dtype
         scale = self._constant(f"{name}_scale", np.array(value.q_scale(), np.float32))
         return scale, self._constant(f"{name}_zero_point", np.array(value.q_zero_point(), dtype))
 
     def _quantized(self, name: str, value: Tensor, source: str) -> str:
-        """A float of the ONNX graph, as the INT8 value that torch made of it."""
+        """Quantize a float of the ONNX graph with the scale and zero point that torch used."""
         return self._add("QuantizeLinear", [source, *self._steps(name, value)], name)
 
 
@@ -178,7 +178,7 @@ def _as_list(value: Any) -> list[Any]:
 
 
 def _args(n: Node) -> list[Any]:
-    """Nodes and plain values that a node was called with."""
+    """Return the nodes and plain values that a node was called with."""
     return list(n.args)
 
 
@@ -190,25 +190,25 @@ def _lowest(value: Tensor) -> int:
 
 
 def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
-    """Windows of 8 pixels in each of 4 rows, 96 bytes, that begin at every second pixel of every second row.
+    """Cut windows of 8 pixels in each of 4 rows, 96 bytes, that begin at every second pixel of every second row.
 
-    The stem's 7x1 convolution over 24 channels becomes one of 2x1 over these 96 (see `stacked`): ONNX Runtime's kernels
-    for a convolution want 64 channels, and copy and round once more what has fewer. Windows with numbers p, p + 4,
-    p + 8, ... follow each other in a row without a gap, so a row from pixel 2 p on is a quarter of its windows, as it
-    lies; quarters of rows are then laid between each other in pieces of 24 bytes.
+    The stem's 7x1 convolution over 24 channels becomes one of 2x1 over these 96 (see `stacked`), because ONNX Runtime's
+    kernels for a convolution are made for 64 channels, and copy and round again if there are fewer. In a row, the
+    windows with the numbers p, p + 4, p + 8, ... follow each other without a gap. So the row from pixel 2 p on is,
+    without moving a byte, a quarter of its windows, and the four quarters are then interleaved in pieces of 24 bytes.
     """
     (frame,) = _args(n)
     height, width, channels = w._value(frame).shape
     name = n.name
     flat = w._add("Reshape", [w._name(frame), w._ints(f"{name}_rows", [height, width * channels])], f"{name}_pixels")
     fours, phases, out_rows = -(-m.out_width // 4), m.WINDOW // 2, (m.rows - 5) // 2
-    stacks = out_rows + STRIDE  # each of 4 rows; a row of the output takes two of them
-    surplus = 4 * fours - m.out_width  # windows that nobody asked for, where there are no whole fours
+    stacks = out_rows + STRIDE  # each of 4 rows; a row of the output reads two of them
+    surplus = 4 * fours - m.out_width  # windows that are cut off again, if their number is no multiple of four
     right = torch.cat([m.right, m.top[:1, : 6 * surplus].expand(height, -1)], 1)
     top, bottom = (torch.cat([e, e[:, : 6 * surplus]], 1) for e in (m.top, m.bottom))
-    bottom = torch.cat([bottom, top[:1]])  # the eighth row, of weight 0
+    bottom = torch.cat([bottom, top[:1]])  # the eighth row, whose weight is 0
     edges = {"left": m.left, "right": right, "top": top, "bottom": bottom}
-    if m.dtype == torch.qint8:  # pixel - 128, by bits: 128 more without a carry, and taken for signed
+    if m.dtype == torch.qint8:  # pixel - 128: add 128 without a carry, and read the same bits as signed
         shifted = w._add("Add", [flat, w._constant(f"{name}_128", np.array(128, np.uint8))], f"{name}_shifted")
         flat = w._add("Cast", [shifted], f"{name}_signed", to=TensorProto.INT8)
         edges = {side: (edge.to(torch.int16) - 128).to(torch.int8) for side, edge in edges.items()}
@@ -238,11 +238,11 @@ def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
     return w._add("Transpose", [columns], name, perm=[0, 3, 1, 2])
 
 
-STACK, STRIDE = 4, 2  # rows in a stack of columns, and between the first rows of two
+STACK, STRIDE = 4, 2  # rows in a stack of columns, and rows from one stack's first to the next one's
 
 
 def stacked(weight: Tensor) -> Tensor:
-    """The stem's weight over columns, (out, 24, 7, 1), as one over stacks of 4 of their rows: (out, 96, 2, 1)."""
+    """Turn the stem's weight over columns, (out, 24, 7, 1), into one over stacks of 4 rows: (out, 96, 2, 1)."""
     out_channels, in_channels, _, _ = weight.shape
     eight = F.pad(weight, (0, 0, 0, 1)).reshape(out_channels, in_channels, 2, STACK)
     return eight.permute(0, 3, 1, 2).reshape(out_channels, STACK * in_channels, 2, 1)
@@ -277,7 +277,7 @@ def _conv_relu(w: _Writer, n: Node, result: Tensor, m: ConvReLU2d) -> str:
 
 
 def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
-    """A convolution between DequantizeLinear and QuantizeLinear, which engines compute in INT8 with sums of INT32."""
+    """Write a convolution between DequantizeLinear and QuantizeLinear. Engines compute it in INT8 with INT32 sums."""
     source, weight, bias = _args(n)[0], m.weight(), m.bias()
     assert bias is not None
     scales, zeros = weight.q_per_channel_scales(), weight.q_per_channel_zero_points()
@@ -291,8 +291,8 @@ def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
         ("weight", stacked(weight.int_repr()) if of_stacks else weight.int_repr(), scales, np.int8),
         ("bias", whole_bias, sums, np.int32),
     ):
-        # A backbone looks through one camera after the other: its weights are stored once, its biases in the steps of
-        # each camera's own pixels.
+        # The backbone runs once for each camera. Its weights are stored once, its biases for each camera, because their
+        # scale depends on that of the camera's pixels.
         made = f"{n.target}.{part}{again}"
         name = f"{n.target}.{part}" if part == "weight" else made
         scale = w._constant(f"{name}_scale", steps.float())
@@ -303,7 +303,7 @@ def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
 
 
 def _rounded(w: _Writer, n: Node, result: Tensor, source: str, *, relu: bool) -> str:
-    """QuantizeLinear of a result; with the ReLU before it, unless clipping at the zero point is that already."""
+    """Quantize a result, after a ReLU if there is one and clipping at the zero point does not do the same."""
     if relu and result.q_zero_point() != _lowest(result):
         source = w._add("Relu", [source], f"{n.name}_positive")
     return w._quantized(n.name, result, source)
@@ -316,7 +316,7 @@ def _linear(w: _Writer, n: Node, result: Tensor, m: nn.Linear) -> str:
 
 
 def _max_pool(w: _Writer, n: Node, result: Tensor, m: nn.MaxPool2d) -> str:
-    return w._add("MaxPool", [w._name(_args(n)[0])], n.name, **_geometry(m))  # of bytes, too
+    return w._add("MaxPool", [w._name(_args(n)[0])], n.name, **_geometry(m))  # works on INT8 values too
 
 
 def _layer_norm(w: _Writer, n: Node, result: Tensor, m: nn.LayerNorm) -> str:
@@ -449,7 +449,7 @@ FUNCTIONS: dict[Any, Callable[[_Writer, Node, Any], Any]] = {
     "float": _cast,
     torch.cat: _cat,
     operator.add: _binary("Add"),
-    "add": _binary("Add"),  # of a constant and a value, in this order
+    "add": _binary("Add"),  # a constant plus a value, in this order
     operator.mul: _binary("Mul"),
     "mul": _binary("Mul"),
     torch.addcmul: _addcmul,

@@ -22,9 +22,9 @@ from rover_lib.workshop.judge import Range, constant_actions
 from rover_lib.workshop.samples import Sample, frame_rate_hz, is_another_rate
 
 FRAMES = 12  # planned in FP32, which takes ten seconds for a policy of full size
-BEYOND = 0.5  # of the recorded range, past either end; a good policy overshoots less
+BEYOND = 0.5  # a prediction lies beyond if it passes either end by this share of the range; a good policy does not
 MOST_BEYOND_PCT = 5.0
-LEAST_SPREAD = 0.1  # of the recorded spread; a policy that moves less does not drive
+LEAST_SPREAD = 0.1  # a policy whose predictions vary by less than this share of the recorded spread does not drive
 LARGEST_STATE = 10.0  # standard deviations; in wrong units there are hundreds
 
 

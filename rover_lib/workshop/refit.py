@@ -1,19 +1,19 @@
-"""A layer that reads fewer inputs than before, refitted to the output that all of them gave.
+"""Refit a layer that reads fewer inputs than before to the output that all of them gave.
 
 gram = Gram()
-gram.add(rows)                                        # what the layer reads, as often as wanted
+gram.add(rows)                                        # what the layer reads; may be called repeatedly
 weight, errors = refitted(whole, gram.mean(), kept)
 """
 
 import torch
 from torch import Tensor
 
-RIDGE = 1e-4  # of the mean square of an input: keeps the weights near what they were where the rows say nothing
-ROWS = 4096  # that are multiplied at once: the sums are double, and memory is small
+RIDGE = 1e-4  # times an input's mean square: it keeps the weights as they were where the rows say nothing
+ROWS = 4096  # rows that are multiplied at once; few, because they become double and memory is small
 
 
 class Gram:
-    """The mean of x x^T over rows that come a few at a time, x a row and a 1 behind it."""
+    """The mean of x x^T over rows that come a few at a time. x is a row with a 1 appended."""
 
     def __init__(self) -> None:
         self._sum: Tensor | None = None
@@ -21,13 +21,13 @@ class Gram:
         self._count = 0
 
     def add(self, rows: Tensor) -> None:
-        """rows: (n, inputs), on any device."""
+        """Add rows, (n, inputs), on any device."""
         self._waiting.append(rows.cpu().clone())
         if sum(map(len, self._waiting)) >= ROWS:
             self._multiply()
 
     def mean(self) -> Tensor:
-        """(inputs + 1, inputs + 1) float64, of one row at least."""
+        """Return the mean, (inputs + 1, inputs + 1) float64. At least one row must have been added."""
         if self._waiting:
             self._multiply()
         assert self._sum is not None
@@ -44,16 +44,17 @@ class Gram:
 
 
 def refitted(whole: Tensor, gram: Tensor, kept: Tensor) -> tuple[Tensor, dict[str, float]]:
-    """The weights of the inputs that stay, by least squares.
+    """Compute the weights of the inputs that stay, by least squares.
 
-    whole: (inputs + 1, outputs) float64, a row of weights for each input, and the bias. gram: of `Gram.mean`. kept:
-    (n,) which inputs stay. Returns (n + 1, outputs) float64, and how far the output is off on the rows, in percent of
-    its own size: error_pct with the others left out, error_refit_pct with the rest refitted.
+    whole: (inputs + 1, outputs) float64, a row of weights for each input, and the bias last. gram: from `Gram.mean`.
+    kept: (n,), the indices of the inputs that stay. Returns the weights, (n + 1, outputs) float64, and how far the
+    output is off on the rows, in percent of its own size: error_pct with the other inputs left out, error_refit_pct
+    with the weights refitted after that.
     """
     rows = torch.cat([kept, torch.tensor([len(gram) - 1])])  # and the 1 that carries the bias
     cut = whole[rows]
     inside = gram[rows][:, rows]
-    # least squares of what is missing, so that where the rows say nothing the old weights stay
+    # The least squares are of what is missing, so that the old weights stay where the rows say nothing.
     ridge = RIDGE * inside.diagonal()[:-1].mean() * torch.eye(len(rows), dtype=gram.dtype)
     refit = cut + torch.linalg.solve(inside + ridge, gram[rows] @ whole - inside @ cut)
 

@@ -1,15 +1,16 @@
-"""A drive that was, as a view shows one that is: its pictures, each with what the flight log says of that moment.
+"""Replay a recorded drive as a view shows a live one: its pictures, each with what the flight log says of that moment.
 
     for moment in load_replay("flight.log").moments:
         moment.head                # a message as feed.py makes them
         moment.frame_bgr()
 
-The flight log has no pictures: they are those of the episode that was recorded with the drive (`rover drive --record`),
-which the log names. It has no plans either, but what became of them: "plan" is what was commanded in the next second.
+The flight log has no pictures. They come from the episode that was recorded with the drive (`rover drive --record`),
+which the log names. It has no plans either, only what became of them: "plan" is what was commanded in the next second.
 """
 
 import asyncio
 import csv
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,22 +35,26 @@ if TYPE_CHECKING:
 
 RECORDED = "recorded: "  # the event that names the episode
 AHEAD = "ahead: where the commands of the next second led"
-EVENTS = 8
+EVENTS = 8  # at most this many are shown
 AGAIN_S = 3.0  # between two showings
-LATEST = 100  # ticks whose lateness is shown
+LATEST = 100  # ticks: the rate and the largest lateness are those of the last 100
 PAGE_HZ = 10.0
 
 
 @dataclass(frozen=True)
 class Moment:
-    """t_s: since the first moment. head: a message of feed.py, its times by the same clock. frame: the picture."""
+    """One picture of a drive.
+
+    t_s: seconds since the first moment. head: a message as feed.py makes them, whose times are seconds since the drive
+    began. frame: the picture's file.
+    """
 
     t_s: float
     head: dict[str, Any]
     frame: Path
 
     def frame_bgr(self) -> np.ndarray | None:
-        """(h, w, 3) uint8 BGR; None where the picture is damaged or gone."""
+        """Read the picture, (h, w, 3) uint8 BGR; None if it is damaged or gone."""
         try:
             return read_jpeg(self.frame)
         except (OSError, PictureError):
@@ -58,7 +63,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class Replay:
-    """A drive that was. car: the one that was driven. moments: one for each picture, in their order; at least one."""
+    """A recorded drive. car: the car that was driven. moments: at least one; one for each picture, in order of time."""
 
     car: Car
     moments: list[Moment]
@@ -83,10 +88,11 @@ class Replay:
 
 
 def load_replay(file: Path | str, drive: int = -1, pictures: Path | None = None) -> Replay:
-    """The replay of a flight log, or of a recording alone; of a folder of several episodes, the first one's.
+    """Load the replay of a flight log, or of a recording alone; from a folder of several episodes, of the first.
 
-    drive: which drive of a log. pictures: the episode that was recorded with it, None: the one that the log names.
-    Raises LogError; EpisodeError if there are no pictures; CarError if the file describes no car.
+    drive: which drive of a log, the last by default. pictures: the episode that was recorded with it; None takes the
+    one that the log names. Raises LogError; EpisodeError if there are no pictures; CarError if the file's description
+    of its car is not valid.
     """
     file = Path(file)
     if "flight log" not in kinds_of(file):
@@ -96,7 +102,7 @@ def load_replay(file: Path | str, drive: int = -1, pictures: Path | None = None)
 
 
 def recorded_with(flight: Flight) -> Path:
-    """The episode that was recorded with a drive. Raises EpisodeError where none was, or it is gone."""
+    """Return the folder of the episode recorded with a drive. Raises EpisodeError if there is none, or it is gone."""
     for event in reversed(flight.events):
         if event.text.startswith(RECORDED):
             named = Path(event.text.removeprefix(RECORDED))
@@ -111,7 +117,7 @@ def recorded_with(flight: Flight) -> Path:
 
 
 def began_s(flight: Flight) -> float:
-    """When t_s was 0, by the system's clock. Raises LogError where the log's header is damaged."""
+    """Return when t_s was 0, in seconds by the system's clock. Raises LogError if the log's header is damaged."""
     try:
         return datetime.fromisoformat(str(flight.header["start"])).timestamp()
     except (KeyError, ValueError):
@@ -185,21 +191,23 @@ def _head(title: str, now_s: float, ahead: Sequence[Sequence[float]], rate_hz: f
 
 
 def pictures_of(episode: Path) -> list[tuple[float, Path]]:
-    """When each picture of an episode was taken, by the system's clock, and its file.
+    """Return when each picture of an episode was taken, in seconds by the system's clock, and its file, in that order.
 
-    Raises EpisodeError where there is no list of them.
+    A file outside the episode's folder, and a picture without a finite time, are left out. Raises EpisodeError if the
+    list of pictures cannot be read.
     """
     try:
         with (episode / "frame_data.csv").open(newline="") as file:
             rows = [(float(row["timestamp"]), episode / row["image_path"]) for row in csv.DictReader(file)]
-    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:
+        inside = episode.resolve()
+        rows = [(t_s, path) for t_s, path in rows if math.isfinite(t_s) and path.resolve().is_relative_to(inside)]
+    except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:  # ValueError: also a zero byte in a path
         raise EpisodeError(f"{episode}: its list of pictures cannot be read ({error})") from None
-    inside = episode.resolve()
-    return sorted((t_s, path) for t_s, path in rows if path.resolve().is_relative_to(inside))
+    return sorted(rows)
 
 
 def _plain(value: Any) -> Any:
-    """A number that was not known as None, text as text."""
+    """Return a value of the log as JSON has it: a number that is not known (NaN) as None, a text as str."""
     if isinstance(value, str):
         return str(value)
     value = float(value)

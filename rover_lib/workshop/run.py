@@ -32,12 +32,12 @@ from rover_lib.workshop.run_folder import run_folder, says_how_it_was_taught
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
-# Of a run that is there: what `make arm` and `rover world latency`, `students` and `learn` execute.
+# Notebooks for a finished run, which `make arm` and `rover world latency`, `students` and `learn` execute.
 AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")
 OWN_FILES = ("calibration*.pt", "policy_*.pt", f"policy_*{ONNX_SUFFIX}")
 KERNEL_ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",  # rover_lib/__init__.py says why; a cell may import torch before it
-    # Both are known, and noise in a stored output: QNNPACK ignores reduce_range, tqdm misses widgets.
+    # Two known warnings would only be noise in a stored output: QNNPACK ignores reduce_range, tqdm misses widgets.
     "PYTHONWARNINGS": "ignore:Currently,ignore:IProgress not found",
     "TORCH_CPP_LOG_LEVEL": "ERROR",
 }
@@ -48,7 +48,7 @@ class NotebookError(RoverError):
 
 
 class ThisPython(AsyncKernelManager):
-    """A kernel of the interpreter that runs this, whatever kernels the user has registered under its name."""
+    """A kernel of the interpreter that runs this code, whichever kernels the user has registered as "python3"."""
 
     @property
     def kernel_spec(self) -> KernelSpec:
@@ -57,12 +57,12 @@ class ThisPython(AsyncKernelManager):
 
 
 def parameters_of(notebook: Path) -> set[str]:
-    """Names that the notebook's `parameters` cell sets."""
+    """Return the names that the notebook's `parameters` cell sets."""
     return {name for name, *_ in parameters_in(notebook)}
 
 
 def parameters_in(notebook: Path) -> list[tuple[str, str, str]]:
-    """(name, literal, comment) of each line of the notebook's `parameters` cell."""
+    """Return (name, literal, comment) for each line of the notebook's `parameters` cell."""
     for cell in nbformat.read(notebook, as_version=4).cells:
         if "parameters" in cell.metadata.get("tags", []):
             return re.findall(r"^(\w+) *= *(.*?) *(?:# *(.*))?$", cell.source, re.M)
@@ -80,18 +80,20 @@ def run(
     timed: bool = True,
     **overrides: Any,
 ) -> Path:
-    """Execute the five notebooks in order; return the run's folder.
+    """Execute the five notebooks in order, and return the run's folder.
 
     overrides: any of the notebooks' parameters, say worlds=40, samples=200, iterations=100. progress: called like
-    tqdm.tqdm(iterable, desc=, total=). timed: False leaves out the last notebook, the benchmark, for another moment.
+    tqdm.tqdm(iterable, desc=, total=). timed: False leaves out the last notebook, the benchmark, so that it can be
+    executed at another time.
 
-    The new run is made beside the old one of that name, in .<name>.new, and takes its place when it is whole: stage by
-    stage a run that fails at its third notebook would have cost the policies of the last good one, and left reports of
-    two runs side by side. So for a while both are on the disk, about 570 MB each for a full-size policy. Only a run's
-    own files (`files_of_a_run`) are replaced; recordings, a checkpoint and benchmarks of other hosts stay.
+    The new run is made beside the old one of that name, in .<name>.new, and replaces it when it is complete. If each
+    stage replaced its own files instead, a run that fails at its third notebook would destroy the policies of the last
+    good one and leave a mixture of two runs' reports. So for a while both are on the disk, about 570 MB each for a
+    full-size policy. Only a run's own files (`files_of_a_run`) are replaced; recordings, a checkpoint and benchmarks of
+    other hosts stay.
 
     Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C, the old run
-    is as it was and nothing is left of the new one. RoverError while another process makes a run of that name.
+    is as it was and nothing of the new one is left. Raises RoverError while another process makes a run of that name.
     """
     folder = run_folder(runs_dir, name, NotebookError)
     sources = [Path(notebooks) / f"{n}.ipynb" for n in NAMES]
@@ -117,11 +119,11 @@ def run(
 
 
 def files_of_a_run(folder: Path) -> list[Path]:
-    """What a run leaves in its folder, and what was made of its artifacts later: none of it is of another run's."""
+    """List what a run left in its folder and what was later made from its artifacts. A new run replaces all of it."""
     stages = ("load", "calibrate", "quantize", "compare", "run", "arm", "parts", "drive", "learn")
     names = [f"{stage}.json" for stage in (*stages, f"benchmark-{socket.gethostname()}")]
     names += [*(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures", "report.html"]
-    with suppress(RoverError):  # one that is damaged, or not there, is nobody's
+    with suppress(RoverError):  # a distill.json that is damaged, or missing, belongs to no run
         if not says_how_it_was_taught(folder / "distill.json"):
             names.append("distill.json")
     own = [folder / n for n in names] + [p for pattern in OWN_FILES for p in folder.glob(pattern)]
@@ -133,7 +135,7 @@ def _benchmarks_of_other_hosts(folder: Path) -> list[Path]:
 
 
 def _say_final_paths(new: Path, folder: Path) -> None:
-    """Files that name the folder in which they were made name the one in which they will be."""
+    """Replace the path of the folder in which the files were made by that of their final folder."""
     for path in [*new.glob("*.json"), *new.glob("*.ipynb")]:
         text = path.read_text()
         final = text.replace(str(new), str(folder)).replace(json.dumps(str(new))[1:-1], json.dumps(str(folder))[1:-1])
@@ -142,9 +144,9 @@ def _say_final_paths(new: Path, folder: Path) -> None:
 
 
 def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:
-    """Execute one notebook on a run that is there; returns the executed one, in the run's folder.
+    """Execute one notebook on an existing run, and return the path of the executed notebook in the run's folder.
 
-    Raises NotebookError, in one sentence with the notebook, the cell and its error; then an earlier one stays.
+    Raises NotebookError, in one sentence with the notebook, the cell and its error; an earlier executed one then stays.
     """
     folder, source = Path(run_dir).resolve(), Path(notebooks) / f"{name}.ipynb"
     if not source.is_file() or not folder.is_dir():
@@ -155,7 +157,7 @@ def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS
 
 
 def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> None:
-    # here, because it takes a second that the kernels, which import this module too, need not spend
+    # Imported here, because it takes a second, and the kernels import this module too and do not need it.
     import papermill
     from nbclient.exceptions import DeadKernelError
 
@@ -180,7 +182,7 @@ def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> N
 
 @contextmanager
 def environment(values: dict[str, str]) -> Iterator[None]:
-    """os.environ with these values inside, as before outside: a kernel inherits it."""
+    """Set these values in os.environ, which a kernel inherits, and restore the old ones afterwards."""
     before = {k: os.environ.get(k) for k in values}
     os.environ.update(values)
     try:
@@ -201,7 +203,7 @@ def _is_terminal(stream: Any) -> bool:
 
 
 def _sentence(error: Any) -> str:
-    """A RoverError's own words; for what the program did not foresee also the error's name and how to see more."""
+    """Return a RoverError's own text; for any other error also its name, and how to see the traceback."""
     text = " ".join(str(error.evalue).split())
     ours = {c.__name__ for c in _subclasses(RoverError)} | {RoverError.__name__}
     if error.ename in ours:

@@ -1,6 +1,7 @@
-"""What a recording becomes, whoever wrote it: samples by episode, where they are from, and what was wrong.
+"""The common form of recordings: the samples of each episode, the files that they came from, and what was wrong.
 
-`episodes` reads our own recordings and `lerobot_dataset` LeRobot's; behind them nobody asks which of the two it was.
+`episodes` reads our own recordings and `lerobot_dataset` reads LeRobot's. Code that uses the result need not know which
+of the two it was.
 """
 
 from collections import Counter
@@ -18,7 +19,7 @@ from rover_lib.onboard.picture import PictureError, read_jpeg
 from rover_lib.onboard.recording import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
 
-OTHER_RATE = 0.2  # of the usual time between two frames
+OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has another rate
 
 ACTION_NAMES = CHANNELS
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
@@ -26,10 +27,10 @@ CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 @dataclass(frozen=True)
 class Source:
-    """Where recordings are, and what a user says of a dataset that does not say it itself.
+    """Where recordings are, and what the user adds if the dataset itself does not say it.
 
-    action_names: in the order of its numbers, and of its state's where that is unnamed too. cameras: those that the
-    policy looks through, in its order.
+    action_names: the names of its actions, in the order of its columns, and of its states too if those are unnamed.
+    cameras: the cameras that the policy looks through, in the policy's order.
     """
 
     path: Path
@@ -38,15 +39,21 @@ class Source:
 
     @classmethod
     def of(cls, path: "Path | str | Source", action_names: str = "", camera: str = "") -> "Source":
-        """action_names, camera: with commas between, as on a command line. A source stays what it is."""
+        """Make a source from a path and the texts of a command line, whose names are separated by commas.
+
+        A Source as `path` is returned unchanged.
+        """
         if isinstance(path, Source):
             return path
-        names, cameras = (tuple(n.strip() for n in said.split(",") if n.strip()) for said in (action_names, camera))
+        names, cameras = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (action_names, camera))
         return cls(Path(path), names, cameras)
 
     @classmethod
     def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":
-        """What a run loaded, or other recordings, read as those were. given: the params of its load.json."""
+        """The recordings that a run loaded, or those `elsewhere`, to be read with the same names and cameras.
+
+        given: the params in the run's load.json.
+        """
         return cls.of(elsewhere or given["episodes"], given.get("action_names", ""), given.get("camera", ""))
 
 
@@ -54,8 +61,8 @@ class Source:
 class Layout:
     """Which cameras and which numbers the samples have.
 
-    rate_hz: frames a second, None where a recording says nothing of it. state_order, action_order: the file's columns,
-    in the order of the names; a car's are always [steering, throttle] here, in whatever order they were recorded.
+    rate_hz: frames a second; None if the recordings do not state it. state_order, action_order: for each name, its
+    column in the file. A car's names are always [steering, throttle] here, in whatever order they were recorded.
     """
 
     cameras: tuple[str, ...] = ("the car's",)
@@ -66,7 +73,7 @@ class Layout:
     action_order: tuple[int, ...] = (0, 1)
 
     def words(self) -> str:
-        """A line in which users should find their own car."""
+        """Describe the layout in one line, in which users should recognise their own car."""
 
         def columns(names: tuple[str, ...], order: tuple[int, ...]) -> str:
             swapped = list(order) != sorted(order)
@@ -80,8 +87,9 @@ class Layout:
 
 @dataclass(frozen=True)
 class Fault:
-    """Something wrong in a recording: `count` times `kind` in `file` (relative to the root), with the first
-    in words.
+    """Something wrong in a recording: `kind` happened `count` times in `file`, and `note` describes the first time.
+
+    file: relative to the root of the recordings.
     """
 
     file: str
@@ -106,17 +114,20 @@ class Sample:
     state: np.ndarray
     chunk: np.ndarray
     is_pad: np.ndarray
-    row: int  # of the frame: in its episode, or in the whole of a LeRobotDataset
+    row: int  # the frame's number in its episode, or in the whole of a LeRobotDataset
     driver: str = HUMAN
     car: Car = field(default_factory=Car)
 
     @property
     def frame_name(self) -> str:
-        """What to call the picture within its episode."""
+        """The picture's name within its episode."""
         return self.frame_path.name
 
     def frame_bgr(self) -> np.ndarray:
-        """The picture, (h, w, 3) uint8 BGR. Raises EpisodeError if it is gone, or no whole JPEG of a camera's size."""
+        """Read the picture: (h, w, 3) uint8 BGR.
+
+        Raises EpisodeError if the file is gone, or is not a whole JPEG of a size that a camera gives.
+        """
         try:
             return read_jpeg(self.frame_path)
         except OSError as e:
@@ -145,7 +156,10 @@ def car_of(samples: Iterable[Any]) -> Car:
 
 
 def frame_rate_hz(samples: Sequence[Sample]) -> float | None:
-    """Frames a second of one episode, by the usual time between two of its samples; None where there are not two."""
+    """Return one episode's frames per second, from the median time between two neighbouring frames.
+
+    None for fewer than two samples, or if time does not advance between them.
+    """
     if len(samples) < 2:
         return None
     step_s = float(np.median(np.diff([s.time_s for s in samples]) / np.diff([s.row for s in samples])))
@@ -153,17 +167,20 @@ def frame_rate_hz(samples: Sequence[Sample]) -> float | None:
 
 
 def is_another_rate(found_hz: float | None, rate_hz: float) -> bool:
-    """Whether an episode of found_hz frames a second was not recorded at rate_hz. A plan's steps are frames: of 15 a
-    second, a car that takes 30 would do in half the time what the human did.
+    """Whether an episode with found_hz frames a second was recorded at another rate than rate_hz.
+
+    Each step of a plan is one frame. If a policy learned from 15 frames a second, a car that takes 30 steps a second
+    would do in half the time what the human did.
     """
     return found_hz is not None and abs(rate_hz / found_hz - 1) > OTHER_RATE
 
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One drive. frames and controls: how many were listed; duration_s: first to last frame.
+    """One drive.
 
-    outcome: one of onboard.recording.OUTCOMES, None where none was noted.
+    duration_s: from the first to the last frame. frames, controls: how many the recording lists. outcome: one of
+    onboard.recording.OUTCOMES, None if none was noted.
     """
 
     id: str
@@ -173,18 +190,18 @@ class Episode:
     frames: int
     controls: int
     samples: tuple[Sample, ...]
-    files: tuple[Path, ...]  # that the numbers came from
+    files: tuple[Path, ...]  # those that the numbers came from
     outcome: str | None = None
 
     @cached_property
     def by_policy(self) -> bool:
-        """Whether a policy drove in it, so that what a human did there are corrections."""
+        """Whether a policy drove in it, so that what a human did in it was a correction."""
         return any(sample.driver == POLICY for sample in self.samples)
 
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """All usable episodes below `root`, and what was wrong with the rest."""
+    """All usable episodes below `root`, and every fault that was found."""
 
     root: Path
     episodes: tuple[Episode, ...]
@@ -198,14 +215,14 @@ class Recordings:
         return tuple(s for e in self.episodes for s in e.samples)
 
     def action_range(self) -> dict[str, tuple[float, float]]:
-        """Smallest and largest recorded value of each action: what errors are given as a share of."""
+        """Smallest and largest recorded value of each action. Errors are given as a share of this range."""
         actions = np.concatenate([s.chunk for s in self.samples])  # padding repeats values that are in it anyway
         return {
             n: (float(actions[:, i].min()), float(actions[:, i].max())) for i, n in enumerate(self.layout.action_names)
         }
 
     def driven_by_pct(self) -> dict[str, float]:
-        """Who drove, one of onboard.recording.DRIVERS, at how many percent of the samples."""
+        """The percentage of samples at which each of onboard.recording.DRIVERS drove, without those who never did."""
         count = len(self.samples)
         return {who: round(100 * n / count, 1) for who, n in self._counted(s.driver for s in self.samples).items()}
 
@@ -214,9 +231,9 @@ class Recordings:
         return dict(sorted(Counter(words).items()))
 
     def hashes(self) -> dict[str, str]:
-        """SHA-256 of every file that the samples came from, by its path relative to `root`.
+        """SHA-256 of every file that the samples came from, keyed by its path relative to `root`.
 
-        Raises EpisodeError for one that cannot be read any more.
+        Raises EpisodeError if one cannot be read any more.
         """
         files = {path: None for e in self.episodes for path in (*e.files, *(s.frame_path for s in e.samples))}
         hashes = {}
@@ -228,7 +245,7 @@ class Recordings:
         return hashes
 
     def summary(self) -> dict[str, Any]:
-        """Counts, ranges and faults as plain JSON types, for load.json."""
+        """Return counts, ranges and faults in plain JSON types, for load.json."""
         return {
             "episodes": len(self.episodes),
             "frames": sum(e.frames for e in self.episodes),
@@ -245,19 +262,19 @@ class Recordings:
 
 
 def camera_names(keys: Iterable[str]) -> dict[str, str]:
-    """The LeRobot features of cameras, by what a policy calls them.
+    """Map the name that a policy gives to each camera to the key of its LeRobot feature.
 
-    Such features begin in one of two ways, which is left out; not where two would then have one name, as
-    observation.image and observation.images.image.
+    The name is the key without its prefix, `observation.images.` or `observation.`. If two cameras would then have the
+    same name, as observation.image and observation.images.image, all keep their whole key.
     """
     keys = list(keys)
-    # one of the two: a camera may itself be called observation.image, where we wrote the policy
+    # Only one prefix is removed: in a policy that we wrote, a camera may itself be called observation.image.
     names = {key.removeprefix(CAMERA if key.startswith(CAMERA) else "observation."): key for key in keys}
     return names if len(names) == len(keys) else {key: key for key in keys}
 
 
 def relative(path: Path, root: Path) -> str:
-    """A file's path as reports name it."""
+    """Return a file's path as reports show it: relative to `root`, or only its name if it lies elsewhere."""
     try:
         return path.relative_to(root).as_posix()
     except ValueError:

@@ -1,6 +1,6 @@
-"""What every notebook of a run opens first: the checkpoint and the recordings that notebook 01 loaded.
+"""Open the checkpoint and the recordings of a run, as every notebook does first.
 
-Apart from `run`, so that a kernel need not import what only executing notebooks needs.
+This module is separate from `run`, so that a kernel does not import what only the execution of notebooks needs.
 """
 
 from dataclasses import dataclass, replace
@@ -18,12 +18,12 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import Source
 from rover_lib.workshop.untrusted import shown
 
-SMALL_GMAC = 1.0  # below this a second thread costs more, on a busy machine, than it brings
+SMALL_GMAC = 1.0  # a policy below this gains less from a second thread than the thread costs on a busy machine
 
 
 @dataclass(frozen=True)
 class Opened:
-    """What notebook 01 loaded: the checkpoint, the recordings, and which of them calibrate, choose and judge."""
+    """What notebook 01 loaded: the checkpoint, the recordings, and which episodes calibrate, choose and judge."""
 
     checkpoint: Checkpoint
     recordings: Recordings
@@ -31,26 +31,26 @@ class Opened:
 
 
 def load(checkpoint: Path | str, episodes: Path | str | Source, progress: Progress = silent) -> Opened:
-    """Read a checkpoint and its recordings, and part them as params.yml says.
+    """Read a checkpoint and its recordings, and split the recordings as params.yml says.
 
-    Of a LeRobotDataset the policy's own cameras are read, if nobody chose others, and a LeRobot policy gets the order
-    and the rate of the numbers that it was trained on. Raises CheckpointError and EpisodeError.
+    For a LeRobot policy, the cameras that the policy uses are read from a LeRobotDataset unless the user chose others,
+    and the policy gets the dataset's order and rate of numbers. Raises CheckpointError and EpisodeError.
     """
     p = params()["calibration"]
     policy = load_checkpoint(checkpoint)
-    check_sizes(policy)  # each sample has as many actions as a plan: of a million, a few frames fill the memory
+    check_sizes(policy)  # a sample has as many actions as a plan; with a million, a few frames would fill the memory
     source = Source.of(episodes)
     if policy.format == "lerobot" and not source.cameras:  # the trainer's file does not say what its camera is called
         source = replace(source, cameras=policy.config.cameras)
     recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
     recorded = policy.recorded_as(recordings.layout)
-    _check_limits(recorded)  # whose rate and names are the recordings'
+    _check_limits(recorded)  # after recorded_as, because its rate and names are the recordings'
     return Opened(recorded, recordings, parts)
 
 
 def _check_limits(policy: Checkpoint) -> None:
-    """Raise CheckpointError for a policy that no artifact may hold: now, rather than after minutes of calibration."""
+    """Raise CheckpointError for a policy that no artifact may hold, before minutes are spent on its calibration."""
     check_sizes(policy)
     c = policy.config
     _within(policy, "steps of a plan in a second", c.rate_hz, RATE_HZ)
@@ -65,7 +65,10 @@ def _check_limits(policy: Checkpoint) -> None:
 
 
 def check_sizes(policy: Checkpoint) -> None:
-    """Raise CheckpointError for a plan, pictures or numbers that no artifact may have: before recordings are read."""
+    """Raise CheckpointError for a plan, pictures, or a number of cameras, states or actions that no artifact may have.
+
+    This needs no recordings, so it can be checked before they are read.
+    """
     c = policy.config
     _within(policy, "steps in a plan", c.chunk, CHUNK)
     for side in (side for size in c.image_sizes for side in size):
@@ -85,9 +88,9 @@ def _within(policy: Checkpoint, what: str, value: float, limits: tuple[float, fl
 
 
 def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:
-    """What notebook 01 loaded, again. Raises RoverError if it did not run, or if the files have changed since.
+    """Load again what notebook 01 loaded. Raises RoverError if it did not run, or if the files have changed since.
 
-    For a policy of less than SMALL_GMAC, torch is set to one thread (a benchmark sets its own).
+    For a policy of less than SMALL_GMAC, this sets torch to one thread; a benchmark sets its own number.
     """
     stage = read_stage(Path(run_dir) / "load.json", "load")
     if sum(stage["metrics"]["checkpoint"]["macs_by_block"].values()) < SMALL_GMAC * 1e9:
@@ -115,7 +118,11 @@ def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:
 
 
 def training_device(asked: str | None, error: type[RoverError]) -> torch.device:
-    """Where a policy learns: 'cpu' or 'cuda' as asked for, None for the best there is. Raises `error` for another."""
+    """Return the device to train on.
+
+    asked: "cpu" or "cuda"; None takes cuda if torch finds one, else the CPU. Raises `error` for anything else, and for
+    cuda where torch finds none.
+    """
     there = torch.cuda.is_available()
     if asked not in (None, "cpu", "cuda") or (asked == "cuda" and not there):
         raise error("device must be cpu, or cuda where torch finds one", found=asked, remedy="leave it out")

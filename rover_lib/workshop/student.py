@@ -1,12 +1,13 @@
-"""A smaller policy that begins with its teacher's weights.
+"""Make a smaller policy that begins with its teacher's weights.
 
     shape = StudentShape(height=180, width=320, decoder_layers=2, feedforward=1600)
     config = student_config(teacher, shape)
     weights, notes = initial_weights(teacher, config, inputs)
 
-No weight of ACT depends on the picture's size and positions are relative to it, so backbone, projections and attention
-are taken as they are; of the decoder's layers the first; of every feed-forward the units that matter most. What only
-training by recordings needs, the VAE's encoder, is left out: a student is taught plans.
+No weight of ACT depends on the picture's size, and positions are relative to it, so a student takes the backbone, the
+projections and the attention as they are. It takes the first of the decoder's layers, and the most important units of
+every feed-forward. The VAE's encoder is left out, because only training on recordings needs it, and a student learns
+its teacher's plans.
 """
 
 from collections import defaultdict
@@ -29,10 +30,10 @@ from rover_lib.workshop.untrusted import listed
 
 @dataclass(frozen=True)
 class StudentShape:
-    """What of a student's shape may differ from its teacher's; None: as the teacher's.
+    """What may differ between a student's shape and its teacher's. None keeps the teacher's value.
 
-    backbone_channels: the share of the channels inside the backbone's blocks that it computes. In its files they are
-    all there, the others as zeros: see `channels`.
+    backbone_channels: the share of the channels inside the backbone's blocks that the student computes. Its files still
+    have all channels, the others as zeros; see `channels`.
     """
 
     height: int | None = None
@@ -43,8 +44,11 @@ class StudentShape:
 
 
 def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
-    """The student's config. Raises DistillError for a student that is larger than its teacher in anything, for a policy
-    that a car's recordings cannot teach; CheckpointError for an image size that the teacher's weights do not run at.
+    """Return the student's config.
+
+    Raises DistillError for a student that exceeds its teacher in anything, for a backbone whose channels cannot be left
+    out, and for a teacher that cannot teach from a car's recordings; CheckpointError for an image size at which the
+    teacher's weights do not run.
     """
     c = teacher.config
     if found := not_a_cars(c):
@@ -86,8 +90,11 @@ def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
 
 
 def not_a_cars(config: ActConfig) -> str | None:
-    """What a policy has instead of one camera, and steering and throttle as its states and its actions; None: it has
-    those. What we teach is also shown mirrored, with the first number negated, and left behind under these names.
+    """Say what a policy has instead of one camera, and steering and throttle as its states and actions; None if it has
+    those.
+
+    A policy that we teach needs them, because it is also shown mirrored samples, with the first number negated, and is
+    stored under these names.
     """
     c = config
     if len(c.cameras) == 1 and c.state_names == c.action_names == ACTION_NAMES:
@@ -97,7 +104,7 @@ def not_a_cars(config: ActConfig) -> str | None:
 
 
 def gmac(config: ActConfig, weights: dict[str, Tensor] | None = None) -> float:
-    """Multiply-accumulates of one inference, in 10^9. weights: None for those of a policy without dead channels."""
+    """Return the multiply-accumulates of one inference, in 10^9. weights: None means a policy without dead channels."""
     weights = weights or {name: torch.ones(shape) for name, shape in expected_shapes(config).items()}
     return sum(multiply_accumulates(ACT(config, weights)).values()) / 1e9
 
@@ -105,12 +112,12 @@ def gmac(config: ActConfig, weights: dict[str, Tensor] | None = None) -> float:
 def initial_weights(
     teacher: Checkpoint, config: ActConfig, inputs: Iterable[tuple[Tensor, ...]]
 ) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
-    """The teacher's weights in the student's shape, by LeRobot's names without the leading `model.`.
+    """Return the teacher's weights in the student's shape, by LeRobot's names without the leading `model.`.
 
-    inputs: calibration frames as the student sees them (`act.inputs_of`); they are run only if units must go.
-    Returns the weights, float32 and each with its own memory, and for each feed-forward that lost units
-    {"layer", "units", "of", "error_pct", "error_refit_pct"}: how far its output is off on the frames, in percent of the
-    output's own size, with the units left out and with `down` refitted.
+    inputs: calibration frames as the student sees them (`act.inputs_of`); they are only run if units are left out.
+    The weights are float32, each with its own memory. The second value returned has for each feed-forward that lost
+    units {"layer", "units", "of", "error_pct", "error_refit_pct"}: the errors say how far its output is off on the
+    frames, in percent of the output's own size, with the units left out, and with `down` refitted after that.
     """
     kept = {name: weight.detach().float().clone() for name, weight in teacher.weights.items() if _is_kept(name, config)}
     if config.feedforward == teacher.config.feedforward:
@@ -133,10 +140,10 @@ def _is_kept(name: str, config: ActConfig) -> bool:
 
 @torch.inference_mode()
 def _grams(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> dict[str, Tensor]:
-    """Of every feed-forward's hidden activations h, and a 1 beside them, the mean of h h^T over all tokens.
+    """Return for every feed-forward the mean of h h^T over all tokens, h being its hidden activations and a 1.
 
-    By LeRobot's name of the layer: (units + 1, units + 1) float64. The mean magnitude of a unit that ReLU cuts is its
-    product with the 1; for other activations the root of its mean square stands for it, see `_narrowed`.
+    The keys are LeRobot's names of the layers; each value is (units + 1, units + 1) float64. After ReLU, a unit's mean
+    magnitude is its product with the 1. For other activations `_narrowed` uses the root of its mean square instead.
     """
     grams: dict[str, Gram] = defaultdict(Gram)
 
@@ -158,7 +165,7 @@ def _grams(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> dict[str, Tensor
 
 
 def _lerobots(name: str) -> str:
-    """encoder.3.feed_forward -> encoder.layers.3"""
+    """Return LeRobot's name of a layer: encoder.3.feed_forward -> encoder.layers.3."""
     part, index, _ = name.split(".")
     return f"{part}.layers.{index}"
 
@@ -166,7 +173,7 @@ def _lerobots(name: str) -> str:
 def _narrowed(
     weights: dict[str, Tensor], layer: str, gram: Tensor, units: int
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """One feed-forward with its most important units, and `down` refitted to the output that all of them gave."""
+    """Keep one feed-forward's most important units, and refit `down` to the output that all units gave."""
     down, bias = weights[f"{layer}.linear2.weight"].double(), weights[f"{layer}.linear2.bias"].double()
     magnitude = gram[-1, :-1].abs() if (gram[-1, :-1] >= 0).all() else gram.diagonal()[:-1].sqrt()
     best = (magnitude * down.norm(dim=0)).topk(units).indices.sort().values

@@ -1,9 +1,9 @@
-"""Many runs from one sheet: checkpoints, students, settings and seeds, as `rover run` makes each, on Dask.
+"""Make many runs from one sheet of checkpoints, students, settings and seeds on Dask, each as `rover run` makes it.
 
     with on_this_machine(workers=2) as client:
         failed = sweep(Sheet.read("sweep.yml").jobs(), "runs/sweep", client)
 
-Each run is an ordinary run's folder, with job.json beside its stages. Finished parts are not done again, so that an
+Each run has an ordinary run's folder, with job.json beside its stages. Finished parts are not done again, so an
 interrupted sweep continues where it was. docs/sweep.md describes the sheet, clusters, and the cost of a thousand
 policies.
 """
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 JOB, REPORT, FIGURE = "job.json", "sweep.json", "sweep.png"
 TIMING = "timing"  # the Dask resource of a worker that has a machine to itself while it works
-STUDENT_OPTIONS = (  # as of `rover distill`
+STUDENT_OPTIONS = (  # those of `rover distill`
     "size",
     "decoder_layers",
     "feedforward",
@@ -58,9 +58,10 @@ class SweepError(RoverError):
 
 @dataclass(frozen=True)
 class Job:
-    """One run. student: options of `rover distill` for the policy that is taught first, {}: the checkpoint itself.
+    """One run.
 
-    notebooks: parameters of the notebooks. params: values of params.yml by their place, say "calibration.seed".
+    student: options of `rover distill` for a student that is taught first and then judged; {} judges the checkpoint
+    itself. notebooks: parameters of the notebooks. params: values of params.yml by their place, say "calibration.seed".
     """
 
     checkpoint: str
@@ -71,7 +72,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """What the run varies, and a few unique digits. Stays the same when the sheet grows."""
+        """The run's name: what it varies, and a few unique digits. It stays the same when the sheet grows."""
         settings = {**self.student, **self.notebooks, **self.params}
         parts = [Path(self.checkpoint).stem, *(f"{key.split('.')[-1]}{value}" for key, value in settings.items())]
         digits = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:6]
@@ -95,7 +96,7 @@ class Sheet:
 
     @classmethod
     def read(cls, path: Path | str) -> "Sheet":
-        """Paths in the file are relative to the working folder. Raises SweepError, ParamsError."""
+        """Read a sheet. Paths in it are relative to the working folder. Raises SweepError, ParamsError."""
         from rover_lib.workshop.run import NAMES, NOTEBOOKS, parameters_of
 
         if not Path(path).exists():
@@ -128,12 +129,12 @@ class Sheet:
             raise SweepError(f"{path}: params are named by their place, say calibration.seed", found=wrong[0])
         here = params()
         if unknown := [place for place in of_params if not _has(here, place)]:
-            # Runs that differ in a misspelt value alone would be the same run under several names.
+            # Runs that differ only in the value of a misspelt name would be the same run several times.
             raise SweepError(f"{path}: params.yml has no {unknown[0]!r}", remedy="look at params.yml for its name")
         return cls([absolute(c) for c in checkpoints], absolute(content["episodes"]), students, of_notebooks, of_params)
 
     def jobs(self) -> list[Job]:
-        """Every combination as a job. Raises SweepError if two are the same."""
+        """Return every combination as a job. Raises SweepError if two are the same."""
         jobs = [
             Job(checkpoint, self.episodes, student, notebooks, params)
             for checkpoint in self.checkpoints
@@ -163,7 +164,7 @@ def _check_student(student: Mapping[str, Any]) -> None:
 
 
 def _lists(values: Any, where: str) -> dict[str, list[Any]]:
-    """Each name with its values; a single value is a list of one. Raises SweepError."""
+    """Return each name with its values; a single value becomes a list of one. Raises SweepError."""
     if not isinstance(values, dict | None):
         raise SweepError(f"{where} must be a mapping of names to values", found=values)
     lists = {str(key): value if isinstance(value, list) else [value] for key, value in (values or {}).items()}
@@ -173,7 +174,7 @@ def _lists(values: Any, where: str) -> dict[str, list[Any]]:
 
 
 def _has(values: Any, place: str) -> bool:
-    """Whether there is a value at that place, say "calibration.seed"."""
+    """Whether there is a value at this place, say "calibration.seed"."""
     for name in place.split("."):
         if not isinstance(values, Mapping) or name not in values:
             return False
@@ -190,7 +191,7 @@ def _combinations(values: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any
 
 
 class Work(Protocol):
-    """The two parts of a job. Both leave nothing half-made in the sweep's folder, and may be repeated."""
+    """Does the two parts of a job. Both leave nothing incomplete in the sweep's folder, and may be repeated."""
 
     def prepare(self, job: Job, folder: Path) -> None: ...
 
@@ -201,7 +202,7 @@ class Notebooks:
     """The work of `rover distill` and `rover run`."""
 
     def prepare(self, job: Job, folder: Path) -> None:
-        """Teach the student, if the job has one, and make the run, all but its benchmark."""
+        """Teach the student, if the job has one, and make the run without its benchmark."""
         from rover_lib.workshop.run import run
 
         with _settings_of(job, folder):
@@ -239,7 +240,7 @@ class Notebooks:
 
 @contextmanager
 def _settings_of(job: Job, folder: Path) -> Iterator[None]:
-    """The job's own values of params.yml, for this process and the kernels that it starts."""
+    """Apply the job's own values of params.yml inside the block, for this process and the kernels that it starts."""
     from rover_lib.workshop.run import environment
 
     values: dict[str, Any] = {}
@@ -259,7 +260,7 @@ def _settings_of(job: Job, folder: Path) -> Iterator[None]:
 
 
 def do(part: str, work: Work, job: Job, folder: Path, fingerprint: str) -> str:
-    """Do one part of a job, "prepare" or "benchmark", unless it is done. Returns its name.
+    """Do one part of a job, "prepare" or "benchmark", unless it is done, and return the job's name.
 
     fingerprint: of the job's files when the sweep began. If files change meanwhile, the next sweep computes another
     fingerprint, and makes the run again.
@@ -268,7 +269,7 @@ def do(part: str, work: Work, job: Job, folder: Path, fingerprint: str) -> str:
     it, and then finds the work done.
     """
     with (folder / f".{job.name}.lock").open("w") as lock:
-        fcntl.lockf(lock, fcntl.LOCK_EX)  # which works on a network's file systems too
+        fcntl.lockf(lock, fcntl.LOCK_EX)  # unlike flock, it also works on network file systems
         if part not in parts_done(job, folder, fingerprint):
             getattr(work, part)(job, folder)
             done = ["prepare"] if part == "prepare" else ["prepare", "benchmark"]
@@ -279,7 +280,7 @@ def do(part: str, work: Work, job: Job, folder: Path, fingerprint: str) -> str:
 
 
 def parts_done(job: Job, folder: Path, fingerprint: str) -> list[str]:
-    """The finished parts of a job, made from exactly these files. Empty if job.json cannot be read."""
+    """Return the parts of a job that were finished with exactly these files. Empty if job.json cannot be read."""
     try:
         content = json.loads((folder / job.name / JOB).read_text())
         return list(content["done"]) if content["fingerprint"] == fingerprint else []
@@ -288,9 +289,9 @@ def parts_done(job: Job, folder: Path, fingerprint: str) -> list[str]:
 
 
 def fingerprints(jobs: Sequence[Job]) -> dict[str, str]:
-    """A hash for each job, by its name, which changes with the files of its checkpoint and recordings.
+    """Return a hash for each job, by its name, which changes with the files of its checkpoint and recordings.
 
-    It is of their names, sizes and times, because hashing their content takes long. Files that many jobs share are
+    It covers their names, sizes and times, because hashing their content takes long. Files that many jobs share are
     looked up once.
     """
     places = {place for job in jobs for place in (job.checkpoint, job.episodes)}
@@ -299,7 +300,7 @@ def fingerprints(jobs: Sequence[Job]) -> dict[str, str]:
 
 
 def _files_in(place: Path) -> bytes:
-    """A line for each file, in order."""
+    """Return a line with the name, size and time of each file, in order."""
     lines = []
     for path in [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.is_file()):
         at = path.stat()
@@ -312,11 +313,14 @@ def _files_in(place: Path) -> bytes:
 
 @contextmanager
 def on_this_machine(workers: int | None = None) -> Iterator["Client"]:
-    """A local Dask cluster of `workers` processes, or one for every two cores. Only the first may run benchmarks."""
+    """Start a local Dask cluster of `workers` processes, by default one for every two cores.
+
+    Only the first may run benchmarks.
+    """
     from distributed import Client, Nanny, Scheduler, SpecCluster
 
     count = workers or max(1, (os.cpu_count() or 1) // 2)
-    # A run's memory is its kernels', which Dask does not see: its own limit would only end workers that hold nothing.
+    # Dask does not see the kernels, which use a run's memory; its own limit would only end workers that use little.
     options = {"nthreads": 1, "memory_limit": 0, "dashboard": False, "silence_logs": logging.ERROR}
     specs = {
         i: {"cls": Nanny, "options": {**options, "resources": {TIMING: 1} if i == 0 else {}}} for i in range(count)
@@ -361,7 +365,9 @@ def sweep(
     work: Work | None = None,
     progress: Progress = silent,
 ) -> dict[str, str]:
-    """Do the missing parts of these jobs. Returns a sentence for each failed job, by its name; all others are complete.
+    """Do the missing parts of these jobs, and return a sentence for each failed job, by its name.
+
+    All other jobs are then complete.
 
     together: benchmark a run as soon as it is prepared, on a worker with a machine of its own, while others prepare.
     Otherwise all benchmarks come last, when nothing disturbs them. If a worker dies, another repeats what it was doing,
@@ -421,10 +427,10 @@ def _sentence(error: BaseException) -> str:
 
 
 def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> list[dict[str, Any]]:
-    """One for each whole run, from the JSON that it left: its settings, and figures of its static INT8 artifact.
+    """Return a row for each complete run, from its JSON: its settings, and the figures of its static INT8 artifact.
 
-    marks: what `fingerprints` says of the jobs.
-    error_pct: the worse action's, against FP32; to_recorded_pct: against what the driver did. best: no other is at
+    marks: the result of `fingerprints` for these jobs. In a row, error_pct is the largest of the actions' errors
+    against FP32, and to_recorded_pct the largest against what the driver did. best is true unless another run is at
     least as good in error to the recordings, time and size, and better in one of them.
     """
     found = []
@@ -456,7 +462,7 @@ def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> l
 
 
 def _timed(run: Path) -> dict[str, Any]:
-    """The benchmark of the run's artifacts."""
+    """Read the benchmark of the run's artifacts. Raises SweepError if there is none."""
     path = benchmark_of(run, read_stage(run / "quantize.json", "quantize")["metrics"]["modes"])
     if path is None:
         raise SweepError(f"{run}: no benchmark of its artifacts", remedy="remove that folder, and sweep again")
@@ -464,14 +470,17 @@ def _timed(run: Path) -> dict[str, Any]:
 
 
 def _beats(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """A figure that nobody has counts as equal."""
+    """Whether one row is at least as good as the other in everything, and better in something.
+
+    A figure that one of them lacks is not compared.
+    """
     keys = ("to_recorded_pct", "latency_p50_ms", "size_mb")
     pairs = [(one[k], other[k]) for k in keys if one[k] is not None and other[k] is not None]
     return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
 
 
 def write_report(jobs: Sequence[Job], folder: Path | str, failed: Mapping[str, str]) -> dict[str, Any]:
-    """Leave sweep.json and sweep.png in the sweep's folder; returns the JSON's content."""
+    """Write sweep.json and sweep.png into the sweep's folder, and return the JSON's content."""
     from rover_lib.workshop.plots.sweep import pareto
 
     folder, marks = Path(folder), fingerprints(jobs)
@@ -485,7 +494,7 @@ def write_report(jobs: Sequence[Job], folder: Path | str, failed: Mapping[str, s
 
 
 def table(found: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The rows as text, the best error to the recordings first; a star marks those that none beats in everything."""
+    """Return the rows as text, the smallest error to the recordings first. A star marks a run that no other beats."""
     header = ["", "run", "to recorded %", "to FP32 %", "p50 ms", "MB", "hits"]
     lines = [header]
     for row in sorted(found, key=lambda r: (r["to_recorded_pct"] is None, r["to_recorded_pct"])):

@@ -1,10 +1,11 @@
-"""What training a policy on recordings shares, whoever trains: frames, batches, the loss, and going on after a kill.
+"""What every training on recordings needs: frames, batches, the loss, and a way to go on after it was killed.
 
     with Resumable(folder) as saved:
         for _ in saved.steps("backbone", 200, rng, model=model, optimizer=optimizer, scheduler=scheduler):
             saved.losses["backbone"].append(descend(loss_of(model), model, optimizer, scheduler))
 
-Ended at any moment and started again, this gives the same weights to the last bit as if it had never been ended.
+A training that is ended at any moment and started again gives the same weights, to the last bit, as one that was never
+ended.
 """
 
 import fcntl
@@ -39,14 +40,14 @@ KL_WEIGHT = 10.0
 WEIGHT_DECAY = 1e-4
 BETAS = (0.9, 0.999)
 GRAD_CLIP = 1.0
-SWAPPED_STATES = 0.5  # the share of samples that get another's state, so that it does not give the action away
-STANDING_THROTTLE = 0.01  # below it the car stands, which no frame shows: these states are never swapped
+SWAPPED_STATES = 0.5  # the share of samples that get another's state, so that the state does not give the action away
+STANDING_THROTTLE = 0.01  # below it the car stands, which no frame shows, so such a state is never swapped
 SAVE_EVERY_S = 60.0
-SAVING_SHARE = 0.05  # of the time at most goes into saving, however slow the disk
+SAVING_SHARE = 0.05  # saving takes at most this share of the time, however slow the disk
 
 
 class Pictures:
-    """Samples' frames at one size, read from their files when asked for: memory does not grow with recordings."""
+    """The frames of samples at one size, read from their files when asked for, so that many need no more memory."""
 
     def __init__(self, samples: tuple[Sample, ...], height: int, width: int):
         self.samples, self.height, self.width = samples, height, width
@@ -55,17 +56,17 @@ class Pictures:
         return len(self.samples)
 
     def __getitem__(self, rows: np.ndarray | slice) -> np.ndarray:
-        """(n, height, width, 3) uint8 RGB. Raises EpisodeError for a picture that is gone or damaged."""
+        """Read these rows: (n, height, width, 3) uint8 RGB. Raises EpisodeError if a picture is gone or damaged."""
         chosen = np.arange(len(self.samples))[rows]
         return np.stack([prepare_frame(self.samples[i].frame_bgr(), self.height, self.width) for i in chosen])
 
 
 @dataclass
 class Frames:
-    """Samples aligned by row.
+    """Samples as arrays with a row for each.
 
-    images: (n, height, width, 3) uint8 RGB, in memory or read when asked for. states: (n, 2) and chunks:
-    (n, chunk, 2) float32. is_pad: (n, chunk) bool, true where the drive had ended.
+    images: (n, height, width, 3) uint8 RGB, in memory or read when asked for. states: (n, 2) float32. chunks:
+    (n, chunk, 2) float32. is_pad: (n, chunk) bool, true where a chunk is padded.
     """
 
     images: np.ndarray | Pictures
@@ -78,7 +79,7 @@ class Frames:
 
 
 def frames_of(samples: tuple[Sample, ...], height: int, width: int) -> Frames:
-    """Samples with their frames at that size, read from disk whenever they are asked for."""
+    """Return the samples with their frames at this size, which are read from disk whenever they are asked for."""
     return Frames(
         Pictures(samples, height, width),
         np.stack([s.state for s in samples]).astype(np.float32),
@@ -88,29 +89,29 @@ def frames_of(samples: tuple[Sample, ...], height: int, width: int) -> Frames:
 
 
 def in_memory(frames: Frames, desc: str, progress: Progress = silent) -> Frames:
-    """The same with all images read: for small ones, of which a step takes less time than reading them."""
+    """Return the same with all images in memory: for small images, which take longer to read than to train on."""
     rows = progress(range(len(frames)), desc=desc, total=len(frames))
     images = np.concatenate([frames.images[row : row + 1] for row in rows])
     return Frames(images, frames.states, frames.chunks, frames.is_pad)
 
 
 class RowFile:
-    """Arrays of one shape on disk, appended and read by row: features and tokens that would not fit into memory.
+    """Arrays of one shape in a file, appended and read by row, such as features that would not fit into memory.
 
-    A part of a training's state, as a module is: it has the rows that were saved with it, and those appended since.
+    Like a module it is a part of a training's saved state: after a restart it has the rows that it had when saved.
     """
 
     def __init__(self, path: Path, shape: tuple[int, ...], dtype: type = np.float32):
         self.path, self.shape, self.dtype = path, shape, np.dtype(dtype)
         self.row_bytes = math.prod(shape) * self.dtype.itemsize
-        self._rows = 0  # whatever a process that was killed may have left in the file
+        self._rows = 0  # although a process that was killed may have left rows in the file
         self._file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+b", buffering=0)
 
     def __len__(self) -> int:
         return self._rows
 
     def append(self, rows: np.ndarray | Tensor) -> None:
-        """rows: (n, *shape)."""
+        """Append rows, (n, *shape). Raises TrainingError for another shape."""
         array = np.ascontiguousarray(rows, self.dtype)
         if array.shape[1:] != self.shape:
             raise TrainingError(f"{self.path.name}: its rows are of another shape", found=array.shape[1:])
@@ -121,7 +122,7 @@ class RowFile:
         self._rows += len(array)
 
     def __getitem__(self, rows: np.ndarray) -> np.ndarray:
-        """(n, *shape) of these rows. Read, not mapped: mapped pages would count as this process's memory."""
+        """Return these rows, (n, *shape). They are read, because mapped pages would count as this process's memory."""
         chosen = np.empty((len(rows), *self.shape), self.dtype)
         for i, row in enumerate(rows):
             data = os.pread(self._file.fileno(), self.row_bytes, int(row) * self.row_bytes)
@@ -141,7 +142,7 @@ class RowFile:
 
 
 class Stateful(Protocol):
-    """What a training consists of: modules, optimisers, schedulers, files of rows."""
+    """A part of a training whose state can be saved: a module, an optimiser, a scheduler, a file of rows."""
 
     def state_dict(self) -> Any: ...
 
@@ -149,12 +150,12 @@ class Stateful(Protocol):
 
 
 class Resumable:
-    """A training in phases that goes on where it was, after Ctrl-C, kill -9 or a power cut at any moment.
+    """A training in phases that goes on where it was after Ctrl-C, kill -9 or a power cut at any moment.
 
-    folder: holds a file per phase; remove it when the training's result is safe. Only one process at a time may train
-    in it. work: what all steps cost together, in the unit of `steps`' cost, for one bar over all phases, to be set
-    before the first; without it each phase has its own. every_s: between two saves, more where saving is slow.
-    losses: what the steps put there, by phase; saved with them.
+    folder: has a file for each phase; remove it once the training's result is safe. Only one process at a time may
+    train in it. work: the cost of all steps together, in the unit of the cost given to `steps`, for one progress bar
+    over all phases, to be set before the first; without it each phase has its own bar. every_s: seconds between two
+    saves, more if saving is slow. losses: by phase, the values that the loop's body puts there; they are saved too.
     """
 
     def __init__(
@@ -168,12 +169,12 @@ class Resumable:
         self.folder, self.every_s, self.clock = folder, every_s, clock
         self.losses: dict[str, list[float]] = defaultdict(list)
         self.progress, self.work = progress, work
-        self._behind = 0  # work that was done by the process before this one
+        self._behind = 0  # work that an earlier process had done
         self._bar: Any = None
         self._ticks: Iterator[None] = iter(())
 
     def __enter__(self) -> "Resumable":
-        """Raises TrainingError if another process trains in this folder."""
+        """Make the folder and lock it. Raises TrainingError if another process trains in it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock = (self.folder / "lock").open("w")
         try:
@@ -183,7 +184,7 @@ class Resumable:
             raise TrainingError(
                 "another process trains the same", found=f"its lock on {self.folder}", remedy="wait for it or stop it"
             ) from None
-        for left in self.folder.glob(".*.pt"):  # half of a file, by a process that was killed while it saved
+        for left in self.folder.glob(".*.pt"):  # incomplete files of a process that was killed while it saved
             left.unlink()
         return self
 
@@ -195,10 +196,10 @@ class Resumable:
     def steps(
         self, phase: str, count: int, rng: np.random.Generator, cost: int = 1, **parts: Stateful
     ) -> Iterator[int]:
-        """The numbers of the steps of a phase that are still to be made; the loop's body makes one.
+        """Yield the numbers of the steps of a phase that are still to be done; the loop's body does one of them.
 
-        parts: all that a step changes, put back as it was saved. rng and torch's own random numbers are too: after a
-        phase they are what they were at its end, whichever process made it. cost: of one step.
+        parts: everything that a step changes. Before the first step they are restored as they were saved, and so are
+        rng and torch's own random numbers: after a phase these are the same whichever process did it. cost: of a step.
         """
         file = self.folder / f"{phase}.pt"
         done = self._restore(file, phase, rng, parts) if file.exists() else 0
@@ -218,7 +219,7 @@ class Resumable:
 
     def _advance(self, phase: str, cost: int, total: int) -> None:
         desc = f"training, {phase}"
-        if self._bar is None:  # only now it is known how much had been done before
+        if self._bar is None:  # not earlier, because only now it is known how much had been done before
             left = max(0, total - self._behind)
             self._bar = self.progress(repeat(None, left), desc=desc, total=total, initial=self._behind)
             self._ticks = iter(self._bar)
@@ -260,7 +261,7 @@ class Resumable:
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """torch's random numbers follow from the seed inside, and are as before outside."""
+    """Seed torch's random numbers inside the block, and restore their state afterwards."""
     devices = list(range(torch.cuda.device_count()))
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
@@ -269,7 +270,7 @@ def seeded(seed: int) -> Iterator[None]:
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """torch computes with that many inside."""
+    """Let torch compute with this number of threads inside the block."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -279,7 +280,7 @@ def threads(count: int) -> Iterator[None]:
 
 
 def batch_of(data: Frames, rows: np.ndarray, rng: np.random.Generator, device: torch.device) -> dict[str, Tensor]:
-    """What a policy trains on: light changed, half of the drives mirrored, half of the states swapped."""
+    """Return a batch to train on: in another light, half of the samples mirrored, and half of the states swapped."""
     flipped = rng.random(len(rows)) < 0.5
     images, states, chunks = data.images[rows], swapped_states(data, rows, rng), data.chunks[rows].copy()
     images[flipped] = images[flipped, :, ::-1]
@@ -295,7 +296,7 @@ def batch_of(data: Frames, rows: np.ndarray, rng: np.random.Generator, device: t
 
 
 def swapped_states(data: Frames, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(n, 2) float32: these rows' states, half of those in motion replaced by another frame's."""
+    """Return these rows' states, (n, 2) float32, with half of those in motion replaced by another moving frame's."""
     states = data.states[rows].copy()
     moving = np.flatnonzero(data.states[:, 1] >= STANDING_THROTTLE)
     if len(moving):
@@ -305,14 +306,17 @@ def swapped_states(data: Frames, rows: np.ndarray, rng: np.random.Generator) -> 
 
 
 def recorded_spread(data: Frames) -> np.ndarray:
-    """(2,) float32, each action's standard deviation: errors count in it, for throttle's is a tenth of steering's."""
+    """Return each action's standard deviation, (2,) float32, at least 0.001.
+
+    It is the unit in which errors count, because throttle varies a tenth as much as steering.
+    """
     return np.maximum(data.chunks[~data.is_pad].std(axis=0), 1e-3)
 
 
 def error_of(predicted: Tensor, batch: dict[str, Tensor], loss_weights: Tensor) -> Tensor:
-    """Mean absolute error of the actions that were recorded, each in its own unit.
+    """Return the mean absolute error over the recorded actions, without padding, each action in its own unit.
 
-    predicted: (n, chunk, 2). loss_weights: (2,), one over each action's spread.
+    predicted: (n, chunk, 2). loss_weights: (2,), one divided by each action's spread.
     """
     recorded = ~batch[IS_PAD][..., None]
     error = (predicted - batch[ACTION]).abs() * loss_weights * recorded
@@ -320,7 +324,7 @@ def error_of(predicted: Tensor, batch: dict[str, Tensor], loss_weights: Tensor) 
 
 
 def policy_loss(policy: "ACTPolicy", batch: dict[str, Tensor], loss_weights: Tensor) -> Tensor:
-    """ACT's loss, as LeRobot's forward has it, with each action in its own unit."""
+    """Return ACT's loss as LeRobot's forward computes it, but with each action in its own unit."""
     actions, (mean, log_variance) = policy.model({**batch, "observation.images": [batch[IMAGE]]})
     divergence = -0.5 * (1 + log_variance - mean.pow(2) - log_variance.exp()).sum(-1).mean()
     return error_of(actions, batch, loss_weights) + KL_WEIGHT * divergence
@@ -329,7 +333,10 @@ def policy_loss(policy: "ACTPolicy", batch: dict[str, Tensor], loss_weights: Ten
 def optimiser(
     parameters: Iterable[nn.Parameter], rate: float, steps: int, warmup: int = 0
 ) -> tuple[torch.optim.AdamW, torch.optim.lr_scheduler.LRScheduler]:
-    """AdamW whose rate warms up over `warmup` steps, a twentieth of all for 0, and falls to 1/100 along a cosine."""
+    """Make AdamW with a rate that warms up over `warmup` steps and falls to 1/100 along a cosine.
+
+    warmup: 0 means a twentieth of all steps.
+    """
     optimizer = torch.optim.AdamW(parameters, lr=rate, betas=BETAS, weight_decay=WEIGHT_DECAY)
     warmup = warmup or max(1, steps // 20)
 
@@ -341,7 +348,7 @@ def optimiser(
 
 
 def descend(loss: Tensor, module: nn.Module, optimizer: torch.optim.Optimizer, scheduler: Any) -> float:
-    """One step down. Returns the loss before it. Raises TrainingError if that is not finite."""
+    """Do one step of the optimiser, and return the loss before it. Raises TrainingError if that is not finite."""
     value = loss.item()
     if not math.isfinite(value):
         raise TrainingError("training went wrong: the loss is not finite", found=value, remedy="try another seed")
@@ -354,14 +361,14 @@ def descend(loss: Tensor, module: nn.Module, optimizer: torch.optim.Optimizer, s
 
 
 class Given(nn.Module):
-    """Stands in for the backbone while the transformer trains: its 'image' is the feature map already."""
+    """Takes the backbone's place while the transformer trains: its input is already the feature map."""
 
     def forward(self, features: Tensor) -> dict[str, Tensor]:
         return {"feature_map": features}
 
 
 def driving_error(policy: "ACTPolicy", data: Frames, rows: np.ndarray) -> float:
-    """Mean absolute error, in action units, of what the policy would drive on these rows (no latent sampled)."""
+    """Return the mean absolute error, in action units, of the policy's plans on these rows (no latent is sampled)."""
     policy.eval()
     device = next(policy.parameters()).device
     chunks = policy.predict_action_chunk(
@@ -374,10 +381,10 @@ def driving_error(policy: "ACTPolicy", data: Frames, rows: np.ndarray) -> float:
 
 
 def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
-    """The config of the user's trainer, a plain dict, key for key.
+    """Return the config of the user's trainer as a plain dict, key for key.
 
-    known: learning_rate, batch_size, data_dir, output_dir, device and seed. Folders by name only: a checkpoint is
-    shown to others.
+    known: learning_rate, batch_size, data_dir, output_dir, device and seed. Give folders by their name only, because a
+    checkpoint is shown to others.
     """
     ((height, width),) = size.image_sizes
     return {
@@ -413,7 +420,7 @@ def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
 
 
 def to_cpu(value: Any) -> Any:
-    """A state dict, or anything nested of lists, tuples and dicts, with all its tensors on the processor."""
+    """Return a state dict, or anything nested of lists, tuples and dicts, with all its tensors on the CPU."""
     if isinstance(value, Tensor):
         return value.cpu()
     if isinstance(value, dict):

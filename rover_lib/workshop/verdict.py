@@ -1,12 +1,12 @@
-"""Which artifact to deploy, and what to do about what failed? By rule, from the JSON that the stages of a run left.
+"""Decide by a rule which artifact to deploy, and what to do about what failed, from the JSON of a run's stages.
 
     stages = {name: read_stage(...)["metrics"] for name in ("load", "quantize", "compare", "benchmark")}
     judged = verdict(stages, params(), Names("runs/mine", "best_model.pth", "episodes"))
 
-The rule, with its limits in params.yml's sections `verdict` and `gates`: of the modes that keep every gate, those that
-are as fast as the fastest; of these, those that are as true to FP32 as the truest; of these, the smallest; and where
-that leaves several, the first of PREFERRED. FP32 always keeps its gates of error, so that there is an artifact to
-deploy whenever the policy itself drives.
+The rule takes its limits from the sections `verdict` and `gates` of params.yml. Of the modes that keep every gate, it
+keeps those about as fast as the fastest; of these, those about as true to FP32 as the truest; of these, those about as
+small as the smallest; and if several are left, it takes the first of PREFERRED. FP32 has no gates of error to miss, so
+there is an artifact to deploy whenever the policy itself drives.
 """
 
 import shlex
@@ -31,17 +31,17 @@ OF_BENCHMARKS = {  # the original's acceptance table
     "temperature_c": "temperature, Celsius",
     "throttled": "what the Pi's firmware throttled",
 }
-PREFERRED = ("fp32", "static", "mixed", "dynamic")  # where nothing else parts them: what was trained, then the simplest
+PREFERRED = ("fp32", "static", "mixed", "dynamic")  # between equals: the policy as trained, then the simplest
 COUNTED = "counted on an emulated Cortex-A76"
 NEXT_COMMANDS = 3
-MOST_EPISODES = 3  # named for a remedy
+MOST_EPISODES = 3  # a remedy names at most this many
 
 Stages = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class Names:
-    """What a user types for the run's folder, its checkpoint and its recordings, as from where they stand."""
+    """What a user types, from the current folder, for the run's folder, its checkpoint and its recordings."""
 
     run: str
     checkpoint: str
@@ -56,10 +56,10 @@ class Names:
 
 
 def verdict(stages: Stages, params: Mapping[str, Any], names: Names) -> dict[str, Any]:
-    """What run.json says of a run.
+    """Return the verdict on a run, as run.json stores it.
 
-    stages: metrics by stage: load, quantize, compare and benchmark; arm and distill where they were made. params:
-    params.yml's content. Its "deploy" is None where no artifact of this policy ought to drive a car.
+    stages: the metrics of the stages load, quantize, compare and benchmark, and of arm and distill if they were made.
+    params: the content of params.yml. "deploy" in the result is None if no artifact of this policy should drive a car.
     """
     rows = _rows(stages, params)
     failed = _failed(stages, params, names, rows)
@@ -84,7 +84,7 @@ def verdict(stages: Stages, params: Mapping[str, Any], names: Names) -> dict[str
 
 
 def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """A row for each mode that was compared, FP32 first. Units are in the keys."""
+    """Return a row for each mode that was compared, FP32 first. Units are in the keys."""
     compared, timed = stages["compare"], stages["benchmark"]["artifacts"]
     counted = stages.get("arm", {}).get("artifacts", {})
     fp32 = compared["fp32"]
@@ -113,7 +113,10 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
 
 
 def _missed(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str) -> list[dict[str, Any]]:
-    """The gates that a mode does not keep, each said once: a loss in general only where no action has its own gate."""
+    """Return the gates that a mode misses, each once.
+
+    The original's general gates of accuracy and size are left out if a gate of our own for the same thing is missed.
+    """
     rows = [r for r in gates(compared, limits, mode) if r["passed"] is False and r["gate"].startswith(f"{mode} ")]
     keys = {r["gate"].partition(" ")[2] for r in rows}
     doubled = set()
@@ -121,11 +124,11 @@ def _missed(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str) -
         doubled.add("accuracy_loss_pct")
     if "size_mb" in keys:
         doubled.add("model_size_mb")
-    return [_said(r) for r in rows if r["gate"].partition(" ")[2] not in doubled]
+    return [_with_words(r) for r in rows if r["gate"].partition(" ")[2] not in doubled]
 
 
 def _best(rows: Sequence[dict[str, Any]], limits: Mapping[str, Any]) -> dict[str, Any]:
-    """The row that the rule takes. FP32 has no gates to miss, so one is always left."""
+    """Return the row that the rule takes. FP32 has no gates to miss, so there always is one."""
     same = 1 + limits["worth_pct"] / 100
     left = _candidates(rows)
     key = _work_key(left)
@@ -140,38 +143,38 @@ def _best(rows: Sequence[dict[str, Any]], limits: Mapping[str, Any]) -> dict[str
 
 
 def _candidates(rows: Iterable[Mapping[str, Any]]) -> list[Any]:
-    """Those that keep their gates; a mixed one that has no block in float is static INT8 once more."""
+    """Return the modes that keep their gates, but not a mixed one with no block in float: that is static INT8 again."""
     return [row for row in rows if not row["missed_gates"] and (row["mode"] != "mixed" or row["float_blocks"])]
 
 
 def _work_key(rows: Sequence[Mapping[str, Any]]) -> str | None:
-    """What says which is fastest: instructions where all are counted, else the time here; None without either."""
+    """Return the key to compare speed by: instructions if all rows have them, else the time here, else None."""
     return next((k for k in ("instructions_g", "time_ms") if all(row[k] for row in rows)), None)
 
 
 def error_pct(row: Mapping[str, Any]) -> float:
-    """The worse action's error, in percent of its recorded range; 0 for FP32, and where nothing is judged."""
+    """Return the larger of the actions' errors, in percent of the recorded range; 0 for FP32 or if none was judged."""
     return judge.worst(row["errors_pct"]) or 0.0
 
 
 def _timing(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Where the figures of speed come from."""
+    """Say where the figures of speed come from."""
     key = _work_key(_candidates(rows.values()))
     return {"instructions_g": COUNTED, "time_ms": "measured here", None: "not measured"}[key]
 
 
 def _time_key(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
-    """Which time of a mode is compared: the median; of a machine that did other things meanwhile, the least.
+    """Return which time of a mode is compared: the median, or the smallest if the machine was busy with other things.
 
-    INT8's engine waits for all its threads at each layer, so that another process's share of a core can make it slower
-    than FP32, in the median.
+    INT8's engine waits for all its threads at each layer, so another process that takes part of a core can make its
+    median slower than FP32's.
     """
     least = all("latency_min_ms" in timed for timed in benchmark["artifacts"].values())
     return "latency_min_ms" if least and _busy(benchmark, limits) else "latency_p50_ms"
 
 
 def _busy(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
-    """How it is seen that the machine did other things while it took the times; empty if it is not."""
+    """Say what shows that the machine did other things while it took the times; empty if nothing does."""
     cores, own_pct = benchmark.get("cpu_per_core_pct"), benchmark.get("cpu_pct")
     if cores and own_pct is not None and len(cores) == benchmark.get("cores"):
         others_pct = sum(cores) / len(cores) - own_pct
@@ -185,14 +188,14 @@ def _busy(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
 # --- what failed, and what to do --------------------------------------------------------------------------------------
 
 
-def _said(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of `compare.gates` with what it is in words."""
+def _with_words(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row of `compare.gates` with its gate in words added."""
     mode, _, key = row["gate"].partition(" ")
     return {**row, "words": in_words(mode, key)}
 
 
 def in_words(mode: str, key: str) -> str:
-    """A gate as people call it: "throttle error of static INT8"."""
+    """Return what people call a gate, such as "throttle error of static INT8, % of the recorded range"."""
     of = CALLED.get(mode, mode)
     if key.endswith("_mae_pct"):
         return f"{key.removesuffix('_mae_pct')} error of {of}, % of the recorded range"
@@ -216,9 +219,9 @@ def in_words(mode: str, key: str) -> str:
 
 
 def gate_in_words(gate: str) -> str:
-    """Any gate's name, as notebooks show it: of a comparison, a benchmark, a drive, a count or a student.
+    """Return any gate's name as notebooks show it: of a comparison, a benchmark, a drive, a count or a student.
 
-    What is in words already stays as it is.
+    A name that is already in words stays as it is.
     """
     name, _, key = gate.partition(" ")
     stem, dot, _ = name.removeprefix("policy_").partition(".onnx")
@@ -236,9 +239,9 @@ def gate_in_words(gate: str) -> str:
 def _failed(
     stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Each gate that the policy, or the mode that a Pi is meant to run, does not keep: with its remedies, best first.
+    """Return each gate that the policy, or the mode that a Pi is meant to run, misses, with its remedies, best first.
 
-    What this workstation measures of time and memory fails no gate here: those are a Pi's.
+    Time and memory measured on this workstation are not judged here: those gates are for a Pi.
     """
     limits, hits = params["gates"], stages["compare"]["fp32"]["hits"]
     failed = []
@@ -248,7 +251,7 @@ def _failed(
             "No other format can fix this: train longer, on more recordings.",
             "Record drives in which the car has left its way and is steered back, so that the policy learns it.",
         ]
-        failed.append(_said(trained) | {"remedies": remedies})
+        failed.append(_with_words(trained) | {"remedies": remedies})
     for row in rows[GATED]["missed_gates"] if GATED in rows else []:
         failed.append(row | {"remedies": _remedies(row["gate"].partition(" ")[2], stages, params, names, rows)})
     promised = limits["original"]["latency_mean_ms"][1]
@@ -258,7 +261,7 @@ def _failed(
             "Driving at 30 Hz does not need it: one plan covers a second. No program can make this policy faster.",
             f"A smaller policy can: `{_smaller(stages, names)}`.",
         ]
-        failed.append(_said(floor) | {"remedies": remedies})
+        failed.append(_with_words(floor) | {"remedies": remedies})
     return failed
 
 
@@ -269,7 +272,7 @@ def _remedies(
     names: Names,
     rows: Mapping[str, Mapping[str, Any]],
 ) -> list[str]:
-    """What to do about a gate that static INT8 does not keep, the cheapest first."""
+    """Say what to do about a gate that static INT8 misses, the cheapest remedy first."""
     if key in ("size_mb", "model_size_mb"):
         return [f"INT8 cannot make it smaller; a smaller policy can: `{_smaller(stages, names)}`."]
     action = key.removesuffix("_mae_pct") if key.endswith("_mae_pct") else None
@@ -327,7 +330,11 @@ def _qat(names: Names) -> str:
 
 
 def _smaller(stages: Stages, names: Names) -> str:
-    """rover distill, to half of the picture's sides; fewer decoder layers where there are several."""
+    """Return a `rover distill` command for a smaller policy.
+
+    It halves the picture's sides if they are known, and asks for two decoder layers if there are more. If neither
+    applies, it asks for a narrower feed-forward layer.
+    """
     report = stages["load"]["checkpoint"]
     config = report.get("trainer_config") or {}
     width, height = config.get("image_width"), config.get("image_height")
@@ -349,7 +356,7 @@ def _shell(*words: str) -> str:
 
 
 def _does_not_drive(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Why no artifact of this policy ought to drive a car; empty where that is not known to be so."""
+    """Say why no artifact of this policy should drive a car; empty if nothing is known to speak against it."""
     looking = stages["compare"].get("looking", {})
     actions = [k.removesuffix("_apart_pct") for k, v in looking.items() if k.endswith("_apart_pct") and v is not None]
     if actions and not any(judge.follows(looking[f"{a}_by_picture_pct"], looking[f"{a}_apart_pct"]) for a in actions):
@@ -363,7 +370,7 @@ def _does_not_drive(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list
 
 
 def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
-    """Why this one, each reason a sentence."""
+    """Say why this mode was chosen, each reason in a sentence."""
     if best is fp32:
         return ["No INT8 mode keeps every gate and is worth its cost, so this is FP32, the policy as it was trained."]
     errors = [f"{action} {judge.shown_pct(e).strip()}" for action, e in best["errors_pct"].items()]
@@ -388,7 +395,7 @@ def _because(
     best: Mapping[str, Any],
     limits: Mapping[str, Any],
 ) -> str:
-    """Why a mode is the one to deploy, or not worth it, in one sentence."""
+    """Say in one phrase why a mode is the one to deploy, or why it is not worth it."""
     if row is best:
         return "the one to deploy"
     if row["missed_gates"]:
@@ -412,7 +419,7 @@ def _because(
 
 
 def against(row: Mapping[str, Any]) -> str:
-    """A gate that was judged, in words: what it is of, what was found, and the limit."""
+    """Put a judged gate in words: what it limits, what was found, and the limit."""
     return (
         f"{row['words']}: {row['found']:.3g}, {'at least' if row['relation'] == '>=' else 'at most'} {row['limit']:g}"
     )
@@ -421,7 +428,9 @@ def against(row: Mapping[str, Any]) -> str:
 def _cautions(
     stages: Stages, params: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]], best: Mapping[str, Any]
 ) -> list[str]:
-    """What limits the verdict: numbers that do not fit, too few recordings, nobody who drove, a time not of a Pi."""
+    """Say what weakens the verdict, such as numbers that do not fit, too few recordings, no trial drives, or times that
+    were not measured on a Pi.
+    """
     compared, split = stages["compare"], stages["load"]["split"]
     unfit = stages["load"].get("fit", {}).get("warnings", [])
     lines = [f"Do not drive before this is clear: {warning.removesuffix('?')}." for warning in unfit]
@@ -456,12 +465,12 @@ def _cautions(
 
 
 def count(number: int, what: str) -> str:
-    """A number of things in words, such as 2 episodes."""
+    """Return a number with its noun, such as "2 episodes"."""
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[str, str]]:
-    """The next three commands to type, with the reason for each."""
+    """Return at most three commands to type next, with the reason for each."""
     deploy, drove = judged["deploy"], bool(stages["compare"]["fp32"]["trials"])
     student = f"{names.name}-qat"
     left = "pretrained_model" if stages["load"]["checkpoint"].get("format") == "lerobot" else "best_model.pth"

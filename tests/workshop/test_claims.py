@@ -1,8 +1,12 @@
 """What figures say above themselves: computed of what they draw, and the contrary where that is so."""
 
+from pathlib import Path
+
 import pytest
 
+from rover_lib.workshop import plots
 from rover_lib.workshop.plots import claims
+from rover_lib.workshop.samples import Fault, Recordings, Source
 
 
 def compared(fp32, static):
@@ -62,3 +66,9 @@ def test_how_much_of_the_recorded_range_calibrates():
     pool = [(0.0, 0.0), (0.5, 0.1), (1.0, 0.2)]
     found = claims.coverage(pool[:2], pool, ("steering", "throttle"))
     assert found == "2 of 3 frames reach 50 % of steering and 50 % of throttle's recorded range"
+
+
+def test_a_fault_that_was_repaired_is_not_called_skipped():
+    fault = Fault("episode_1/control_data.csv", "serial_burst", 7, "placed by the Arduino's clock")
+    figure = plots.faults(Recordings(Path("episodes"), (), (fault,), Source(Path("episodes"))))
+    assert figure._suptitle.get_text() == "0 episodes give 0 samples; 7 faults were left out or repaired"

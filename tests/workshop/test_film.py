@@ -128,7 +128,7 @@ def test_a_film_is_of_the_car_that_was_driven(tmp_path):
 
 
 def test_a_replayed_recording_has_its_own_cars_pulses(tmp_path):
-    with EpisodeWriter(tmp_path / "episode_20260101_000000", About("a test", car=OTHER), (64, 36)) as writer:
+    with EpisodeWriter(tmp_path / "episode_20260101_000000", About("a test", car=OTHER), resolution=(64, 36)) as writer:
         for n in range(60):
             pulses = OTHER.pwm.pulses(0.5, 0.1)
             writer.control(n / 30, n * 33, pulses.steering_us, pulses.throttle_us, 20000, 20000)
@@ -179,6 +179,18 @@ def test_pictures_of_another_drive_are_refused(tmp_path):
         r.load_replay(log)
     with pytest.raises(LogError, match="no drive 3"):
         r.load_replay(log, drive=3)
+
+
+def test_a_damaged_time_in_the_list_costs_its_picture_alone(tmp_path):
+    log = drive(tmp_path)
+    whole = r.load_replay(log).moments
+    listed = tmp_path / "episodes/episode_1/frame_data.csv"
+    sound = listed.read_text()
+    listed.write_text(f"{sound}100,nan,frames/frame_000003.jpg\n101,inf,frames/frame_000003.jpg\n")
+    assert r.load_replay(log).moments == whole
+    listed.write_text(f"{sound}100,1,frames/frame\0.jpg\n")
+    with pytest.raises(EpisodeError, match="its list of pictures cannot be read"):
+        r.load_replay(log)
 
 
 def test_a_view_shows_it_again_and_again_in_its_own_time(tmp_path, monkeypatch):

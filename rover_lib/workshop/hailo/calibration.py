@@ -1,4 +1,4 @@
-"""The calibration set of a kit, and the observations that the compiler's emulator is asked: arrays, channels last."""
+"""Write a kit's calibration set, and the observations for the compiler's emulator, as arrays with channels last."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from rover_lib.workshop.progress import Progress
 
 
 def write_calibration(splits: Splits, samples: Sequence[Sample], folder: Path, progress: Progress) -> None:
-    """calibration_<input>.npy: frames, normalised states, and `backbone`'s features of the frames, (n, ...) each."""
+    """Write calibration_<input>.npy: frames, normalised states, and `backbone`'s features, (n, ...) each."""
     session = session_of(splits.front.model)
     arrays: dict[str, np.memmap] = {}
     for i, sample in enumerate(progress(samples, desc="calibration set")):
@@ -34,7 +34,7 @@ def write_calibration(splits: Splits, samples: Sequence[Sample], folder: Path, p
 
 
 def write_expected(splits: Splits, judged: Exporter, folder: Path) -> None:
-    """expected_<network>.npz: the parity vectors' observations and a network's answers in FP32, (n, ...) each."""
+    """Write expected_<network>.npz: the parity vectors' observations and a network's FP32 answers, (n, ...) each."""
     inputs = [judged.inputs[i] for i in judged.stored]
     frames = {
         f"frame_{camera}": np.stack([x[1 + c].numpy() for x in inputs])

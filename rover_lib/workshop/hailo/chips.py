@@ -1,4 +1,4 @@
-"""Hailo's chips, and how long a network takes on one: computed from the figures of Hailo's model zoo."""
+"""Hailo's chips, and how long a network takes on one, computed from the figures of Hailo's model zoo."""
 
 from dataclasses import dataclass
 
@@ -7,10 +7,10 @@ from rover_lib.workshop.hailo.networks import Network
 
 @dataclass(frozen=True)
 class Chip:
-    """A chip, and what Hailo's model zoo measured on it at batch 1, in frames a second.
+    """A chip, and the rates that Hailo's model zoo measured on it at batch 1, in frames a second.
 
-    detr: detr_resnet_v1_18_bn, 61.87 GOP. resnet: resnet_v1_18, 3.64 GOP. Of docs/public_models in hailo_model_zoo
-    v5.2.0, where a multiply-accumulate is two operations.
+    detr: of detr_resnet_v1_18_bn, 61.87 GOP. resnet: of resnet_v1_18, 3.64 GOP. They are from docs/public_models in
+    hailo_model_zoo v5.2.0, where a multiply-accumulate counts as two operations.
     """
 
     name: str
@@ -32,7 +32,9 @@ DETR_GOP, RESNET_GOP = 61.87, 3.64
 
 @dataclass(frozen=True)
 class Estimate:
-    """Milliseconds on a chip: at the rate of the zoo's DETR, and for a network without attention of its ResNet-18."""
+    """Milliseconds on a chip. slow_ms: at the rate of the zoo's DETR. fast_ms: at that of its ResNet-18, or slow_ms for
+    a network with attention. arithmetic: how they were computed.
+    """
 
     slow_ms: float
     fast_ms: float
@@ -40,7 +42,7 @@ class Estimate:
 
 
 def estimate(network: Network, chip: Chip) -> Estimate:
-    """Time of one inference on that chip, computed from the zoo's rates of alike networks; nobody has measured it."""
+    """Estimate the time of one inference on a chip from the zoo's rates of similar networks. Nobody has measured it."""
     gop = 2 * network.macs / 1e9
     slow = DETR_GOP * chip.detr
     words = f"{gop:.1f} GOP / ({DETR_GOP} GOP x {chip.detr:g}/s) = {1000 * gop / slow:.1f} ms"

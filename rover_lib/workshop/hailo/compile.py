@@ -3,11 +3,11 @@
     python3 compile.py hailo8 backbone                     # parse, quantize, emulate, compile, pack
     python3 compile.py hailo8 backbone --hef mine.hef      # only pack a HEF that was compiled otherwise
 
-Runs where Hailo's Dataflow Compiler is installed: x86-64 Linux, 3.x for Hailo-8 and 8L, 5.x for Hailo-10H. It lies in
-a kit as compile.py and needs nothing else of the project.
+It runs where Hailo's Dataflow Compiler is installed: on x86-64 Linux, version 3.x for Hailo-8 and 8L, 5.x for
+Hailo-10H. It is a kit's compile.py, and needs nothing else of the project.
 
-Nobody who wrote this had that compiler. What it calls is what Hailo's tutorials and model zoo call; where the compiler
-names a layer otherwise than this kit expects, it stops and says how.
+Nobody who wrote this had that compiler. It makes the same calls as Hailo's tutorials and model zoo. If the compiler
+names a layer differently from what this kit expects, it stops and says what the name is.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-MOST = 3.0  # times the error of ONNX Runtime's INT8: more than that from the emulator is worth a look
+MOST = 3.0  # if the emulator's error is more than this many times that of ONNX Runtime's INT8, a warning is printed
 
 
 def main() -> None:
@@ -36,7 +36,10 @@ def main() -> None:
 
 
 def compile_network(kit: Path, chip: str, name: str) -> Path:
-    """The network's HEF, beside its archives after each step. Exits with a sentence where something does not fit."""
+    """Compile a network and return the path of its HEF. The archive of each step is kept beside it.
+
+    If something does not fit, the program ends with a sentence that says what.
+    """
     network = json.loads((kit / "kit.json").read_text())["networks"][name]
     _check_compiler(network["compilers"][chip])
     from hailo_sdk_client import ClientRunner
@@ -67,7 +70,7 @@ def compile_network(kit: Path, chip: str, name: str) -> Path:
 
 
 def pack(kit: Path, chip: str, name: str, hef: Path) -> Path:
-    """The artifact for the rover: the HEF with what follows it on the processor, its manifest and parity vectors."""
+    """Pack the artifact for the rover: the HEF, what runs after it on the CPU, the manifest and the parity vectors."""
     content = json.loads((kit / "kit.json").read_text())
     network = content["networks"][name]
     manifest = content["manifest"] | {
@@ -76,7 +79,7 @@ def pack(kit: Path, chip: str, name: str, hef: Path) -> Path:
         "weights_mb": network["weights_mb"],
     }
     path = kit / f"policy_{name}_{chip}.hailo.zip"
-    new = path.with_name(f".{path.name}.new")  # so that what is there stays until this is whole
+    new = path.with_name(f".{path.name}.new")  # so that an earlier artifact stays until this one is complete
     with zipfile.ZipFile(new, "w", zipfile.ZIP_STORED) as z:
         z.writestr("archive/extra/manifest.json", json.dumps(manifest, sort_keys=True, indent=1))
         z.write(kit / "parity.npz", "archive/extra/parity.npz")
@@ -96,7 +99,7 @@ def _check_compiler(major: str) -> None:
 
 
 def _layer_of(layers: dict[str, Any], original: str) -> str:
-    """The compiler's name for what the ONNX file calls `original`."""
+    """Return the compiler's name for the layer that the ONNX file calls `original`."""
     names = [name for name, layer in layers.items() if original in layer.get("original_names", [])]
     names = [n for n in names if layers[n].get("type") == "input_layer"] or names
     if not names:
@@ -105,8 +108,9 @@ def _layer_of(layers: dict[str, Any], original: str) -> str:
 
 
 def _check_layers(layers: dict[str, Any], network: dict[str, Any]) -> None:
-    """The model script names layers as the compiler should call them; one that is something else would be quantized
-    in the wrong place without a word.
+    """Stop unless the compiler names the layers as the model script does.
+
+    With other names, the script would silently change the quantization of the wrong layers.
     """
     wrong = []
     for original, expected in network["script_names"].items():

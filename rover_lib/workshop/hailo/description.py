@@ -1,4 +1,4 @@
-"""KIT.md: what a kit's files are, what its networks consist of, and what to expect of them."""
+"""Write KIT.md: what a kit's files are, what its networks consist of, and what to expect of them."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +9,7 @@ from rover_lib.workshop.hailo.operators import OPERATORS
 
 
 def description(config: ActConfig, report: Mapping[str, Any]) -> str:
-    """The text of KIT.md. report: the content of kit.json."""
+    """Return the text of KIT.md. report: the content of kit.json."""
     lines = [
         "# A kit for Hailo's compiler",
         "",
@@ -45,7 +45,7 @@ def description(config: ActConfig, report: Mapping[str, Any]) -> str:
 
 
 def files(config: ActConfig) -> dict[str, str]:
-    """Every file of a kit, and what it is."""
+    """Return every file of a new kit, and what it is."""
     listed = {
         "KIT.md": "this",
         "kit.json": "the same as numbers, and what compile.py reads",

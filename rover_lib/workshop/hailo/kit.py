@@ -1,4 +1,4 @@
-"""A kit, written as a folder: all files, and kit.json, which says of them in numbers what KIT.md says in words."""
+"""Write a kit as a folder: all its files, and kit.json, which has in numbers what KIT.md says in words."""
 
 import json
 import shutil
@@ -26,19 +26,19 @@ from rover_lib.workshop.pipeline import CHOOSING_FRAMES, Recipe
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.session import Opened
 
-LEAST_SAMPLES = 1024  # what the zoo's scripts calibrate transformers with (vit_small.alls, deit_base.alls)
-# How many times as far from FP32 as ONNX Runtime's INT8 the chip's answers may be: it rounds elsewhere than that, and
-# nobody knows how much; a HEF that computes something else is off by hundreds of times.
+LEAST_SAMPLES = 1024  # as many as the zoo's scripts use to calibrate transformers (vit_small.alls, deit_base.alls)
+# The chip's answers may be this many times as far from FP32 as those of ONNX Runtime's INT8. The chip rounds in other
+# places, and nobody knows by how much, but a HEF that computes something else is hundreds of times as far off.
 STAND_IN_TIMES = 5.0
 
 
 def write_kit(
     loaded: Opened, out: Path | str, *, samples: int = LEAST_SAMPLES, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Write the kit of a checkpoint to the new folder `out`; return the content of its kit.json.
+    """Write the kit of a checkpoint to the new folder `out`, and return the content of its kit.json.
 
-    samples: frames of the calibration set. Raises QuantizeError where `out` exists or too few frames were recorded, and
-    leaves nothing half-written.
+    samples: how many frames the calibration set has. Raises QuantizeError if `out` exists or too few frames were
+    recorded. After an error nothing of the kit is left.
     """
     out = Path(out)
     if out.exists() or out.is_symlink():
@@ -76,7 +76,7 @@ def write_kit(
 
 
 def _write_networks(splits: Splits, samples: int, folder: Path) -> None:
-    """The ONNX files, and what compiles them."""
+    """Write the ONNX files and the scripts that compile them."""
     for name, model in (
         ("backbone", splits.front.model),
         ("whole", splits.whole.model),
@@ -92,9 +92,9 @@ def _write_networks(splits: Splits, samples: int, folder: Path) -> None:
 
 
 def _described(splits: Splits, network: Network, error: Error, recipe: Recipe) -> dict[str, Any]:
-    """What kit.json says of a network."""
+    """Return what kit.json says of a network."""
     whole, of_front = splits.whole, network is splits.front
-    # An action may be off by STAND_IN_TIMES what the stand-in's is, up to what an artifact may allow at all.
+    # An action may be off by STAND_IN_TIMES the stand-in's error, but not by more than an artifact may allow.
     tolerance = {
         name: max(recipe.parity.tolerance, min(STAND_IN_TIMES * largest, LARGEST_TOLERANCE["int8"]))
         for name, largest in error.actions.items()
@@ -115,7 +115,7 @@ def _described(splits: Splits, network: Network, error: Error, recipe: Recipe) -
         "stand_in_error": error.network,
         "stand_in_actions": error.actions,
         "tolerance": tolerance,
-        # what is not on the chip stays in float
+        # Weights that are not on the chip stay in float.
         "weights_mb": (whole.parameters + 3 * (whole.parameters - network.parameters)) / 1e6,
         "runs": {
             "outputs": {name: splits.output_shape(network, name) for name in network.outputs},
@@ -131,9 +131,9 @@ def _affine(affine: Affine | None) -> Mapping[str, Any] | None:
 
 
 def _manifest(judged: Exporter, samples: int, folder: Path) -> dict[str, Any]:
-    """The manifest of what compile.py packs, but for what the network adds. Writes parity.npz.
+    """Return the manifest of what compile.py packs, without what depends on the network, and write parity.npz.
 
-    Both are those of the FP32 artifact, which has proven that it computes what the policy does.
+    Both come from the FP32 artifact, whose export checks that it computes what the policy computes.
     """
     with TemporaryDirectory() as temporary:
         path = Path(temporary) / "policy_fp32.pt"

@@ -1,4 +1,4 @@
-"""A policy as the networks of a kit, in ONNX, and its observations as those take them."""
+"""Make the networks of a kit from a policy, in ONNX, and their inputs from its observations."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from rover_lib.workshop.onnx_graph import graph_of, onnx_model
 
 
 class Front(nn.Module):
-    """Pictures, each (1, 3, height, width) float32 and normalised -> projected features, each (1, D, h, w)."""
+    """Normalised pictures, each (1, 3, height, width) float32 -> projected features, each (1, D, h, w)."""
 
     def __init__(self, policy: ACT):
         super().__init__()
@@ -29,7 +29,7 @@ class Front(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Tokens -> actions before their normalisation is undone."""
+    """Tokens -> actions, still normalised."""
 
     def __init__(self, policy: ACT):
         super().__init__()
@@ -47,9 +47,9 @@ class Transformer(nn.Module):
 
 
 class Rest(nn.Module):
-    """What follows the chip in split `backbone`: (state (1, S), features (h, w, D) each) -> actions (1, C, A).
+    """What runs after the chip in split `backbone`: (state (1, S), features (h, w, D) each) -> actions (1, C, A).
 
-    Raw state in, raw actions out. Features as HailoRT gives them: channels last, without a batch.
+    The state and the actions are raw. The features are as HailoRT gives them: channels last, without a batch.
     """
 
     def __init__(self, policy: ACT):
@@ -65,10 +65,11 @@ class Rest(nn.Module):
 
 
 class Whole(nn.Module):
-    """(state (1, S, 1, 1), pictures (1, 3, height, width) each) -> (1, C, A), all normalised outside.
+    """(state (1, S, 1, 1), pictures (1, 3, height, width) each) -> (1, C, A), all of them normalised.
 
-    A chip has one scale for all numbers of a layer: normalised ones are of one size, degrees and shares are not. The
-    state is a picture of one pixel here, for the parser to see nothing but pictures.
+    Normalisation happens outside, because the chip has one scale for all numbers of a layer: normalised numbers are of
+    similar size, but degrees and shares are not. The state is a picture of one pixel, so that the parser sees nothing
+    but pictures.
     """
 
     def __init__(self, policy: ACT):
@@ -93,9 +94,9 @@ class Whole(nn.Module):
 class Network:
     """A graph for the compiler.
 
-    inputs: shapes by name, as the parser sees them. outputs: by name, the node that gives each. sums: nodes that should
-    become ew_add1, ew_add2 ... in the compiler's own order of numbers, without biases. sixteen_bit: those of them that
-    a LayerNormalization reads. macs, parameters: of one inference.
+    inputs: shapes by name, as the parser sees them. outputs: for each name, the node that computes it. sums: the
+    additions that are no biases, which the compiler should name ew_add1, ew_add2 ... in this order. sixteen_bit: those
+    of them that a LayerNormalization reads. macs: multiply-accumulates of an inference. parameters: weights and biases.
     """
 
     name: str
@@ -113,16 +114,16 @@ class Network:
 
 
 def networks(policy: ACT) -> tuple[Network, Network, onnx.ModelProto]:
-    """The networks of an FP32 policy: `backbone`, `whole`, and the transformer behind `backbone` for the processor."""
+    """Make an FP32 policy's networks: `backbone`, `whole`, and what runs after `backbone` on the processor."""
     config = policy.config
     pictures = {f"frame_{n}": torch.zeros(1, 3, *s) for n, s in zip(config.cameras, config.image_sizes, strict=True)}
     grids = [config.grid(*size) for size in config.image_sizes]
     features = {f"features_{n}": torch.zeros(*g, config.dim) for n, g in zip(config.cameras, grids, strict=True)}
     state = torch.zeros(1, len(config.state_names))
     macs, weights = multiply_accumulates(policy), parameters_by_block(policy)
-    looks = {b for b in macs if b.startswith("backbone") or b == "image_project"}
+    of_front = {b for b in macs if b.startswith("backbone") or b == "image_project"}
     front = _network(
-        "backbone", Front(policy), pictures, list(features), [{b: n[b] for b in looks} for n in (macs, weights)]
+        "backbone", Front(policy), pictures, list(features), [{b: n[b] for b in of_front} for n in (macs, weights)]
     )
     whole = _network(
         "whole", Whole(policy), {"state": state[:, :, None, None], **pictures}, ["actions"], [macs, weights]
@@ -139,7 +140,7 @@ def _network(
     biases = {i.name for i in model.graph.initializer if len(i.dims) == 1}
     sums = [node for node in model.graph.node if node.op_type == "Add" and not biases & set(node.input)]
     normalised = {node.input[0] for node in model.graph.node if node.op_type == "LayerNormalization"}
-    macs, parameters = (sum(of.values()) for of in counts)
+    macs, parameters = (sum(by_block.values()) for by_block in counts)
     return Network(
         name,
         model,
@@ -153,7 +154,7 @@ def _network(
 
 
 def _tidied(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The same function with two transposes in a row as one, constants multiplied, and no Identity."""
+    """Merge two transposes in a row, multiply constants, and remove Identity; the model computes the same as before."""
     graph = model.graph
     constants = {i.name: i for i in graph.initializer}
     made = {node.output[0]: node for node in graph.node}
@@ -182,10 +183,10 @@ def _tidied(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 class Splits:
-    """The networks of an FP32 policy, and recorded observations as each of them takes these.
+    """The networks of an FP32 policy, and recorded observations in the form that each of them takes.
 
-    front: split `backbone` on the chip. rest: what follows it on the processor. whole: split `whole`. A state is (1, S)
-    float32, a frame (height, width, 3) uint8 RGB, both raw, as `act.inputs_of` gives them.
+    front: what runs on the chip in split `backbone`. rest: what runs after it on the processor. whole: split `whole`.
+    A state is (1, S) float32 and a frame (height, width, 3) uint8 RGB, both raw, as `act.inputs_of` gives them.
     """
 
     def __init__(self, policy: ACT):
@@ -193,32 +194,32 @@ class Splits:
         self.front, self.whole, self.rest = networks(policy)
 
     def pictures(self, frames: Sequence[Tensor]) -> dict[str, np.ndarray]:
-        """Inputs of `front`: frames as the model script normalises them on the chip, (1, 3, height, width) float32."""
+        """Return the inputs of `front`, (1, 3, height, width) float32: frames, normalised as the model script does."""
         named = zip(self.config.cameras, self.policy.image_input, frames, strict=True)
         return {f"frame_{camera}": pixels(frame).contiguous().numpy() for camera, pixels, frame in named}
 
     def normalised_state(self, state: Tensor) -> np.ndarray:
-        """(1, 1, S) float32, as calibration and emulator take a picture of one pixel: channels last."""
+        """Normalise a state, (1, 1, S) float32: a picture of one pixel, channels last, for calibration and emulator."""
         return self.policy.state_norm(state).numpy().reshape(1, 1, -1)
 
     def whole_inputs(self, state: Tensor, frames: Sequence[Tensor]) -> dict[str, np.ndarray]:
         return {"state": self.policy.state_norm(state)[:, :, None, None].numpy(), **self.pictures(frames)}
 
     def rest_inputs(self, state: Tensor, features: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-        """features: (1, D, h, w) each, as `front` gives them."""
+        """Return the inputs of `rest`. features: (1, D, h, w) each, as `front` gives them."""
         return {"state": state.numpy(), **self.features(features)}
 
     def features(self, features: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-        """What `front` gives, (1, D, h, w) each, as HailoRT gives it: (h, w, D), by name."""
+        """Turn what `front` gives, (1, D, h, w) each, into what HailoRT gives: (h, w, D) each, by name."""
         named = zip(self.config.cameras, features, strict=True)
         return {f"features_{camera}": f[0].transpose(1, 2, 0) for camera, f in named}
 
     def actions(self, answer: np.ndarray) -> Tensor:
-        """What `whole` gives, as actions."""
+        """Turn what `whole` gives into actions, by undoing their normalisation."""
         return self.policy.action_unnorm(torch.from_numpy(answer))
 
     def output_shape(self, network: Network, output: str) -> list[int]:
-        """Of an output as HailoRT gives it: channels last, without a batch."""
+        """Return an output's shape as HailoRT gives it: channels last, without a batch."""
         if network is self.whole:
             return [1, self.config.chunk, len(self.config.action_names)]
         h, w = self.config.grid(*self.config.image_sizes[list(network.outputs).index(output)])

@@ -1,4 +1,4 @@
-"""What is known of each operator in Hailo's parser, none of it tried here."""
+"""What is known of each operator in Hailo's parser. None of it was tried here."""
 
 OPERATORS = {
     "Conv": "the chip's own; the zoo's ResNets and the backbone of its DETR consist of it",

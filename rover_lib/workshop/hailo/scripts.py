@@ -1,4 +1,4 @@
-"""The texts that Hailo's compiler is given: a model script (.alls) for each network and chip, and what starts it."""
+"""Write the texts for Hailo's compiler: a model script (.alls) for each network and chip, and a script to start it."""
 
 from rover_lib.workshop.act import ActConfig, zero_colour
 from rover_lib.workshop.hailo.chips import Chip
@@ -6,10 +6,10 @@ from rover_lib.workshop.hailo.networks import Network
 
 
 def script_names(network: Network) -> dict[str, str]:
-    """What the compiler should call the layers of the nodes that the model script names, by those nodes' names.
+    """Return what the compiler should call the layers that the model script names, keyed by the names of their nodes.
 
-    As in the zoo's script for DETR, layers of a kind are numbered in the graph's order, and a product with weights is a
-    convolution. compile.py checks it before anything is quantized.
+    As in the zoo's script for DETR, layers of one kind are numbered in the graph's order, and a product with weights is
+    a convolution. compile.py checks the names before anything is quantized.
     """
     names = {name: f"input_layer{i}" for i, name in enumerate(network.inputs, 1)}
     names |= {node: f"ew_add{i}" for i, node in enumerate(network.sums, 1) if node in network.sixteen_bit}
@@ -22,14 +22,14 @@ def script_names(network: Network) -> dict[str, str]:
     last = {n.name: f"conv{i}" for i, n in enumerate(weighted, 1) if n.op_type == "Conv" or n is weighted[-1]}
     made = {n.name: n for n in network.model.graph.node}
     for node in network.outputs.values():
-        # the head's bias is an Add of its own in ONNX
+        # In ONNX the head's bias is a separate Add, so the layer's name belongs to the product before it.
         source = node if node in last else next(n.name for n in weighted if n.output[0] in made[node].input)
         names[source] = last[source]
     return names
 
 
 def model_script(network: Network, chip: Chip, config: ActConfig, samples: int) -> str:
-    """The .alls file of a network for a chip. Each line says where it is from; zoo: hailo_model_zoo's scripts."""
+    """Return the .alls file of a network for a chip. Comments in it give its sources; zoo means hailo_model_zoo."""
     names, scope = script_names(network), network.name
     lines = [f"# {network.name} for {chip.name}, Dataflow Compiler {chip.compiler}.x; compiled by nobody yet"]
     for i, (camera, norm) in enumerate(zip(config.cameras, config.image_norm, strict=True), 1):
@@ -67,7 +67,7 @@ def model_script(network: Network, chip: Chip, config: ActConfig, samples: int) 
 
 
 def compile_script(chip: Chip) -> str:
-    """The text of compile_<chip>.sh."""
+    """Return the text of compile_<chip>.sh."""
     return f"""#!/bin/sh
 # sh compile_{chip.name}.sh [backbone|whole], where Hailo's Dataflow Compiler {chip.compiler}.x is installed
 exec python3 "$(dirname "$0")/compile.py" {chip.name} "${{1:-backbone}}"

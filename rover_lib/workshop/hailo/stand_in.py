@@ -1,4 +1,4 @@
-"""ONNX Runtime's INT8 as a stand-in for the chip's: how far it takes a network, and the actions behind, from FP32."""
+"""Use ONNX Runtime's INT8 as a stand-in for the chip's: how far are a network's answers, and the actions, from FP32?"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,25 +17,28 @@ from rover_lib.workshop.progress import Progress
 if TYPE_CHECKING:
     import onnxruntime
 
-FRAMES = 32  # calibrate it
+FRAMES = 32  # of the calibration set, which calibrate the stand-in
 
 
 @dataclass(frozen=True)
 class Error:
-    """network: of a network's answers, relative, by root mean square. actions: the largest, by action."""
+    """The error that INT8 causes.
+
+    network: of the network's answers, as a share of their root mean square. actions: the largest of each action.
+    """
 
     network: float
     actions: dict[str, float]
 
 
 def stand_in_errors(splits: Splits, folder: Path, judged: Exporter, progress: Progress) -> dict[str, Error]:
-    """What INT8 does to both networks, by name, against the FP32 policy. folder: of the kit's calibration set."""
+    """Return what INT8 does to both networks, by name, against the FP32 policy. folder: with the calibration set."""
     known = _calibration_inputs(splits, folder)
     return {n.name: _error(splits, n, known, judged, progress) for n in (splits.front, splits.whole)}
 
 
 def _calibration_inputs(splits: Splits, folder: Path) -> list[dict[str, np.ndarray]]:
-    """FRAMES of the calibration set, evenly chosen, as `whole` takes them."""
+    """Take FRAMES samples of the calibration set, evenly spaced, as inputs of `whole`."""
     every = [f"frame_{c}" for c in splits.config.cameras]
     stored = {n: np.load(folder / f"calibration_{n}.npy", mmap_mode="r") for n in ("state", *every)}
     inputs = []
@@ -48,7 +51,7 @@ def _calibration_inputs(splits: Splits, folder: Path) -> list[dict[str, np.ndarr
 def _error(
     splits: Splits, network: Network, known: Sequence[Mapping[str, np.ndarray]], judged: Exporter, progress: Progress
 ) -> Error:
-    """known: inputs that calibrate."""
+    """Measure one network's error on the judged observations. known: the inputs that calibrate."""
     float_session = session_of(network.model)
     quantized = session_of(int8(network.model, [{k: x[k] for k in network.inputs} for x in known]), exact=True)
     rest = session_of(splits.rest)
@@ -67,8 +70,10 @@ def _error(
 
 
 def session_of(model: onnx.ModelProto, *, exact: bool = False) -> "onnxruntime.InferenceSession":
-    """exact: nothing fused, so that an INT8 graph gives what its numbers say, whatever this processor's kernels do with
-    them (those for AVX2 saturate).
+    """Open a model in ONNX Runtime.
+
+    exact: turn fusing off, so that an INT8 graph computes exactly what it says. This processor's INT8 kernels may not;
+    those for AVX2 saturate.
     """
     import onnxruntime
 
@@ -80,10 +85,10 @@ def session_of(model: onnx.ModelProto, *, exact: bool = False) -> "onnxruntime.I
 
 
 def int8(model: onnx.ModelProto, inputs: Sequence[Mapping[str, np.ndarray]]) -> onnx.ModelProto:
-    """ONNX Runtime's static INT8 of a network: a stand-in for what Hailo's compiler makes of it, calibrated on inputs.
+    """Quantize a network by ONNX Runtime's static INT8, calibrated on `inputs`, as Hailo's compiler might.
 
-    Convolutions and products of matrices are INT8. Sums stay in float: on the chip they are part of a convolution, or
-    of 16 bits.
+    Convolutions and products of matrices are INT8. Sums stay in float, because on the chip they are part of a
+    convolution or have 16 bits.
     """
     from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
 
@@ -95,11 +100,11 @@ def int8(model: onnx.ModelProto, inputs: Sequence[Mapping[str, np.ndarray]]) -> 
             return next(self.left, None)
 
     constants = {i.name for i in model.graph.initializer}
-    # ONNX Runtime takes a constant first factor for a weight, and quantizes it along the wrong axis.
+    # ONNX Runtime takes a first factor that is constant for a weight, and quantizes it along the wrong axis.
     backwards = [n.name for n in model.graph.node if n.op_type == "MatMul" and n.input[0] in constants]
     with TemporaryDirectory() as folder:
         source, path = Path(folder) / "float.onnx", Path(folder) / "int8.onnx"
-        onnx.save(model, source)  # a file, because what is given as a model gets changed
+        onnx.save(model, source)  # as a file, because quantize_static changes a model that it is given
         quantize_static(
             source,
             path,

@@ -1,9 +1,9 @@
-"""One function per figure or table; each returns what a cell shows, and touches nothing else.
+"""One function for each figure or table. Each returns what a cell shows, and changes nothing else.
 
-    plots.save(plots.action_error(report), run_dir, "04_action_error")  # a figure, or a sentence where it were empty
+    plots.save(plots.action_error(report), run_dir, "04_action_error")  # a figure, or a sentence if it would be empty
     plots.gates(rows)                                                   # a table
 
-A module for each subject; `style` has what all figures share.
+Each subject has a module; `style` has what all figures share.
 """
 # ruff: noqa: F401, these are the names that notebooks use
 

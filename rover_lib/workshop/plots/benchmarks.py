@@ -23,7 +23,7 @@ from rover_lib.workshop.plots.style import (
 
 
 def latency(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """How long one inference takes, by host and artifact: p50, p95, p99, and the floor of a Pi 5 by arithmetic.
+    """Draw how long one inference takes, by host and artifact: p50, p95, p99, and the computed floor of a Pi 5.
 
     benchmarks: contents of benchmark-<host>.json by host, one panel each.
     """
@@ -63,9 +63,9 @@ def latency(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def soak(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """What a soak did to a host, over time: latency, temperature, clock, and when the firmware held it back.
+    """Draw what a soak did to a host over time: latency, temperature, clock, and when the firmware held it back.
 
-    benchmarks: contents of benchmark-<host>.json with a series, by host. What no host has a sensor for has no panel.
+    benchmarks: contents of benchmark-<host>.json with a series, by host. A reading that no host has gets no panel.
     """
     hosts = dict(zip(benchmarks, itertools.cycle(OTHERS), strict=False))
     series = {host: b["metrics"]["series"] for host, b in benchmarks.items()}
@@ -90,7 +90,7 @@ def soak(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
         for ax, (key, _) in zip(axes[1:, 0], readings, strict=False):
             ax.plot(minutes, _values(points, key), color=colour, lw=1.8)
         if held:
-            since = np.r_[0.0, minutes[:-1]]  # a point tells of the time since the one before
+            since = np.r_[0.0, minutes[:-1]]  # a point describes the time since the one before
             bits = [int(p.get("throttled") or "0x0", 16) & NOW_BITS for p in points]
             spans = [(s, m - s) for s, m, b in zip(since, minutes, bits, strict=True) if b]
             last.broken_barh(spans, (row - 0.35, 0.7), color=colour)
@@ -108,5 +108,5 @@ def soak(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def _values(points: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
-    """One reading over time, NaN where there is none."""
+    """Return one reading over time, NaN where it is missing."""
     return np.array([np.nan if p.get(key) is None else p[key] for p in points], float)

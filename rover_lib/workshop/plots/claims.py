@@ -1,4 +1,7 @@
-"""What figures show, each in a sentence that is computed of what is drawn: where the contrary is so, it says that."""
+"""Say in a sentence what a figure shows. It is computed from what is drawn, so it also says when the opposite is true.
+
+A function returns an empty text if what it would compare is not there.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,7 +20,7 @@ def _called(mode: str) -> str:
 
 
 def times(over: float | None, under: float | None, more: str, less: str) -> str:
-    """Such as "4.2 times as fast", or the other way round; nothing where one was not measured, or is 0."""
+    """Return "4.2 times as fast", for example, or "... as slow"; an empty text if one was not measured, or is 0."""
     if not over or not under:
         return ""
     ratio = over / under
@@ -30,7 +33,7 @@ def times(over: float | None, under: float | None, more: str, less: str) -> str:
 
 
 def size(sizes_mb: Mapping[str, float]) -> str:
-    """sizes_mb: of artifacts by mode."""
+    """sizes_mb: of the artifacts, by mode."""
     if not (GATED in sizes_mb and "fp32" in sizes_mb):
         return ""
     return f"{_upper(_called(GATED))} is {times(sizes_mb['fp32'], sizes_mb[GATED], 'small', 'large')} as FP32"
@@ -53,7 +56,7 @@ def worst_frame(frame: WorstFrame) -> str:
 
 
 def hits(metrics: Mapping[str, Any], mode: str = GATED) -> str:
-    """metrics: of compare.json."""
+    """metrics: those of compare.json."""
     fp32, other = metrics["fp32"], metrics["modes"].get(mode, {})
     if not (fp32.get("trials") and other.get("trials")):
         return ""
@@ -64,7 +67,7 @@ def hits(metrics: Mapping[str, Any], mode: str = GATED) -> str:
 
 
 def apart(most_m: float, worlds: int) -> str:
-    """most_m: how far drives of one world part, in metres."""
+    """most_m: the largest distance between two drives in one world, in metres."""
     return f"In {worlds} worlds the drives part by at most {100 * most_m:.0f} cm"
 
 
@@ -72,7 +75,7 @@ def apart(most_m: float, worlds: int) -> str:
 
 
 def speed(benchmarks: Mapping[str, Mapping[str, Any]]) -> str:
-    """Of the first host, by the median. benchmarks: contents of benchmark-<host>.json by host."""
+    """Compare the medians of the first host. benchmarks: contents of benchmark-<host>.json by host."""
     host, content = next(iter(benchmarks.items()))
     p50 = {name: v["latency_p50_ms"] for name, v in content["metrics"]["artifacts"].items()}
     how = times(p50.get("fp32"), p50.get(GATED), "fast", "slow")
@@ -91,7 +94,7 @@ def instructions(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def smaller_picture(rows: Sequence[Mapping[str, Any]]) -> str:
-    """rows: static artifacts of arm.json by their work, the least first."""
+    """rows: the static artifacts of arm.json, the one with the least work first."""
     least, most = rows[0], rows[-1]
     if least is most:
         return ""
@@ -104,7 +107,7 @@ def smaller_picture(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def work(parameters: Mapping[str, int], macs: Mapping[str, int], part: str = "backbone") -> str:
-    """What share of the work, and of the weights, a part of the policy has; both by block."""
+    """Say what share of the work and of the weights a part of the policy has. parameters, macs: by block."""
 
     def share(amounts: Mapping[str, int]) -> float:
         of_part = sum(n for block, n in amounts.items() if block.split(".")[0] == part)
@@ -114,7 +117,7 @@ def work(parameters: Mapping[str, int], macs: Mapping[str, int], part: str = "ba
 
 
 def coverage(chosen: Sequence[Sequence[float]], pool: Sequence[Sequence[float]], names: Sequence[str]) -> str:
-    """How much of each action's recorded range the chosen frames reach. chosen, pool: (n, actions)."""
+    """Say how much of each action's recorded range the chosen frames reach. chosen, pool: (n, actions)."""
     shares = []
     for name, own, every in zip(names, zip(*chosen, strict=True), zip(*pool, strict=True), strict=False):
         whole = max(every) - min(every)
@@ -127,13 +130,13 @@ def coverage(chosen: Sequence[Sequence[float]], pool: Sequence[Sequence[float]],
 
 
 def clipped(rows: Sequence[Mapping[str, Any]], limit_pct: float) -> str:
-    """rows: of `inspect_layers`."""
+    """rows: from `inspect_layers`."""
     count = sum(row["clipped_pct"] > limit_pct for row in rows)
     return f"{count or 'None'} of {len(rows)} layers clip{'s' if count == 1 else ''} more than {limit_pct:g} %"
 
 
 def even(before: float, after: float) -> str:
-    """Largest channel over the median one, of the worst projection."""
+    """before, after: the worst projection's largest channel divided by its median one."""
     if after >= before:
         return f"Channel scales do not help the worst projection: {before:.0f} times its median channel before"
     return f"Channel scales take the worst projection from {before:.0f} to {after:.1f} times its median channel"
@@ -161,7 +164,7 @@ def most_sensitive(table: Mapping[str, Mapping[str, float | None]]) -> str:
 
 
 def late_hits(alone: Sequence[Mapping[str, Any]]) -> str:
-    """How late plans may be without a balloon lost. alone: compensated rows of drive.json, of cars left alone."""
+    """Say how late plans may be without losing a balloon. alone: compensated rows of drive.json, of cars left alone."""
     rows = sorted(alone, key=lambda row: row["latency_ms"])
     if not rows:
         return ""
@@ -174,7 +177,10 @@ def late_hits(alone: Sequence[Mapping[str, Any]]) -> str:
 
 
 def beside(compensated: Mapping[float, float], others: Mapping[float, float]) -> str:
-    """Where compensation keeps the car closer, and where not: median cm from the path, by the latency in ms."""
+    """Say at which latencies compensation keeps the car closer, and at which not.
+
+    compensated, others: median cm from the path, by the latency in ms.
+    """
     common = sorted(ms for ms in compensated.keys() & others.keys() if compensated[ms] and others[ms])
     closer = [ms for ms in common if compensated[ms] < others[ms]]
     if not common:
@@ -192,7 +198,7 @@ def _and(numbers: Sequence[float]) -> str:
 
 
 def student(students: Sequence[Mapping[str, Any]], chosen: str) -> str:
-    """students: of distill.json, the teacher first."""
+    """students: rows of distill.json, the teacher first. chosen: the name of the recommended one."""
     teacher = students[0]
     row = next((r for r in students[1:] if r["name"] == chosen), None)
     if row is None:
@@ -208,7 +214,7 @@ def student(students: Sequence[Mapping[str, Any]], chosen: str) -> str:
 
 
 def learned(policies: Sequence[Mapping[str, Any]]) -> str:
-    """policies: of learn.json, the one that all began with first."""
+    """policies: rows of learn.json, first the one that all began with."""
     first, last = policies[0], max(row["round"] for row in policies)
     of = {row["arm"]: row["pushed"] for row in policies if row["round"] == last}
     if not {"corrected", "demonstrated"} <= of.keys():

@@ -28,7 +28,7 @@ from rover_lib.workshop.plots.style import (
 
 
 def sizes(metrics: Mapping[str, Any]) -> Figure:
-    """Artifact files, weights with weights. metrics: of compare.json."""
+    """Draw the sizes of the artifact files, which hold weights without an optimizer. metrics: those of compare.json."""
     sizes_mb = {"fp32": metrics["fp32"]["size_mb"]} | {m: v["size_mb"] for m, v in metrics["modes"].items()}
     fig, axes = new_figure(1, height_in=1.3 + 0.34 * len(sizes_mb))
     ax, y = axes[0, 0], range(len(sizes_mb))
@@ -45,7 +45,7 @@ def sizes(metrics: Mapping[str, Any]) -> Figure:
 
 
 def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
-    """Mean error of every mode against FP32 at each step of the plan: percent of the recorded range, and pulse."""
+    """Draw each mode's mean error against FP32 at each step of the plan, in % of the recorded range and as pulse."""
     actions, steps = report.action_names, report.reference.shape[1]
     if all(report.pct(action) is None for action in actions):
         return Note("no action changes in these recordings: nothing is judged")
@@ -74,9 +74,10 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
 def worst_frames(
     report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0, *, first: int = 0
 ) -> Figure | Note:
-    """The frames on which a mode differs most from FP32: the picture and both plans, with the recording's own.
+    """Draw the frames on which a mode differs most from FP32: the picture, both plans, and what was recorded.
 
-    Of a policy with many actions the one that is worst there. first: how many of the worst are left out before.
+    For a policy with many actions, only the worst action of each frame is drawn. first: how many of the worst frames to
+    skip.
     """
     frames = report.worst(mode, first + count)[first:]
     if not frames:
@@ -114,7 +115,10 @@ def worst_frames(
 
 
 def hits(metrics: Mapping[str, Any]) -> Figure:
-    """Balloons hit in unseen worlds, with Wilson's 95 % interval: how little so few drives say. metrics: of compare."""
+    """Draw the balloons hit in unseen worlds, with Wilson's 95 % interval, which shows how little so few drives say.
+
+    metrics: those of compare.json.
+    """
     rows = {"fp32": metrics["fp32"]} | dict(metrics["modes"])
     rows = {m: v for m, v in rows.items() if v["trials"]}
     fig, axes = new_figure(1, height_in=1.5 + 0.36 * max(len(rows), 1))
@@ -140,7 +144,7 @@ def hits(metrics: Mapping[str, Any]) -> Figure:
 
 
 def drives_from_above(trials: Mapping[str, Any], count: int = 4) -> Figure:
-    """The worlds in which the modes' drives part most. trials: closed-loop reports by mode, FP32 among them."""
+    """Draw the worlds in which the modes' drives differ most. trials: closed-loop reports by mode, with FP32's."""
 
     def apart(index: int) -> float:
         base, gap = trials["fp32"].per_world[index].trajectory, 0.0
@@ -156,7 +160,7 @@ def drives_from_above(trials: Mapping[str, Any], count: int = 4) -> Figure:
         for mode, trial in trials.items():
             path = trial.per_world[i].trajectory
             style = "-" if mode == "fp32" else "--"
-            # forward is up; positive y is to the left of the car
+            # Forward is up. Positive y is to the left of the car.
             ax.plot(-path.y_m, path.x_m, style, color=COLOURS.get(mode, GREY), lw=1.8, label=NAMES.get(mode, mode))
         x, y = trials["fp32"].per_world[i].trajectory.balloon_xy_m
         ax.add_patch(Circle((-y, x), 0.16, color=RED))

@@ -27,8 +27,9 @@ from rover_lib.workshop.plots.style import (
     simd_bars,
 )
 
-# Instructions of one inference of the full policy (15 GMAC, 360x640), in 1e9: label, all, SIMD among them. What
-# notebook 03 shows of a run that `make arm` has not counted. Source: `make arm NAME=full PEERS=1`, as in notebook 06.
+# Instructions of one inference of the full policy (15 GMAC, 360x640), in 1e9: label, all instructions, and the SIMD
+# instructions among them. Notebook 03 shows them for a run that `make arm` has not counted. Source: `make arm NAME=full
+# PEERS=1`, as in notebook 06.
 COUNTED = (
     ("FP32, TorchScript", 6.08, 3.81),
     ("INT8 affine (quint8): QNNPACK's kernels", 5.03, 4.34),
@@ -38,14 +39,14 @@ COUNTED = (
     ("dot-product instructions alone", 0.94, 0.94),
 )
 
-NEAR = 2  # times the fewest instructions: shown once more, closer
+NEAR = 2  # rows with less than this many times the fewest instructions are shown again, enlarged
 GROUP_COLOURS = (BLUE, SKY, *OTHERS[1:], MIST, GREY)  # the first two are the INT8 products
 
 
 def whole_size(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Artifacts of the image size of training, by mode, and peers that are none of them, most instructions first.
+    """Return the artifacts at the image size of training, by mode, and other engines' peers, most instructions first.
 
-    metrics: of arm.json.
+    A peer that only counts one of the artifacts again is left out. metrics: those of arm.json.
     """
     ours = {stem.removeprefix("policy_"): m for stem, m in metrics["artifacts"].items()}
     ours = {mode: m for mode, m in ours.items() if not re.search(r"_\d+x\d+$", mode)}
@@ -54,7 +55,7 @@ def whole_size(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 
 
 def counted(metrics: Mapping[str, Any]) -> Figure:
-    """Instructions against the floor, and beside them the error on the same core. metrics: of arm.json."""
+    """Draw instructions against the floor, and beside them the error on the same core. metrics: those of arm.json."""
     rows = whole_size(metrics)
     fig, axes = new_figure(1, 2, height_in=1.7 + 0.4 * len(rows), sharey=True, width_ratios=(1.5, 1))
     (left, right), y = axes[0], np.arange(len(rows))
@@ -89,7 +90,7 @@ def counted(metrics: Mapping[str, Any]) -> Figure:
 
 
 def counted_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
-    """What the instructions do. groups: {artifact or peer: {group: 10**9 instructions}}, groups in one order."""
+    """Draw what the instructions do. groups: {artifact or peer: {group: 10**9 instructions}}, all in the same order."""
     totals = {name: sum(by_group.values()) for name, by_group in groups.items()}
     near = {name: by_group for name, by_group in groups.items() if totals[name] < NEAR * min(totals.values())}
     panels = [groups, near] if 1 < len(near) < len(groups) else [groups]
@@ -113,7 +114,7 @@ def counted_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
 
 
 def counted_by_size(metrics: Mapping[str, Any]) -> Figure:
-    """What a smaller image saves: static INT8 and its floor by image size. metrics: of arm.json."""
+    """Draw what a smaller image saves: static INT8 and its floor by image size. metrics: those of arm.json."""
     rows = [m for stem, m in metrics["artifacts"].items() if re.fullmatch(r"policy_static(_\d+x\d+)?", stem)]
     rows.sort(key=lambda m: m["gmac"])
     fig, axes = new_figure(1, height_in=3.7)
@@ -135,9 +136,9 @@ def counted_by_size(metrics: Mapping[str, Any]) -> Figure:
 
 
 def instruction_counts(metrics: Mapping[str, Any] | None = None) -> Figure:
-    """Why symmetric: instructions of one inference, by what ran.
+    """Draw why the scheme is symmetric: the instructions of one inference, by engine and scheme.
 
-    metrics: those of the run's arm.json; if None, the full policy's, as recorded in COUNTED.
+    metrics: those of the run's arm.json; None draws the full policy's, as recorded in COUNTED.
     """
     rows, title = list(COUNTED), "full policy at 360x640, recorded, not of this run"
     if metrics is not None:

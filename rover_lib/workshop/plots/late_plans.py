@@ -26,12 +26,12 @@ HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", SLATE, "
 
 
 def _late(rows: Sequence[Mapping[str, Any]], *, pushed: bool = False) -> list[Mapping[str, Any]]:
-    """Those without ensembling. rows: of drive.json."""
+    """Return the rows without ensembling, of cars that were pushed or not. rows: of drive.json."""
     return [r for r in rows if r["ensemble"] is None and bool(r["pushes"]) == pushed]
 
 
 def throttle_over_age(rows: Sequence[Mapping[str, Any]], settings: Settings, chunk: int, rate_hz: float) -> Figure:
-    """What the loop leaves of the throttle at each age of a plan, and the ages that each latency brings.
+    """Draw what the loop leaves of the throttle at each age of a plan, and the ages that each latency brings.
 
     rows: of drive.json. chunk, rate_hz: of the policy's plans.
     """
@@ -59,7 +59,7 @@ def throttle_over_age(rows: Sequence[Mapping[str, Any]], settings: Settings, chu
 
 
 def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Balloons hit, with Wilson's 95 % interval, against how long an inference takes. rows: of drive.json."""
+    """Draw the balloons hit, with Wilson's 95 % interval, against how long an inference takes. rows: of drive.json."""
     sets = [(title, _late(rows, pushed=pushed)) for title, pushed in (("left alone", False), ("pushed", True))]
     sets = [(title, drives) for title, drives in sets if drives]
     counts = [len({r["latency_ms"] for r in drives}) for _, drives in sets]
@@ -90,9 +90,9 @@ def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def beside_the_path(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """How far a late drive leaves the path of the first latency's, at most: median of the worlds, and 90 % of them.
+    """Draw how far drives stray at most from the path that the first latency gave: median and 90 % of the worlds.
 
-    rows: of drive.json; latencies at which cars were stopped are left out.
+    rows: of drive.json; those in which cars were stopped are left out.
     """
     drives = [r for r in _late(rows) if not r["stopped"]]
     places = {ms: x for x, ms in enumerate(sorted({r["latency_ms"] for r in drives}))}
@@ -117,9 +117,9 @@ def beside_the_path(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def plans_from_above(drives: Sequence[Mapping[str, Any]], tick: int | None = None) -> Figure | Note:
-    """Drives of one world with all their plans, each from where it looked. drives: `from_above` of drive.json.
+    """Draw drives of one world with all their plans, each from where it looked. drives: `from_above` of drive.json.
 
-    tick: draw where the cars are then, with what they drove until then.
+    tick: draw the cars at this moment, with what they drove until then; None draws whole drives.
     """
     if not drives:
         return Note("no drive was kept to be shown from above")

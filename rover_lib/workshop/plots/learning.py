@@ -1,4 +1,4 @@
-"""Notebook 09: what corrections gave, beside as many seconds of demonstrations."""
+"""Notebook 09: what corrections gained, beside as many seconds of demonstrations."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,14 +10,15 @@ from matplotlib.figure import Figure
 from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import MIST, SLATE, Note, claim, legend_below, new_figure
 
-ARMS = (("corrected", SLATE, "o", -1.0), ("demonstrated", MIST, "s", 1.0))  # and how far aside, in human seconds
+# name, colour, marker, and to which side the marks are moved
+ARMS = (("corrected", SLATE, "o", -1.0), ("demonstrated", MIST, "s", 1.0))
 PANELS = (("pushed", "pushed"), ("alone", "left alone"), ("decoy", "beside a red decoy"))
 
 
 def hits_by_round(policies: Sequence[Mapping[str, Any]]) -> Figure | Note:
-    """Worlds hit over what it cost, in human seconds: both arms, with Wilson's 95 % interval.
+    """Draw the worlds hit against the human seconds that it cost, for both arms, with Wilson's 95 % interval.
 
-    policies: of learn.json, the one that all began with first.
+    policies: rows of learn.json, first the one that all began with.
     """
     if not policies:
         return Note("nothing has been learned yet: there is no figure")

@@ -29,24 +29,24 @@ from rover_lib.workshop.plots.style import (
 
 
 def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
-    """The largest activation per channel, before and after channel scales.
+    """Draw the largest activation of each channel, before and after channel scales.
 
-    Left: a projection's largest channel over its median one, of the `count` projections where that was worst. Right:
-    the worst of all, channel by channel.
+    Left: the largest channel divided by the median one, for the `count` projections in which that was largest. Right:
+    the worst projection of all, channel by channel.
     """
     layers = {n: c for n, c in calibration.channels.items() if "in_max_scaled" in c}
 
     def peak(x: torch.Tensor) -> float:
-        """How much larger the largest channel is than the middle one, of those that are not dead."""
+        """Return the largest channel divided by the median one, without dead channels."""
         x = x[x > 1e-6 * x.max()]
         return float(x.max() / x.median()) if len(x) else 1.0
 
-    # Behind `up` INT8 sees the other side of the activation function, which is the input of `down`.
+    # After `up`, INT8 sees only what leaves the activation function, and that is the input of `down`.
     sides = {n: ("in",) if n.endswith(".up") else ("in", "out") for n in layers}
     pairs = [(n, s) for n in layers for s in sides[n]]
     worst, side = max(pairs, key=lambda row: peak(layers[row[0]][f"{row[1]}_max"]))
     uneven = sorted(layers, key=lambda n: max(peak(layers[n][f"{s}_max"]) for s in sides[n]), reverse=True)[:count]
-    layers = {n: c for n, c in layers.items() if n in uneven}  # in the order of the data
+    layers = {n: c for n, c in layers.items() if n in uneven}  # in the order in which data passes them
     fig, axes = new_figure(1, 2, height_in=max(3.7, 1.3 + 0.2 * len(layers)))
     left, right = axes[0]
     y = {name: i for i, name in enumerate(layers)}
@@ -79,7 +79,7 @@ def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
 def errors_by_choice(
     table: Mapping[str, Mapping[str, float | None]], title: str, budget_pct: float | None = None
 ) -> Figure:
-    """Error of each action for each choice, say of observers. table: {choice: {<action>_mae_pct}}."""
+    """Draw the error of each action for each choice, say of observers. table: {choice: {<action>_mae_pct}}."""
     table, what = few_actions(table)
     choices = list(table)
     fig, axes = new_figure(1, height_in=1.6 + 0.42 * len(choices))
@@ -105,9 +105,9 @@ def errors_by_choice(
 def sensitivity(
     table: Mapping[str, Mapping[str, float | None]], steps: Sequence[Mapping[str, Any]], budget_pct: float
 ) -> Figure:
-    """Left: each block quantized alone. Right: what leaving some of them in float buys, and costs.
+    """Draw on the left each block quantized alone, and on the right what leaving some in float gains and costs.
 
-    table: {block: {<action>_mae_pct}}; steps: of `Chooser.mixed`, {float_blocks, cost_pct, <action>_mae_pct}.
+    table: {block: {<action>_mae_pct}}. steps: from `Chooser.mixed`, {float_blocks, cost_pct, <action>_mae_pct} each.
     """
     table, what = few_actions(table)
     shown, _ = few_actions({str(i): step for i, step in enumerate(steps)})
@@ -136,7 +136,10 @@ def sensitivity(
 
 
 def layers(rows: Sequence[Mapping[str, Any]], clipped_warn_pct: float) -> Figure:
-    """Signal to noise and clipped share of every INT8 layer, in the order of the data. rows: `inspect_layers`."""
+    """Draw signal to noise and clipped share of every INT8 layer, in the order in which data passes them.
+
+    rows: from `inspect_layers`.
+    """
     fig, axes = new_figure(2, 1, height_in=4.9, sharex=True)
     upper, lower = axes[:, 0]
     x = np.arange(len(rows))

@@ -1,4 +1,4 @@
-"""Notebooks 01 and 02: the checkpoint, the recordings, and what calibration saw of them."""
+"""Notebooks 01 and 02: the checkpoint, the recordings, and what calibration saw in them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -40,7 +40,7 @@ from rover_lib.workshop.scheme import OBSERVERS
 
 
 def checkpoint_size(report: Mapping[str, Any]) -> Figure:
-    """Where a checkpoint's megabytes are, and what remains of them. report: `Checkpoint.report`."""
+    """Draw where a checkpoint's megabytes are, and how many remain. report: `Checkpoint.report`."""
     acting_mb = 4 * report["parameters_acting"] / 1e6
     training_mb = 4 * report["parameters"] / 1e6 - acting_mb
     other_mb = max(report["file_mb"] - report["optimizer_mb"] - acting_mb - training_mb, 0)
@@ -72,7 +72,7 @@ def checkpoint_size(report: Mapping[str, Any]) -> Figure:
 
 
 def work_per_block(parameters: Mapping[str, int], macs: Mapping[str, int]) -> Figure:
-    """Parameters and multiply-accumulates of every block, in the order of the data."""
+    """Draw parameters and multiply-accumulates of every block, in the order in which data passes them."""
     blocks = [b for b in macs if macs[b] or parameters.get(b)]
     fig, axes = new_figure(1, 2, height_in=1.5 + 0.21 * len(blocks), sharey=True)
     left, right = axes[0]
@@ -94,7 +94,7 @@ def work_per_block(parameters: Mapping[str, int], macs: Mapping[str, int]) -> Fi
 
 
 def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pictures: int = 5) -> Figure:
-    """One episode: what the cameras saw, and what was done; of a car also the pulses that its servos got."""
+    """Draw one episode: what the cameras saw, and what was done; for a car also the pulses that its servos got."""
     samples = episode.samples
     shown = [samples[i] for i in np.linspace(0, len(samples) - 1, pictures).round().astype(int)]
     car = tuple(actions) == ACTION_NAMES
@@ -119,7 +119,7 @@ def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pi
 
 
 def frame(sample: Sample, actions: Sequence[str] = ACTION_NAMES, rate_hz: float = 30.0) -> Figure:
-    """What one sample saw, and what was done from there on: the plan that a perfect policy would have made."""
+    """Draw what one sample saw, and what was done from there on, which is the plan that a perfect policy would make."""
     fig, axes = new_figure(1, 2, height_in=2.6)
     left, right = axes[0]
     left.imshow(shown_picture(sample))
@@ -135,7 +135,7 @@ def frame(sample: Sample, actions: Sequence[str] = ACTION_NAMES, rate_hz: float 
 
 
 def _motion(fields: Sequence[Axes], samples: Sequence[Sample], actions: Sequence[str]) -> None:
-    """Each action over time, in its own units."""
+    """Draw each action over time, in its own units."""
     for i, (ax, name) in enumerate(zip(fields, actions, strict=True)):
         ax.plot([s.time_s for s in samples], [s.chunk[0, i] for s in samples], color=action_colour(name, i), lw=1.5)
         ax.set_ylabel(name, fontsize=8, rotation=0, ha="right")
@@ -145,7 +145,7 @@ def _motion(fields: Sequence[Axes], samples: Sequence[Sample], actions: Sequence
 
 
 def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) -> None:
-    """A car's steering and throttle, and their pulses."""
+    """Draw a car's steering and throttle, and their pulses."""
     times_s = [s.time_s for s in samples]
     actions = np.stack([s.chunk[0] for s in samples])
     pulses = [samples[0].car.pwm.pulses(*(float(v) for v in a)) for a in actions]
@@ -166,7 +166,7 @@ def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) 
 
 
 def faults(recordings: Recordings) -> Figure | Note:
-    """What was wrong in the recordings, by kind; every count was skipped, none became an action."""
+    """Draw what was wrong in the recordings, by kind. Reading them left it out, or repaired it as `episodes` says."""
     counts: dict[str, int] = {}
     for fault in recordings.faults:
         counts[fault.kind] = counts.get(fault.kind, 0) + fault.count
@@ -181,7 +181,7 @@ def faults(recordings: Recordings) -> Figure | Note:
     ax.set_yticks(range(len(kinds)), [k.replace("_", " ") for k in kinds])
     ax.invert_yaxis()
     ax.set_xlabel("times")
-    claim(fig, f"{used}; {sum(counts.values())} faults were skipped")
+    claim(fig, f"{used}; {sum(counts.values())} faults were left out or repaired")
     return fig
 
 
@@ -191,7 +191,7 @@ def calibration_coverage(
     held_out: Sequence[Sample],
     names: Sequence[str] = ACTION_NAMES,
 ) -> Figure:
-    """Which recorded actions the calibration samples cover, beside those that judge later."""
+    """Draw which recorded actions the calibration samples cover, beside those that judge later."""
     first_two = list(names[:2])
     fig, fields = figure_of(1 + len(names), 3, 3.4)
     unit = " (share of full)" if tuple(names) == ACTION_NAMES else ""
@@ -235,9 +235,9 @@ def calibration_coverage(
 
 
 def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
-    """What calibration saw in a few layers, and the range that each observer would give INT8's 256 steps to.
+    """Draw what calibration saw in a few layers, and the range over which each observer would spread INT8's 256 steps.
 
-    Of each part of the policy the layer where the observers disagree most.
+    For each part of the policy, up to `count` parts, it is the layer in which the observers disagree most.
     """
     rows = []
     for layer, observers in _observers(calibration).items():
@@ -270,7 +270,7 @@ def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
 
 
 def _observers(calibration: Calibration) -> dict[str, dict[str, Any]]:
-    """For each layer with a recorded range: an observer of each choice with what calibration saw there."""
+    """Return for each layer with a recorded range an observer of each choice, with what calibration saw there."""
     states: dict[str, dict[str, torch.Tensor]] = {}
     for key, tensor in calibration.observers.items():
         name, _, buffer = key.rpartition(".")

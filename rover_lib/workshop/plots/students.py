@@ -1,4 +1,4 @@
-"""Notebook 08: what a smaller policy costs, and what it gives."""
+"""Notebook 08: what a smaller policy costs, and what it gains."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -20,14 +20,15 @@ from rover_lib.workshop.plots.style import (
     new_figure,
 )
 
-# of a row's keys: the mark is full or hollow
+# prefix of a row's keys, label, face colour, marker, and how far the marks are moved
 DRIVES = (("", "left alone", SLATE, "o", -0.16), ("pushed_", "pushed", "white", "s", 0.16))
 
 
 def frontier(students: Sequence[Mapping[str, Any]], chosen: str) -> Figure:
-    """Policies from most work to least: the time of a plan, hits with Wilson's 95 % interval where they drove, errors.
+    """Draw the policies from most work to least: time of a plan, errors, and hits with Wilson's 95 % interval.
 
-    students: of distill.json, the teacher first. chosen: the name of the one that is recommended.
+    Without drives there is no panel of hits. students: rows of distill.json, the teacher first. chosen: the name of the
+    recommended one.
     """
     drove = any(row["trials"] for row in students)
     rows = sorted(students, key=lambda row: -row["gmac"])
@@ -106,9 +107,9 @@ def _errors(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def losses(by_student: Mapping[str, Mapping[str, Sequence[float]]], means: int = 40) -> Figure | Note:
-    """How each student learned: a panel for each phase, means of neighbouring steps.
+    """Draw how each student learned, with a panel for each phase. A point is the mean of neighbouring steps.
 
-    by_student: {name: {phase: losses}}. means: points of a curve, at most.
+    by_student: {name: {phase: losses}}. means: at most this many points for a curve.
     """
     phases = list(dict.fromkeys(phase for found in by_student.values() for phase, steps in found.items() if steps))
     if not phases:

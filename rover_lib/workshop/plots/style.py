@@ -1,10 +1,10 @@
 """What all figures share: axes, legends, colours, names of artifacts.
 
-A colour has one meaning in every figure: a mode, an action, a part of the policy, or an alarm. What is none of these is
-slate or grey, and told apart by marker or line; categories that only one figure has take theirs from OTHERS. Colours
-are Okabe and Ito's and Paul Tol's, which colour-blind people can tell apart.
+A colour has the same meaning in every figure: a mode, an action, a part of the policy, or an alarm. Everything else is
+slate or grey, and differs by marker or line; categories that only one figure has take their colours from OTHERS. The
+colours are Okabe and Ito's and Paul Tol's, which colour-blind people can tell apart.
 
-Figures are drawn for a notebook's width at 100 dots per inch, and shown and saved with twice the pixels.
+Figures are drawn for a notebook's width at 100 dots per inch, and shown and saved with twice as many pixels each way.
 """
 
 import io
@@ -36,10 +36,10 @@ OLIVE = "#999933"
 SAND = "#DDCC77"
 WINE = "#882255"
 SLATE = "#4A5A6A"  # a figure that belongs to no mode, action or part
-MIST = "#AAB7C4"  # beside it: before, without, the rest
+MIST = "#AAB7C4"  # what is compared with a slate figure: before, without, the rest
 GREY = "#B0B0B0"
 OTHERS = (SLATE, "#8C6D31", "#AA4499", "#117733", "#6699CC", "#994455", "#997700")  # hosts, students, more actions
-NOW_BITS = sum(1 << bit for bit in THROTTLED_BITS)  # of get_throttled; the others are since the machine's start
+NOW_BITS = sum(1 << bit for bit in THROTTLED_BITS)  # get_throttled's bits for now; others are since the last boot
 COLOURS = {
     "fp32": BLACK,
     "dynamic": ORANGE,
@@ -50,7 +50,7 @@ COLOURS = {
     "steering": INDIGO,
     "throttle": PINK,
 }
-PARTS = {"backbone": OLIVE, "encoder": SAND, "decoder": WINE}  # of the policy; every other is grey
+PARTS = {"backbone": OLIVE, "encoder": SAND, "decoder": WINE}  # parts of the policy; all others are grey
 NAMES = {
     "fp32": "FP32",
     "dynamic": "dynamic",
@@ -67,7 +67,7 @@ NAMES = {
 
 
 class Drawn(Figure):
-    """A figure that shows itself in a notebook with four pixels where it takes one: sharp, and of the same size."""
+    """A figure that a notebook shows at its own size, but with four pixels in the place of one, so that it is sharp."""
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
         buffer = io.BytesIO()
@@ -79,7 +79,7 @@ class Drawn(Figure):
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence in the place of a figure that would show nothing."""
+    """A sentence that takes the place of a figure that would show nothing."""
 
     text: str
 
@@ -88,7 +88,7 @@ class Note:
 
 
 def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: Any) -> tuple[Figure, np.ndarray]:
-    """A figure and its (rows, columns) axes, closed for pyplot: who shows the figure is the caller's affair."""
+    """Make a figure and its (rows, columns) axes. pyplot is told to forget it, so only the caller shows it."""
     fig, axes = plt.subplots(
         rows,
         columns,
@@ -107,7 +107,7 @@ def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: A
 
 
 def figure_of(count: int, columns: int, row_in: float) -> tuple[Figure, list[Any]]:
-    """A figure with a field for each of `count` things, in rows of `columns`."""
+    """Make a figure with axes for each of `count` things, in rows of `columns`."""
     columns = min(columns, count)
     rows = -(-count // columns)
     fig, axes = new_figure(rows, columns, height_in=row_in * rows)
@@ -117,7 +117,10 @@ def figure_of(count: int, columns: int, row_in: float) -> tuple[Figure, list[Any
 
 
 def shown_picture(sample: Any) -> np.ndarray:
-    """What a sample saw, (h, w, 3) uint8 RGB: of several cameras the pictures side by side, as high as the highest."""
+    """Return what a sample saw, (h, w, 3) uint8 RGB.
+
+    The pictures of several cameras are side by side, all as high as the highest.
+    """
     seen = sample.frame_bgr()
     frames = list(seen.values()) if isinstance(seen, Mapping) else [seen]
     height = max(len(frame) for frame in frames)
@@ -131,26 +134,26 @@ def legend(ax: Axes, **options: Any) -> None:
 
 
 def legend_below(fig: Figure, ax: Axes, columns: int) -> None:
-    """One legend for all of a figure's axes."""
+    """Put one legend, with what `ax` has, below all of a figure's axes."""
     handles, labels = ax.get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
 def bar_values(ax: Axes, y: Iterable[float], x: Iterable[Any], form: str) -> None:
-    """The numbers behind horizontal bars, with room for them."""
+    """Write the numbers at the ends of horizontal bars, with room for them."""
     for at, value in zip(y, x, strict=True):
         ax.annotate(form.format(value), (value, at), (4, 0), textcoords="offset points", va="center", fontsize=9)
     ax.margins(x=0.16)
 
 
 def note(ax: Axes, text: str) -> None:
-    """A sentence where there is nothing to draw."""
+    """Write a sentence into axes in which there is nothing to draw."""
     ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes, fontsize=11)
     ax.set_axis_off()
 
 
 def judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
-    """The keys <action>_mae_pct of actions that are judged; those that are not are named in the legend of `ax`."""
+    """Return the keys <action>_mae_pct of the judged actions. The others are named in the legend of `ax`."""
     keys = [k for k in errors if k.endswith("_mae_pct")]
     for key in keys:
         if errors[key] is None:
@@ -158,13 +161,16 @@ def judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
     return [k for k in keys if errors[k] is not None]
 
 
-MOST_ACTIONS = 3  # that a figure shows beside each other
+MOST_ACTIONS = 3  # a figure shows at most this many beside each other
 
 
 def few_actions(
     table: Mapping[str, Mapping[str, float | None]],
 ) -> tuple[dict[str, dict[str, float | None]], str]:
-    """A table of <action>_mae_pct as it can be drawn: of many actions only the worst of each row, and what is drawn."""
+    """Return a table of <action>_mae_pct as it can be drawn, and what it then has, in words.
+
+    If there are more than MOST_ACTIONS actions, only the worst of each row is kept.
+    """
     keys = [k for k in next(iter(table.values())) if k.endswith("_mae_pct")]
     if len(keys) <= MOST_ACTIONS:
         return {name: {k: row[k] for k in keys} for name, row in table.items()}, "mean error"
@@ -173,7 +179,7 @@ def few_actions(
 
 
 def claim(fig: Figure, sentence: str) -> None:
-    """What a figure shows, above it. Sentences are computed of what is drawn, by `claims`."""
+    """Write above a figure what it shows. `claims` computes such sentences from what is drawn."""
     if sentence:
         fig.suptitle(sentence, fontsize=12, weight="bold")
 
@@ -181,7 +187,7 @@ def claim(fig: Figure, sentence: str) -> None:
 def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:
     """Write run_dir/figures/<name>.png and return the figure, so that a cell that ends with this also shows it.
 
-    Of a Note no file is written, and one that is there is removed: it would be of an earlier run.
+    For a Note no file is written, and an existing one is removed, because it would be of an earlier run.
     """
     path = Path(run_dir) / "figures" / f"{name}.png"
     if isinstance(shown, Note):
@@ -193,17 +199,20 @@ def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:
 
 
 def simd_bars(ax: Axes, y: np.ndarray, total: np.ndarray, simd: np.ndarray) -> None:
-    """Bars of instructions, parted into SIMD and others. y: places, total, simd: in 10^9, (n,) each."""
+    """Draw bars of instructions, divided into SIMD and others. y: the bars' places. total, simd: in 10^9. (n,) each."""
     ax.barh(y, simd, color=SLATE, label="SIMD (vector) instructions")
     ax.barh(y, total - simd, left=simd, color=MIST, label="all others")
     bar_values(ax, y, total, "{:.3g}")
 
 
 def action_colour(key: str, index: int) -> str:
-    """Of an action, or of a key that begins with one, such as steering_mae_pct. index: for one without its own."""
+    """Return the colour of an action, or of a key that begins with one, such as steering_mae_pct.
+
+    index: chooses a colour for an action that has none of its own.
+    """
     return COLOURS.get(key.split("_")[0], OTHERS[index % len(OTHERS)])
 
 
 def part_colours(blocks: Iterable[str]) -> list[str]:
-    """Of blocks such as "encoder.0.attention"."""
+    """Return the colours of blocks such as "encoder.0.attention"."""
     return [PARTS.get(block.split(".")[0], GREY) for block in blocks]

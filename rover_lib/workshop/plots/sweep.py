@@ -1,4 +1,4 @@
-"""What a sweep found: the error to the recordings against the time of a plan."""
+"""The result of a sweep: the error to the recordings against the time of a plan."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,7 +9,7 @@ from rover_lib.workshop.plots.style import BLUE, GREEN, legend, new_figure, note
 
 
 def pareto(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """A point for each run, its area by its size in MB; those that no other beats are joined and named."""
+    """Draw a point for each run, larger for a larger artifact. The runs that no other beats are joined and named."""
     fig, axes = new_figure(1, height_in=4.5)
     ax = axes[0, 0]
     judged = [row for row in rows if row["to_recorded_pct"] is not None]

@@ -13,7 +13,10 @@ SHADES = {True: "#009E7333", False: "#D55E0044", None: "#88888833"}  # transluce
 
 
 def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """What was promised and what was found, a gate in words to a row. rows: of `compare.gate` or `check_gates`."""
+    """Make a table of what was promised and what was found, with a gate in each row.
+
+    rows: from `compare.gate` or `check_gates`.
+    """
     kept = sum(row["passed"] is True for row in rows)
     missed = sum(row["passed"] is False for row in rows)
     unknown = len(rows) - kept - missed
@@ -26,7 +29,7 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def computed_times(metrics: Mapping[str, Any]) -> Table:
-    """The computed range of a Raspberry Pi 5's time, in a table of its own. metrics: of arm.json."""
+    """Make a table of the times that are computed for a Raspberry Pi 5. metrics: those of arm.json."""
     rows = []
     for stem, m in sorted(metrics["artifacts"].items(), key=lambda item: -item[1]["instructions_g"]):
         mode, time_ms = re.sub(r"^policy_|_\d+x\d+$", "", stem), m["computed_pi5_ms"]
@@ -40,7 +43,7 @@ def _shown(value: Any) -> str:
 
 
 def _limit(row: Mapping[str, Any]) -> str:
-    """A gate's limit in words; a promised range as it was promised."""
+    """Return a gate's limit in words. A promised range stays as it was promised."""
     limit = row["limit"]
     if isinstance(limit, (list, tuple)):
         return f"{limit[0]:g} to {limit[1]:g}"
