@@ -152,8 +152,8 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
 class _Exported:
     """What our own export says of a dataset.
 
-    drivers: of each episode, who drove where nobody intervened. outcomes: of each episode, None if it is not labelled.
-    car: whose actions they are.
+    drivers: for each episode, who drove where nobody intervened. outcomes: for each episode, None if not labelled.
+    car: the car whose actions the dataset has.
     """
 
     drivers: list[str]
@@ -162,10 +162,11 @@ class _Exported:
 
 
 def _exported(root: Path, episodes: int, marked: bool) -> tuple[_Exported, tuple[Fault, ...]]:
-    """What our own export's REPORT says, and the faults found in it.
+    """Read our own export's REPORT. Return what it says, and the faults found in it.
 
-    If there is no REPORT, or one for other episodes (a fault), the result has what is known without it: LeRobot's
-    datasets do not say which car it was, so it is this machine's. marked: whether the dataset marks interventions.
+    If there is no REPORT, or one for other episodes (a fault), the result has what is known without it. LeRobot's
+    datasets do not say which car they are of, so without a REPORT it is this machine's. marked: whether the dataset
+    marks interventions.
     """
     default = _Exported([POLICY if marked else HUMAN] * episodes, [None] * episodes, this_car())
     path = root / REPORT
@@ -175,17 +176,18 @@ def _exported(root: Path, episodes: int, marked: bool) -> tuple[_Exported, tuple
         if path.stat().st_size > INFO_BYTES:
             raise ValueError("it is larger than any that rover export-dataset writes")
         report = json.loads(path.read_bytes())
+        if CAR in report:  # right also if somebody has removed episodes since, with LeRobot's tools
+            default = replace(default, car=Car.of(report[CAR], "the exported car"))
         if DRIVEN_BY not in report:  # of before there were takeovers
             return default, ()
         driven_by, outcomes = report[DRIVEN_BY], report[OUTCOMES]
-        car = Car.of(report[CAR], "the exported car") if CAR in report else default.car
         if not len(driven_by) == len(outcomes) == episodes:
             raise ValueError(f"it is of {len(driven_by)} episodes, here are {episodes}")
         if not set(driven_by) <= {POLICY, HUMAN} or not set(outcomes) <= {None, HIT, MISSED}:
             raise ValueError("it names who drove, or what it came to, by unknown words")
     except (OSError, ValueError, RecursionError, TypeError, KeyError, CarError) as e:
         return default, (Fault(REPORT, "another_export", 1, f"not used: {shown(str(e))}"),)
-    return _Exported(driven_by, outcomes, car), ()
+    return replace(default, drivers=driven_by, outcomes=outcomes), ()
 
 
 def fetched(source: Source) -> Source:

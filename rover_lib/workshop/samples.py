@@ -104,8 +104,8 @@ class Sample:
 
     time_s: seconds since the episode's first frame. state: (S,) float32, in our recordings the previous frame's
     [steering, throttle]. chunk: (chunk, A) float32, this frame's action and the following ones. is_pad: (chunk,)
-    bool, True past the end. driver: who drove at this frame, one of onboard.recording.DRIVERS. car: whose actions they
-    are.
+    bool, True past the end. driver: who drove at this frame, one of onboard.recording.DRIVERS. car: the car that was
+    driven.
     """
 
     episode: str

@@ -219,8 +219,14 @@ def test_a_dataset_of_another_car_is_read_as_its_own(tmp_path):
     backwards(tmp_path / "mine", "episode_20260101_120000", CRAWLER)
     export_dataset(tmp_path / "mine", tmp_path / "out")
     again = load(tmp_path / "out")
+    assert car_of(again.samples) == CRAWLER
+    report = tmp_path / "out" / "rover_export.json"
+    content = json.loads(report.read_text())
+    report.write_text(json.dumps(content | {"outcomes": [None, None]}))  # as if an episode had been removed since
+    again = load(tmp_path / "out")
+    assert [fault.kind for fault in again.faults] == ["another_export"]
     assert car_of(again.samples) == CRAWLER and again.action_range()["throttle"] == pytest.approx((-0.1, 0.1))
-    (tmp_path / "out" / "rover_export.json").unlink()
+    report.unlink()
     with pytest.raises(EpisodeError, match="a rover's lies from 0 to 1"):
         load(tmp_path / "out")
 
