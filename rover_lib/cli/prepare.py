@@ -12,7 +12,7 @@ import click
 
 from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
 from rover_lib.onboard.columns import aligned
-from rover_lib.onboard.kinds import Output, PathTo
+from rover_lib.onboard.kinds import Number, Output, PathTo
 from rover_lib.workshop.progress import terminal
 
 if TYPE_CHECKING:
@@ -298,7 +298,9 @@ def distill(
 @click.argument("episodes", type=EPISODES, nargs=-1, required=True)
 @click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
-@click.option("--weight", type=float, help="Weight of a frame of a correction [default: params.yml].")
+@click.option(
+    "--weight", type=Number(min=0, min_open=True), help="Weight of a frame of a correction [default: params.yml]."
+)
 @click.option(
     "--samples", type=click.IntRange(min=1), help="Maximum number of frames of each kind [default: params.yml]."
 )

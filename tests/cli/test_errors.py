@@ -95,6 +95,7 @@ WRONG = [
     ("drive policy_static.pt --record out --record-mb nan", "--record-mb", "nan is not a finite number"),
     ("arm-car --max-seconds inf", "--max-seconds", "inf is not a finite number"),
     ("arm-car --heartbeat-s nan", "--heartbeat-s", "nan is not a finite number"),
+    ("finetune params.yml params.yml --name x --weight nan", "--weight", "nan is not a finite number"),
 ]
 
 
