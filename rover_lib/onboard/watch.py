@@ -202,7 +202,9 @@ class HealthWatch:
     def _of_the_link(self, garbled_lines: int, t: Telemetry) -> Iterator[str]:
         counted = (self._report.resent, garbled_lines, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
         before, self._counted = self._counted or counted, counted
-        again, garbled, bad, old, beyond, lost = (now - then for now, then in zip(counted, before, strict=True))
+        # An Arduino that was reset counts from 0 again.
+        news = (now - then if now >= then else now for now, then in zip(counted, before, strict=True))
+        again, garbled, bad, old, beyond, lost = news
         if again > OFTEN or garbled or bad or old or beyond or lost:
             yield (
                 f"the link: {again} commands were sent again, {garbled} lines came garbled; the Arduino had {bad} "

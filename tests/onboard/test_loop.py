@@ -634,6 +634,8 @@ def test_what_is_ridden_through_is_said(link, monkeypatch):
     assert list(look()) == []  # now and then one is late
     report.resent += OFTEN + 1
     assert "6 commands were sent again" in next(look())
+    link.status = replace(STATUS, bad_lines=1)  # of an Arduino that was reset: it counts from 0 again
+    assert "the Arduino had 1 garbled, 0 old" in next(look())
 
     said = []
     for second in range(1, 8):  # what goes on is said again, but not each time
