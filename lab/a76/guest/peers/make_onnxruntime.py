@@ -47,14 +47,11 @@ def stays_float(graph: onnx.GraphProto) -> list[str]:
     """Return the nodes that quantize_static shall leave in float, chosen by what they compute."""
     constants = {i.name for i in graph.initializer}
     users = Counter(name for node in graph.node for name in node.input)
-    used_by = {
-        name: node.op_type for node in graph.node for name in node.input
-    }  # only of use for a value with a single user
+    used_by = {name: node.op_type for node in graph.node for name in node.input}  # right for values with one user
     found = []
     for node in graph.node:
-        product = (
-            node.op_type in LAYERS and node.input[1] not in constants
-        )  # only the second: a constant query is the first input
+        # A product has no constant as its second input; a constant query would be its first.
+        product = node.op_type in LAYERS and node.input[1] not in constants
         residual = node.op_type == "Add" and not (users[node.output[0]] == 1 and used_by[node.output[0]] == "Relu")
         if product or residual or "/head/" in node.name or "/state_project/" in node.name:
             found.append(node.name)
