@@ -154,7 +154,7 @@ def in_cgroup(name: str) -> Iterator[Callable[[], None]]:
 
 
 def _remove_cgroups(folders: list[Path], tries: int = 100) -> None:
-    """Kills what is in them and removes them, with those below. Raises nothing."""
+    """Kill what is in the groups, and remove them with those below them. Raises nothing."""
     for _ in range(tries):
         left = [f for folder in folders for f in sorted(folder.glob("**/"), reverse=True)]
         for folder in left:

@@ -29,7 +29,7 @@ class PinEvent(NamedTuple):
     pins float; 'open': somebody opened the port; 'stall': this machine had no time for the Arduino, for pulse_us;
     'lost': events were not read in time, and pulse_us is their number. pin: 'steering', 'throttle' or ''.
     monotonic_s: time.monotonic() when the pin rose, or when the event happened. period_us: the time since the pin rose
-    before that, 0 for the first pulse after a reset.
+    before that, 0 for the first pulse after a reset; from a StandIn always the nominal period.
     """
 
     monotonic_s: float

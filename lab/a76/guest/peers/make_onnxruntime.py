@@ -33,7 +33,7 @@ OPSET = 17
 
 
 class Recorded(CalibrationDataReader):
-    """Gives the calibration frames one by one."""
+    """A reader that gives the calibration frames one by one."""
 
     def __init__(self, calibration: str):
         self.rest = observations(calibration)
