@@ -17,8 +17,9 @@ from rover_lib.workshop.progress import terminal
 @click.group("lab", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
 def main(debug: bool) -> None:
-    """What the rover project is proven with: an emulated Arduino, faults, counted instructions, emulated Pis."""
-    os.environ.setdefault(AS_ROOT, "1")  # some of it needs root, and its artifacts are made here
+    """Prove what the rover project claims, with an emulated Arduino, faults, counted instructions and emulated Pis."""
+    # Some of it needs root, and loads only artifacts that were made here.
+    os.environ.setdefault(AS_ROOT, "1")
 
 
 @main.command()
@@ -27,11 +28,11 @@ def main(debug: bool) -> None:
 @click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
 @click.pass_context
 def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> None:
-    """`rover drive --world`, with the real firmware on an emulated Arduino."""
+    """Do what `rover drive --world` does, with the real firmware on an emulated Arduino."""
     from lab.arduino.emulator import BOARD, build
     from rover_lib.world.car import VirtualCar
 
-    build()  # here, where its errors are seen
+    build()  # in this process, where its errors are seen
     ctx.exit(run_drive(car=partial(VirtualCar, seed=seed, board=BOARD), latency_ms=latency_ms, **options))
 
 
@@ -39,7 +40,7 @@ def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> N
 @click.argument("artifact", type=ARTIFACT, required=False)
 @click.pass_context
 def doctor(ctx: click.Context, artifact: Path | None) -> None:
-    """`rover doctor`, then its ritual with the transmitter, with the real firmware on an emulated Arduino.
+    """Do `rover doctor` and its ritual with the transmitter, with the real firmware on an emulated Arduino.
 
     The camera is the balloon world's, and a script holds the transmitter. Exit code 1 if anything fails.
     """
@@ -64,9 +65,9 @@ def doctor(ctx: click.Context, artifact: Path | None) -> None:
 def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as_json: bool) -> None:
     """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
 
-    A count, never a time. Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of
-    lab/params.yml hold. With --pi4 it leaves arm-cortex-a72.json alone. Needs Debian 12 with qemu-user and gcc, which
-    are installed when you are root.
+    The result is a count, never a time. Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates
+    of lab/params.yml hold. With --pi4 it leaves only arm-cortex-a72.json. Needs Debian 12 with qemu-user and gcc, which
+    it installs if you are root.
     """
     from lab.a76.core import A72
     from lab.a76.count_run import count_other_core, count_run
@@ -95,8 +96,9 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as
 def full(run_dir: Path, steps: int, learned: bool, **options: Any) -> None:
     """Make a policy of the real car's size in RUN_DIR, and artifacts of it at several image sizes, for `arm`.
 
-    Real in format, size and ranges, but trained for a few steps only: it does not drive. With --learned it does: that
-    takes an hour or more on two cores, goes on where it was ended, and is done once: the checkpoint stays in the cache.
+    Its format, size and ranges are real, but it is trained for a few steps only and cannot drive. With --learned it
+    can: its training takes an hour or more on two cores, goes on where it was ended, and is done only once, as the
+    checkpoint stays in the cache.
     """
     from lab.a76.full import LEARNED_NOTE, NOTE, full_run
 
@@ -115,14 +117,14 @@ def faults(
 ) -> None:
     """Break what can break while the car drives, and see on the pins of an emulated Arduino whether it stops.
 
-    About 6 minutes for all. With OUTPUT, the rows are left there as JSON. Exit code 1 if anything is not as expected.
-    Needs Debian's packages for the Arduino's firmware and simavr, see docs/first_hour.md.
+    All faults take about 6 minutes. The rows are written to OUTPUT as JSON, if it is given. The exit code is 1 if
+    anything is not as expected. Needs Debian's packages for the Arduino's firmware and simavr, see docs/first_hour.md.
     """
     from rover_lib.onboard.car import FILE_VARIABLE, read_car
 
     if car:
         read_car(car)
-        os.environ[FILE_VARIABLE] = str(car.resolve())  # before anything asks which car this is, drive included
+        os.environ[FILE_VARIABLE] = str(car.resolve())  # before anything reads it, the drives included
     from lab.driving.faults import run_faults
 
     outcome = run_faults(only, kinds=kinds, echo=click.echo)
@@ -143,8 +145,8 @@ def faults(
 def view(ctx: click.Context, output: Path, artifact: Path, pairs: int, stops: int | None) -> None:
     """Measure what a view costs a drive, how old its picture is, and how soon its button stops the car.
 
-    About 10 minutes. Leaves OUTPUT as JSON; exit code 1 if a gate of lab/params.yml does not hold. Needs Debian's
-    packages for the Arduino's firmware and simavr, see docs/first_hour.md.
+    It takes about 10 minutes and writes OUTPUT as JSON. The exit code is 1 if a gate of lab/params.yml does not hold.
+    Needs Debian's packages for the Arduino's firmware and simavr, see docs/first_hour.md.
     """
     from lab.driving.view_bench import measure
 
@@ -162,10 +164,11 @@ def view(ctx: click.Context, output: Path, artifact: Path, pairs: int, stops: in
 @click.option("--jobs", type=click.IntRange(min=1), help="Drives at a time [default: all cores].")
 @click.pass_context
 def random_drives(ctx: click.Context, output: Path | None, drives: int, first: int, jobs: int | None) -> None:
-    """Drive with random faults in virtual time, and hold each drive against what must never be.
+    """Drive with random faults in virtual time, and check each drive against invariants: what must never happen.
 
-    Some minutes for all. Prints how many states they visited; of each drive that breaks an invariant its seed, and a
-    short story that breaks the same. With OUTPUT, that is left there as JSON. Exit code 1 if one does. Needs gcc.
+    All drives take some minutes. Prints how many states they visited and, for each drive that breaks an invariant, its
+    seed and a short story that breaks the same one. This is written to OUTPUT as JSON, if it is given. The exit code is
+    1 if a drive breaks an invariant. Needs gcc.
     """
     from lab.driving import random_drives as lab_random
 
@@ -180,7 +183,7 @@ def random_drives(ctx: click.Context, output: Path | None, drives: int, first: i
 
 @main.group()
 def pi() -> None:
-    """Emulated Pis: the playbooks, the service and its faults on real Debian arm64 systems. Needs root, and Debian."""
+    """Test playbooks, the service and its faults on emulated Pis: real Debian arm64 systems. Needs root and Debian."""
 
 
 def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
@@ -205,8 +208,8 @@ def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
 def pi_fast(ctx: click.Context, output: Path, demo: Path, **options: Any) -> None:
     """Run every playbook on an emulated Pi in a container, and prove from within what they promise.
 
-    Real systemd and sshd, aarch64 programs, the real firmware on an emulated Arduino. OUTPUT is JSON, what the
-    playbooks said is beside it; exit code 1 if anything is not as expected.
+    The container has real systemd and sshd, aarch64 programs, and the real firmware on an emulated Arduino. Writes
+    OUTPUT as JSON, and what the playbooks printed beside it. The exit code is 1 if anything is not as expected.
     """
     from lab.pi.container_run import run_container
 
@@ -223,10 +226,11 @@ def pi_fast(ctx: click.Context, output: Path, demo: Path, **options: Any) -> Non
 @click.option("--fresh", is_flag=True, help="Provision anew, even if the cache has a card that was provisioned so.")
 @click.pass_context
 def pi_whole(ctx: click.Context, output: Path, **options: Any) -> None:
-    """Provision, deploy and drive a whole emulated Pi, and hold each servo pulse against its command.
+    """Provision, deploy and drive a whole emulated Pi, and check each servo pulse against its command.
 
-    QEMU's Cortex-A76 with kernel, camera and USB; the real firmware on an emulated Arduino. Cables are pulled while
-    it drives. OUTPUT is JSON; exit code 1 if anything is not as expected, the machine's console is beside it then.
+    The machine is QEMU's Cortex-A76 with kernel, camera and USB, and the real firmware on an emulated Arduino. Cables
+    are pulled while it drives. Writes OUTPUT as JSON. The exit code is 1 if anything is not as expected; the machine's
+    console is beside OUTPUT then.
     """
     from lab.pi.machine_run import run_machine
 

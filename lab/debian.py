@@ -1,4 +1,4 @@
-"""Debian packages: what this machine lacks, installed by root; and arm64 ones, fetched without being installed.
+"""Find and install the Debian packages that this machine lacks, and fetch arm64 packages without installing them.
 
 missing_packages({"qemu-aarch64": "qemu-user", "/usr/include/stdio.h": "libc6-dev"})     # ["qemu-user"]
 """
@@ -16,13 +16,14 @@ NO_DEBIAN = "use a Debian 12 or 13 with the network, in a container if need be"
 
 
 class DebianError(RoverError):
-    """Debian packages that are needed and are not to be had."""
+    """Debian packages are needed but cannot be had."""
 
 
 def missing_packages(needs: Mapping[str, str]) -> list[str]:
-    """Debian packages that this machine lacks.
+    """Return which of these Debian packages this machine lacks.
 
-    needs: the package of each command, or of each file by its absolute path; commands of root's folders count too.
+    needs: the package that each command, or each file by its absolute path, comes from. Commands in root's folders
+    count too.
     """
 
     missing = set()
@@ -33,14 +34,14 @@ def missing_packages(needs: Mapping[str, str]) -> list[str]:
 
 
 def which(command: str) -> str | None:
-    """As shutil.which, in root's folders too, which a user's PATH may lack."""
+    """Find a command as shutil.which does, but also in root's folders, which a user's PATH may lack."""
     return shutil.which(command) or shutil.which(command, path="/usr/sbin:/sbin")
 
 
 def install_packages(packages: Sequence[str], what: str) -> None:
-    """Install Debian packages; nothing happens if there are none to install. what: needs them, for the error.
+    """Install Debian packages, if there are any to install. what: the thing that needs them, for the error.
 
-    Raises DebianError with the command to type where this is not root, or with apt-get's last words.
+    Raises DebianError with the command to type if this is not root, or with apt-get's last lines if it fails.
     """
     if not packages:
         return
@@ -54,14 +55,15 @@ def install_packages(packages: Sequence[str], what: str) -> None:
 
 
 def fetch_packages(folder: Path, packages: Sequence[str], installed: Path | None = None) -> list[Path]:
-    """arm64 packages and what they depend on, as .deb files in a scratch folder; nothing of this machine is changed.
+    """Fetch arm64 packages and their dependencies as .deb files into a scratch folder; return their paths.
 
-    By this machine's apt sources and keys, with lists, cache and status of its own. packages: names, or apt's patterns.
-    installed: the root of a system; what it has already is left out. Raises DebianError if they are not to be had.
+    Nothing on this machine is changed: apt uses its sources and keys, but its own lists, cache and status in the
+    folder. packages: names, or apt's patterns. installed: the root of a system whose packages are left out. Raises
+    DebianError if the packages cannot be had.
     """
     for subfolder in ("lists/partial", "archives/partial"):
         (folder / subfolder).mkdir(parents=True)
-    (folder / "status").touch()  # nothing is installed: the dependencies come along
+    (folder / "status").touch()  # says that nothing is installed, so that apt fetches all dependencies
     if installed:
         shutil.copy(installed / "var" / "lib" / "dpkg" / "status", folder / "status")
     options = {
@@ -86,6 +88,6 @@ def fetch_packages(folder: Path, packages: Sequence[str], installed: Path | None
 
 
 def unpack_packages(packages: Iterable[Path], folder: Path) -> None:
-    """The files of .deb packages, without installing them. Raises DebianError."""
+    """Unpack the files of .deb packages into a folder without installing them. Raises DebianError."""
     for package in packages:
         run("dpkg", "--extract", package, folder, error=DebianError, remedy=NO_DEBIAN)

@@ -1,4 +1,4 @@
-"""The laboratory's gates and limits: params.yml beside this file. What a user sets is rover_lib.onboard.params'."""
+"""Read the laboratory's gates and limits from lab/params.yml. A user's settings are in rover_lib.onboard.params."""
 
 from pathlib import Path
 from typing import Any
@@ -7,5 +7,5 @@ from rover_lib.onboard.params import read_params
 
 
 def lab_params() -> dict[str, Any]:
-    """The content of lab/params.yml."""
+    """Return the content of lab/params.yml."""
     return read_params(Path(__file__).with_name("params.yml"))

@@ -1,17 +1,17 @@
-"""An emulated Cortex-A76, the core of a Raspberry Pi 5, that counts what a program executes on it. Or a Pi 4's, an A72.
+"""Count what a program executes on an emulated Cortex-A76, the core of a Raspberry Pi 5, or on a Pi 4's Cortex-A72.
 
     core = prepare()
     emulation = emulate_script(core, Path("predict.py"), [], folder)
     emulation.total(section=0)
 
-Emulation says nothing about time, but it counts exactly, on any workstation, and the same again tomorrow. What is
-emulated is an arm64 Debian's Python with the wheels that a Pi gets (requirements_pi.txt), under QEMU's user emulation
-with a small plugin of ours (guest/count.c). Nothing of the host is changed: packages are fetched by a private apt,
-unpacked without being installed, and cached.
+Emulation says nothing about time, but it counts exactly, on any workstation, and gives the same count every time. It
+runs an arm64 Debian's Python with the wheels that a Pi gets (requirements_pi.txt), under QEMU's user emulation with a
+small plugin of ours (guest/count.c). Nothing on the host is changed: packages are fetched by a private apt, unpacked
+without being installed, and cached.
 
-Memory is the most that the emulator's process held resident, as the kernel keeps it, less the emulator's own share: its
-translated code and the plugin's counters lie outside the address range that it reserves for the guest at a fixed place,
-grow slowly, and are read five times a second. They are reported beside it. MB are 10**6 bytes.
+A peak of memory is the most that the emulator's process held resident, as the kernel records it, minus the emulator's
+own share: its translated code and the plugin's counters. These lie outside the address range that is reserved for the
+guest at a fixed place. They grow slowly, are read five times a second, and are reported separately. MB are 10**6 bytes.
 """
 
 import os
@@ -45,17 +45,17 @@ GUEST = Path(__file__).parent / "guest"
 PLUGIN = GUEST / "count.c"
 REQUIREMENTS = REPOSITORY / "requirements_pi.txt"
 
-NEEDS = {  # the Debian packages of commands and files
+NEEDS = {  # commands and files, each with the Debian package that it comes from
     "qemu-aarch64": "qemu-user",
     "gcc": "gcc",
     "c++filt": "binutils",
     "/usr/include/stdio.h": "libc6-dev",
 }
-RECIPE = 1  # one more when the userland is made in another way: older ones are then not used
+RECIPE = 1  # raise it when the userland is made in another way, so that older ones are not used
 GUEST_PACKAGES = ("python3.11", "libgomp1", "libstdc++6")
 PYTHON, PLATFORM = "3.11", "aarch64-manylinux_2_28"
-FOR_GUEST = ("--python-platform", PLATFORM, "--python-version", PYTHON)  # of `fetch_wheels`
-CORES = 4  # of the Pi; with fewer or others in /proc/cpuinfo, XNNPACK would choose other kernels
+FOR_GUEST = ("--python-platform", PLATFORM, "--python-version", PYTHON)  # options for `fetch_wheels`
+CORES = 4  # as on the Pi: with fewer cores or others in /proc/cpuinfo, XNNPACK would choose other kernels
 CPUINFO = """processor\t: {core}
 BogoMIPS\t: 108.00
 Features\t: {features}
@@ -67,7 +67,7 @@ CPU revision\t: {revision}
 
 """
 A76, A72 = "cortex-a76", "cortex-a72"  # QEMU's names for the cores of a Raspberry Pi 5 and 4
-PROCESSORS = {  # what Linux says of each there
+PROCESSORS = {  # what Linux says about each of these cores on a Pi
     A76: {
         "features": "fp asimd evtstrm aes pmull sha1 sha2 crc32 atomics fphp asimdhp cpuid asimdrdm lrcpc dcpop "
         "asimddp",
@@ -78,15 +78,15 @@ PROCESSORS = {  # what Linux says of each there
     A72: {"features": "fp asimd evtstrm crc32 cpuid", "variant": "0x0", "part": "0xd08", "revision": 3},
 }
 GUEST_BASE, GUEST_SIZE = 0x100000000000, 0x4000000000  # the guest's addresses, as the host sees them
-SAMPLE_S = 0.2  # the emulator's own memory grows slowly
-SILENCE_S = 1200  # of its processor's time: loading the full policy in FP32 takes five minutes without a word
-WAITING = 6  # times as long by the clock, on a machine that has more to do
+SAMPLE_S = 0.2  # often enough, as the emulator's own memory grows slowly
+SILENCE_S = 1200  # of processor time: loading the full policy in FP32 prints nothing for five minutes
+WAITING = 6  # by the clock the silence may be that many times longer, as the machine may have more to do
 
 BLOCK = np.dtype([(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot")])  # as in count.c
 
 
 class CountError(RoverError):
-    """Instructions that cannot be counted: no emulated core here, a program that failed on it, or an unfit run."""
+    """Instructions cannot be counted: there is no emulated core, a program failed on it, or the run is unfit."""
 
 
 # --- preparing --------------------------------------------------------------------------------------------------------
@@ -94,7 +94,7 @@ class CountError(RoverError):
 
 @dataclass(frozen=True)
 class Core:
-    """An emulated core: its file system, the Pi's wheels included, the plugin that counts, and QEMU's name for it."""
+    """An emulated core: its file system with the Pi's wheels, the plugin that counts, and QEMU's name for the core."""
 
     root: Path
     plugin: Path
@@ -102,10 +102,10 @@ class Core:
 
 
 def prepare(progress: Progress = silent, cpu: str = A76) -> Core:
-    """Everything that counting needs, from the cache or made now (about half a minute).
+    """Return everything that counting needs, from the cache or made now, which takes about half a minute.
 
-    Debian packages that are missing are installed when this runs as root. Raises CountError or DebianError if anything
-    is not to be had.
+    Missing Debian packages are installed if this runs as root. Raises CountError or DebianError if anything cannot be
+    had.
     """
     steps = (_install_missing, build_plugin, partial(_userland, cpu))
     _, plugin, root = [step() for step in progress(steps, desc=f"emulated {cpu}", total=len(steps))]
@@ -117,10 +117,10 @@ def _install_missing() -> None:
 
 
 def build_plugin() -> Path:
-    """The plugin that counts, from the cache or compiled now."""
+    """Return the plugin that counts, from the cache or compiled now."""
 
     def make(folder: Path) -> None:
-        # What the emulator provides is resolved when it loads the plugin.
+        # The emulator's functions need no library here: they are resolved when it loads the plugin.
         run("gcc", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "count.so", PLUGIN, error=CountError)
 
     return cached_folder("arm-plugin", key_of({}, PLUGIN), make) / "count.so"
@@ -130,7 +130,7 @@ def _userland(cpu: str) -> Path:
     recipe = {"made": [GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, PROCESSORS[cpu], CORES, RECIPE]}
 
     def of_another_core(root: Path) -> None:
-        """The same files, but for what Linux says of its processor."""
+        """Make a root with the same files, except for what Linux says about the processor."""
         shutil.copytree(_userland(A76), root, copy_function=os.link, symlinks=True, dirs_exist_ok=True)
         (root / "proc" / "cpuinfo").unlink()
         _write_cpuinfo(root, cpu)
@@ -151,7 +151,8 @@ def _make_userland(root: Path) -> None:
     cpus.mkdir(parents=True)
     for name in ("possible", "present", "online"):
         (cpus / name).write_text(f"0-{CORES - 1}\n")
-    # Leaves the bytecode of all that they import, which costs a third of a minute in the emulator, and proves them.
+    # This proves that the packages work, and leaves the bytecode of everything that they import. To compile that takes
+    # a third of a minute in the emulator.
     imports = [_python(root), "-c", "import torch, cv2, serial"]
     run(*_qemu(root, A76), *imports, error=CountError, env=_environment(root, root))
 
@@ -162,9 +163,9 @@ def _write_cpuinfo(root: Path, cpu: str) -> None:
 
 
 def fetch_wheels(folder: Path, *what: object) -> None:
-    """Python packages in a folder, by uv and without being installed. what: packages, and further options of uv.
+    """Fetch Python packages into a folder with uv, without installing them. what: packages, and further options of uv.
 
-    Without their dependencies: all are named. Raises CountError if they are not to be had.
+    Dependencies are not fetched, so `what` must name them all. Raises CountError if they cannot be had.
     """
     beside = Path(sys.executable).parent / "uv"
     uv = str(beside) if beside.is_file() else shutil.which("uv")
@@ -177,7 +178,7 @@ def fetch_wheels(folder: Path, *what: object) -> None:
 
 def _qemu(root: Path, cpu: str) -> list[str]:
     place = ["-B", hex(GUEST_BASE), "-R", hex(GUEST_SIZE)]
-    # setpriv: whoever started it may be killed before it can end its emulator
+    # setpriv ends the emulator if the process that started it is killed and cannot do so itself.
     return ["setpriv", "--pdeathsig", "KILL", "qemu-aarch64", "-L", str(root), "-cpu", cpu, *place]
 
 
@@ -190,7 +191,7 @@ def _site(root: Path) -> Path:
 
 
 def _environment(root: Path, home: Path) -> dict[str, str]:
-    """Of an emulated Python: nothing of the host's, one thread."""
+    """Return the environment of an emulated Python, which has nothing from the host's and uses one thread."""
     return {
         "PATH": "/usr/bin",
         "LANG": "C.UTF-8",
@@ -198,10 +199,10 @@ def _environment(root: Path, home: Path) -> dict[str, str]:
         "TMPDIR": str(home),
         "PYTHONHOME": str(root / "usr"),
         "PYTHONPATH": str(_site(root)),
-        "PYTHONHASHSEED": "0",  # the same order in every dict, the same count
+        "PYTHONHASHSEED": "0",  # the same hashes every time, so that the count is the same
         "OMP_NUM_THREADS": "1",
         "OPENBLAS_NUM_THREADS": "1",
-        AS_ROOT: "1",  # of an emulated program, and of artifacts that were made here
+        AS_ROOT: "1",  # allowed, as the program is emulated and loads only artifacts that were made here
     }
 
 
@@ -212,12 +213,12 @@ def _environment(root: Path, home: Path) -> dict[str, str]:
 class Emulation:
     """What one program did: its counts by section, and the most memory that it held in each of its steps."""
 
-    sections: dict[int, np.ndarray]  # of BLOCK
-    peak_mb: dict[str, float]  # by the line that the program had printed last; "" before the first
-    emulator_mb: float  # the emulator's own, at the end
+    sections: dict[int, np.ndarray]  # arrays of BLOCK
+    peak_mb: dict[str, float]  # by the line that the program had printed last; "" stands for before the first
+    emulator_mb: float  # the emulator's own memory at the end
 
     def total(self, section: int, what: str = "instructions") -> int:
-        """Instructions (or "simd", "sdot") that were executed in a section."""
+        """Return how many instructions, or "simd" or "sdot" ones, were executed in a section."""
         blocks = self.sections[section]
         return int((blocks["entered"] * blocks[what]).sum())
 
@@ -231,14 +232,14 @@ def emulate_script(
     packages: Path | None = None,
     **options: Any,
 ) -> Emulation:
-    """`emulate` a Python script of ours with the Pi's wheels, rover_lib and what lies beside guest/predict.py.
+    """`emulate` a Python script of ours with the Pi's wheels, rover_lib and the modules beside guest/predict.py.
 
-    packages: laid before the Pi's own. options: of `emulate`.
+    packages: a folder of packages that come before the Pi's own on the path. options: for `emulate`.
     """
     environment = _environment(core.root, folder)
     places = [*([packages] if packages else []), environment["PYTHONPATH"], REPOSITORY, GUEST]
     environment["PYTHONPATH"] = ":".join(map(str, places))
-    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # nothing of the emulated Python goes into the checkout
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"  # keep the emulated Python's bytecode out of the checkout
     return emulate(core, [_python(core.root), script, *arguments], folder, environment=environment, **options)
 
 
@@ -251,11 +252,12 @@ def emulate(
     on_line: Callable[[str], None] = lambda line: None,
     stop: Event | None = None,
 ) -> Emulation:
-    """Run an aarch64 program to its end, one core, and read the counts that it marked (see guest/count.c).
+    """Run an aarch64 program to its end on one core, and read the counts that it marked (see guest/count.c).
 
-    folder: for the counts, and what the program leaves. on_line: told each line on its stdout. stop: ends it when set.
-    Raises CountError with the end of its stderr if it fails, or prints nothing for SILENCE_S of its processor's time;
-    whatever ends this, the emulator ends with it.
+    folder: takes the counts, and what the program leaves. on_line: called with each line on its stdout. stop: ends the
+    program when set.
+    Raises CountError with the end of its stderr if it fails, or if it prints nothing for SILENCE_S of processor time.
+    Whatever ends this function also ends the emulator.
     """
     qemu = [*_qemu(core.root, core.cpu), "-plugin", f"{core.plugin},folder={folder}", *command]
     with (folder / "stderr").open("wb") as stderr:
@@ -288,7 +290,7 @@ def emulate(
 
 @dataclass
 class _Watched:
-    """What is known of a running emulator; its peaks are told apart by the line that the program printed last."""
+    """What is known about a running emulator. Each line that the program prints begins a step with its own peak."""
 
     pid: int
     step: str = ""
@@ -332,11 +334,14 @@ def _read_to_the_end(stdout: IO[bytes], watched: _Watched, on_line: Callable[[st
                 on_line(watched.step)
 
 
-# By hand: psutil knows neither the kernel's own peak (VmHWM) nor how to reset it.
+# Read from /proc, as psutil knows neither the kernel's own peak (VmHWM) nor how to reset it.
 
 
 def _memory_mb(pid: int) -> tuple[float, float]:
-    """The most that a process held resident, and what it holds now outside the guest's addresses; zeros if it ended."""
+    """Return the most that a process held resident, and what it holds outside the guest's addresses now.
+
+    Both in MB, and zero if the process has ended.
+    """
     outside_kb, in_guest = 0, False
     try:
         mappings = Path(f"/proc/{pid}/smaps").read_text()
@@ -346,13 +351,13 @@ def _memory_mb(pid: int) -> tuple[float, float]:
     for line in mappings.splitlines():
         if line.startswith("Rss:"):
             outside_kb += 0 if in_guest else int(line.split()[1])
-        elif not line[0].isupper():  # a mapping's addresses; the lines about it start in capitals
+        elif not line[0].isupper():  # a mapping's addresses; the lines about it start with capitals
             in_guest = GUEST_BASE <= int(line.partition("-")[0], 16) < GUEST_BASE + GUEST_SIZE
     return (int(peak[1]) * 1024 / 1e6, outside_kb * 1024 / 1e6) if peak else (0.0, 0.0)
 
 
 def _cpu_s(pid: int) -> float:
-    """Processor time that a process has used; 0 if it ended."""
+    """Return the processor time that a process has used, in seconds; 0 if it has ended."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -361,5 +366,6 @@ def _cpu_s(pid: int) -> float:
 
 
 def _forget_peak(pid: int) -> None:
-    with suppress(OSError):  # ended, or a kernel without it: then a peak of before counts too, and none is missed
+    # If the process has ended or the kernel cannot do it, earlier peaks count too, but none is missed.
+    with suppress(OSError):
         Path(f"/proc/{pid}/clear_refs").write_text("5")

@@ -1,4 +1,4 @@
-"""Instructions that an artifact executes in the emulated Pi, in one thread and by rover_lib.onboard alone."""
+"""Count the instructions that an artifact executes in the emulated Pi, in one thread, with rover_lib.onboard alone."""
 
 import json
 import tempfile
@@ -19,17 +19,17 @@ from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
-COUNTED = 10  # inferences after loading, each for itself
-STEADY = 3  # the first whose count is what all later ones cost
+COUNTED = 10  # how many inferences after loading are counted, each by itself
+STEADY = 3  # the number of the first inference whose count is that of all later ones too
 
 
 @dataclass(frozen=True)
 class Guest:
-    """A script that runs an artifact in the emulated Pi: it is told, and leaves, what guest/predict.py is and does."""
+    """A script that runs an artifact in the emulated Pi. It takes guest/predict.py's arguments and leaves its files."""
 
     script: Path = GUEST / "predict.py"
-    arguments: tuple[object, ...] = ()  # after those
-    packages: Path | None = None  # laid before the Pi's own
+    arguments: tuple[object, ...] = ()  # further arguments, after those of guest/predict.py
+    packages: Path | None = None  # come before the Pi's own on the path
 
 
 OURS = Guest()
@@ -37,7 +37,7 @@ Name = TypeVar("Name", bound=Hashable)
 
 
 def onnxruntime_there() -> Path:
-    """The folder of what a Pi without torch installs, for the emulated one: from the cache or fetched now."""
+    """Return a folder with the packages of a Pi without torch, for the emulated Pi, from the cache or fetched now."""
     wheels = REQUIREMENTS["onnxruntime"]
 
     def make(folder: Path) -> None:
@@ -47,20 +47,23 @@ def onnxruntime_there() -> Path:
 
 
 def guest_of(artifact: Path) -> Guest:
-    """What runs an artifact of ours: the same script, with the engine that its manifest names."""
+    """Return what runs one of our artifacts: always the same script, with packages for the manifest's engine."""
     is_onnx = read_manifest(artifact)["engine"] == engines.ONNXRUNTIME
     return Guest(packages=onnxruntime_there()) if is_onnx else OURS
 
 
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """An artifact in the emulated Pi. inferences[0] is the first after loading; chunks (n, C, A) float32."""
+    """What an artifact executed in the emulated Pi.
 
-    load: int  # instructions of load_policy: integrity, unpacking, parity vectors
-    inferences: tuple[int, ...]
-    simd: int  # of the steady inference, as is sdot
-    sdot: int
-    kernels: dict[str, tuple[int, int, int]]  # its (instructions, SIMD, SDOT) by function
+    inferences[0] is the first after loading. chunks: (n, C, A) float32.
+    """
+
+    load: int  # instructions of load_policy: integrity check, unpacking, parity vectors
+    inferences: tuple[int, ...]  # instructions of each
+    simd: int  # SIMD instructions of the steady inference
+    sdot: int  # SDOT instructions of the steady inference
+    kernels: dict[str, tuple[int, int, int]]  # (instructions, SIMD, SDOT) of the steady inference by function
     peak_mb: float
     peak_loading_mb: float
     emulator_mb: float
@@ -74,9 +77,9 @@ class Counted:
 
 
 def write_observations(path: Path, samples: Sequence[Any]) -> Path:
-    """What a policy shall see, where the guest can read it: `state` (n, S) float32, `frame_0000`... (h, w, 3) BGR.
+    """Write what a policy shall see for the guest: `state` (n, S) float32 and `frame_0000`, ... (h, w, 3) uint8 BGR.
 
-    Of several cameras `frame_0000.<camera>`, ... each.
+    If there are several cameras, each has its own frames: `frame_0000.<camera>`, ...
     """
     frames: dict[str, Any] = {}
     for i, sample in enumerate(samples):
@@ -99,9 +102,9 @@ def count_artifact(
 ) -> Counted:
     """Load an artifact in the emulated Pi, predict each sample, and count the first `counted` inferences one by one.
 
-    samples: with frame_bgr() and state; the first ones come again if there are fewer than `counted`, which is at
-    least STEADY. on_step: told after each inference. stop: ends it when set. Raises CountError with the guest's last
-    words, if it fails there.
+    samples: have frame_bgr() and state. If there are fewer than `counted`, which must be at least STEADY, they are
+    repeated from the first. on_step: called after each inference. stop: ends the count when set. Raises CountError with
+    the last lines that the guest printed, if it fails.
     """
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:
         folder = Path(scratch)
@@ -134,10 +137,10 @@ def count_artifact(
 def side_by_side(
     counts: Mapping[Name, Callable[..., Counted]], inferences: int, what: str, jobs: int, progress: Progress
 ) -> dict[Name, Counted]:
-    """Count in several emulated machines, `jobs` at a time: a count does not depend on who else is running.
+    """Count in several emulated machines, `jobs` at a time: a count does not depend on what else is running.
 
-    counts: by name, each called with on_step and stop (see `count_artifact`); the others end when one fails.
-    inferences: of all of them together, for the bar; what: their name there.
+    counts: functions by name, each called with on_step and stop (see `count_artifact`). If one fails, the others end.
+    inferences: how many all of them have together, for the progress bar. what: the bar's label.
     """
     bar = iter(progress(range(inferences), desc=what, total=inferences))
     one_at_a_time, stop = Lock(), Event()
@@ -152,7 +155,7 @@ def side_by_side(
             for future in as_completed(started.values()):
                 future.result()
         finally:
-            stop.set()  # when one failed, or the user does not want to wait
+            stop.set()  # if one failed, or the user interrupts, the others end
             pool.shutdown(cancel_futures=True)
     next(bar, None)
     return {name: future.result() for name, future in started.items()}

@@ -1,4 +1,4 @@
-"""Every artifact of a run counted in the emulated Pi, and what it predicts there judged.
+"""Count every artifact of a run in the emulated Pi, and judge what it predicts there.
 
 count_run("runs/demo")      # writes runs/demo/arm.json
 """
@@ -34,16 +34,17 @@ from rover_lib.workshop.session import Opened, opened
 
 REFERENCE = "policy_fp32"
 FRAMES = 50
-SLOW_GMAC = 1.0  # FP32 of more takes a minute and a half per emulated inference, so that few frames must do
+SLOW_GMAC = 1.0  # a larger FP32 takes a minute and a half for an emulated inference, so a few frames must be enough
 BIT_FRAMES = 4
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How an artifact is counted: its FP32 artifact, the frames that it predicts in the emulated Pi, and more.
+    """How an artifact is counted.
 
-    reference: None where there is no FP32 artifact of its image size, so that it is only counted. frames: indices.
-    counted: inferences that are counted one by one.
+    reference: the FP32 artifact of its image size; None if there is none, so that it is only counted and not judged.
+    frames: the indices of the frames that it predicts in the emulated Pi. counted: how many inferences are counted one
+    by one.
     """
 
     reference: str | None
@@ -54,15 +55,15 @@ class Plan:
 def count_run(
     run_dir: Path | str, *, frames: int = FRAMES, jobs: int | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Count every artifact of a run, write its arm.json and return what is in it.
+    """Count every artifact of a run; write and return its arm.json.
 
-    Judged on `frames` of the run's held-out frames: what each artifact predicts in the emulated Pi against what the
-    FP32 artifact of its image size predicts on this machine, and the same of this machine's predictions beside it.
-    FP32 takes up to minutes per frame there: it predicts a few frames there too, and must give what it gives here, to
-    the parity vectors' tolerance. An artifact of an image size without an FP32 is counted only. Of policy_static also
-    the bits that its INT8 backbone gives are compared (see `backbone_bits`).
-    jobs: artifacts at a time, each in one thread and below 1 GB; the machine's cores if None. Raises CountError, or
-    what reading the run raises.
+    Artifacts are judged on `frames` of the run's held-out frames. What an artifact predicts in the emulated Pi is
+    compared with what the FP32 artifact of its image size predicts on this machine; so is what it predicts on this
+    machine. FP32 takes up to minutes for a frame in the emulated Pi. So it predicts only a few frames there, which must
+    equal this machine's within the parity vectors' tolerance. An artifact without an FP32 of its image size is only
+    counted. For policy_static the bits that its INT8 backbone gives are compared too (see `backbone_bits`).
+    jobs: how many artifacts are counted at a time, each in one thread and below 1 GB; this machine's cores if None.
+    Raises CountError, or what reading the run raises.
     """
     run_dir = Path(run_dir)
     files = [*run_dir.glob("policy_*.pt"), *run_dir.glob(f"policy_*{ONNX_SUFFIX}")]
@@ -99,8 +100,8 @@ def count_run(
 def count_other_core(run_dir: Path | str, cpu: str, progress: Progress = silent) -> dict[str, Any]:
     """Count policy_fp32 and policy_static of a run on another core and on a Pi 5's; write and return arm-<cpu>.json.
 
-    metrics: for each the instructions of an inference on both, 10**9, and their ratio. Counted only: what an artifact
-    predicts on another core is judged where it is deployed, by its parity vectors. Raises as `count_run`.
+    metrics: for each artifact, the instructions of an inference on both cores, in 10**9, and their ratio. Predictions
+    are not judged here: parity vectors do that on the machine where the artifact is deployed. Raises as `count_run`.
     """
     run_dir = Path(run_dir)
     artifacts = {stem: run_dir / f"{stem}.pt" for stem in (REFERENCE, STATIC)}
@@ -124,21 +125,22 @@ def count_other_core(run_dir: Path | str, cpu: str, progress: Progress = silent)
 
 
 def reference_of(stem: str, artifacts: Iterable[str]) -> str | None:
-    """The FP32 artifact to judge by: policy_static_180x320 by policy_fp32_180x320, or by none if that is not there."""
+    """Return the FP32 artifact to judge an artifact by, policy_fp32_180x320 for policy_static_180x320, if it exists."""
     size = re.search(r"_\d+x\d+$", stem)
     own = REFERENCE + (size.group() if size else "")
     return own if own in artifacts else None
 
 
 def plans_of(manifests: Mapping[str, Mapping[str, Any]], frames: int) -> dict[str, Plan]:
-    """How each artifact is counted; what takes longest comes first, so that no core waits for it in the end."""
+    """Plan how each artifact is counted. What takes longest comes first, so that no core waits for it in the end."""
     plans, every = {}, range(frames)
     for stem, manifest in manifests.items():
         reference = reference_of(stem, manifests)
         if reference is None or (manifest["mode"] == "fp32" and manifest["gmac"] >= SLOW_GMAC):
             plans[stem] = Plan(reference, tuple(every[:STEADY]), STEADY)
         elif manifest["mode"] in ("fp32", "dynamic"):
-            # FP32 is only held against this machine's, and nobody would drive a Pi with dynamic: both are slow.
+            # Both are slow, and fewer frames are enough: FP32 is only compared with this machine's, and nobody would
+            # drive a Pi with a dynamic artifact.
             plans[stem] = Plan(reference, thinned(every, COUNTED))
         else:
             plans[stem] = Plan(reference, tuple(every))
@@ -171,9 +173,9 @@ def _judged(
     again: Opened,
     progress: Progress,
 ) -> dict[str, dict[str, Any]]:
-    """What the predictions of each artifact with a reference say, for arm.json.
+    """Judge the predictions of each artifact that has a reference; return the rows for arm.json.
 
-    Raises CountError if an FP32 artifact gives something else in the emulated Pi than on this machine.
+    Raises CountError if an FP32 artifact predicts something else in the emulated Pi than on this machine.
     """
     rows: dict[str, dict[str, Any]] = {}
     ranges = again.recordings.action_range()
@@ -199,7 +201,7 @@ def _judged(
 
 
 def chunks_here(path: Path, samples: Sequence[Any], progress: Progress) -> np.ndarray:
-    """(n, C, A) float32: what an artifact predicts on this machine, in one thread."""
+    """Return what an artifact predicts on this machine in one thread: (n, C, A) float32."""
     policy = load_policy(path, threads=1)
     watched = progress(samples, desc=f"{path.stem} on this machine", total=len(samples))
     return np.stack([policy.predict_chunk(s.frame_bgr(), s.state) for s in watched])
@@ -208,28 +210,28 @@ def chunks_here(path: Path, samples: Sequence[Any], progress: Progress) -> np.nd
 def errors_pct(
     reference: np.ndarray, chunks: np.ndarray, actions: Sequence[str], ranges: dict[str, tuple[float, float]]
 ) -> dict[str, float | None]:
-    """<action>_mae_pct: mean difference of two sets of chunks (n, C, A), in percent of the recorded range.
+    """Return <action>_mae_pct: the mean difference of two sets of chunks (n, C, A), in percent of the recorded range.
 
-    None for an action that never changes in the recordings: not judged.
+    It is None for an action that never changes in the recordings, which is not judged.
     """
     mean = np.abs(chunks.astype(np.float64) - reference).mean((0, 1))
     return {f"{action}_mae_pct": pct_of_range(float(mean[i]), ranges[action]) for i, action in enumerate(actions)}
 
 
 def backbone_bits(run_dir: Path, core: Core, checkpoint: Checkpoint, samples: Sequence[Any]) -> dict[str, int]:
-    """Whether policy_static's INT8 backbone gives the same bits in the emulated Pi as on this machine.
+    """Check whether policy_static's INT8 backbone gives the same bits in the emulated Pi as on this machine.
 
     The backbone (up to the image projection's INT8 output) is cut out of the same graph (see pipeline.requantized) and
-    run on prepared frames on both. Returns {frames, values, differing}, the counts of frames, of values that were
-    compared, and of those that are not the same. Raises QuantizeError if the run's files are not those that
-    policy_static.pt was made from.
+    run on prepared frames on both. Returns {frames, values, differing}: how many frames there were, how many values
+    were compared, and how many of them differ. Raises QuantizeError if policy_static.pt was not made from the run's
+    files.
     """
     backbone = q.backbone_of(requantized(run_dir, checkpoint)).eval()
     inputs = [q.inputs_of(s, checkpoint.config) for s in samples]
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch, torch.inference_mode():
         folder = Path(scratch)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of the trace: shapes are constants here, and meant to be
+            warnings.simplefilter("ignore")  # the trace warns that shapes become constants, which is intended
             traced = torch.jit.freeze(torch.jit.trace(backbone, inputs[0], check_trace=False).eval())
         traced.save(folder / "backbone.pt")
         frames: dict[str, Any] = {}

@@ -1,7 +1,7 @@
-"""A full-size policy to count, with no checkpoint at hand: real in format, size and ranges, but it cannot drive.
+"""Make a full-size policy to count if no checkpoint is at hand: format, size and ranges are real, but it cannot drive.
 
-full_run("runs/full")                  # some ten minutes; `python -m lab arm runs/full` then counts it
-full_run("runs/full", steps=None)      # one that has learned to drive: an hour or more, once
+full_run("runs/full")                  # takes some ten minutes; then `python -m lab arm runs/full` counts it
+full_run("runs/full", steps=None)      # makes one that has learned to drive; takes an hour or more, only once
 """
 
 from dataclasses import replace
@@ -29,17 +29,17 @@ from rover_lib.workshop.session import Opened, load
 from rover_lib.world.record import record_episodes
 from rover_lib.world.train import train
 
-LAST = f"policy_static{ONNX_SUFFIX}"  # that is made; the Makefile looks for it
+LAST = f"policy_static{ONNX_SUFFIX}"  # the last file that is made, which the Makefile looks for
 NOTE = "trained for a few steps only, so that activations have real ranges: this policy does not drive"
 LEARNED_NOTE = "trained whole on the balloon world's drives: this policy has learned to drive there"
 STEPS = 24
-DRIVES = 16  # two of them choose, two judge: far more than the 50 frames that judge a count
-LEARNED_DRIVES = 80  # the demo's, so that what was trained on them is in the cache already
-SAMPLES = 64  # calibrate
-CURVE_SAMPLES = 8  # calibrate what is only counted: the count does not depend on the ranges
-CHECKED_FRAMES = 8  # on which an export is checked against its policy
-SIZES = ((180, 320),)  # judged, beside the size of training
-CURVE = ((320, 576), (288, 512), (240, 432))  # counted only
+DRIVES = 16  # two of them choose and two judge, with far more frames than the 50 that judge a count
+LEARNED_DRIVES = 80  # as many as the demo's, so that their recordings are in the cache already
+SAMPLES = 64  # how many frames calibrate
+CURVE_SAMPLES = 8  # how many calibrate what is only counted, as a count does not depend on the ranges
+CHECKED_FRAMES = 8  # how many frames check an export against its policy
+SIZES = ((180, 320),)  # image sizes that are judged, in addition to that of training
+CURVE = ((320, 576), (288, 512), (240, 432))  # image sizes that are only counted
 
 
 def full_run(
@@ -53,20 +53,19 @@ def full_run(
     curve: tuple[tuple[int, int], ...] = CURVE,
     progress: Progress = silent,
 ) -> Path:
-    """Record drives, train a policy a few steps, and quantize it at several image sizes. Returns run_dir.
+    """Record drives, train a policy for a few steps, and quantize it at several image sizes. Returns run_dir.
 
-    size: 'full' (the user's policy, 360x640), or 'small' to try this out. steps: None for the whole recipe, as `rover
-    world train` has it. drives: 16, or the demo's 80 for the whole recipe. samples: at most this many frames calibrate.
-    sizes, curve: further image sizes (height, width) in pixels, of the same weights. progress: called like
+    size: 'full' (the user's policy, 360x640), or 'small' to try this out. steps: None for the whole recipe, as in
+    `rover world train`. drives: if None, 16, or the demo's 80 for the whole recipe. samples: how many frames calibrate
+    at most. sizes, curve: further image sizes (height, width) in pixels, with the same weights. progress: called like
     tqdm.tqdm(iterable, desc=, total=).
 
-    Leaves what the notebooks leave, as far as counting needs it: episodes, best_model.pth, load.json,
-    calibrate.json, calibration.pt, policy_fp32.pt, policy_static.pt, quantize.json and, last, these two policies for
-    ONNX Runtime as policy_fp32.onnx.zip and policy_static.onnx.zip; for each of
-    `sizes` calibration_<height>x<width>.pt, policy_fp32_<height>x<width>.pt and policy_static_<height>x<width>.pt; for
-    each of `curve` only the last. load.json says whether this policy drives. Recordings and checkpoint come from
-    the cache if they were made before. Raises WorldError if run_dir holds another kind of run, and what the steps
-    raise.
+    Leaves what the notebooks leave, as far as counting needs it: episodes, best_model.pth, load.json, calibrate.json,
+    calibration.pt, policy_fp32.pt, policy_static.pt, quantize.json and, last, these two policies for ONNX Runtime as
+    policy_fp32.onnx.zip and policy_static.onnx.zip. For each of `sizes` it leaves calibration_<height>x<width>.pt,
+    policy_fp32_<height>x<width>.pt and policy_static_<height>x<width>.pt; for each of `curve` only the last of these.
+    load.json says whether the policy can drive. Recordings and checkpoint come from the cache if they were made before.
+    Raises WorldError if run_dir holds another kind of run, and whatever the steps raise.
     """
     run_dir = Path(run_dir).resolve()
     note = NOTE if steps else LEARNED_NOTE
@@ -95,7 +94,7 @@ def full_run(
 
 
 def suffix_of(size: tuple[int, int]) -> str:
-    """What the files of another image size end in, say _180x320 for (180, 320): height first."""
+    """Return how the files of another image size end: _180x320 for (180, 320), height first."""
     return f"_{size[0]}x{size[1]}"
 
 
@@ -108,7 +107,7 @@ def _quantized(
     fp32: bool = True,
     progress: Progress = silent,
 ) -> dict[str, dict[str, Any]]:
-    """Calibrate at one image size, None for training's, and write its artifacts; what quantize.json says of them."""
+    """Calibrate at one image size (None: training's), write its artifacts, and return their part of quantize.json."""
     checkpoint, suffix = (loaded.checkpoint.at_size(*size), suffix_of(size)) if size else (loaded.checkpoint, "")
     chosen, note = recipe.choose(loaded.parts.calibration)
     calibration = calibrate(checkpoint, chosen, smooth=recipe.scheme.smooth, progress=progress)

@@ -1,10 +1,10 @@
-"""What other engines execute for the same policy on the same emulated Cortex-A76.
+"""Count what other engines execute for the same policy on the same emulated Cortex-A76.
 
     count_peers("runs/full")      # adds metrics.peers to runs/full/arm.json, which count_run.count_run has written
 
 Each engine quantizes the float policy with its own tools, on the frames that calibrated ours, and is judged on the same
-held-out frames. It brings packages of its own, pinned here, that are laid before ours on Python's path, on this machine
-and in the emulated Pi, and never installed: nothing of it is in our environment.
+held-out frames. It has its own packages, which are pinned here. They come before ours on Python's path, on this machine
+and in the emulated Pi, and are never installed, so our environment does not change.
 """
 
 import json
@@ -48,14 +48,14 @@ SHIM = FOLDER / "executorch.cpp"
 COMPILER = "aarch64-linux-gnu-g++"
 NEEDS = {COMPILER: "g++-aarch64-linux-gnu"}  # the Debian package of a command
 AFFINE = "policy_static_affine"
-FRAMES = 20  # judge a peer: its error is only to show that it computes the same policy
+FRAMES = 20  # how many judge a peer; its error only has to show that it computes the same policy
 
 
 @dataclass(frozen=True)
 class Engine:
-    """Another engine: what it needs before our packages, here and in the emulated Pi, and the file that it makes.
+    """Another engine: the packages that it needs before ours, here and in the emulated Pi, and its files' suffix.
 
-    Without their dependencies: numpy and all else that these use is in ours.
+    Dependencies such as numpy are not listed, as our own packages have them.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Engine:
 
     @property
     def maker(self) -> Path:
-        """The script of ours that runs its tools."""
+        """The path of our script that runs the engine's tools."""
         return FOLDER / f"make_{self.name}.py"
 
 
@@ -82,8 +82,8 @@ ENGINES = (
         (
             "executorch==1.5.1",
             "torchao==0.18.0",
-            # It only exports, and is the newest that runs on the CUDA libraries of our torch 2.8, gigabytes that an
-            # x86-64 wheel insists on; one of them is new since.
+            # This torch only exports. It is the newest that runs on the CUDA libraries of our torch 2.8, gigabytes that
+            # an x86-64 wheel insists on; it needs one more of them.
             "torch==2.10.0",
             "nvidia-nvshmem-cu12==3.4.5; platform_machine == 'x86_64'",
             "flatbuffers==25.12.19",
@@ -92,7 +92,7 @@ ENGINES = (
             "expecttest==0.3.0",
             "parameterized==0.9.0",
         ),
-        ("executorch==1.5.1",),  # of it the C++ runtime alone: see executorch.cpp
+        ("executorch==1.5.1",),  # only its C++ runtime is used: see executorch.cpp
     ),
 )
 
@@ -101,7 +101,7 @@ ENGINES = (
 
 
 def packages_here(engine: Engine) -> Path:
-    """The folder of an engine's packages for this machine, from the cache or fetched now."""
+    """Return the folder of an engine's packages for this machine, from the cache or fetched now."""
     made = {"packages": engine.packages, "python": sys.version_info[:2], "machine": os.uname().machine}
 
     def make(folder: Path) -> None:
@@ -111,7 +111,7 @@ def packages_here(engine: Engine) -> Path:
 
 
 def packages_there(engine: Engine) -> Path:
-    """The same for the emulated Pi; for ExecuTorch with our call of its C++ runtime, compiled."""
+    """Return the same for the emulated Pi; for ExecuTorch, it includes our compiled caller of its C++ runtime."""
     made = {"packages": engine.guest_packages, "for": FOR_GUEST}
     compiled = engine.name == "executorch"
 
@@ -124,7 +124,7 @@ def packages_there(engine: Engine) -> Path:
 
 
 def _compile(folder: Path) -> None:
-    """policy.so from executorch.cpp, as ExecuTorch's own CMake package would compile and link it."""
+    """Compile policy.so from executorch.cpp, as ExecuTorch's own CMake package would compile and link it."""
     install_packages(missing_packages(NEEDS), "ExecuTorch")
     sdk = folder / "executorch"
     command = [COMPILER, "-std=c++17", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "policy.so", SHIM]
@@ -138,14 +138,14 @@ def _compile(folder: Path) -> None:
     run(*command, error=CountError)
 
 
-# --- their form of the policy -----------------------------------------------------------------------------------------
+# --- the engines' forms of the policy ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Made:
-    """An engine's form of the policy, and what its maker says of it.
+    """An engine's form of the policy, and what the script that made it reported.
 
-    report: `int8_layers` (their count), `float_layers` (their names), `versions`; empty for our own.
+    report: `int8_layers` (how many), `float_layers` (their names) and `versions`; empty for our own engine.
     """
 
     path: Path
@@ -153,9 +153,10 @@ class Made:
 
 
 def made_by(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> Made:
-    """The policy as an engine's own tools quantize it, in `folder`, made again only if anything that goes in changed.
+    """Quantize the policy with an engine's own tools into `folder`, unless it is there and its inputs are unchanged.
 
-    samples: calibrate. Raises CountError if the tools fail, or if they left a layer in float that ours has in INT8.
+    samples: for calibration. Raises CountError if the tools fail, or if they leave a layer in float that is INT8 in our
+    artifact.
     """
     artifact, report = folder / f"{engine.name}{engine.suffix}", folder / f"{engine.name}.json"
     frames = [sha256_of(s.frame_path) for s in samples]
@@ -182,21 +183,21 @@ def made_by(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], f
 
 
 def int8_layers(checkpoint: Checkpoint) -> int:
-    """How many convolutions and linears of the policy are INT8 in ours."""
+    """Return how many convolutions and linear layers of the policy are INT8 in our artifact."""
     modules = act.ACT(checkpoint.config, checkpoint.weights).named_modules()
     layers = (name for name, m in modules if isinstance(m, (nn.Conv2d, nn.Linear)))
     return sum(act.block_of(name) not in q.STAYS_FLOAT for name in layers)
 
 
 def check_int8(name: str, made: dict[str, Any], expected: int) -> None:
-    """Raise CountError unless a peer has as many layers in INT8 as ours: tools have left some in float silently."""
+    """Raise CountError unless a peer has as many INT8 layers as ours, since tools have silently left some in float."""
     if made["int8_layers"] != expected:
         what = f"{name}: {made['int8_layers']} convolutions and linears became INT8, and {expected} in ours"
         raise CountError(f"{what}; float are {made['float_layers'][:5]}")
 
 
 def affine(run_dir: Path, again: Opened) -> Made:
-    """Our static artifact by the recipe of the tutorials (quint8 activations), from the run's own calibration."""
+    """Make our static artifact by the recipe of the tutorials (quint8 activations), with the run's own calibration."""
     calibration = q.Calibration.load(run_dir / "calibration.pt")
     path = run_dir / "peers" / f"{AFFINE}.pt"
     policy = q.quantize(again.checkpoint, q.Scheme("static", kind="affine", smooth=calibration.smooth), calibration)
@@ -209,22 +210,23 @@ def affine(run_dir: Path, again: Opened) -> Made:
 
 
 def guest_of(engine: Engine, size: tuple[int, int]) -> Guest:
-    """What runs an engine's artifact in the emulated Pi. size: (height, width) of the image that it takes."""
+    """Return what runs an engine's artifact in the emulated Pi. size: (height, width) of the image that it takes."""
     return Guest(FOLDER / "guest.py", (engine.name, *size), packages_there(engine))
 
 
 def count_peers(
     run_dir: Path | str, *, frames: int = FRAMES, jobs: int | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Count the peers of a run's static artifact, add them to its arm.json and return what is in it.
+    """Count the peers of a run's static artifact, add them to its arm.json and return the content of that.
 
-    metrics.peers has, keyed as metrics.artifacts: `torch_fp32` and, where the run has that artifact, `torch_affine`
-    (with the `artifact` that they repeat), `onnxruntime` and `executorch` (with `file_mb`, `int8_layers` and
-    `made_with`, the versions of their tools). What the engines make is kept in run_dir/peers. A peer's chunks come from
-    the emulated Pi, the reference from this machine, whose FP32 count_run has held against the Pi's.
-    frames: held-out frames to judge with (`torch_affine`, several times slower, with half of them). jobs: emulated
-    machines at a time. Raises CountError if arm.json is not there or is of other artifacts, or if a peer cannot be had,
-    made or run.
+    metrics.peers has rows like those of metrics.artifacts. `torch_fp32`, and `torch_affine` if the run has that
+    artifact, repeat a row whose name is in `artifact`; otherwise `torch_affine` is made and counted too. `onnxruntime`
+    and `executorch` also have `int8_layers` and `made_with`, the versions of their tools. All have `file_mb`. What the
+    engines make is kept in run_dir/peers. A peer's chunks come from the emulated Pi, the reference from this machine,
+    whose FP32 count_run has compared with the Pi's.
+    frames: how many held-out frames to judge with; `torch_affine`, which is several times slower, gets half of them.
+    jobs: how many machines are emulated at a time. Raises CountError if arm.json is missing or was counted from other
+    artifacts, or if a peer cannot be had, made or run.
     """
     run_dir = Path(run_dir)
     content, reference = counted_run(run_dir)
@@ -232,7 +234,7 @@ def count_peers(
     again = opened(run_dir)
     samples = thinned(again.parts.held_out, frames)
     core = prepare(progress)
-    # The packages of all of them first: what cannot be had should fail before hours are spent on the others.
+    # Get the packages of all engines first: if some cannot be had, it fails before hours are spent on the others.
     guests = {}
     for engine in progress(ENGINES, desc="peers' packages", total=len(ENGINES)):
         packages_here(engine)
@@ -271,12 +273,12 @@ def count_peers(
 
 
 def file_mb(path: Path) -> float:
-    """Size of a file in 10**6 bytes."""
+    """Return the size of a file in 10**6 bytes."""
     return path.stat().st_size / 1e6
 
 
 def counted_run(run_dir: Path) -> tuple[dict[str, Any], Path]:
-    """A run's arm.json, and its FP32 artifact. Raises CountError unless the one was counted from the other."""
+    """Return a run's arm.json and its FP32 artifact. Raises CountError unless the one was counted from the other."""
     path, reference = run_dir / "arm.json", run_dir / f"{REFERENCE}.pt"
     remedy = f"count the run's own artifacts first ('python -m lab arm {run_dir}')"
     if not path.exists():
@@ -290,7 +292,10 @@ def counted_run(run_dir: Path) -> tuple[dict[str, Any], Path]:
 def peer_metrics(
     counted: Counted, manifest: dict[str, Any], reference: np.ndarray, ranges: dict[str, tuple[float, float]]
 ) -> dict[str, Any]:
-    """What arm.json says of one peer. manifest: of our FP32 artifact. reference: its chunks, (n, C, A)."""
+    """Return one peer's part of arm.json. manifest: of our FP32 artifact. reference: that artifact's chunks, (n, C, A).
+
+    Raises CountError if the peer's chunks have another shape or are not finite.
+    """
     if counted.chunks.shape != reference.shape:
         raise CountError(f"a peer gave no actions of {reference.shape}", found=counted.chunks.shape)
     if not np.isfinite(counted.chunks).all():

@@ -1,4 +1,4 @@
-"""What arm.json says of counts: its numbers by artifact, gates, groups of kernels, the computed time, and a table."""
+"""Turn counts into arm.json: the numbers of each artifact, gates, groups of kernels, computed times, and a table."""
 
 import re
 from typing import Any
@@ -12,7 +12,7 @@ from rover_lib.workshop.judge import worst
 
 LABEL = "counted on an emulated Cortex-A76"
 STATIC, STATIC_ONNX = "policy_static", "policy_static.onnx"
-SDOT_MACS = 16  # multiply-accumulates of one SDOT: the floor is as if nothing else ran
+SDOT_MACS = 16  # multiply-accumulates of one SDOT; the floor is the count if nothing but SDOT ran
 
 PI5_CORES, PI5_GHZ, SIMD_PER_CYCLE = 4, 2.4, 2
 LOOP_PER_SDOT = 80 / 64  # instructions of XNNPACK's inner loop per SDOT, counted here
@@ -22,8 +22,9 @@ PREDICTED = (
     f"high: all instructions / ({IPC_SEEN:.2f} per cycle x {PI5_CORES} cores x {PI5_GHZ} GHz)"
 )
 
-SAME_POLICY = 0.01  # of the multiply-accumulates: the instructions' gates are for one policy
-# What kernels do, by their names; the first that matches counts.
+# The gates of instructions are for one policy: one whose multiply-accumulates differ by less than this share.
+SAME_POLICY = 0.01
+# What kernels do, by patterns of their names; the first pattern that matches decides.
 INT8_SDOT, INT8_OTHER, REST = "INT8 products: SDOT", "INT8 products: all else", "rest"
 GROUPS = (
     (
@@ -39,16 +40,16 @@ GROUPS = (
     ("element-wise", r"VectorizedLoop|vectorized_loop|max_?pool|v(add|mul|clamp|max)|(add|mul|relu|clamp)\w*_kernel"),
 )
 
-COLUMNS = {  # of the table, with their widths
+COLUMNS = {  # the table's columns with their widths
     **dict.fromkeys(("instructions_g", "simd_g", "x_floor", "first_g", "tenth_g", "load_instructions_g"), 7),
     **{"peak_memory_mb": 6, "peak_memory_loading_mb": 7},
 }
 FRAMES = "frames_on_the_core"
-WORST = "worst action"  # of a policy with more than two
+WORST = "worst action"  # the table's only error for a policy with more than two actions
 
 
 def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, Any]:
-    """What arm.json says of one artifact; _g are 10**9 instructions. The floor is SDOT alone, for every mode."""
+    """Return one artifact's part of arm.json; _g are 10**9 instructions. The floor is SDOT alone, for every mode."""
     floor_g = manifest["gmac"] / SDOT_MACS
     inferences_g = [n / 1e9 for n in counted.inferences]
     low_ms, high_ms = predicted_ms(counted.simd / 1e9, counted.steady / 1e9)
@@ -78,29 +79,29 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
 
 
 def predicted_ms(simd_g: float, instructions_g: float) -> tuple[float, float]:
-    """A range for the time of one inference on a Raspberry Pi 5, in ms, computed from counts. Nothing here was timed.
+    """Compute a range for the time of one inference on a Raspberry Pi 5, in ms, from counts. Nothing here was timed.
 
     low: the SIMD instructions alone at two per cycle, which is what a Cortex-A76 can issue (Arm's optimisation guide),
     on four cores at 2.4 GHz, all of them always busy. No program with this count can be faster.
-    high: all instructions at the rate that such kernels have been seen to reach on a Pi 5. Published: ResNet18 at
-    224x224 with XNNPACK's INT8 kernels in 8.75 ms, which is 207 GMAC/s, 67 % of the chip's SDOT peak, or 1.35 SDOT per
-    cycle and core. Their inner loop executes 80 instructions for 64 SDOT, hence 1.68 instructions per cycle (more, if
-    what is outside the loop is counted too).
-    Not known, and in neither: how evenly the work divides over four threads, waiting for memory (the published network
-    has 11 MB of weights, the full policy 66), and whether float kernels, which are most of FP32's, reach that rate. So
-    high is a careful estimate and no bound.
+    high: all instructions at the rate that such kernels have been seen to reach on a Pi 5. It was published that
+    ResNet18 at 224x224 with XNNPACK's INT8 kernels takes 8.75 ms, which is 207 GMAC/s, 67 % of the chip's SDOT peak, or
+    1.35 SDOT per cycle and core. Their inner loop executes 80 instructions for 64 SDOT, hence 1.68 instructions per
+    cycle, or more if the instructions outside the loop are counted too.
+    Some things are not known and are in neither number: how evenly the work divides over four threads, how long it
+    waits for memory (the published network has 11 MB of weights, the full policy 66), and whether float kernels, which
+    are most of FP32's, reach that rate. So high is a careful estimate and no bound.
     """
     cycles_per_ms = PI5_CORES * PI5_GHZ * 1e6
     return simd_g * 1e9 / (SIMD_PER_CYCLE * cycles_per_ms), instructions_g * 1e9 / (IPC_SEEN * cycles_per_ms)
 
 
 def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any]]:
-    """What static artifacts must reach, as `compare.gate` rows. metrics: of arm.json; limits: arm.gates of
-    lab/params.yml.
+    """Hold static artifacts to their gates; return `compare.gate` rows.
 
-    A gate that this run has no artifact for is left out: the instructions are for the user's policy, known by its
-    multiply-accumulates. Errors are divided by this machine's, ONNX Runtime's by torch's too, and the worse of the
-    actions is judged.
+    metrics: of arm.json. limits: arm.gates of lab/params.yml.
+    A gate is left out if this run has no artifact for it: those of instructions are for the user's policy, which is
+    known by its multiply-accumulates. Errors are divided by this machine's, ONNX Runtime's by torch's too, and the
+    worst action is judged.
     """
     rows = []
     for stem, artifact in metrics["artifacts"].items():
@@ -131,15 +132,16 @@ def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any
 
 
 def _times(artifact: dict[str, Any], errors: dict[str, float | None]) -> float | None:
-    """The artifact's errors as multiples of these, the worst of them; None if no action is judged."""
+    """Return the largest ratio of the artifact's errors to these; None if no action is judged."""
     judged = [(artifact[key], error) for key, error in errors.items() if error is not None]
     return worst(mine / error if error else float("inf") for mine, error in judged)
 
 
 def group_kernels(counts: dict[str, Any]) -> dict[str, float]:
-    """An artifact's or a peer's instructions by what they do, 10**9 each, in a fixed order; the sum is instructions_g.
+    """Group the instructions of an artifact or a peer by what they do, in 10**9; together they are instructions_g.
 
-    counts: of arm.json, with instructions_by_kernel and, to part a product's SDOT from what feeds it, sdot_by_kernel.
+    The order is fixed. counts: of arm.json, with instructions_by_kernel and, to separate a product's SDOT from the
+    instructions that feed it, sdot_by_kernel.
     """
     groups = dict.fromkeys((INT8_SDOT, *(name for name, _ in GROUPS), REST), 0.0)
     sdot = counts.get("sdot_by_kernel", {})
@@ -152,7 +154,7 @@ def group_kernels(counts: dict[str, Any]) -> dict[str, float]:
 
 
 def table(content: dict[str, Any]) -> str:
-    """arm.json for people: the counts, fewest instructions first; the computed time by itself; the gates."""
+    """Show arm.json as text: the counts, fewest instructions first; then the computed times, the note and the gates."""
     metrics = content["metrics"]
     counted = metrics["artifacts"] | {n: m for n, m in metrics.get("peers", {}).items() if "artifact" not in m}
     rows = sorted(counted.items(), key=lambda item: item[1]["instructions_g"])
@@ -186,7 +188,7 @@ def table(content: dict[str, Any]) -> str:
 
 
 def other_core_table(content: dict[str, Any]) -> str:
-    """The JSON of `count_other_core` for people."""
+    """Show the JSON of `count_other_core` as a table."""
     names = [f"{A76}_g", f"{content['params']['cpu']}_g"]
     rows = [["", *(f"{name.removesuffix('_g')}, G instructions" for name in names), "ratio"]]
     for stem, m in content["metrics"]["artifacts"].items():

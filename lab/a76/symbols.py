@@ -1,4 +1,4 @@
-"""From the addresses that a guest executed to the functions they belong to."""
+"""Find the functions that the addresses executed by a guest belong to."""
 
 import re
 from bisect import bisect_right
@@ -13,9 +13,9 @@ from elftools.elf.elffile import ELFFile
 from lab.a76.core import CountError
 from rover_lib.workshop.program import run
 
-KERNELS = 30  # named in the report, the rest summed up
+KERNELS = 30  # how many are named in the report; the rest are summed up
 NAME_LENGTH = 140
-# By numpy: of the 778,000 symbols of libtorch_cpu.so it reads all in 0.3 s, pyelftools one by one in 40 s.
+# Symbols are read with numpy: it reads the 778,000 of libtorch_cpu.so in 0.3 s, pyelftools in 40 s, one by one.
 SYMBOL = np.dtype(
     [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("at", "<u8"), ("size", "<u8")]
 )
@@ -23,7 +23,7 @@ FUNCTIONS = (0, 2, 10)  # symbol types none (assembly), function, indirect funct
 
 
 class Functions:
-    """The functions of an ELF file, by address. Raises CountError if it is none of 64 bits."""
+    """The functions of an ELF file, by address. Raises CountError if the file is not a 64-bit ELF file."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -34,22 +34,22 @@ class Functions:
                     raise ELFError("of 32 bits")
             except ELFError as e:
                 raise CountError(f"{path}: not a 64-bit ELF file", found=e) from None
-            # By the first loaded segment, a mapping tells where the file was put.
+            # The address of the first loaded segment. A mapping of the file starts there, which shows where it was put.
             self.base = min((s["p_vaddr"] & ~0xFFF for s in elf.iter_segments("PT_LOAD")), default=0)
             whole = elf.get_section_by_name(".symtab")
-            self.complete = whole is not None  # a stripped file names only what it exports
+            self.complete = whole is not None  # a stripped file names only the functions that it exports
             table = whole or elf.get_section_by_name(".dynsym")
             symbols: Any = np.frombuffer(table.data() if table else b"", SYMBOL)
             self._names = elf.get_section(table["sh_link"]).data() if table else b"\0"
         symbols = symbols[np.isin(symbols["info"] & 15, FUNCTIONS) & (symbols["section"] > 0) & (symbols["at"] > 0)]
-        # Mapping symbols ($x, $d) mark code and data, they name nothing.
+        # Mapping symbols ($x, $d) only mark code and data and are no names of functions.
         first = np.frombuffer(self._names, "u1")[symbols["name"]]
         symbols = symbols[(first != ord("$")) & (first != 0)]
         self._symbols = symbols[np.lexsort((symbols["size"], symbols["at"]))]
         self._at = self._symbols["at"].tolist()
 
     def function_at(self, address: int) -> str:
-        """Mangled name of the function at an address of the file; the file's name where it names none."""
+        """Return the mangled name of the function at an address of the file, or the file's name if it has no name."""
         i = bisect_right(self._at, address) - 1
         if i >= 0:
             symbol = self._symbols[i]
@@ -60,7 +60,7 @@ class Functions:
 
 
 class GuestFunctions:
-    """The functions of a guest, by its addresses. maps: /proc/self/maps as the guest sees it."""
+    """The functions of a guest, by its addresses. maps: the guest's own /proc/self/maps."""
 
     def __init__(self, maps: str):
         self._mappings = []
@@ -76,7 +76,7 @@ class GuestFunctions:
         self._files: dict[str, Functions] = {}
 
     def __getitem__(self, address: int) -> str:
-        """Mangled name of the function at an address of the guest."""
+        """Return the mangled name of the function at an address of the guest."""
         i = bisect_right(self._starts, address) - 1
         _, end, path = self._mappings[i] if i >= 0 else (0, 0, "")
         if address >= end or not path.startswith("/"):
@@ -88,10 +88,10 @@ class GuestFunctions:
 
 
 def by_kernel(blocks: np.ndarray, functions: Any, at_most: int = KERNELS) -> dict[str, tuple[int, int, int]]:
-    """Executed (instructions, SIMD, SDOT) by function, demangled, most first; what is beyond `at_most` is "other".
+    """Sum up the executed (instructions, SIMD, SDOT) by function: demangled names, the most instructions first.
 
-    blocks: of core.BLOCK. functions: names by address. Where a library was stripped of names, its blocks that hold an
-    SDOT stand apart from the rest of it.
+    All functions after the first `at_most` are summed up as "other". blocks: an array of core.BLOCK. functions: names
+    by address. For a library that was stripped of names, blocks with an SDOT are listed apart from the rest.
     """
     executed: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
     for address, entered, *counts in blocks.tolist():
@@ -113,6 +113,6 @@ def _add(row: list[int], counts: list[int]) -> None:
 
 
 def _short(name: str) -> str:
-    """A C++ name without the wrapper that torch's element-wise loops are called through."""
+    """Shorten a C++ name, without the wrapper through which torch's element-wise loops are called."""
     name = re.sub(r"^c10::function_ref<.*?>::callback_fn<", "", name)
     return name if len(name) <= NAME_LENGTH else name[: NAME_LENGTH - 3] + "..."

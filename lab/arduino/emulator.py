@@ -1,6 +1,6 @@
-"""The rover's Arduino without a board: the real firmware in simavr.
+"""Emulate the rover's Arduino: the real firmware runs in simavr.
 
-It is a serial port that a ServoLink opens, and tells what its servo pins do, as PinEvents.
+A ServoLink opens its serial port, and PinEvents tell what happens on its servo pins.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from rover_lib.world.standin import BOOT_S, REST_US, PinEvent
 REPOSITORY = Path(__file__).parents[2]
 FIRMWARE = REPOSITORY / "firmware"
 EMULATOR = Path(__file__).with_name("arduino.c")
-NEEDS = {  # commands and files, and the Debian packages that have them
+NEEDS = {  # commands and files, each with the Debian package that it comes from
     "gcc": "gcc",
     "make": "make",
     "avr-gcc": "gcc-avr",
@@ -38,32 +38,32 @@ NEEDS = {  # commands and files, and the Debian packages that have them
 CC = ("gcc", "-O2", "-g", "-Wall", "-Wextra", "-Werror")
 WITH_SIMAVR = ("-I/usr/include/simavr", str(EMULATOR), "-lsimavr", "-lelf", "-lutil", "-lm")
 OUR_SOURCE = "is this the repository's own source?"
-LOG_BYTES = 1 << 20  # of the pins that wait to be read: 20 s of every pulse
+LOG_BYTES = 1 << 20  # how much of the pins' events may wait to be read: 20 s of every pulse
 START_S = 10.0
 NICE = -10  # a real Arduino has a processor of its own
 
 
 class ArduinoError(RoverError):
-    """An emulated Arduino that cannot be built or started, or that has ended."""
+    """The emulated Arduino cannot be built or started, or it has ended."""
 
 
 class Built(NamedTuple):
-    """The firmware as it is flashed, an ELF file, and the emulated Arduino, a program."""
+    """The firmware's ELF file, as it is flashed, and the program that is the emulated Arduino."""
 
     firmware: Path
     program: Path
 
 
 def missing_packages() -> list[str]:
-    """Debian packages that the emulated Arduino needs and this machine lacks."""
+    """Return the Debian packages that the emulated Arduino needs and this machine lacks."""
     return debian.missing_packages(NEEDS)
 
 
 @functools.cache
 def build() -> Built:
-    """Firmware and emulated Arduino, from the cache or made now (some seconds).
+    """Return the firmware and the emulated Arduino, from the cache or built now, which takes some seconds.
 
-    Raises ArduinoError where Debian packages or the repository's sources are missing, or the compiler complains.
+    Raises ArduinoError if Debian packages or the repository's sources are missing, or if the compiler fails.
     """
     if missing := " ".join(missing_packages()):
         raise ArduinoError(
@@ -85,13 +85,13 @@ def build() -> Built:
 
 
 def compile_c(*command: object) -> None:
-    """Runs a compiler, or make. Raises ArduinoError with its last words."""
+    """Run a compiler, or make. Raises ArduinoError with the last lines that it printed."""
     run(*command, error=ArduinoError, remedy=OUR_SOURCE)
 
 
 @functools.cache
 def symbol(name: str) -> int:
-    """Flash address of a function of the firmware."""
+    """Return the address of one of the firmware's functions in flash memory."""
     table = run("avr-nm", build().firmware, error=ArduinoError)
     line = re.search(rf"^([0-9a-f]+) \w {name}$", table, re.M)
     if not line:
@@ -100,10 +100,10 @@ def symbol(name: str) -> int:
 
 
 def _set_nice(pid: int, nice: int) -> None:
-    """A priority for a process that leads a session, as far as this user may.
+    """Set the priority of a process that leads a session, as far as this user may.
 
-    Linux shares the processors among sessions first, and among the processes of each then, where autogroups are on: see
-    sched(7).
+    If autogroups are on, Linux shares the processors among sessions first, and then among the processes of each. So
+    both priorities are set; see sched(7).
     """
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, pid, nice)
@@ -112,10 +112,10 @@ def _set_nice(pid: int, nice: int) -> None:
 
 
 class EmulatedArduino:
-    """The real firmware in simavr, in real time, as a process of its own that ends with this one.
+    """The real firmware in simavr, in real time, in its own process, which ends with this one.
 
-    port: for a ServoLink. Opening it resets the Arduino, as a real one's: not if who had it last left DTR up. pid: of
-    the process.
+    port: for a ServoLink. Opening it resets the Arduino, as with a real one, unless the last user of the port left DTR
+    up. pid: of the process.
     """
 
     def __init__(
@@ -128,16 +128,17 @@ class EmulatedArduino:
         nice: int = 0,
         slow: float = 1.0,
     ):
-        """every_pulse: pulses() has each pulse, a thousand a second; otherwise those that differ from the one before.
+        """Start the process.
 
-        transmitter: its pulses from the start on, see transmitter(), with this_car()'s periods. ready: see ready().
-        nice: scheduling priority, NICE comes near a processor of its own (below 0 only for root, silently left out for
-        others). slow: its clock runs that many times slower than this machine's; pulses are by its own, monotonic_s by
-        this machine's.
+        every_pulse: whether pulses() returns each pulse, about a thousand a second, or only those that differ from the
+        one before. transmitter: its pulses from the start on, see transmitter(); their periods are this_car()'s. ready:
+        see ready(). nice: scheduling priority; NICE comes close to a processor of its own. Below 0 it works only for
+        root, and is silently left out for others. slow: how many times slower than this machine's the Arduino's clock
+        runs; pulses are measured by its clock, monotonic_s by this machine's.
         Raises ArduinoError as build() does, and if the program does not start.
         """
         built = build()
-        # A link that the program makes, and removes even where this process was killed.
+        # The program makes this link, and removes it even if the present process was killed.
         self.port = str(Path(tempfile.gettempdir()) / f"rover-arduino-{secrets.token_hex(8)}")
         self._reading = threading.Lock()
         self._rest = b""
@@ -153,7 +154,7 @@ class EmulatedArduino:
         try:
             _set_nice(self.pid, nice)
             deadline = time.monotonic() + START_S
-            while not os.path.lexists(self.port):  # Path.exists would follow the link
+            while not os.path.lexists(self.port):  # not Path.exists, which would follow the link
                 self._process.check()
                 if time.monotonic() > deadline:
                     raise ArduinoError(
@@ -173,33 +174,33 @@ class EmulatedArduino:
         self.close()
 
     def transmitter(self, steering_us: float, throttle_us: float) -> None:
-        """The pulses that the receiver gets, from the next on; 0 is no signal."""
+        """Set the pulses that the receiver gets from the next one on; 0 stands for no signal."""
         self._process.send_line(f"transmitter {steering_us} {throttle_us}")
 
     def wiggle(self) -> None:
-        """The human moves the steering stick to both sides and lets go: 0.14 s, and 0.25 until it counts."""
+        """Let the human move the steering stick to both sides and let go. It takes 0.14 s, and counts 0.25 s later."""
         self._process.send_line("wiggle")
 
     def ready(self, ready: bool) -> None:
-        """Whether the human wiggles the stick by himself whenever that is all that arming lacks.
+        """Set whether the human wiggles the stick unasked whenever arming lacks only that.
 
-        He leaves a stopped car alone until somebody opens its port again.
+        They leave a stopped car alone until somebody opens its port again.
         """
         self._process.send_line(f"ready {ready:d}")
 
     def reset(self) -> None:
-        """The reset button."""
+        """Press the reset button."""
         self._process.send_line("reset")
 
     def hang(self) -> None:
-        """The firmware's loop() becomes an endless one, until the next reset."""
+        """Make the firmware's loop() an endless loop until the next reset."""
         self._process.send_line(f"hang {symbol('loop'):x}")
 
     def pulses(self) -> list[PinEvent]:
-        """What happened since the last call, in the order of its end.
+        """Return what happened since the last call, ordered by when it ended.
 
-        With every_pulse call it every 10 s at least: what does not fit the pipe is lost, and 'lost' has how much.
-        Raises ArduinoError if the process has ended.
+        With every_pulse, call it at least every 10 s: what does not fit into the pipe is lost, and a 'lost' event says
+        how much. Raises ArduinoError if the process has ended.
         """
         with self._reading:
             try:
@@ -215,15 +216,15 @@ class EmulatedArduino:
         ]
 
     def close(self) -> None:
-        """Ends the process. Raises nothing."""
+        """End the process. Raises nothing."""
         with self._reading:
             self._process.close()
         Path(self.port).unlink(missing_ok=True)
 
 
-BOARD = f"{__name__}:board"  # for a VirtualCar, which makes it in its own process
+BOARD = f"{__name__}:board"  # the board for a VirtualCar, which makes it in its own process
 
 
 def board() -> EmulatedArduino:
-    """The real firmware as a virtual car's board: a human who is ready, and only pulses that changed are read."""
+    """Make a virtual car's board with the real firmware, with a ready human and events only for changed pulses."""
     return EmulatedArduino(every_pulse=False, transmitter=REST_US, ready=True, nice=NICE)

@@ -1,7 +1,8 @@
-"""The firmware's parser and state machine as a library for this machine, and a board of them in virtual time.
+"""Compile the firmware's parser and state machine as a library for this machine, and run a board in virtual time.
 
-It is firmware/rover/protocol.c and vehicle.c as they are flashed. What they have around them on the chip (timers,
-captures, the serial line) is a few lines here: judge that by the emulator. A second of it takes some 10 ms.
+The sources are firmware/rover/protocol.c and vehicle.c as they are flashed. What surrounds them on the chip (timers,
+captures, the serial line) is replaced by a few lines here; use the emulator to test that. A second of virtual time
+takes some 10 ms.
 """
 
 import ctypes
@@ -18,7 +19,7 @@ SOURCES = (FIRMWARE / "rover" / "protocol.c", FIRMWARE / "rover" / "vehicle.c")
 STEERING, THROTTLE = range(2)
 READ_COMMAND, READ_BAD = 1, 2
 WIGGLE_US = (1750, 1750, 1750, 1150, 1150, 1150)  # the stick's pulses, 21 ms apart
-LET_GO_MS = 300  # a little more than the firmware's
+LET_GO_MS = 300  # a little longer than the firmware wants the stick to rest after a wiggle
 
 
 class Command(ctypes.Structure):
@@ -107,7 +108,7 @@ class Vehicle(ctypes.Structure):
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """The firmware's C for this machine, from the cache or compiled now. Raises ArduinoError without gcc."""
+    """Load the firmware's C code for this machine, from the cache or compiled now. Raises ArduinoError without gcc."""
     headers = sorted((FIRMWARE / "rover").glob("*.h"))
 
     def make(folder: Path) -> None:
@@ -134,19 +135,20 @@ def library() -> ctypes.CDLL:
 
 
 def said(speak: Callable[..., int], *arguments: object) -> bytes:
-    """The line that vehicle_status or vehicle_hello makes of its arguments, with its end."""
+    """Return the line, with its line break, that vehicle_status or vehicle_hello makes for these arguments."""
     line = Line()
     length = speak(*arguments, ctypes.byref(line))
     return ctypes.string_at(ctypes.addressof(line), length)
 
 
 class NativeArduino:
-    """A board in virtual time: a transmitter's pulses in, the host's lines in, pulses out, a millisecond at a time.
+    """A board in virtual time, a millisecond at a time. A transmitter's pulses and the host's lines go in, pulses out.
 
-    sticks: the transmitter's pulses (us), may be set; 0 is no signal. misread: may be set; what the receiver makes of
-    a throttle pulse, by its number (None: no pulse). now_ms: its clock, which wraps at 32 bits. sequence: of the last
-    command. periods_us: of the transmitter's pulses, may be set. car: the transmitter's, the host's, and what the board
-    was told: nothing is told of the default.
+    You may set these: sticks: the transmitter's pulses (us), where 0 stands for no signal. misread: a function of a
+    throttle pulse's number and length that returns what the board measures (None: no pulse). periods_us: of the
+    transmitter's pulses.
+    now_ms: the board's clock, which wraps at 32 bits. sequence: of the last command. car: the car of the transmitter
+    and of the host. The board is told of it too, unless it is the default.
     """
 
     def __init__(self, now_ms: int = 0, sequence: int = 0, car: Car | None = None):
@@ -156,7 +158,8 @@ class NativeArduino:
         self.misread: Callable[[int, float], float | None] = lambda number, pulse_us: pulse_us
         self.now_ms = now_ms
         self.sequence = sequence
-        self.heard_ms: int | None = None  # what the host says that it heard; None: the newest
+        # The board's time that the host claims to have heard last; None stands for now_ms.
+        self.heard_ms: int | None = None
         self._vehicle, self._reader = Vehicle(), Reader()
         self._native = library()
         self._due_us = [0.0, 0.0]
@@ -169,12 +172,12 @@ class NativeArduino:
             assert self.command("C", *self.car.numbers) == "k"
 
     def start(self, kept: Car) -> None:
-        """A reset. kept: the car that it knows of afterwards."""
+        """Reset the board. kept: the car that it knows afterwards."""
         self._native.vehicle_start(self._vehicle, 7, CarNumbers((ctypes.c_uint16 * 9)(*kept.numbers)))
 
     @property
     def status(self) -> Telemetry:
-        """What it says of itself, as the host reads it."""
+        """The board's status line, as the host reads it."""
         text = said(self._native.vehicle_status, self._vehicle, self.now_ms)
         telemetry = parse(text[:-1], 0.0)
         assert isinstance(telemetry, Telemetry), text
@@ -182,13 +185,13 @@ class NativeArduino:
 
     @property
     def hello(self) -> Hello:
-        """As after a power-on."""
+        """The board's hello, as it is after a power-on."""
         hello = parse(said(self._native.vehicle_hello, self._vehicle, b"p")[:-1], 0.0)
         assert isinstance(hello, Hello)
         return hello
 
     def run(self, ms: int) -> list[tuple[int, int]]:
-        """Lets time pass; the pulses (steering, throttle; us) for the pins after each millisecond."""
+        """Let time pass; return the pins' pulses (steering, throttle; us) after each millisecond."""
         pins = []
         for _ in range(ms):
             self.now_ms = (self.now_ms + 1) % (1 << 32)
@@ -210,7 +213,7 @@ class NativeArduino:
                     self._native.vehicle_received(self._vehicle, channel, round(pulse_us), period_us, self.now_ms)
 
     def wiggle(self) -> None:
-        """The human moves the steering stick both ways, lets go and waits for what that takes."""
+        """Let the human move the steering stick both ways and let go, and wait until that counts."""
         rest_us = self.sticks[STEERING]
         for pulse_us in WIGGLE_US:
             self.sticks[STEERING] = pulse_us
@@ -219,7 +222,7 @@ class NativeArduino:
         self.run(LET_GO_MS)
 
     def send(self, data: bytes) -> str:
-        """Bytes of the host; the result of the last command, a key of servo_link.RESULTS."""
+        """Give the board bytes from the host; return the result of the last command, a key of servo_link.RESULTS."""
         command = Command()
         for byte in data:
             reading = self._native.reader_take(self._reader, byte, self.now_ms, command)
@@ -229,7 +232,10 @@ class NativeArduino:
         return self._vehicle.result.decode()
 
     def command(self, kind: str, *pulses_us: int, sequence: int | None = None) -> str:
-        """The host's next command: "A", "N", "L" with a throttle, "D" with both pulses, "C". Its result."""
+        """Send the host's next command and return its result.
+
+        kind: "A", "N", "L" with a throttle pulse, "D" with both pulses, or "C" with a car's numbers.
+        """
         if sequence is None:
             self.sequence = sequence = (self.sequence + 1) % (1 << 32)
         heard_ms = self.now_ms if self.heard_ms is None else self.heard_ms
@@ -239,7 +245,7 @@ class NativeArduino:
         return self.send(frame(" ".join(map(str, (f">{kind}", self._vehicle.boot, sequence, *dated, *pulses_us)))))
 
     def drive(self, steering_us: int, throttle_us: int, ms: int, every_ms: int = 33) -> list[tuple[int, int]]:
-        """Commands at a rate, for a time; the pins as from run()."""
+        """Send a drive command every `every_ms` for `ms` milliseconds; return the pins' pulses as run() does."""
         pins = []
         for start in range(0, ms, every_ms):
             self.command("D", steering_us, throttle_us)

@@ -1,4 +1,4 @@
-"""What `rover doctor` says and asks for, rehearsed without a car: a script holds the transmitter."""
+"""Rehearse what `rover doctor` says and asks for without a car: a script holds the transmitter."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,18 +10,18 @@ from rover_lib.world.standin import REST_US
 
 
 def rehearse(artifact: Path | None, say: Callable[[str], object]) -> Iterator[Check]:
-    """The checks before a drive, then those of the ritual, with the real firmware and the balloon world's camera.
+    """Yield the checks before a drive, then those of the ritual, with the real firmware and the balloon world's camera.
 
-    say: gets what the human is asked to do, when the script does it. Raises ArduinoError and WorldError where an
-    emulator does not start, and LinkError as the link does.
+    say: called with what the human is asked to do, just before the script does it. Raises ArduinoError and WorldError
+    if an emulator does not start, and LinkError as the link does.
     """
     with EmulatedArduino(every_pulse=False, transmitter=REST_US) as board, VirtualCar() as world:
         yield from examine(artifact, camera=world.camera, port=board.port, log_folder=Path.cwd())
         does = iter(
             (
-                lambda: board.transmitter(*REST_US),  # on, sticks let go of
+                lambda: board.transmitter(*REST_US),  # switched on, with the sticks at rest
                 board.wiggle,
-                lambda: board.transmitter(0, 0),  # off: a receiver whose failsafe is no pulses
+                lambda: board.transmitter(0, 0),  # switched off, with a receiver that sends no pulses as its failsafe
                 lambda: board.transmitter(*REST_US),
             )
         )

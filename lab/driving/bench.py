@@ -1,4 +1,4 @@
-"""The bench for faults: `rover drive` as a process, between a camera, a cable and an Arduino that can be broken."""
+"""The bench for faults: `rover drive` runs as a process, with a camera, a cable and an Arduino that can be broken."""
 
 import contextlib
 import ctypes
@@ -30,21 +30,22 @@ from rover_lib.world.child import Child
 from rover_lib.world.standin import REST_US, PinEvent
 
 AT_SPEED_S = 0.6  # from the first throttle to the fault
-START_S = 90.0  # a drive imports torch twice, which takes a third of a minute where four others are busy
+START_S = 90.0  # a drive imports torch twice, which takes a third of a minute while four other processes are busy
 END_S = 6.0
 DISK_BYTES = 512 * 1024
 CLOCK = Path(__file__).with_name("clock.c")
 
 
 class FaultError(RoverError):
-    """A fault that cannot be injected or judged here."""
+    """A fault cannot be injected or judged here."""
 
 
-# ---- inside the process of a drive
+# ---- what runs inside the process of a drive
 
 
 def _end_this_thread() -> None:
-    ctypes.CDLL(None).syscall({"x86_64": 60, "aarch64": 93}[platform.machine()], 0)  # exit, of the thread alone
+    # The system call exit ends only this thread.
+    ctypes.CDLL(None).syscall({"x86_64": 60, "aarch64": 93}[platform.machine()], 0)
 
 
 def _raise() -> None:
@@ -57,14 +58,14 @@ def _break_logger() -> None:
     def broken(*_: Any) -> bytes:
         raise RuntimeError("raised in the logger")
 
-    telemetry._sealed = telemetry._tick_line = broken  # type: ignore[assignment]  # that is the fault
+    telemetry._sealed = telemetry._tick_line = broken  # type: ignore[assignment]  # this is the fault
 
 
 INSIDE = {"end the loop's thread": _end_this_thread, "raise in the loop": _raise, "raise in the logger": _break_logger}
 
 
 def on_signal(what: str) -> None:
-    """From now on SIGUSR2 does one of INSIDE, in the main thread, which is the loop's."""
+    """Make SIGUSR2 do one of INSIDE from now on, in the main thread, which is the loop's."""
     signal.signal(signal.SIGUSR2, lambda *_: INSIDE[what]())
 
 
@@ -74,7 +75,8 @@ def on_signal(what: str) -> None:
 class RoverCommand(Child):
     """A `rover` command that runs beside this program.
 
-    arguments: its own. run: how it is started, `rover` itself if empty. env: variables beside this process's own.
+    arguments: of the command. run: the program that runs it, `rover` itself if empty. env: variables in addition to
+    this process's own.
     """
 
     def __init__(self, *arguments: object, run: Sequence[str] = (), env: Mapping[str, str] | None = None):
@@ -82,7 +84,7 @@ class RoverCommand(Child):
         super().__init__(f"rover {arguments[0]}", *run, *arguments, error=FaultError, env=env)
 
     def wait_for_message(self, text: str) -> None:
-        """Waits until it prints that on stderr. Raises FaultError if that does not come."""
+        """Wait until the command prints `text` on stderr. Raises FaultError if it does not."""
         deadline = time.monotonic() + START_S
         while not any(text in line for line in self.errors()):
             self.check()
@@ -91,7 +93,7 @@ class RoverCommand(Child):
             time.sleep(0.02)
 
     def wait_for_success(self) -> None:
-        """Waits until it ends. Raises FaultError if it does not, or not well."""
+        """Wait until the command ends. Raises FaultError if it does not, or if its exit code is not 0."""
         if (code := self.wait(START_S)) != 0:
             raise FaultError(f"{self.name} ended with {code}: {self.last_words()}", remedy="try it by hand")
 
@@ -99,10 +101,11 @@ class RoverCommand(Child):
 class Drive(RoverCommand):
     """`rover drive` with the bench's artifact, camera and cable.
 
-    start: one of INSIDE; 'clock', bench.step_clock sets its clock; 'disk', its log is on bench.disk; '' none of them.
+    start: how it is prepared: one of INSIDE; 'clock': bench.step_clock can set its clock; 'disk': its log is on
+    bench.disk; '': nothing of these.
     """
 
-    arguments: tuple[str, ...] = ()  # more of them
+    arguments: tuple[str, ...] = ()  # further arguments of the command
 
     def __init__(self, bench: "DrivingBench", start: str):
         self.start = start
@@ -120,7 +123,7 @@ class Drive(RoverCommand):
         super().__init__("drive", bench.artifact, *bench.devices(), *options, *self.arguments, run=run, env=env)
 
     def children(self) -> list[int]:
-        """Its processes: the policy's."""
+        """Return the ids of its child processes, of which the policy's is the only one."""
         children = []
         for status in Path("/proc").glob("[0-9]*/stat"):
             with contextlib.suppress(OSError):
@@ -129,9 +132,9 @@ class Drive(RoverCommand):
         return children
 
     def messages(self, since_s: float | None = None) -> list[str]:
-        """Its flight log's events since a time [default: its start], then its stderr's lines, those since the mark.
+        """Return the flight log's events since a time, then the lines of stderr since mark(); without a time, all.
 
-        Without the bench's folder, which has another name each time.
+        The bench's folder is removed from the lines, as its name is different each time.
         """
         events = []
         with contextlib.suppress(LogError):
@@ -142,7 +145,7 @@ class Drive(RoverCommand):
         return [line.replace(f"{self._folder}/", "") for line in lines]
 
     def mark(self) -> None:
-        """What it has printed on stderr until now is from before the fault."""
+        """Note that what it has printed on stderr until now is from before the fault."""
         self._marked = len(self.errors())
 
 
@@ -150,11 +153,11 @@ class Drive(RoverCommand):
 
 
 class DrivingBench:
-    """Arduino, camera, cable, and the drive that uses them; a context manager."""
+    """An Arduino, a camera, a cable, and the drive that uses them; a context manager. undo: what ends the fault."""
 
     def __init__(self) -> None:
         self._stack = contextlib.ExitStack()
-        self.undo = contextlib.ExitStack()  # of the fault
+        self.undo = contextlib.ExitStack()
         self.folder = Path(tempfile.mkdtemp(prefix="rover-faults-"))
         self._stack.callback(shutil.rmtree, self.folder, ignore_errors=True)
         self.disk = self.folder / "disk"
@@ -191,12 +194,12 @@ class DrivingBench:
 
     @property
     def drive(self) -> Drive:
-        """The drive that is on, or was the last to be."""
+        """The present drive, or the last one."""
         assert self._drive is not None, "at_speed() comes first"
         return self._drive
 
     def wait(self, seconds: float) -> None:
-        """Lets time pass, and reads the pins."""
+        """Let time pass, and read the pins meanwhile."""
         end = time.monotonic() + seconds
         while True:
             self.events += self.arduino.pulses()
@@ -205,15 +208,15 @@ class DrivingBench:
             time.sleep(min(left, 0.1))
 
     def devices(self) -> list[str]:
-        """Options of a `rover` command."""
+        """Return the options that give a `rover` command the bench's camera and port."""
         return ["--camera", str(self.camera), "--port", self.cable.port]
 
     def show(self, instruction: int) -> None:
-        """What the camera sees from its next frame on."""
+        """Let the camera see pictures with that instruction from its next frame on."""
         self.feed.show(*self._pictures[instruction])
 
     def at_speed(self, start: str = "") -> None:
-        """Has a drive that was started like that, and has been driving for a while; the one that is on, if it fits."""
+        """Make sure that a drive with this start has been driving for a while: the present one if it fits, or a new."""
         if self._drive and self._drive.running and self._drive.start == start:
             self.wait(AT_SPEED_S)
             if self.driving:
@@ -221,7 +224,7 @@ class DrivingBench:
         self.restart(start)
 
     def clear_faults(self) -> None:
-        """No more faults, as far as a drive that goes on notices."""
+        """End all faults that a drive which goes on would notice."""
         self.undo.close()
         self.cable.to_arduino = self.cable.to_host = None
         self.feed.late_s = 0.0
@@ -229,10 +232,10 @@ class DrivingBench:
         self.arduino.transmitter(*REST_US)
 
     def restart(self, start: str = "") -> None:
-        """A new drive, from the start until it has been driving for a while."""
+        """Start a new drive, and wait until it has been driving for a while."""
         drive = self.start(start)
         deadline = time.monotonic() + START_S
-        first_s = None  # command
+        first_s = None  # the time of its first command
         while first_s is None or time.monotonic() - first_s < AT_SPEED_S or not self.driving:
             self.wait(0.02)
             if first_s is None and self.cable.commands:
@@ -241,7 +244,7 @@ class DrivingBench:
                 raise FaultError(
                     f"rover drive did not drive within {START_S:g} s: {drive.last_words()}", remedy="drive it by hand"
                 )
-        self.arduino.ready(False)  # from here on the human does nothing but what a fault says
+        self.arduino.ready(False)  # from here on the human only does what a fault says
 
     def start(
         self,
@@ -249,7 +252,7 @@ class DrivingBench:
         fault: Callable[["DrivingBench"], object] = lambda bench: None,
         make: type[Drive] = Drive,
     ) -> Drive:
-        """A new drive, with a fault that is there before it. make: another kind of it."""
+        """Start a new drive, with a fault that is injected before. make: the class of the drive."""
         self.end_drive()
         self.repair()
         self.arduino.ready(True)
@@ -258,7 +261,7 @@ class DrivingBench:
         return self._drive
 
     def repair(self) -> None:
-        """Whatever was broken is as before."""
+        """Restore everything that was broken: end all faults, and plug in a new camera and a new cable."""
         self.clear_faults()
         self._disconnect()
         self.feed = CameraFeed(self.camera, *self._pictures[PLAIN])
@@ -273,12 +276,12 @@ class DrivingBench:
         self.drive.process.send_signal(number)
 
     def step_clock(self, seconds: int) -> None:
-        """Steps the system's clock, as a drive that was started with 'clock' sees it."""
+        """Step the system's clock as a drive that was started with 'clock' sees it."""
         with self.clock.open("r+b") as file, mmap.mmap(file.fileno(), 8) as step:
             struct.pack_into("q", step, 0, struct.unpack_from("q", step)[0] + seconds)
 
     def fill_disk(self) -> None:
-        """Until undone, rover drive can write no more to its files on `disk`."""
+        """Let rover drive write no more to its files on `disk`, until this is undone."""
         if self._own_disk:
             filling = self.disk / "filling"
             self.undo.callback(filling.unlink)
@@ -290,7 +293,7 @@ class DrivingBench:
             self.undo.callback(resource.prlimit, self.drive.pid, resource.RLIMIT_FSIZE, limits)
 
     def clock_library(self) -> Path:
-        """For LD_PRELOAD."""
+        """Return the library for LD_PRELOAD that lets step_clock() set a drive's clock; compile it if necessary."""
         library = self.folder / "clock.so"
         if not library.exists():
             compile_c(*CC, "-shared", "-fPIC", "-o", library, CLOCK)
@@ -308,7 +311,7 @@ class DrivingBench:
         return bool(latest) and min(latest) > STOPPED_THROTTLE_US
 
     def _make_disk(self) -> Callable[[], object]:
-        """A small disk of its own at `disk`, where that is allowed; how to get rid of it."""
+        """Mount a small disk at `disk`, if this user may; return a function that unmounts it."""
         mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(self.disk)]
         own = os.geteuid() == 0 and subprocess.run(mount, capture_output=True).returncode == 0
         self.disk_is = "a small tmpfs is filled" if own else "RLIMIT_FSIZE by prlimit, as this user may mount no disk"

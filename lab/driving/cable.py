@@ -1,4 +1,4 @@
-"""A serial cable with this program in it, so that it can be cut, stuck and garbled."""
+"""Simulate a serial cable. This program passes on what it carries, so that it can be cut, stuck and garbled."""
 
 import contextlib
 import os
@@ -21,7 +21,7 @@ Change = Callable[[bytes], bytes]
 
 
 def whole_lines(change: Change) -> Change:
-    """A change of whole lines, made one of a stream of bytes."""
+    """Turn a change of whole lines into a change of a stream of bytes."""
     pending = b""
 
     def pass_on(data: bytes) -> bytes:
@@ -33,17 +33,17 @@ def whole_lines(change: Change) -> Change:
 
 
 def flipping(rng: random.Random, share: float) -> Change:
-    """Flips a bit of that share of the bytes."""
+    """Return a change that flips a bit in that share of the bytes."""
     return lambda data: bytes(b ^ (1 << rng.randrange(8)) if rng.random() < share else b for b in data)
 
 
 def dropping(rng: random.Random, share: float) -> Change:
-    """Drops that share of the lines."""
+    """Return a change that drops that share of the lines."""
     return whole_lines(lambda line: b"" if rng.random() < share else line)
 
 
 def lagging(share: float) -> Change:
-    """Falls behind by that share of the time, as far as more bytes come."""
+    """Return a change whose delay grows by that share of the passing time. Bytes come out only when more come in."""
     start_s, waiting = time.monotonic(), deque[tuple[float, bytes]]()
 
     def lag(data: bytes) -> bytes:
@@ -62,15 +62,16 @@ _DRIVE = re.compile(rb">D \d+ \d+ \d+ (\d+) (\d+)\*[0-9A-F]{8}")
 class Cable:
     """The cable between a host and an Arduino. port: the host's end; opening it opens the Arduino's.
 
-    to_arduino, to_host: may be set; change what passes. commands: the drives that the host wrote, before any change.
-    lines: all that it wrote. not_ours: lines that others write to the port, and which are no commands of the drive.
+    to_arduino, to_host: changes of what passes, which you may set. commands: the drive commands that the host wrote,
+    before any change; lines: all lines that it wrote. not_ours: lines that another program writes to the port; they are
+    not counted among these.
     """
 
     def __init__(self, arduino_port: str):
         self._arduino_port = arduino_port
         self._master, slave = pty.openpty()
         tty.setraw(slave)
-        _set_hang_up(slave, True)  # as a serial port has it
+        _set_hang_up(slave, True)  # as on a serial port
         self.port = os.ttyname(slave)
         os.close(slave)  # so that POLLHUP tells whether somebody has the port open
         os.set_blocking(self._master, False)
@@ -86,18 +87,18 @@ class Cable:
         self._thread.start()
 
     def unplug(self) -> None:
-        """Both ends come to nothing."""
+        """Close both ends."""
         self._closing.set()
         self._thread.join()
 
     def stick(self) -> None:
-        """The port takes no more bytes: who writes waits."""
+        """Let the port take no more bytes, so that whoever writes has to wait."""
         port = os.open(self.port, os.O_RDWR | os.O_NOCTTY)
         termios.tcflow(port, termios.TCOOFF)
         os.close(port)
 
     def inject(self, data: bytes) -> None:
-        """Bytes for the Arduino, as if the host had sent them."""
+        """Send bytes to the Arduino as if they came from the host."""
         self._injected.append(data)
 
     def _run(self) -> None:
@@ -109,7 +110,8 @@ class Cable:
             if events.get(self._master, 0) & select.POLLHUP:  # nobody has it open
                 if arduino >= 0:
                     poller.unregister(arduino)
-                    # What the host left: whether its next opening is an edge of DTR, which resets the Arduino.
+                    # Pass on the setting that the host left. It decides whether the next opening is an edge of DTR,
+                    # which resets the Arduino.
                     _set_hang_up(arduino, bool(termios.tcgetattr(self._master)[2] & termios.HUPCL))
                     os.close(arduino)
                     arduino = -1
@@ -156,5 +158,5 @@ def _read(fd: int) -> bytes:
 
 
 def _write(fd: int, data: bytes) -> None:
-    with contextlib.suppress(OSError):  # what nobody takes is lost, as on a wire
+    with contextlib.suppress(OSError):  # bytes that nobody takes are lost, as on a wire
         os.write(fd, data)

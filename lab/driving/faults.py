@@ -1,19 +1,19 @@
-"""Faults while the car drives at speed, judged by the pulses on its servo pins: `python -m lab faults OUTPUT`.
+"""Inject faults while the car drives at speed, and judge the pulses on its servo pins: `python -m lab faults OUTPUT`.
 
-Everything is what drives the real car: `rover drive` as a process, pyserial, and the real firmware, in simavr and in
-real time. Three things stand in for hardware. The camera is a FIFO of JPEGs, read by the same Camera class as a V4L2
-device (which needs a kernel with v4l2loopback to be emulated). The cable is a pair of ptys with this program between
-them, so that it can be cut, stuck and garbled. The transmitter's pulses are simavr's.
+Everything that drives is what drives the real car: `rover drive` as a process, pyserial, and the real firmware, in
+simavr and in real time. Three pieces of hardware are replaced. The camera is a FIFO of JPEGs, read by the same Camera
+class as a V4L2 device (to emulate one takes a kernel with v4l2loopback). The cable is a pair of ptys with this program
+between them, so that it can be cut, stuck and garbled. The transmitter's pulses come from simavr.
 
-The policy is a small artifact that does what the corner of the picture tells it to: raise, hang, give NaN. So what
-happens inside an inference comes in by the camera, and there is no hook for tests in what drives. Only what cannot
-come from outside (an exception in the logger, the death of a thread) is done by the bench inside the process of the
-drive, on SIGUSR2, before `rover_lib.cli.main` is called.
+The policy is a small artifact that does what the corner of the picture tells it to: raise, hang, give NaN. So a fault
+inside an inference comes in through the camera, and the code that drives needs no hook for tests. A few faults cannot
+come from outside, such as an exception in the logger or the death of a thread. For these the bench prepares the drive's
+process before `rover_lib.cli.main` is called, and SIGUSR2 brings them about.
 
-The rows are in rows/, each where its kind is. What a row expects is `stopped` (neutral, until an explicit new start),
-`human` (the transmitter's pulses), `continues` (only what drive commanded, on time), or `refused`: the fault is there
-before `rover drive` is started, and the car is never armed. All times are of the monotonic clock that simavr's pins,
-the cable and this program share.
+The rows are in rows/, in a module for each kind. A row expects one of these: `stopped` (neutral, until an explicit new
+start), `human` (the transmitter's pulses), `continues` (only what the drive commanded, on time), or `refused` (the
+fault is there before `rover drive` is started, and the car is never armed). All times are of the monotonic clock that
+simavr's pins, the cable and this program share.
 """
 
 import contextlib
@@ -53,18 +53,18 @@ from rover_lib.onboard.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.stage import write_stage
 from rover_lib.world.standin import REST_US, PinEvent
 
-SLEWED_MS = 2  # of the Arduino's clock, which it slews by, and of pulses that it measured a step off
-TICK_S = 0.04  # one of a drive's, and what it may be late
-KNOWN_S = 0.05  # a pulse is known when it has ended, and was read
-ATTEMPTS = 5  # at a row that this machine spoilt
+SLEWED_MS = 2  # for rounding to the milliseconds in which the Arduino slews, and for pulses that it measured a step off
+TICK_S = 0.04  # a tick of a drive, and by how much it may be late
+KNOWN_S = 0.05  # how long it takes until a pulse has ended and been read
+ATTEMPTS = 5  # how often a row is tried if this machine was too busy
 FUZZ_LINES = 1_000_000
 
 
 def run_fault(bench: DrivingBench, fault: FaultRow, gates: Gates) -> dict[str, Any]:
-    """Injects a fault into the drive that is at speed and judges it; a row of metrics.faults.
+    """Inject a fault into the drive that is at speed, judge it, and return a row of metrics.faults.
 
-    Where this machine spoilt it, it is repeated, at most ATTEMPTS times in all. Its `recovered`, and its `log_line` if
-    that is told later, are None where the next start of a drive tells them.
+    If this machine was too busy for the fault to be judged, it is repeated, up to ATTEMPTS times in all. Two values are
+    None in the row if only the next start of a drive tells them: `recovered` and `log_line`.
     """
     for attempts in range(1, ATTEMPTS + 1):
         seen, code, line = (_start_with if fault.expected == REFUSED else _inject)(bench, fault)
@@ -91,7 +91,7 @@ def run_fault(bench: DrivingBench, fault: FaultRow, gates: Gates) -> dict[str, A
 
 
 def _inject(bench: DrivingBench, fault: FaultRow) -> tuple[Observation, int | None, str | None]:
-    """Makes it happen once: what was seen, the drive's exit code, and the line that tells of it."""
+    """Inject a fault once. Returns what was seen, the drive's exit code, and the line that tells of the fault."""
     drive = bench.drive
     bench.rng.seed(fault.name)
     bench.events = bench.events[-2000:]
@@ -110,10 +110,10 @@ def _inject(bench: DrivingBench, fault: FaultRow) -> tuple[Observation, int | No
 
 
 def _start_with(bench: DrivingBench, fault: FaultRow) -> tuple[Observation, int | None, str | None]:
-    """As _inject, of a fault that is there before the drive is started."""
+    """Do as _inject does, but inject the fault before the drive is started."""
     bench.rng.seed(fault.name)
     bench.end_drive()
-    bench.wait(0.1)  # and its last pulses
+    bench.wait(0.1)  # until its last pulses are over
     bench.events = []
     at_s = time.monotonic()
     drive = bench.start(fault.start, fault.inject)
@@ -129,7 +129,7 @@ def _start_with(bench: DrivingBench, fault: FaultRow) -> tuple[Observation, int 
 
 
 def _spoilt(fault: FaultRow, seen: Observation, gates: Gates) -> bool:
-    """Whether this machine had no time for the Arduino or for the drive, so that there is nothing to judge."""
+    """Whether this machine had no time for the Arduino or the drive, so that there is nothing to judge."""
     if seen.stalled_ms() or (fault.expected != REFUSED and not seen.was_driving(gates.throttle_max_us)):
         return True
     must_command = fault.expected == CONTINUES and not fault.until_limit and not fault.starves
@@ -144,7 +144,7 @@ def _limits(fault: FaultRow, verdict: Verdict) -> str:
 
 
 def _line_of(message: str, drive: Drive, since_s: float | None = None, within_s: float = 1.5) -> str | None:
-    """The first line of the drive that matches."""
+    """Return the first of the drive's messages that matches, or None if there is none within that time."""
     deadline = time.monotonic() + within_s
     while True:
         for line in drive.messages(since_s):
@@ -156,9 +156,9 @@ def _line_of(message: str, drive: Drive, since_s: float | None = None, within_s:
 
 
 def fuzz(lines: int = FUZZ_LINES, seed: int = 1) -> dict[str, Any]:
-    """Random and mutated lines into the firmware's parser and state machine, natively: tests/firmware/fuzz.c.
+    """Run tests/firmware/fuzz.c: give random and mutated lines to the firmware's parser and state machine, natively.
 
-    unsafe_pulses: 0 or 1, it ends at the first.
+    In the result, unsafe_pulses is 0 or 1, as the program ends at the first unsafe pulse.
     """
     firmware = REPOSITORY / "firmware" / "rover"
     sources = REPOSITORY / "tests" / "firmware" / "fuzz.c", firmware / "protocol.c", firmware / "vehicle.c"
@@ -173,15 +173,14 @@ def fuzz(lines: int = FUZZ_LINES, seed: int = 1) -> dict[str, Any]:
 
 
 def transmitted_and_replayed(bench: DrivingBench, steps: int = 24, step_s: float = 0.25) -> dict[str, Any]:
-    """A transmitter's pulses, recorded by `rover record` and replayed by `rover drive --replay`, on the pins.
+    """Record a transmitter's pulses by `rover record`, replay them by `rover drive --replay`, and compare the pins.
 
-    worst_us: of all pulses of the replay, against what was transmitted in their place; None if that is another
-    sequence. worst_ms: how far a step of the replay began from its time. Raises FaultError if either command fails.
+    Returns compare_steps()'s result. Raises FaultError if either command fails.
     """
     rng = random.Random(0)
     sent = [REST_US]
     while len(sent) < steps - 1:
-        # -256 to 304 and 4 to 116: what the cap lets through
+        # These ranges are -256 to 304 and, for a car without a car.yml, 4 to 116, which the cap lets through.
         steering_us, throttle_us = rng.randint(-256, 304), rng.randint(4, CAR.cap_us - 2)
         pulses = REST_US[0] + steering_us, REST_US[1] + throttle_us
         if all(abs(a - b) > 40 for a, b in zip(pulses, sent[-1], strict=True)):
@@ -207,14 +206,18 @@ def transmitted_and_replayed(bench: DrivingBench, steps: int = 24, step_s: float
         bench.wait(steps * step_s)
         replay.wait_for_success()
     bench.wait(0.2)
-    since_s = bench.cable.commands[0].at_s + 2 * PERIOD_US["steering"] * 1e-6  # before, they are the transmitter's
+    since_s = bench.cable.commands[0].at_s + 2 * PERIOD_US["steering"] * 1e-6  # before, the transmitter's pulses pass
     return compare_steps([e for e in bench.events if e.monotonic_s > since_s], sent, times_s)
 
 
 def compare_steps(
     events: Sequence[PinEvent], sent: Sequence[tuple[float, float]], times_s: Sequence[float]
 ) -> dict[str, Any]:
-    """Steps of pulses (steering, throttle; us) that were sent at times, against those on the pins; see above."""
+    """Compare steps of pulses (steering, throttle; us), sent at those times, with the pulses on the pins.
+
+    In the result, worst_us is the largest error of a pulse against what was sent in its place, or None if the steps on
+    the pins are not those that were sent. worst_ms: by how much a step's delay differs from the median delay at most.
+    """
     result: dict[str, Any] = {"steps": len(sent), "worst_us": 0.0, "worst_ms": 0.0, "pulses": 0}
     for i, pin in enumerate(PERIOD_US):
         pulses = [e for e in events if e.pin == pin and e.kind == "pulse"]
@@ -232,16 +235,16 @@ def compare_steps(
 
 
 def _followed(pin: str, pulses: Sequence[PinEvent], levels: Sequence[float]) -> tuple[list[float], list[float]]:
-    """How far each pulse (us) is from its level, and when each level but the first was set out for.
+    """Return how far (us) each pulse is from its level, and when each level but the first was set out for.
 
-    The firmware moves a pin no faster than its slew, so pulses on the way from one level to the next are none of
-    either, and are not counted: as long as they only come nearer, and for no longer than that takes.
+    The firmware moves a pin no faster than its slew. So the pulses on the way from one level to the next belong to
+    neither and are not counted, as long as each comes nearer to the next level and they take no longer than the slew.
     """
     off_us: list[float] = []
     begun_s: list[float] = []
     on_the_way, last = False, levels[0]
     for e in pulses:
-        # A pin does whole ticks; what simavr adds to an edge is its granularity, not the chip's.
+        # A pin's pulses have whole ticks. The rest comes from simavr's granularity, not from the chip.
         us = TICK_US[pin] * round(e.pulse_us / TICK_US[pin])
         level, after = levels[len(begun_s) : len(begun_s) + 2] if len(begun_s) + 1 < len(levels) else (levels[-1],) * 2
         if not on_the_way and abs(us - level) > ARDUINO_STEP_US and (us - level) * (after - level) > 0:
@@ -262,7 +265,7 @@ def _followed(pin: str, pulses: Sequence[PinEvent], levels: Sequence[float]) -> 
 
 @dataclass
 class FaultsOutcome:
-    """What a run found: the rows, the fuzz and the bytes (None: left out), and all that is not as expected."""
+    """What a run found: the rows, the results of fuzz and bytes (None if left out), and what is not as expected."""
 
     gates: Gates
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -273,7 +276,7 @@ class FaultsOutcome:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """rows, stopped_rows, as_expected, worst_stopped_after_ms, takeover_ms, repeated, seconds."""
+        """The counts of rows, the worst times (ms), and how long the run took (seconds)."""
         stopped = [r for r in self.rows if r["expected"] == STOPPED]
         takeovers = [r["takeover_ms"] for r in self.rows if r.get("takeover_ms") is not None]
         return {
@@ -287,7 +290,7 @@ class FaultsOutcome:
         }
 
     def write(self, path: Path | str) -> dict[str, Any]:
-        """Writes the stage `faults`, and returns it."""
+        """Write the stage `faults`, and return it."""
         metrics = {"faults": self.rows, "fuzz": self.fuzz, "bytes": self.bytes, "summary": self.summary}
         return write_stage(path, "faults", params=vars(self.gates), metrics=metrics | {"wrong": self.wrong})
 
@@ -300,10 +303,10 @@ def run_faults(
     fuzz_lines: int = FUZZ_LINES,
     echo: Callable[[str], None] = lambda text: None,
 ) -> FaultsOutcome:
-    """Injects all faults, or those of `only`, where 'fuzz' and 'bytes' are names too, and of `kinds`.
+    """Inject all faults, or only those named in `only` and those of `kinds`. 'fuzz' and 'bytes' are names too.
 
-    About 5 minutes for all. echo: prints a line as each is done. Raises FaultError for names that are none and for a
-    bench that does not drive, ArduinoError if there is no emulated Arduino here.
+    All faults take about 6 minutes. echo: called with a line when a fault is done. Raises FaultError for unknown names
+    and if the bench does not drive, and ArduinoError if there is no emulated Arduino here.
     """
     gates, begin = gates or Gates.of_params(), time.monotonic()
     only, kinds = set(only), set(kinds)
@@ -313,10 +316,10 @@ def run_faults(
         raise FaultError(f"no fault {unknown}", remedy=f"choose from {names}, 'fuzz' and 'bytes'")
     if unknown := sorted(kinds - KINDS.keys()):
         raise FaultError(f"no faults of kind {unknown}", remedy=f"choose from {sorted(KINDS)}")
-    build()  # here, where its errors are seen
+    build()  # before the bench needs it, so that its errors are seen
     outcome = FaultsOutcome(gates)
     chosen = [f for f in FAULTS if everything or f.name in only or f.kind in kinds]
-    # Beside the bytes, which wait for the emulated clock; no fault is injected meanwhile.
+    # The fuzz runs beside the bytes, which wait for the emulated clock; no fault is injected meanwhile.
     with ThreadPoolExecutor() as beside, DrivingBench() as bench:
         fuzzing = beside.submit(fuzz, fuzz_lines) if everything or "fuzz" in only else None
         if everything or "bytes" in only:
@@ -342,9 +345,9 @@ def run_faults(
 
 
 def _rows(bench: DrivingBench, chosen: Sequence[FaultRow], gates: Gates) -> Iterator[tuple[FaultRow, dict[str, Any]]]:
-    """Each fault's row, once all that belongs to it is known: that it drives again only the next start tells.
+    """Yield each fault's row as soon as all of it is known. Only the next start tells whether the car drives again.
 
-    Those that expect a drive which is refused come last, and a drive after all of them.
+    The faults that expect a refused drive come last, and a single drive after all of them.
     """
     refused = [fault for fault in chosen if fault.expected == REFUSED]
     waiting: list[tuple[FaultRow, dict[str, Any]]] = []
@@ -363,7 +366,7 @@ def _rows(bench: DrivingBench, chosen: Sequence[FaultRow], gates: Gates) -> Iter
 
 
 def _drive_again(bench: DrivingBench, waiting: Sequence[tuple[FaultRow, dict[str, Any]]], start: str) -> None:
-    """The next drive; what it tells of the faults before it."""
+    """Start the next drive, and complete the rows of the faults before it with what it tells of them."""
     again = True
     try:
         bench.at_speed(start)
@@ -387,7 +390,7 @@ def _complete(fault: FaultRow, row: dict[str, Any]) -> None:
 
 
 def row_text(row: dict[str, Any]) -> str:
-    """A line for people: fault, expected, found, after how many milliseconds, log line."""
+    """Return a line for people: fault, expected, found, after how many milliseconds, log line."""
     ms = row.get("takeover_ms", row["stopped_after_ms"])
     ms = "" if ms is None else f"{ms:.0f} ms"
     line = " ".join((row["log_line"] or "no line").split())

@@ -1,9 +1,9 @@
-"""What must never be, whatever happens in a drive.
+"""The invariants: what must never happen in a drive, whatever else does.
 
     for sentence in broken(drive_story(story)):
 
-What is allowed is known here, from what hand, operator and picture really did; of the code under test only the state
-that the firmware says it is in is believed.
+This module knows what the human, the operator and the camera's pictures really did, and derives from that what is
+allowed. The only statement of the code under test that it believes is the firmware's state.
 """
 
 import re
@@ -17,24 +17,29 @@ import numpy as np
 from lab.driving.virtual import HELD, LIVE, Hand, Seen
 from rover_lib.onboard.service import REQUEST_S
 
-# What firmware/README.md and params.yml promise, in numbers of our own.
+# What firmware/README.md and params.yml promise, with numbers that are written here anew.
 RESTING_US = 124  # a throttle pulse up to this moves no car
-REST_US = 120 + 32  # the throttle of a hand that rests, as the firmware sees it
+REST_US = 120 + 32  # the largest throttle pulse of a stick at rest, as the firmware sees it
 CAP_US = 238
 SLEW_US_PER_MS = {"steering": 4, "throttle": 2}
-VALID_MS = 200 + 65  # a command holds until its host has heard nothing for as long; its throttle takes time to fall
-SIGNAL_MS = 105  # a lost signal, or a moved stick, is known within 100; and a turn of the loop
+# A command holds for at most 200 ms after the newest status that its host had read; then its throttle takes 65 to fall.
+VALID_MS = 200 + 65
+SIGNAL_MS = 105  # a lost signal, or a moved stick, is noticed within 100 ms, and a turn of the loop
 DEAD_BAND_US = {"steering": 48 + 8, "throttle": 32 + 8}
-STALE_MS = 1000 + VALID_MS  # drive.stop_s of params.yml, and then the last command
-BLIND_MS = 250  # of driving by pictures that show nothing new
-ASKED_MS = 1000 * REQUEST_S + 200  # from the operator's request to autonomous, the line's way included
+STALE_MS = 1000 + VALID_MS  # drive.stop_s of params.yml, and then the last command's time
+BLIND_MS = 250  # how long the car may drive by pictures that show nothing new
+ASKED_MS = 1000 * REQUEST_S + 200  # from the operator's request to autonomous, including the line's way
 GESTURE_MS = 30_000
-ENDED_MS = 1700  # from a stop to the end of the drive: a silent link, and neutral unanswered twice, take 0.5 s each
+# From a stop to the end of the drive. To find a silent link takes 0.5 s, and so does each of two unanswered neutrals.
+ENDED_MS = 1700
 
 
 @dataclass
 class Run:
-    """Seen, a value for each millisecond. live: the pulses are the human's. signals: both come often enough."""
+    """What was seen, as arrays with a value for each millisecond.
+
+    live: whether the receiver's pulses are the human's. signals: whether there are pulses on both channels.
+    """
 
     seen: Seen
 
@@ -65,7 +70,7 @@ def _each_ms(changes: list, n: int, value: Callable[[Any], Any]) -> np.ndarray:
 
 
 def _for_ms(holds: np.ndarray, ms: int) -> np.ndarray:
-    """Whether it had held for that duration by then."""
+    """Return, for each millisecond, whether `holds` was true for the last `ms` milliseconds."""
     return np.convolve(holds, np.ones(ms), "full")[: len(holds)] >= ms - 0.5
 
 
@@ -74,7 +79,7 @@ def _first(bad: np.ndarray) -> int | None:
 
 
 def broken(seen: Seen) -> Iterator[str]:
-    """A sentence for each invariant that is not kept, with the millisecond."""
+    """Yield a sentence, with the millisecond, for each invariant that is broken."""
     run = Run(seen)
     for check in (_asked_for, _capped, _slewed, _not_blind, _human_wins, _human_keeps, _armed_by_people, _told):
         if (what := check(run)) is not None:
@@ -82,7 +87,7 @@ def broken(seen: Seen) -> Iterator[str]:
 
 
 def _asked_for(run: Run) -> str | None:
-    """Never a throttle above neutral that no command of the host, or no live human, asked for."""
+    """The throttle is never above neutral unless a command of the host, or a live human, asked for it."""
     host, human = np.zeros_like(run.throttle), np.full_like(run.throttle, REST_US)
     for c in run.seen.commands:
         span = slice(c.at_ms, c.at_ms + VALID_MS)
@@ -90,7 +95,7 @@ def _asked_for(run: Run) -> str | None:
     for (start_ms, hand), (until, _) in pairwise([*run.seen.hands, (run.seen.end_ms + 1, Hand())]):
         if hand.receiver == LIVE:
             span, us = slice(start_ms, until + SIGNAL_MS + 25), hand.sticks[1]
-        elif hand.receiver == HELD:  # nobody can tell: until the firmware starts anew, see docs/safety.md
+        elif hand.receiver == HELD:  # nobody can tell this from a human, until the firmware starts anew: docs/safety.md
             next_start = min((s for s in run.seen.starts if s > start_ms), default=until)
             span, us = slice(start_ms, min(until, next_start) + SIGNAL_MS + 25), hand.sent[1]
         else:
@@ -103,7 +108,7 @@ def _asked_for(run: Run) -> str | None:
 
 
 def _capped(run: Run) -> str | None:
-    """Never more of the host's throttle than the cap."""
+    """The host's throttle is never above the cap."""
     ms = _first(run.autonomous & (run.throttle > CAP_US))
     return None if ms is None else f"throttle {run.throttle[ms]} us at {ms} ms"
 
@@ -119,7 +124,7 @@ def _slewed(run: Run) -> str | None:
 
 
 def _not_blind(run: Run) -> str | None:
-    """Driven by what was to be seen lately; by anything older, not for longer than it takes to find out."""
+    """The car drives by what was to be seen lately; by older pictures only for as long as it takes to notice."""
     content = np.zeros_like(run.throttle)
     for c in run.seen.commands:
         content[c.at_ms :] = c.content_ms if c.planned else 10**9
@@ -140,7 +145,7 @@ def _human_wins(run: Run) -> str | None:
             rests = np.unique(stick[before])
             moved |= np.abs(stick[span][:, None] - rests).min(1) > DEAD_BAND_US[channel]
         must_end = (moved & (run.live[span] == 1) & bool(run.live[before].all())) | (run.signals[span] == 0)
-        for hung_ms, until_ms in run.seen.hung:  # the watchdog ends that, a little later
+        for hung_ms, until_ms in run.seen.hung:  # a hung loop notices nothing; the watchdog ends that a little later
             must_end[max(0, hung_ms - armed) : max(0, until_ms - armed)] = False
         longest = ms = 0
         for i, must in enumerate(must_end):
@@ -152,7 +157,7 @@ def _human_wins(run: Run) -> str | None:
 
 
 def _human_keeps(run: Run) -> str | None:
-    """In manual the steering is the human's, while his signals come as they should."""
+    """In manual the steering is the human's, as long as their signals come as they should."""
     good = (run.state == ord("M")) & (run.live == 1) & (run.signals == 1) & (run.regular == 1)
     for hung_ms, until_ms in run.seen.hung:
         good[hung_ms:until_ms] = False
@@ -163,8 +168,8 @@ def _human_keeps(run: Run) -> str | None:
 
 
 def _armed_by_people(run: Run) -> str | None:
-    """Autonomous begins by an operator's request since the last end of it, and by a gesture of the human's."""
-    lost = _for_ms(run.signals == 0, 130)[130:] & _for_ms(run.signals == 1, 130)[:-130]  # and was there before
+    """Autonomous begins only by an operator's request since it last ended and a human's gesture since it last began."""
+    lost = _for_ms(run.signals == 0, 130)[130:] & _for_ms(run.signals == 1, 130)[:-130]  # gone after it was there
     used = 0
     for armed in run.armed:
         stopped = max((ms for ms in run.left if ms < armed), default=-1)
@@ -191,11 +196,11 @@ NAMED = re.compile(
     "|said nothing|no status|not answered|no time|frozen|black|contrast|pictures in a row|no frame|ended after|too old"
     "|not finite|outside the range|told to fail|fresh plan|plan within|raised in the loop"
 )
-UNFORESEEN = re.compile(r"\w+(Error|Exception): (?!raised in the loop)")  # as sentence_of() says it of these
+UNFORESEEN = re.compile(r"\w+(Error|Exception): (?!raised in the loop)")  # sentence_of()'s form for unforeseen errors
 
 
 def _told(run: Run) -> str | None:
-    """Each drive ends with a line that says why, and soon after the firmware has stopped the car."""
+    """Each drive ends soon after the firmware has stopped the car, with a line that says why."""
     seen = run.seen
     for _, ms, words in seen.drives:
         if words is not None and (UNFORESEEN.match(words) or not NAMED.search(words)):
@@ -203,9 +208,9 @@ def _told(run: Run) -> str | None:
     refused = [ms for ms, text in seen.log if text.startswith("not armed")]
     for left in run.left:
         if any(left - ENDED_MS <= ms <= left + ENDED_MS for ms in refused):
-            continue  # the answer to arming was lost: the firmware heard no command and stopped, no drive had begun
+            continue  # the answer to arming was lost, so no drive began, and the firmware stopped without a command
         for begin, end, words in seen.drives:
             late = end - left > ENDED_MS + seen.paused_ms
-            if begin <= left < end and late and words is not None:  # None: the next start tells of it
+            if begin <= left < end and late and words is not None:  # if it is None, the next start tells of it
                 return f"stopped at {left} ms, and the drive ended at {end}"
     return None

@@ -1,4 +1,4 @@
-"""The view from outside: its server as a process, and pages without a browser, which speak the page's own protocol."""
+"""Open the view from outside: its server runs as a process, and pages without a browser speak its own protocol."""
 
 import asyncio
 import contextlib
@@ -19,11 +19,11 @@ START_S = 60.0
 
 
 class PageError(RoverError):
-    """A view that does not start, or a page that it does not show."""
+    """The view does not start, or it does not show a page."""
 
 
 class ViewServer:
-    """`rover view` as a process; a context manager. place: the socket for drives. url: of its page."""
+    """`rover view` as a process; a context manager. place: the path of its socket for drives. url: of its page."""
 
     def __init__(self, place: Path):
         options = ("view", "--web-port", "0", "--feed", place)
@@ -59,9 +59,9 @@ class ViewServer:
 
 
 class Page:
-    """An open page, in a thread of its own; a context manager. It says of each message at once that it shows it.
+    """An open page in its own thread; a context manager. It confirms each message at once, as if it had shown it.
 
-    messages: what it got: the head of each, "heard_s" (time.monotonic() at which it was here) and "jpeg_bytes" with it.
+    messages: the head of each message that came, with "heard_s" (time.monotonic() when it came) and "jpeg_bytes".
     """
 
     def __init__(self, url: str):
@@ -87,7 +87,7 @@ class Page:
         self._thread.join(10.0)
 
     def stop(self) -> float:
-        """Clicks; when, by time.monotonic()."""
+        """Click on stop; return when (time.monotonic())."""
         assert self._wire, "it is open"
         now_s = time.monotonic()
         asyncio.run_coroutine_threadsafe(self._wire.send_str("stop"), self._loop)
@@ -116,7 +116,10 @@ class Page:
 
 
 def flood(url: str, seconds: float, a_second: int = 1000) -> dict[str, int]:
-    """Requests that may not look, and some that may: how many of each status the server gave. 0: none."""
+    """Send requests of which some are allowed and most are not; return how often each status was answered.
+
+    Status 0 counts the requests without an answer.
+    """
     base, _, token = url.partition("/?token=")
     requests = [
         (f"{base}/", {}),

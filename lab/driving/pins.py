@@ -1,4 +1,4 @@
-"""What the servo pins do after a fault, judged: stopped, the human's, going on as commanded, or never driven.
+"""Judge what the servo pins do after a fault: stop, follow the human, go on as commanded, or never drive.
 
 All times are of the monotonic clock that simavr's pins, the cable and the bench share.
 """
@@ -19,20 +19,20 @@ CAR = this_car()  # python -m lab faults --car names another
 NEUTRAL_US = {"steering": CAR.numbers[2], "throttle": CAR.numbers[6]}
 PERIOD_US = {"steering": CAR.numbers[0], "throttle": CAR.numbers[4]}
 STOPPED_THROTTLE_US = NEUTRAL_US["throttle"] + ARDUINO_STEP_US
-TICK_US = {"steering": 0.5, "throttle": 4.0}  # of the pin's timer: all that its hardware can do
+TICK_US = {"steering": 0.5, "throttle": 4.0}  # the resolution of the pin's timer
 SLEW_US_PER_MS = {"steering": 4.0, "throttle": 2.0}  # how fast the firmware lets the host move a pin
 EDGE_US = 0.5  # an edge in simavr is known to 0.25 us
-STEP_US = ARDUINO_STEP_US + EDGE_US  # of a pulse that the Arduino measured and made again
-COMMAND_US = {"steering": 1.0, "throttle": 2.5}  # half a step of its timer, and an edge
-STILL_VALID_S = 0.2  # the Arduino holds a command for 150 ms, and a steering pulse begins 21 ms later
-BEFORE_S = 0.2  # it must have been driving for that long before a fault
-LAST_S = 0.2  # of the end, which must have pulses
-LATE_COMMAND_S = 0.1  # three of a drive's ticks
+STEP_US = ARDUINO_STEP_US + EDGE_US  # the error of a pulse that the Arduino measured and sends on
+COMMAND_US = {"steering": 1.0, "throttle": 2.5}  # the error of a commanded pulse: half a tick of its timer, and an edge
+STILL_VALID_S = 0.2  # the Arduino holds a command for 150 ms, and a steering pulse may begin 21 ms later
+BEFORE_S = 0.2  # how long the car must have been driving before a fault
+LAST_S = 0.2  # how long at the end there must be pulses
+LATE_COMMAND_S = 0.1  # three ticks of a drive
 
 
 @dataclass(frozen=True)
 class Gates:
-    """Of lab/params.yml's section `faults`."""
+    """The gates in lab/params.yml's section `faults`."""
 
     stopped_ms: float
     takeover_ms: float
@@ -43,7 +43,7 @@ class Gates:
 
     @classmethod
     def of_params(cls) -> "Gates":
-        """Those of lab/params.yml."""
+        """Read the gates from lab/params.yml."""
         return cls(**lab_params()["faults"])
 
     @property
@@ -52,7 +52,7 @@ class Gates:
 
 
 class Command(NamedTuple):
-    """A drive's line that went into the cable, and when."""
+    """A drive command that the host wrote into the cable, and when."""
 
     at_s: float
     steering_us: int
@@ -61,7 +61,10 @@ class Command(NamedTuple):
 
 @dataclass(frozen=True)
 class Observation:
-    """What a fault is judged by. events: of the pins, in order; commands: of the drive; from before at_s to end_s."""
+    """What a fault is judged by: the pins' events in order, and the drive's commands, from before at_s to end_s.
+
+    at_s: when the fault happened. end_s: until when the car was watched.
+    """
 
     events: Sequence[PinEvent]
     commands: Sequence[Command]
@@ -69,7 +72,7 @@ class Observation:
     end_s: float
 
     def pulses(self, pin: str, from_s: float | None = None, to_s: float | None = None) -> list[PinEvent]:
-        """Of a pin, those that ended in a span of time [default: from the fault on]."""
+        """Return a pin's pulses that ended in a span of time [default: from the fault to the end]."""
         from_s = self.at_s if from_s is None else from_s
         to_s = self.end_s if to_s is None else to_s
         return [e for e in self.events if e.pin == pin and e.kind in ("pulse", "cut") and from_s < e.end_s <= to_s]
@@ -80,19 +83,19 @@ class Observation:
         return bool(before) and min(e.pulse_us for e in before) > throttle_max_us
 
     def stalled_ms(self) -> float:
-        """How long this machine had no time for the Arduino, or for who read its pins."""
+        """Return how long this machine had no time for the Arduino, or 1e9 and more if events of its pins were lost."""
         spoilt = [e for e in self.events if e.kind in ("stall", "lost") and self.at_s - BEFORE_S < e.monotonic_s]
         return sum(e.pulse_us / 1e3 if e.kind == "stall" else 1e9 for e in spoilt)
 
     def longest_pause_s(self) -> float:
-        """The longest between two commands of the drive, from the fault on."""
+        """Return the longest time between two commands of the drive, from the fault on."""
         times = [self.at_s, *(c.at_s for c in self.commands if c.at_s > self.at_s), self.end_s]
         return max(b - a for a, b in pairwise(times))
 
 
 @dataclass
 class Verdict:
-    """figures: for the row. wrong: a sentence for each way in which it is not as expected."""
+    """The result of judging. figures: for the row. wrong: a sentence for everything that is not as expected."""
 
     figures: dict[str, Any]
     wrong: list[str]
@@ -106,9 +109,9 @@ def judge(
     human_us: tuple[float, float] = REST_US,
     until_limit: bool = False,
 ) -> Verdict:
-    """What the pins did from the fault on, against what was expected.
+    """Compare what the pins did from the fault on with what was expected.
 
-    human_us: the transmitter's pulses. until_limit: of `continues`: a limit stops the car in the end.
+    human_us: the human's pulses. until_limit: whether a car that `continues` is stopped by a limit in the end.
     """
     throttle, steering = seen.pulses("throttle"), seen.pulses("steering")
     backwards = [e for e in throttle if CAR.reverses and e.pulse_us < NEUTRAL_US["throttle"] - ARDUINO_STEP_US]
@@ -146,7 +149,7 @@ def _not_stopped(
         yield f"throttle off {figures['stopped_after_ms']:g} ms after the fault, {gates.stopped_ms:g} are allowed"
     if (figures["max_throttle_us_after"] or 0) > gates.throttle_max_us:
         yield f"throttle at {figures['max_throttle_us_after']:g} us after it had to be off"
-    # A reset leaves the Arduino in manual: then it is the resting stick's, as measured.
+    # A reset leaves the Arduino in manual. Then the steering is that of the resting stick, as measured.
     since_s = seen.at_s + gates.stopped_s + PERIOD_US["steering"] * 1e-6
     widths = [e.pulse_us for e in seen.pulses("steering", since_s)]
     if off := [us for us in widths if min(abs(us - NEUTRAL_US["steering"]), abs(us - rest_us[0])) > STEP_US]:
@@ -185,7 +188,7 @@ def _not_continued(seen: Observation, gates: Gates, figures: dict[str, Any], unt
                 yield f"a {pin} pulse out of time: {e.period_us:g} us after the one before, {period_us} is its period"
                 return
             neutral = until_limit and e.end_s > stopped_s and abs(e.pulse_us - NEUTRAL_US[pin]) <= COMMAND_US[pin]
-            # Between two commands a pulse goes no faster than the firmware lets it.
+            # The firmware moves a pin slowly, so a pulse may lie between those of two recent commands.
             within = recent and min(recent) - COMMAND_US[pin] <= e.pulse_us <= max(recent) + COMMAND_US[pin]
             if not neutral and not within:
                 yield f"{pin} at {e.pulse_us:g} us {(e.monotonic_s - seen.at_s) * 1e3:.0f} ms after the fault, which "\
@@ -196,7 +199,10 @@ def _not_continued(seen: Observation, gates: Gates, figures: dict[str, Any], unt
 
 
 def _not_limited(seen: Observation, gates: Gates, figures: dict[str, Any]) -> Iterator[str]:
-    """Fading from params' fade_s on, off at its stop_s: ages of a plan, which is younger when the fault comes."""
+    """The throttle must fade from a plan's age of fade_s (params.yml) on, and be off at stop_s.
+
+    When the fault comes, the plan already has some age, so both may happen earlier after the fault.
+    """
     limits, throttle = params()["drive"], seen.pulses("throttle")
     fading = [e.end_s for e in throttle if e.pulse_us < throttle[0].pulse_us - 2 * ARDUINO_STEP_US]
     figures["fades_after_ms"] = round((fading[0] - seen.at_s) * 1e3, 1) if fading else None

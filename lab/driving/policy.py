@@ -1,4 +1,4 @@
-"""A policy that does what the picture's corner tells it to, so that what happens inside an inference can be chosen."""
+"""A policy that does what the picture's corner tells it to, so that a test can choose what happens in an inference."""
 
 import sys
 import time
@@ -15,7 +15,7 @@ SIZE = (160, 320)  # height and width of the camera's pictures
 CHUNK, RATE_HZ = 32, 30.0
 PLAN, OTHER_PLAN = (0.2, 0.15), (-0.3, 0.08)  # steering, throttle
 
-# Instructions: red, green and blue of the picture's corner are on or off.
+# The instructions. Red, green and blue in the picture's corner, on or off, are the bits 4, 2 and 1 of one.
 PLAIN, RAISE, HANG, NAN, OUT_OF_RANGE, SLOW, OTHER = range(7)
 SLOW_S = 0.3
 
@@ -23,10 +23,10 @@ SLOW_S = 0.3
 def make_artifact(
     path: Path, *, camera: str = "front", size: tuple[int, int] = (48, 96), engine: str | None = None
 ) -> None:
-    """An artifact with the constant plan PLAN.
+    """Write an artifact with the constant plan PLAN.
 
-    camera, size: its name, and height and width of what the policy looks at. engine: in the manifest, torch if None;
-    ONNX Runtime's makes it one for that.
+    camera: the camera's name. size: height and width of the policy's pictures. engine: torch if None; with ONNX
+    Runtime's the artifact is made for that, any other is only named in the manifest.
     """
     import torch
 
@@ -79,9 +79,9 @@ def make_artifact(
 
 
 def obey_pictures() -> None:
-    """From now on the policy's process of this one does what the picture's corner tells it to: PLAIN to OTHER.
+    """Let this process's policy process do from now on what the picture's corner tells it to: PLAIN to OTHER.
 
-    No artifact can do that, whose operators are a closed list. The process is the real one otherwise.
+    An artifact cannot do that, as its operators are a closed list. Otherwise the policy process is the real one.
     """
     from rover_lib.onboard.inference import PolicyProcess
 
@@ -89,7 +89,7 @@ def obey_pictures() -> None:
 
 
 def obey(policy: Any) -> None:
-    """Give a loaded policy with the plan PLAN the will of the picture."""
+    """Change a loaded policy with the plan PLAN, so that it does what the picture's corner tells it to."""
     plain = policy.run
 
     def run(state: np.ndarray, frames_rgb: list[np.ndarray]) -> np.ndarray:
@@ -112,9 +112,10 @@ def obey(policy: Any) -> None:
 
 
 def pictures(instruction: int, size: tuple[int, int] = SIZE, level: int = 100, count: int = 40) -> list[bytes]:
-    """JPEGs with a sensor's noise, no two the same, whose corner has an instruction. level: their grey, 0 is black.
+    """Make JPEGs with a sensor's noise, no two the same, whose corner shows an instruction.
 
-    count: shown over and over again they are a live camera's only if they are more than that remembers.
+    level: their grey; with 0 they are black and show no instruction. count: how many. If they are shown over and over
+    again, they pass for a live camera only if there are more of them than Camera remembers.
     """
     rng = np.random.default_rng(instruction)
     height, width = size

@@ -1,7 +1,7 @@
-"""Random drives in virtual time, held against the invariants: `python -m lab random OUTPUT`.
+"""Drive randomly in virtual time, and check each drive against the invariants: `python -m lab random OUTPUT`.
 
-Stories are of a seed each, by a plain generator: hypothesis varies a few of its own (49 of the firmware's states in 300
-of ours, 34 in 150 of its), and a seed is a name.
+A plain generator makes a story from each seed, and the seed names it. Hypothesis was tried too, but it varies only a
+few stories of its own: they visited 34 of the firmware's states in 150 drives, ours 49 in 300.
 """
 
 import logging
@@ -23,10 +23,11 @@ from rover_lib.onboard.stage import write_stage
 
 @dataclass
 class Tally:
-    """What drives visited. driven: of them, those in which the host moved the car.
+    """What a number of drives visited. driven: in how many of them the host moved the car.
 
-    firmware: its states, each with the result of the last command, what is missing and which signals are there. loop:
-    what the loop is at, with the firmware's state and the reason for it. ends: last words, without their numbers.
+    firmware: the firmware's states, each with its reason, the result of the last command, what is missing and which
+    signals are there. loop: the phases of the loop, each with the firmware's state and its reason. ends: the sentences
+    with which drives ended, without their numbers.
     """
 
     drives: int = 0
@@ -63,7 +64,7 @@ class Tally:
 
     @property
     def summary(self) -> dict[str, int]:
-        """For JSON: drives, driven, and how many different states and transitions."""
+        """The counts for JSON: drives, driven, and different states, transitions and ends."""
         return {
             "drives": self.drives,
             "driven": self.driven,
@@ -84,7 +85,7 @@ def _firmware_state(event: Event | None) -> tuple:
 
 @dataclass(frozen=True)
 class Failure:
-    """A seed whose story breaks an invariant, the sentence that says so, and a short story that breaks the same."""
+    """A seed whose story breaks an invariant, the sentence about it, and a short story that breaks the same one."""
 
     seed: int
     sentence: str
@@ -95,11 +96,11 @@ class Failure:
 
 
 def random_drives(seeds: Sequence[int], jobs: int = 1) -> tuple[Tally, list[Failure]]:
-    """Drives the story of each seed: what they visited, and those that break an invariant.
+    """Drive the story of each seed. Returns what the drives visited, and those that break an invariant.
 
-    jobs: processes that drive. Raises ArduinoError where there is no gcc.
+    jobs: how many processes drive at a time. Raises ArduinoError if there is no gcc.
     """
-    library()  # here, where its errors are seen
+    library()  # in this process, where its errors are seen
     if jobs == 1:
         return _drive_seeds(seeds)
     tally, failures = Tally(), []
@@ -111,7 +112,7 @@ def random_drives(seeds: Sequence[int], jobs: int = 1) -> tuple[Tally, list[Fail
 
 
 def _drive_seeds(seeds: Sequence[int]) -> tuple[Tally, list[Failure]]:
-    logging.getLogger(servo_link.__name__).setLevel(logging.ERROR)  # it warns of what is broken here on purpose
+    logging.getLogger(servo_link.__name__).setLevel(logging.ERROR)  # it would warn of what is broken here on purpose
     tally, failures = Tally(), []
     for seed in seeds:
         story = random_story(seed)
@@ -127,6 +128,6 @@ def _breaks(invariant: str, story: Story) -> bool:
 
 
 def write_random_drives(path: Path | str, first: int, tally: Tally, failures: Sequence[Failure]) -> dict[str, Any]:
-    """Writes the stage `random`, and returns it."""
+    """Write the stage `random`, and return it."""
     metrics = tally.summary | {"broken": [str(failure) for failure in failures]}
     return write_stage(path, "random", params={"first_seed": first}, metrics=metrics)

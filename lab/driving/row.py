@@ -1,4 +1,4 @@
-"""What a fault of a drive is: its injection, and what is expected of the car. The faults themselves are in rows/."""
+"""Define what a fault of a drive is: how it is injected, and what the car should do. The faults are in rows/."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,16 +13,18 @@ Inject = Callable[[DrivingBench], float | None]
 
 @dataclass(frozen=True)
 class FaultRow:
-    """One fault, and what is expected of it.
+    """One fault, and what is expected of the car.
 
-    kind: whose fault it is, the name of its module in rows/.
-    inject: makes it happen, waits if it takes time, and returns when it happened (None: when called). Of `refused`, it
-    is called before the drive is started.
-    message: a regular expression of the line that tells of it, in the flight log or on stderr; of the drive after it if
-    told_later. method: how it is injected. watch_s: how long it is watched after inject.
-    start: of the drive, see Drive. exit_code: of the drive, None: it goes on.
-    limits: what makes a `continues` stop after all. until_limit: that happens here.
-    starves: it takes the time of this machine away. paused_s: it pauses the drive for that long. human_us: of `human`.
+    kind: the name of its module in rows/.
+    inject: makes the fault happen, waits if that takes time, and returns when it happened (None: when inject was
+    called). If `refused` is expected, it is called before the drive is started.
+    message: a regular expression for the line that tells of the fault, in the flight log or on stderr. told_later:
+    whether only the next drive prints that line. method: how the fault is injected, in words. watch_s: how long the car
+    is watched after inject.
+    start: how the drive is prepared, see Drive. exit_code: of the drive, None if it goes on.
+    limits: what stops a drive that `continues` after all, in words. until_limit: whether that happens in this row.
+    starves: whether the fault takes this machine's time away from the drive. paused_s: for how long it pauses the
+    drive. human_us: the pulses expected on the pins if `human` is expected.
     """
 
     kind: str
@@ -50,7 +52,11 @@ class FaultKind:
     rows: list[FaultRow] = field(default_factory=list)
 
     def add(self, name: str, expected: str, message: str, method: str, **more: Any) -> Callable[[Inject], Inject]:
-        """A decorator that makes a row of the function which injects the fault; see FaultRow for the rest of it."""
+        """Return a decorator that adds a row whose inject is the decorated function.
+
+        more: other fields of FaultRow. Unless exit_code is among them, it is 3 for `stopped`, 4 for `human`, None for
+        `continues` and 1 for `refused`.
+        """
         more.setdefault("exit_code", {STOPPED: 3, HUMAN: 4, CONTINUES: None, REFUSED: 1}[expected])
 
         def row(inject: Inject) -> Inject:

@@ -1,9 +1,9 @@
-"""What may happen in a drive: faults of every kind, at any moment and in any order; before arming and after a stop too.
+"""Tell stories of what may happen in a drive: any faults, at any moment and in any order, even before it and after it.
 
     seen = drive_story(random_story(seed=7))
 
-A new kind of fault is a function here: it changes something of the world (virtual.py), and every random drive may have
-it from then on. KEPT are the stories that once broke an invariant.
+To add a new kind of fault, write a function here that changes something in the world (virtual.py). From then on every
+random drive may have it. KEPT has the stories that once broke an invariant.
 """
 
 import random
@@ -21,7 +21,7 @@ WIGGLE_MS, START_MS, ASK_MS, STOP_MS, END_MS = 100, 700, 1300, 4000, 4600
 
 @dataclass(frozen=True)
 class Happening:
-    """One of HAPPENINGS: when, how much of it, and for how long."""
+    """One of HAPPENINGS with its time, amount and duration."""
 
     at_ms: int
     what: str
@@ -31,10 +31,10 @@ class Happening:
 
 @dataclass(frozen=True)
 class Story:
-    """What happens in a drive beside the usual: the human's gesture, an operator's start, and 3.3 s later his stop.
+    """What happens in a drive in addition to the usual: the human's gesture, an operator's start, a stop 3.3 s later.
 
-    wiggled: whether the gesture comes before the start. service: it drives as a service, which the operator then asks
-    to arm the car, and so he does whenever he starts it again. clock_ms: of the Arduino when it is switched on.
+    wiggled: whether the gesture comes before the start. service: whether the drive is a service; then the operator also
+    asks it to arm the car. clock_ms: the Arduino's clock when it is switched on.
     """
 
     happenings: tuple[Happening, ...] = ()
@@ -47,7 +47,7 @@ class Story:
 
 
 class Stage:
-    """A world and, while there is one, the process that drives in it."""
+    """A world, and the process that drives in it while there is one."""
 
     def __init__(self, clock_ms: int):
         self.world = World(clock_ms)
@@ -56,7 +56,7 @@ class Stage:
         self._usual: dict[tuple[object, str], Any] = {}
 
     def during(self, happening: Happening, thing: object, **values: Any) -> None:
-        """Sets attributes of a thing, and sets them back to what is usual."""
+        """Set attributes of a thing while the happening lasts, then set them back to their usual values."""
         for name, value in values.items():
             self._usual.setdefault((thing, name), getattr(thing, name))
             setattr(thing, name, value)
@@ -74,7 +74,7 @@ class Stage:
             self.world.at(self.world.now_ms + ms, what)
 
     def wiggle(self) -> None:
-        """The human's gesture; it counts where the receiver hears something of either side."""
+        """Let the human make the gesture. It counts if the receiver passed on pulses at both sides."""
         world, hand = self.world, self.world.hand
         heard = []
 
@@ -86,7 +86,7 @@ class Stage:
 
         def let_go() -> None:
             move(STICKS_US[0])
-            if any(heard[1:3]) and any(heard[3:5]):  # when a side was reached, and when it was left
+            if any(heard[1:3]) and any(heard[3:5]):  # for each side: when it was reached, and when it was left
                 world.seen.wiggled.append(world.now_ms)
 
         move(1750)
@@ -95,7 +95,7 @@ class Stage:
 
 
 Happen = Callable[[Stage, Happening], None]
-HAPPENINGS: dict[str, tuple[Happen, tuple[int, int], tuple[int, int]]] = {}  # ranges: of amount and of for_ms
+HAPPENINGS: dict[str, tuple[Happen, tuple[int, int], tuple[int, int]]] = {}  # with the ranges of amount and for_ms
 
 
 def _may(what: str, amount: tuple[int, int] = (0, 0), for_ms: tuple[int, int] = (0, 0)) -> Callable[[Happen], Happen]:
@@ -235,7 +235,8 @@ def _preset(stage: Stage, h: Happening) -> None:
     stage.during(Happening(h.at_ms, h.what, for_ms=h.for_ms + 200), hand, receiver=LOST)
 
     def make_up() -> None:
-        if hand.receiver == LOST:  # from the human's own pulses at once to others: nobody can tell
+        # Only after a loss: nobody can tell presets from a human if they follow the human's own pulses at once.
+        if hand.receiver == LOST:
             stage.during(h, hand, receiver=PRESET, sent=[STICKS_US[0], h.amount])
 
     world.at(world.now_ms + 200, make_up)
@@ -357,7 +358,7 @@ KEPT: dict[str, tuple[Story, str]] = {  # stories that once broke an invariant, 
 
 
 def random_story(seed: int) -> Story:
-    """Up to eight happenings; the same for the same seed, as long as HAPPENINGS are the same."""
+    """Make a story of up to eight happenings. The same seed gives the same story, as long as HAPPENINGS is the same."""
     rng = random.Random(seed)
     happenings = []
     for _ in range(rng.randint(0, 8)):
@@ -370,7 +371,7 @@ def random_story(seed: int) -> Story:
 
 
 def shortest(story: Story, breaks: Callable[[Story], bool]) -> Story:
-    """A simpler story that breaks the same: a happening or what it is like is left out for as long as it still does."""
+    """Simplify a story step by step, for as long as it still breaks the same invariant; return the simplest one."""
     while True:
         simpler = next((other for other in _simpler(story) if breaks(other)), None)
         if simpler is None:
@@ -399,7 +400,7 @@ def _simpler(story: Story) -> Iterator[Story]:
 
 
 def drive_story(story: Story) -> Seen:
-    """What is to be seen of it. Takes some hundredths of a second; raises ArduinoError where there is no gcc."""
+    """Drive a story, in some hundredths of a second, and return what was seen. Raises ArduinoError without gcc."""
     stage = Stage(story.clock_ms)
     world = stage.world
     if story.wiggled:

@@ -1,11 +1,11 @@
-"""What a view costs a drive, how old its picture is, and how soon its button stops the car: `python -m lab view`.
+"""Measure what a view costs a drive, how old its picture is and how soon its button stops the car: python -m lab view.
 
-Stops: `rover drive --service` with the real firmware in simavr; a page's button is pressed while the car drives at
-speed, and the pins say when the throttle is off. Then a human wiggles the stick, the car is armed anew, and so on.
+Stops: `rover drive --service` drives with the real firmware in simavr. A page's button is pressed while the car drives
+at speed, and the pins show when the throttle is off. Then a human wiggles the stick, the car is armed again, and so on.
 
-Costs: one drive in the balloon world, in whose time a view with open pages and no view take turns, so that whatever
-else this machine does is beside both. The pages speak the page's own protocol, in this process: a browser would take
-the time of a machine that on a rover it does not run on.
+Costs: during one drive in the balloon world, no view and a view with open pages take turns, so that whatever else this
+machine does affects both. The pages speak the page's own protocol, in this process. A browser would take processor time
+from the drive, which it does not do on a rover, as it runs on another machine there.
 """
 
 import contextlib
@@ -31,17 +31,17 @@ from rover_lib.onboard.stage import write_stage
 from rover_lib.onboard.telemetry import read_log
 from rover_lib.world.child import Child
 
-SPEED_S = 0.5  # at speed before a click
-WATCH_S = 0.5  # after it
-KNOWN_S = 0.05
-ATTEMPTS = 5  # at a stop that this machine spoilt
-SETTLE_S = 4.0  # of a turn, which count for nothing: a view starts in them
+SPEED_S = 0.5  # how long the car drives at speed before a click
+WATCH_S = 0.5  # how long it is watched after the click
+KNOWN_S = 0.05  # how long it takes until a pulse has ended and been read
+ATTEMPTS = 5  # how often a stop is tried if this machine was too busy
+SETTLE_S = 4.0  # the beginning of each turn, which does not count, as a view starts then
 DRIVES_S = 90.0
 
 
 @dataclass(frozen=True)
 class ViewGates:
-    """Of lab/params.yml's section `view_costs`."""
+    """The gates in lab/params.yml's section `view_costs`."""
 
     stops: int
     stop_ms: float
@@ -52,23 +52,24 @@ class ViewGates:
 
 
 def percentiles(values: list[float]) -> dict[str, Any]:
-    """p50, p95, p99, max and n."""
+    """Return p50, p95, p99, max and n."""
     p50, p95, p99 = (round(float(p), 2) for p in np.percentile(values, (50, 95, 99)))
     return {"p50": p50, "p95": p95, "p99": p99, "max": round(max(values), 2), "n": len(values)}
 
 
 class _ServiceDrive(Drive):
-    """As the service drives, without systemd."""
+    """A drive as the service does it, but without systemd."""
 
     arguments = ("--service",)
 
 
 def stops(count: int, echo: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
-    """Presses the button that many times, each time in a car that drives.
+    """Press the button `count` times, each time while the car drives.
 
-    Returns {stops, stopped, stop_ms, shown_ms, spoilt, wrong}: stop_ms from the click to the last throttle pulse that
-    moves the car, shown_ms to the page that says so; spoilt: tried again, as this machine had no time for the
-    Arduino, or so little for the drive that it had ended by itself.
+    Returns {stops, stopped, logged, stop_ms, shown_ms, spoilt, wrong}. stop_ms: from the click to the last throttle
+    pulse that moves the car. shown_ms: from the click until the page says so. logged: how many stops are in the flight
+    log. spoilt: how many were repeated, because this machine had no time for the Arduino, or so little for the drive
+    that it had ended by itself.
     """
     gates = Gates.of_params()
     off_ms: list[float] = []
@@ -76,7 +77,7 @@ def stops(count: int, echo: Callable[[str], None] = lambda text: None) -> dict[s
     wrong: list[str] = []
     spoilt = 0
     with DrivingBench() as bench, contextlib.ExitStack() as stack:
-        os.environ["RUNTIME_DIRECTORY"] = str(bench.folder)  # of the service's socket, here and in its process
+        os.environ["RUNTIME_DIRECTORY"] = str(bench.folder)  # for the service's socket, both here and in its process
         stack.callback(os.environ.pop, "RUNTIME_DIRECTORY", None)
         view = stack.enter_context(ViewServer(bench.view))
         page = stack.enter_context(Page(view.url))
@@ -93,7 +94,7 @@ def stops(count: int, echo: Callable[[str], None] = lambda text: None) -> dict[s
             commands = [c for c in bench.cable.commands if at_s - 1 < c.at_s <= end_s]
             seen = Observation(bench.events, commands, at_s, end_s)
             said = next((m for m in page.messages if m["heard_s"] > at_s and m["stopped"]), None)
-            by_another = said is not None and "stopped from the view" not in said["text"]  # before the click
+            by_another = said is not None and "stopped from the view" not in said["text"]  # and before the click
             attempts += 1
             stalled = seen.stalled_ms() or not seen.was_driving(gates.throttle_max_us)
             if attempts < ATTEMPTS and (stalled or by_another):
@@ -114,7 +115,7 @@ def stops(count: int, echo: Callable[[str], None] = lambda text: None) -> dict[s
             del page.messages[:-1]
         bench.end_drive()
         logged = log.read_bytes().count(b'"ended: stopped from the view')
-    if logged < len(off_ms):  # more: those that were tried again
+    if logged < len(off_ms):  # there may be more in the log, as some were repeated
         wrong.append(f"{logged} of {len(off_ms)} stops are in the flight log")
     return {
         "stops": len(off_ms),
@@ -128,7 +129,7 @@ def stops(count: int, echo: Callable[[str], None] = lambda text: None) -> dict[s
 
 
 def _arm(bench: DrivingBench, page: Page) -> None:
-    """The human wiggles the stick and arms; until the car drives, and the page shows it."""
+    """Let the human wiggle the stick and arm the car; wait until it drives and the page shows that."""
     end_s = time.monotonic() + DRIVES_S
     while True:
         with contextlib.suppress(RoverError):
@@ -148,7 +149,7 @@ def _arm(bench: DrivingBench, page: Page) -> None:
 
 
 class _WorldDrive(Child):
-    """A drive of an artifact in the balloon world, which drives when it is made."""
+    """A drive of an artifact in the balloon world. It is already driving when this object has been made."""
 
     def __init__(self, artifact: Path, place: Path, log: Path):
         self.log = log
@@ -164,7 +165,7 @@ class _WorldDrive(Child):
         time.sleep(SETTLE_S)
 
     def late_ms(self, since_s: float, until_s: float) -> np.ndarray:
-        """Of its commands in a span of time."""
+        """Return by how much each of its commands in a span of time was late, in milliseconds."""
         flight = read_log(self.log)
         t_s = flight.ticks["t_s"] + flight.header["start_monotonic_s"]
         return flight.ticks["late_ms"][(t_s > since_s) & (t_s < until_s)]
@@ -172,7 +173,11 @@ class _WorldDrive(Child):
 
 @dataclass
 class _Turns:
-    """A turn without a view and one with: when each counts, and what the pages and the view's process were."""
+    """A turn without a view and a turn with one.
+
+    alone, looked: from when to when the turns count, without and with a view. delays_ms: of each picture on each page.
+    rates_hz: pictures a second on each page. cpu_pct: what the view's process took of a core.
+    """
 
     alone: tuple[float, float]
     looked: tuple[float, float]
@@ -201,11 +206,11 @@ def _turns(place: Path, turn_s: float, pages: int) -> _Turns:
 def costs(
     artifact: Path, pairs: int, turn_s: float = 12.0, pages: int = 3, echo: Callable[[str], None] = lambda text: None
 ) -> dict[str, Any]:
-    """A drive of `artifact` in the balloon world, with and without a view, in turns.
+    """Drive an artifact in the balloon world, with and without a view in turns.
 
     Returns {pages, late_ms: {with, without}, late_p99_pairs_ms, late_p99_more_ms, delay_ms, pictures_hz, cpu_pct, load,
-    repeated}. delay_ms: from a picture's capture until a page has it. cpu_pct: of one core, by the view with all its
-    pages. repeated: pairs in which the drive ended because this machine was too busy, driven again.
+    repeated}. delay_ms: from a picture's capture until a page has it. cpu_pct: what the view with all its pages takes
+    of one core. repeated: how many pairs were driven again, because the drive had ended as this machine was too busy.
     """
     late: dict[str, list[np.ndarray]] = {"with": [], "without": []}
     turns: list[_Turns] = []
@@ -244,7 +249,7 @@ def costs(
 
 
 def _processor_s(pid: int) -> float:
-    """What a process has taken of the processors until now."""
+    """Return how many seconds of processor time a process has used until now."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -252,7 +257,11 @@ def _processor_s(pid: int) -> float:
 def measure(
     output: Path, artifact: Path, pairs: int, count: int | None, echo: Callable[[str], None] = lambda text: None
 ) -> tuple[dict[str, Any], list[str]]:
-    """Both, written to `output` as the stage `view`; and a sentence for each gate that does not hold."""
+    """Measure stops and costs, and write them to `output` as the stage `view`.
+
+    count: the number of stops, that of lab/params.yml if None. Returns the metrics, and a sentence for each gate that
+    does not hold.
+    """
     gates = ViewGates(**lab_params()["view_costs"])
     metrics = costs(artifact, pairs, pages=gates.pages, echo=echo)
     metrics["stop"] = stop = stops(gates.stops if count is None else count, echo)

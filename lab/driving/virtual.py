@@ -1,7 +1,7 @@
-"""A world in virtual time around the real sketch: the serial line, the human with transmitter and receiver, and time.
+"""Simulate a world in virtual time around the real sketch: the serial line, the human with transmitter and receiver.
 
-Time is whole milliseconds and passes in `World.advance` only. The sketch is a library of this machine (board.c). What
-the host is in this world is in virtual_host.py.
+Time is in whole milliseconds and passes only in `World.advance`. The sketch is compiled as a library for this machine
+(board.c). The host in this world is in virtual_host.py.
 """
 
 import ctypes
@@ -23,15 +23,15 @@ LIBRARY = "board.so"
 BYTES_PER_MS = 11.52
 FRAME_MS = 33.3
 WATCHDOG_MS = 60
-BOOT_MS = 300  # of a boot loader
-LATENCY_MS = 90  # of a plan
+BOOT_MS = 300  # how long the boot loader runs
+LATENCY_MS = 90  # how long a plan takes
 STEERING, THROTTLE = range(2)
 STICKS_US = (1456, 120)  # at rest
 LIVE, LOST, HELD, PRESET = "live", "lost", "held", "preset"  # what the receiver sends
 
 
 class Event(ctypes.Structure):
-    """As in board.c: what the pins do, and why, from a millisecond on."""
+    """What the pins do from a millisecond on, and why. The fields are those of board.c."""
 
     _fields_ = (
         ("at_ms", ctypes.c_uint32),
@@ -44,21 +44,21 @@ class Event(ctypes.Structure):
 
 @functools.cache
 def library() -> Path:
-    """The sketch for this machine, from the cache or compiled now. Raises ArduinoError where there is no gcc."""
+    """Get the sketch as a library for this machine, from the cache or compiled now. Raises ArduinoError without gcc."""
     sources = [BOARD, *sorted(p for p in (FIRMWARE / "rover").iterdir() if p.is_file())]
     key = key_of({"names": [source.name for source in sources]}, *sources)
     return cached_folder("board", key, functools.partial(compile_sketch, FIRMWARE)) / LIBRARY
 
 
 def compile_sketch(firmware: Path, folder: Path) -> None:
-    """Makes LIBRARY in a folder. firmware: where the sketch is."""
+    """Compile the sketch to LIBRARY in a folder. firmware: the folder with the sketch's sources."""
     rover = firmware / "rover"
     sources = ("-x", "c", BOARD, rover / "protocol.c", rover / "vehicle.c")
     compile_c(*CC, "-shared", "-fPIC", "-I", rover, "-o", folder / LIBRARY, *sources)
 
 
 class Board:
-    """The sketch from one start to the next. Raises ArduinoError where there is no gcc."""
+    """The sketch from one start to the next. Raises ArduinoError if there is no gcc."""
 
     def __init__(self, clock_ms: int, boot: int, cause: str):
         self._c = ctypes.CDLL(str(library()))
@@ -68,20 +68,20 @@ class Board:
         self._c.board_start(ctypes.c_uint32(clock_ms), boot, ctypes.c_char(cause.encode()))
 
     def transmit(self, channel: int, pulse_us: int, one_in: int = 1, misread_in: int = 0) -> None:
-        """The receiver's pulses from now on; 0: none. See board.c for the rest."""
+        """Set the receiver's pulses from now on, where 0 stands for none. board.c explains the other arguments."""
         self._c.board_transmit(channel, pulse_us, one_in, misread_in)
 
     def give(self, data: bytes) -> None:
         self._c.board_give(data, len(data))
 
     def run(self, ms: int) -> tuple[int, bytes]:
-        """Lets up to `ms` milliseconds pass; gives how many did, and what it said in the last of them."""
+        """Let up to `ms` milliseconds pass. Returns how many did, and what the sketch sent in the last of them."""
         passed = self._c.board_run(ms)
         length = self._c.board_said(self._text)
         return passed, self._text.raw[:length]
 
     def events(self) -> list[tuple[int, Event]]:
-        """Since the last call, with the milliseconds since this start."""
+        """Return the events since the last call, each with its time in milliseconds since this start."""
         count = self._c.board_events(self._events)
         return [((e.at_ms - self._zero_ms) % 2**32, Event.from_buffer_copy(e)) for e in self._events[:count]]
 
@@ -90,7 +90,7 @@ class Board:
 
 
 class Wire:
-    """One direction of the serial line: whole lines, in order. Each of its faults may be set."""
+    """One direction of the serial line, which carries whole lines in order. You may set its latency and faults."""
 
     def __init__(self, world: "World", arrive: Callable[[bytes], None]):
         self._world, self._arrive = world, arrive
@@ -114,24 +114,24 @@ class Wire:
 
 @dataclass(eq=False)
 class Hand:
-    """The human's, on the transmitter, and what the receiver makes of it."""
+    """The human's hand on the transmitter, and what the receiver makes of it."""
 
     sticks: list[int] = field(default_factory=lambda: list(STICKS_US))
     receiver: str = LIVE
-    sent: list[int] = field(default_factory=lambda: list(STICKS_US))  # by a receiver that holds or presets
+    sent: list[int] = field(default_factory=lambda: list(STICKS_US))  # pulses of a receiver that holds or sends presets
     throttle_wire: bool = True
     one_in: int = 1
     misread_in: int = 0
 
     def pulses(self) -> tuple[int, int]:
-        """On the receiver's pins, 0 is none."""
+        """Return the pulses on the receiver's pins (steering, throttle; us), where 0 stands for none."""
         steering, throttle = {LIVE: self.sticks, LOST: (0, 0)}.get(self.receiver, self.sent)
         return steering, throttle if self.throttle_wire else 0
 
 
 @dataclass(eq=False)
 class Lens:
-    """What the camera shows. frozen_ms: since when the same. late_ms: how old pictures are that come."""
+    """What the camera shows. frozen_ms: since when it shows the same. late_ms: how old the pictures are that come."""
 
     frozen_ms: int | None = None
     black: bool = False
@@ -141,7 +141,7 @@ class Lens:
 
 @dataclass(eq=False)
 class Mind:
-    """How the policy answers. throttle: None: as usual, it goes and it brakes. does: raise, nan, wild."""
+    """How the policy answers. throttle: None: it goes and brakes in turn, as usual. does: '', raise, nan or wild."""
 
     throttle: float | None = None
     latency_ms: int = LATENCY_MS
@@ -149,13 +149,14 @@ class Mind:
 
 
 class Killed(BaseException):
-    """SIGKILL: nothing of the process runs any more."""
+    """The process was killed by SIGKILL: none of its code runs any more."""
 
 
 class Asked(NamedTuple):
-    """A drive's line as the host wrote it. content_ms: when what the plan's picture shows was really to be seen.
+    """A drive command as the host wrote it.
 
-    planned: a plan asked for it, and not a host that went mad.
+    content_ms: when the scene in the picture behind the plan was really to be seen. planned: whether a plan asked for
+    the command, and not a host that went mad.
     """
 
     at_ms: int
@@ -166,12 +167,13 @@ class Asked(NamedTuple):
 
 @dataclass
 class Seen:
-    """What really happened, for the invariants; times in milliseconds.
+    """What really happened, for the invariants. All times are in milliseconds.
 
-    pins: with the board's own words for it, None while they float. hands: what the human and the receiver do, from then
-    on. commands: a drive's lines as the host wrote them. asked: an operator asked for the car to be armed. wiggled: a
-    gesture was complete. starts: of the sketch. hung: it did nothing, from and to. phases: of what drives. drives:
-    begin, end and last words, None if it was killed. paused_ms: the process that drives was stopped, in all.
+    pins: what the pins do from a time on, with the board's reasons; None while they float. hands: what human and
+    receiver do from a time on. commands: the drive commands as the host wrote them. asked: when an operator asked to
+    arm the car. wiggled: when a gesture was complete. starts: when the sketch started. hung: from when to when its loop
+    hung. phases: what the host is doing from a time on. drives: begin, end and closing sentence of each, None if it was
+    killed. log: the events of the flight log. paused_ms: for how long the host's process was stopped in all.
     """
 
     pins: list[tuple[int, Event | None]] = field(default_factory=list)
@@ -192,14 +194,14 @@ class Port(Protocol):
     """The host's end of the serial line."""
 
     def hear(self, data: bytes) -> None:
-        """Bytes came."""
+        """Take bytes from the Arduino."""
 
     def unplug(self) -> None:
-        """The device is gone."""
+        """Notice that the device is gone."""
 
 
 class World:
-    """All of it. What may break are its methods; rng: of lines that are lost or garbled."""
+    """The whole world. Its methods and attributes are what may break. rng: decides which lines are lost or garbled."""
 
     def __init__(self, clock_ms: int = 0):
         self.now_ms = 0
@@ -209,11 +211,11 @@ class World:
         self.board: Board | None = None
         self.port: Port | None = None  # while somebody has it open
         self.mad_us = 0
-        self.alive = True  # the process that drives
+        self.alive = True  # whether the host's process is
         self.paused_until_ms = 0
-        self.failing: BaseException | None = None  # raised where the host waits next
+        self.failing: BaseException | None = None  # to be raised when the host waits next
         self.unplugged = self.stuck = False
-        self.content_ms = 0  # of the picture behind the newest order
+        self.content_ms = 0  # content_ms (see Asked) of the newest order
         self.written: list[bytes] = []
         self._unread: list[bytes] = []
         self._boot = 0
@@ -226,11 +228,11 @@ class World:
     # ---- time
 
     def clock(self) -> float:
-        """Seconds, as time.monotonic()."""
+        """Return the time in seconds, in place of time.monotonic()."""
         return self.now_ms / 1e3
 
     def at(self, at_ms: int, what: Callable[[], None]) -> None:
-        """To be done then; it must not let time pass."""
+        """Do something at a time; it must not let time pass itself."""
         self._count += 1
         heapq.heappush(self._due, (max(at_ms, self.now_ms), self._count, what))
 
@@ -250,7 +252,7 @@ class World:
                 self.up.send(line)
 
     def sleep(self, seconds: float) -> None:
-        """The host's: while its process is stopped it does not come back."""
+        """Let the host sleep. It does not wake up while its process is stopped."""
         self.advance(self.now_ms + math.ceil(seconds * 1e3 - 1e-6))
         while self.paused_until_ms > self.now_ms:
             self.advance(self.paused_until_ms)
@@ -259,11 +261,11 @@ class World:
             raise error
 
     def phase(self, name: str) -> None:
-        """What drives is at something else from now on."""
+        """Note what the host is doing from now on."""
         self.seen.phases.append((self.now_ms, name))
 
     def pause(self, ms: int) -> None:
-        """The process that drives is stopped for a while."""
+        """Stop the host's process for a while."""
         until_ms = self.now_ms + ms
         self.seen.paused_ms += max(0, until_ms - max(self.paused_until_ms, self.now_ms))
         self.paused_until_ms = max(self.paused_until_ms, until_ms)
@@ -271,7 +273,7 @@ class World:
     # ---- the board
 
     def reset(self, cause: str = "e") -> None:
-        """The reset button, or the watchdog: the pins float until the boot loader is over."""
+        """Reset the board, by its button or its watchdog. The pins float until the boot loader has ended."""
         self._stop_board()
         self.seen.pins.append((self.now_ms, None))
         before = self._boot
@@ -283,7 +285,7 @@ class World:
         self.at(self.now_ms + BOOT_MS, start)
 
     def hang(self) -> None:
-        """The sketch's loop does not come back; its pins go on until the watchdog has had enough."""
+        """Hang the sketch's loop. Its pins go on until the watchdog resets the board."""
         if self.board and not self._hung_ms:
             self._hung_ms = self.now_ms
             board = self.board
@@ -306,7 +308,7 @@ class World:
             self.board = None
 
     def handle(self) -> None:
-        """The hand did something: the receiver's pins show it."""
+        """Pass on to the receiver's pins what the hand does now."""
         hand = replace(self.hand, sticks=list(self.hand.sticks), sent=list(self.hand.sent))
         self.seen.hands.append((self.now_ms, hand))
         if self.board:
@@ -315,7 +317,7 @@ class World:
             self.board.transmit(THROTTLE, throttle_us, hand.one_in, hand.misread_in)
 
     def close(self) -> None:
-        """The end: all that was seen is in `seen`."""
+        """End the world, and complete `seen`."""
         self.seen.end_ms = self.now_ms
         self._stop_board()
 
@@ -329,7 +331,7 @@ class World:
         if self.unplugged or not self.port:
             return
         if self.paused_until_ms > self.now_ms:
-            if not self._unread:  # the thread that reads wakes up a little later than the loop
+            if not self._unread:  # the thread that reads wakes up a little later than the host's loop
                 self.at(self.paused_until_ms + 1, self._read_all)
             self._unread.append(line)
         else:
@@ -344,7 +346,7 @@ class World:
             self.port.hear(b"".join(lines))
 
     def write(self, line: bytes) -> None:
-        """The host's; raises what the port does."""
+        """Write a line from the host. Raises what a port raises: OSError if unplugged, BlockingIOError if stuck."""
         if not self.alive:
             return
         if self.unplugged:

@@ -1,6 +1,6 @@
-"""`rover drive` in a virtual world: the real link, camera class, plans, pilot and loop, without their threads.
+"""Run `rover drive` in a virtual world: the real link, camera class, plans, pilot and loop, without their threads.
 
-Whoever waits lets the world go on. What stands in: the port, the driver of the camera, the policy.
+Code that waits lets the world go on. Only the port, the camera's driver and the policy are replaced.
 """
 
 import contextlib
@@ -25,12 +25,12 @@ from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink, Telemetry
 
 RATE_HZ = 30.0
 PLAN = (0.2, 0.15)  # steering, throttle
-GO_MS, BRAKE_MS = 1200, 600  # in turn
+GO_MS, BRAKE_MS = 1200, 600  # how long the policy goes and brakes, in turn
 WALL_S = 1.7e9
 
 
 class _Waiting:
-    """In the place of a threading.Condition: who waits lets the world go on."""
+    """Replaces a threading.Condition: code that waits lets the world go on."""
 
     def __init__(self, world: World):
         self._world = world
@@ -49,7 +49,7 @@ class _Waiting:
 
 
 class VirtualLink(ServoLink):
-    """A ServoLink whose port and reader are the world's."""
+    """A ServoLink whose port and reader belong to the world."""
 
     def __init__(self, world: World):
         super().__init__("the virtual port", clock=world.clock)
@@ -88,7 +88,7 @@ class VirtualLink(ServoLink):
 
 @functools.cache
 def _scenery() -> list[np.ndarray]:
-    """Pictures of a drive, (72, 128, 3) uint8 BGR, no two of them alike."""
+    """Return the pictures of a drive, (72, 128, 3) uint8 BGR, no two of them alike."""
     rng = np.random.default_rng(0)
     wide = rng.integers(30, 220, (9, 40, 3), np.uint8).repeat(8, 0).repeat(8, 1)
     return [
@@ -97,12 +97,12 @@ def _scenery() -> list[np.ndarray]:
 
 
 class Eyes:
-    """The real Camera, whose thread gets a picture when the world says so, and nothing else meanwhile."""
+    """The real Camera, whose thread runs only while the world gives it a picture."""
 
     def __init__(self, world: World):
         self._world = world
         self.camera = Camera("the virtual camera", clock=world.clock, wall_clock=lambda: WALL_S + world.clock())
-        self.content: dict[int, int] = {}  # when what a frame shows was really seen, by its number
+        self.content: dict[int, int] = {}  # by a frame's number, when (ms) its scene was really to be seen
         self._next: tuple[np.ndarray, float] | None = None
         self._seen_ms = -1_000_000
         self._turn, self._idle = threading.Semaphore(0), threading.Semaphore(0)
@@ -136,7 +136,7 @@ class Eyes:
             self._thread.join()
 
     def unplug(self) -> None:
-        """The reader comes to its end."""
+        """Let the camera's reader come to the end of its pictures."""
         self._give(None)
 
     def close(self) -> None:
@@ -155,27 +155,27 @@ class Eyes:
             return
         seen_ms = world.now_ms - lens.late_ms
         if seen_ms <= self._seen_ms:
-            return  # on its way
+            return  # pictures have become late, and the next one is still on its way
         self._seen_ms = seen_ms
         content_ms = seen_ms if lens.frozen_ms is None else lens.frozen_ms
         picture = _scenery()[round(content_ms / FRAME_MS) % len(_scenery())]
         if lens.black:
             picture = (picture - picture.min()) // 64 + world.now_ms % 2
-        # The driver of a frozen camera goes on with its stamps.
+        # The driver of a frozen camera still gives each picture a new time stamp.
         self._give((picture, seen_ms / 1e3))
         self.content.setdefault(self.camera.frames, content_ms)
         self.on_frame()
 
 
 class VirtualPlanner(Planner):
-    """A Planner without its thread: it thinks in virtual time."""
+    """A Planner without its thread, whose plans take virtual time."""
 
     def __init__(self, world: World, eyes: Eyes, commanded: Commanded):
         self._world, self._eyes = world, eyes
         self._thinking = False
         self._looked_at = 0
         self._number = 0
-        self.content: dict[int, int] = {}  # by a plan's number
+        self.content: dict[int, int] = {}  # by a plan's number, when (ms) its picture's scene was really to be seen
         super().__init__(eyes.camera, self._never, commanded, RATE_HZ, clock=world.clock)
         condition: Any = _Waiting(world)
         self._news = condition
@@ -185,7 +185,7 @@ class VirtualPlanner(Planner):
         raise AssertionError("the thread that asks for predictions is never started here")
 
     def _look(self) -> None:
-        """What the thread does as soon as it may."""
+        """Begin a plan from the newest frame, as the thread does as soon as it is free."""
         if self._thinking or self._failure:
             return
         try:
@@ -225,7 +225,7 @@ class VirtualPlanner(Planner):
 
 
 class _Pilot(PolicyPilot):
-    """Whose orders' pictures are known, and who can go mad."""
+    """A pilot that tells the world how old the picture behind each order is, and whose host may go mad."""
 
     world: World
     planner: VirtualPlanner
@@ -256,10 +256,10 @@ def _settings() -> Settings:
 
 
 class Process:
-    """`rover drive` from its start to its end, in this one; its parts, for what breaks them.
+    """`rover drive` from its start to its end, run in the present process. Its parts are attributes, to be broken.
 
-    service: it drives again and again, each time that an operator asks for it with ask(). record: takes each command,
-    as the loop's hook does; armed: the status with which the car was armed.
+    service: whether it drives again each time that an operator asks for it with ask(). record: the loop's hook, called
+    with each command. armed: the status with which the car was armed.
     """
 
     record: Callable[..., None] | None = None
@@ -276,12 +276,12 @@ class Process:
         self._log = _Log(world)
 
     def ask(self) -> None:
-        """The operator asks for the car to be armed."""
+        """Let the operator ask to arm the car."""
         self._asked, self._asked_ms = True, self.world.now_ms
         self.world.seen.asked.append(self.world.now_ms)
 
     def run(self) -> None:
-        """Until it ends; nothing is raised."""
+        """Run until it ends. Raises nothing."""
         world = self.world
         try:
             with contextlib.ExitStack() as stack:
@@ -300,7 +300,7 @@ class Process:
 
     @contextlib.contextmanager
     def _told(self, report: Report) -> Iterator[None]:
-        """A drive, and its last words; what ends a service goes on from here."""
+        """Note a drive's begin, end and closing sentence. A fault or a takeover ends only the drive, not a service."""
         world, begin_ms = self.world, self.world.now_ms
         world.phase("opening")
         try:
@@ -324,7 +324,7 @@ class Process:
               clock=world.clock, sleep=world.sleep)  # fmt: skip
 
     def _arm(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry:
-        """As drive.py and service.py do: one request, one attempt."""
+        """Arm the car as drive.py and service.py do: one attempt for each request."""
         world = self.world
         if not self._service:
             self.ask()

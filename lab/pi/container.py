@@ -1,23 +1,23 @@
-"""An emulated Pi that is up in seconds: real systemd and sshd, aarch64 programs, kernel and network of this machine.
+"""Emulate a Pi that is up in seconds: real systemd and sshd, aarch64 programs, but this machine's kernel and network.
 
     with Container("rover1") as pi:
         pi.boot()
         pi.inside("uname", "-m")            # aarch64
         with EmulatedArduino() as board:
-            pi.plug(board.port)             # PORT in there
+            pi.plug(board.port)             # it is PORT inside
             ...
         pi.cut_power()
         pi.boot()
 
-Its disk is a layer over the folders below it, which stay as they are: what one has installed, many can start from.
+Its disk is a layer over folders that stay as they are, so that many containers can start from what one has installed.
 
     pi.power_off()
     with Container("rover2", layers=pi.layers) as another: ...
 
-Its systemd is this machine's own program, of the same version, and so real with all that a service's sandbox is made
-of; all other programs are aarch64. What a container cannot have: a kernel of its own, so no udev, no V4L2 camera (a
-FIFO of JPEGs stands in for it) and no time of its own; and what is written is with this machine's kernel at once, so
-that a power cut ends all programs at one moment, but takes no unsynced write with it. The whole machine has all that.
+Its systemd is this machine's own program, of the same version, so everything that makes a service's sandbox is real.
+All other programs are aarch64. A container has no kernel of its own, so it has no udev, no V4L2 camera (a FIFO of JPEGs
+replaces it) and no time of its own. This machine's kernel gets every write at once, so a power cut ends all programs at
+one moment, but no write that was not synced is lost. The whole machine (machine.py) has all that.
 """
 
 import ast
@@ -40,15 +40,15 @@ from lab.pi.emulation import EmulationError, emulation, free_port, in_cgroup
 from rover_lib.workshop.cache import cache_root
 from rover_lib.workshop.program import last_words, run
 
-BOOT_S = 180.0  # until sshd answers; 10 on two quiet cores
+BOOT_S = 180.0  # until sshd answers, which takes 10 s on two quiet cores
 OFF_S = 60.0
 KILL_S = 20.0
-BENCH, PTS = "/srv/bench", "/srv/pts"  # in the container: what is plugged in, and the host's pseudo terminals
+BENCH, PTS = "/srv/bench", "/srv/pts"  # folders in the container: what is plugged in, the host's pseudo terminals
 CAMERA, PORT = f"{BENCH}/camera", "/dev/rover-arduino"
 DIALOUT = 20  # Debian's number for the group
-# The network is the host's, which has its own; and nothing begins to update itself while something is measured.
+# The network is the host's, so the host configures it; and nothing may update itself while something is measured.
 MASKED = ("systemd-networkd.service", "systemd-resolved.service", "apt-daily.timer", "apt-daily-upgrade.timer")
-# Their programs may make no memory executable: an emulator must.
+# Units that forbid their programs to make memory executable, which the emulator of these programs must do.
 TRANSLATED = (
     *("systemd-journald", "systemd-logind", "systemd-hostnamed", "systemd-timedated", "systemd-localed"),
     "rover-view",
@@ -60,13 +60,15 @@ CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 class Container:
     """One emulated Pi; a context manager, which leaves nothing behind.
 
-    name: of the rover. root: its file system as it is now, on the host. port: of its sshd, on the loopback. key: the
-    ssh key of its user. layers: for another container that starts from what this one has become, once it is off.
+    name: of the rover. root: the host's path of its present file system. port: of its sshd, on the loopback. key: the
+    ssh key of its user. layers: for another container that starts from what this one has become, once this one is off.
     """
 
     def __init__(self, name: str, *, layers: Sequence[Path] = (), nice: int = 0):
-        """layers: folders with what is changed in the system, from the lowest to the highest. nice: priority of all
-        its programs; -10 comes nearer to a Pi that has its processor for itself.
+        """Prepare a container, which is made when it is entered.
+
+        layers: folders with changes to the system, from the lowest to the highest. nice: the priority of all its
+        programs; -10 comes nearer to a Pi, which has a processor of its own.
         """
         self.name = name
         self._nice = nice
@@ -80,7 +82,7 @@ class Container:
             stack.enter_context(emulation())
             made = debian_image()
             self.key = made.key
-            # Not in /tmp, which may be in memory: torch alone has half a gigabyte.
+            # Not in /tmp, which may be in memory: torch alone takes half a gigabyte.
             disk = Path(tempfile.mkdtemp(prefix=f".pi-{self.name}-", dir=cache_root()))
             stack.callback(shutil.rmtree, disk, ignore_errors=True)
             self._own = Path(tempfile.mkdtemp(prefix=f"rover-pi-{self.name}-"))
@@ -91,7 +93,7 @@ class Container:
                 (disk / folder).mkdir(mode=0o755)
             self.root, self._upper = disk / "root", disk / "upper"
             below = ":".join(str(p) for p in (*reversed(self._below), made.root))
-            # redirect_dir: a folder of a layer below can be renamed, as on any disk.
+            # redirect_dir allows to rename a folder of a lower layer, as on any disk.
             how = f"lowerdir={below},upperdir={self._upper},workdir={disk / 'work'},redirect_dir=on"
             remedy = f"put ROVER_CACHE on a plain disk if {cache_root()} cannot hold a layered file system"
             run("mount", "-t", "overlay", self.machine, "-o", how, self.root, error=EmulationError, remedy=remedy)
@@ -108,28 +110,32 @@ class Container:
 
     @property
     def layers(self) -> tuple[Path, ...]:
-        """For another container, while this one is off and not closed."""
+        """The layers for another container, to be used while this one is off and not closed."""
         return (*self._below, self._upper)
 
     @property
     def on(self) -> bool:
-        """Whether it has power; it need not have booted yet, and may have failed."""
+        """Whether it has power. It may still be booting, or have failed to boot."""
         return self._process is not None and self._process.poll() is None
 
     # Power
 
     def boot(self) -> float:
-        """Switches it on; seconds until sshd answers. Raises EmulationError with the last of its console if not."""
+        """Switch it on, and return how many seconds it took until sshd answered.
+
+        Raises EmulationError with the last lines of its console if sshd does not answer.
+        """
         if self.on:
             raise EmulationError(f"{self.name} is on already", remedy="cut its power, or power it off")
         started = time.monotonic()
         console = (self._own / "console.log").open("wb")
         command = ["systemd-nspawn", "--quiet", "--boot", "--register=no", "--keep-unit", "--link-journal=no"]
         command += [f"--machine={self.machine}", f"--hostname={self.name}", f"--directory={self.root}"]
-        command += ["--capability=CAP_SYS_RESOURCE"]  # for limits, of which one is the drive loop's real-time priority
+        command += ["--capability=CAP_SYS_RESOURCE"]  # for limits such as the drive loop's real-time priority
         command += ["--resolv-conf=replace-host", "--timezone=off", "--console=pipe"]
         command += [f"--bind={self.bench}:{BENCH}", f"--bind=/dev/pts:{PTS}"]
-        # With this machine's, and its /proc/cpuinfo, ONNX Runtime's wheel for arm64 dies when it is imported.
+        # The Pi's numbers of processors: with this machine's, and with its /proc/cpuinfo, ONNX Runtime's wheel for
+        # arm64 crashes when it is imported.
         for cpus in ("possible", "present"):
             command += [f"--bind-ro={self._own / 'cpus'}:/sys/devices/system/cpu/{cpus}"]
         with console:
@@ -139,7 +145,7 @@ class Container:
                 stdout=console,
                 stderr=subprocess.STDOUT,
                 preexec_fn=self._enter,
-                start_new_session=True,  # a terminal's ^C is for this program, which then stops in order
+                start_new_session=True,  # a terminal's ^C must reach only this program, which then stops it in order
             )
         while True:
             if not self.on:
@@ -157,12 +163,12 @@ class Container:
         return time.monotonic() - started
 
     def cut_power(self) -> None:
-        """Kills everything in it at one moment; its disk stays as it was. Raises nothing."""
+        """Kill everything in it at one moment, and leave its disk as it was. Raises nothing."""
         process, self._process = self._process, None
         if process is None:
             return
         with contextlib.suppress(EmulationError, OSError):
-            os.kill(self._leader or self._find_leader(process.pid), signal.SIGKILL)  # and with it its whole namespace
+            os.kill(self._leader or self._find_leader(process.pid), signal.SIGKILL)  # which ends its whole namespace
         self._leader = 0
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(KILL_S)
@@ -170,7 +176,7 @@ class Container:
         process.wait()
 
     def power_off(self) -> None:
-        """Shuts it down as `systemctl poweroff` does."""
+        """Shut it down with `systemctl poweroff`, and cut its power if that takes too long."""
         if self._process and self.on:
             self.inside("systemctl", "poweroff")
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -182,7 +188,10 @@ class Container:
     def inside(
         self, *command: object, check: bool = True, timeout_s: float | None = None
     ) -> subprocess.CompletedProcess[str]:
-        """Runs a program as root, past sshd. Raises EmulationError if it takes longer, or fails and check is set."""
+        """Run a program in it as root, without sshd.
+
+        Raises EmulationError if it takes longer than timeout_s, or if it fails and check is set.
+        """
         enter = ["nsenter", f"--target={self.leader}", "--mount", "--uts", "--ipc", "--pid", "--root", "--wd=/"]
         enter += ["--", "/usr/bin/env", "--ignore-environment", "PATH=/usr/local/bin:/usr/sbin:/usr/bin", "LC_ALL=C"]
         words = [str(word) for word in command]
@@ -197,13 +206,13 @@ class Container:
 
     @property
     def leader(self) -> int:
-        """Its first process, as this machine numbers it. Raises EmulationError while it is off."""
+        """The id of its first process on this machine. Raises EmulationError while it is off."""
         if not self.on or not self._leader:
             raise EmulationError(f"{self.name} is off", remedy="boot it")
         return self._leader
 
     def pid_of(self, pid: int) -> int:
-        """This machine's number of one of its processes. Raises EmulationError if there is none."""
+        """Return the id on this machine of its process `pid`. Raises EmulationError if there is none."""
         inner = Path(f"/proc/{self.leader}/ns/pid").readlink()
         for process in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
@@ -213,7 +222,7 @@ class Container:
         raise EmulationError(f"{self.name} has no process {pid}")
 
     def plug(self, arduino: str | Path) -> None:
-        """Plugs in an Arduino, a pseudo terminal of this machine: PORT in there, when it boots again too."""
+        """Plug in an Arduino, a pseudo terminal of this machine. It is PORT inside, also after the next boot."""
         terminal = Path(arduino).resolve()
         os.chown(terminal, 0, DIALOUT)
         terminal.chmod(0o660)
@@ -235,7 +244,7 @@ class Container:
         (self.root / "etc" / "hosts").write_text(f"127.0.0.1\tlocalhost\n127.0.1.1\t{self.name}\n")
         settings = f"Port {self.port}\nListenAddress 127.0.0.1\nUseDNS no\nPasswordAuthentication no\n"
         (self.root / "etc" / "ssh" / "sshd_config.d" / "emulated.conf").write_text(settings)
-        # What udev would do, and no udev can do here
+        # udev would make this link, but there is none here.
         (self.root / "etc" / "tmpfiles.d" / "emulated.conf").write_text(f"L {PORT} - - - - {BENCH}/arduino\n")
         (self._own / "cpus").write_text(f"0-{CORES - 1}\n")
         _lend_systemd(self.root)
@@ -250,7 +259,7 @@ class Container:
         return " | ".join(text.strip().splitlines()[-8:]) or "nothing"
 
     def _find_leader(self, nspawn: int) -> int:
-        """The child of nspawn that is the first process of another pid namespace."""
+        """Return the descendant of nspawn that is the first process of its own pid namespace."""
         waiting = [nspawn]
         while waiting:
             process = Path("/proc", str(waiting.pop()))
@@ -263,13 +272,13 @@ class Container:
 
 
 def _pids(process: Path) -> list[int]:
-    """Numbers of a process of /proc: this machine's, and then that of each pid namespace which it is in."""
+    """Return the ids of a process in /proc: this machine's first, then that in each nested pid namespace."""
     lines = (process / "status").read_text().splitlines()
     return next([int(word) for word in line.split()[1:]] for line in lines if line.startswith("NSpid:"))
 
 
 def _forget(machine: str) -> None:
-    """What nspawn leaves where /run is no tmpfs."""
+    """Remove what nspawn leaves behind if /run is not a tmpfs."""
     for folder in ("propagate", "unix-export"):
         shutil.rmtree(Path("/run/systemd/nspawn") / folder / machine, ignore_errors=True)
     (Path("/run/systemd/nspawn") / f"{machine}.lock").unlink(missing_ok=True)
@@ -279,10 +288,10 @@ def _forget(machine: str) -> None:
 
 
 def _lend_systemd(root: Path) -> None:
-    """This machine's own systemd as the first process, of the version that the Pi has; everything else stays aarch64.
+    """Copy this machine's own systemd, which must have the Pi's version, into the Pi; everything else stays aarch64.
 
-    What sets up a service's sandbox runs in it, and under qemu-user that fails (PrivateNetwork=, credentials) or does
-    nothing (seccomp). The sandbox holds for the emulator that a service runs in just as well.
+    systemd sets up the sandboxes of services, which under qemu-user fails (PrivateNetwork=, credentials) or has no
+    effect (seccomp). A sandbox also holds for the emulator in which a service's program runs.
     """
     libraries = {Path(word) for word in _run("ldd", SYSTEMD).split() if word.startswith("/")}
     ask = ["dpkg-query", "--show", "--showformat=${Version}"]
@@ -299,7 +308,7 @@ def _lend_systemd(root: Path) -> None:
 
 
 def _lend_registries(root: Path) -> None:
-    """This machine's own ways to Debian's and Python's packages: sources, proxies, certificates, pip's settings."""
+    """Give the Pi this machine's access to Debian's and Python's packages: sources, proxies, certificates, pip.conf."""
     form = "$(REPO_URI) $(RELEASE) $(COMPONENT)"
     listed = _run("apt-get", "indextargets", "--format", form, "Identifier: Packages")
     release = (root / "etc" / "os-release").read_text()
@@ -325,9 +334,9 @@ def _run(*command: object) -> str:
 
 
 def pip_settings(config: str, proxy: str = "") -> str:
-    """A pip.conf for another machine from what `pip config list` told here: where packages are, not how they are used.
+    """Make a pip.conf for another machine from the output of `pip config list` here: only where to get packages.
 
-    Folders of this machine are left out; so are its certificates, since the other has them where its own were.
+    Folders of this machine are left out. The path of its certificates is replaced by that of the other machine's.
     """
     found = {"cert": str(CERTIFICATES), "proxy": proxy}
     for line in config.splitlines():

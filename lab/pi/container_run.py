@@ -1,34 +1,34 @@
-"""`make pi-fast`: every playbook on an emulated Pi that is up in seconds, and what they promise proven from within.
+"""`make pi-fast`: run every playbook on an emulated Pi that is up in seconds, and prove from within what they promise.
 
     report = run_container("runs/pi-fast.json", "runs/demo")
 
-From a flashed card to a driving service (provision, twice, and checked; deploy, status, benchmark, drive, a second
-model, rollback), then: what is installed, what the service's sandbox lets through, what systemd does with a loop that
-hangs, with a camera that is gone, and at boot. The Pi is a container (container.py); its Arduino is the real firmware
-in simavr, its camera a FIFO of JPEGs. Debian's and Python's packages come online, by this machine's own settings, as
-they would for a newcomer; without internet is tested in the whole machine (`make pi`).
+It goes from a flashed card to a driving service: provision, twice and in check mode; deploy, status, benchmark, drive,
+a second model, rollback. Then it proves what is installed, what the service's sandbox lets through, and what systemd
+does if a loop hangs, if the camera is gone, and at boot. The Pi is a container (container.py); its Arduino is the real
+firmware in simavr, its camera a FIFO of JPEGs. Debian's and Python's packages come from the network by this machine's
+own settings, as they would for a newcomer. Provisioning without internet is tested in the whole machine (`make pi`).
 
-Times of the emulated programs say nothing about a Pi: they are some ten times slower. What systemd does takes its real
-time, and so does the Arduino. An INT8 plan takes half a second here, which is too long to drive by; so what drives is
-the small policy of the fault bench, deployed as any other, at HZ. The INT8 policy is deployed, proven by its parity
-vectors in the service's sandbox, loaded by the service until it could drive, and timed. It drives in `make pi`, whose
-clock is slower.
+Times of the emulated programs say nothing about a Pi: they are some ten times slower. systemd and the Arduino take
+their real time. An INT8 plan takes half a second here, which is too long to drive by. So the small policy of the fault
+bench drives, deployed like any other, at HZ. The INT8 policy is deployed, proven by its parity vectors in the service's
+sandbox, loaded by the service until it could drive, and timed. It drives in `make pi`, whose clock is slower.
 
 runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
-    steps          [{step, seconds, ok, ...}], of a playbook also play and recap (Ansible's counts by host)
+    steps          [{step, seconds, ok, ...}], for a playbook also play and recap (Ansible's counts by host)
     second_run     Ansible's own recap of provisioning a second time, as lines
-    driving_after_s  from switching on until a human could arm the car; plays_s: of all playbooks before the proofs
+    driving_after_s  from the beginning until a human could arm the car; plays_s: for all playbooks before the proofs
     system_cached  whether the Pi's file system was in the cache
     engine         what computes the policy there
     environment    {packages: [{name, version, from}], unhashed, lerobot, missing, others, of_view, size_mb}
-    sandbox        {exposure, writable, probes: [{probe, inside, outside}]}; inside: "" is "it worked"
+    sandbox        {exposure, writable, probes: [{probe, inside, outside}]}; inside: "" means that it worked
     service        {hang: {...}, start_limit: {...}, boot: {...}}, in seconds, see the functions of those names
     drive          {ticks, driven, ended} of the fetched flight log; recorded: {episodes, left, frames, commands}
     view           [{row, wanted, found, holds}], see view_proofs.py
     faults         [{fault, model_after, healthy, healed_by_rerun, ...}], see deployment_faults.py
     fleet          {cases: [{broken, results, models, healthy, ...}], good}, see fleet.py
     gates          [{gate, wanted, found, holds}], the limits from lab/params.yml
-What is not as it should be is a sentence in `wrong`. Beside it, pi-fast.log has all that the playbooks printed.
+`wrong` has a sentence for everything that is not as it should be. The file pi-fast.log beside it has all that the
+playbooks printed.
 """
 
 import contextlib
@@ -68,14 +68,14 @@ from rover_lib.world.standin import REST_US
 
 STAGE = "pi-fast"
 ROVER = "rover1"
-ARTIFACTS = {  # by engine: what is deployed first, and after it
+ARTIFACTS = {  # by engine: what is deployed first, and what after it
     "torch": ("policy_static.pt", "policy_mixed.pt"),
     "onnxruntime": (f"policy_static{ONNX_SUFFIX}", f"policy_fp32{ONNX_SUFFIX}"),
 }
 MAKES = {"torch": "make demo leaves them", "onnxruntime": "rover export RUN --onnx leaves them"}
-HZ = 10  # of the service: what the emulator manages on a busy machine; a Pi has 30
-NICE = -5  # of the emulated Pi, which has a processor of its own
-ONE_FAULT = "a byte flipped in what has arrived"  # of those in deployment_faults.py the one that CI meets
+HZ = 10  # the service's rate, which the emulator manages on a busy machine; a real Pi drives at 30
+NICE = -5  # the priority of the emulated Pi, as a real one has a processor of its own
+ONE_FAULT = "a byte flipped in what has arrived"  # the only one of deployment_faults.py that CI runs
 
 
 def run_container(
@@ -88,13 +88,13 @@ def run_container(
     faults: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> PiReport:
-    """All of it; the report is written to `output` whatever fails.
+    """Run everything, and write the report to `output` whatever fails.
 
-    demo: a run's folder with ARTIFACTS. engine: what computes the policy on the Pi, as rover_engine. short: provision,
-    deploy, one fault of a deployment and an armed drive, which is what CI has time for. view: its service too, which
-    all have that are not short. faults: of deployments, and the fleet, too, which are met with torch's artifacts only.
-    say: told a line for each step.
-    Raises RoverError where it cannot begin: no root, packages that cannot be installed, no artifacts.
+    demo: a run's folder with ARTIFACTS. engine: what computes the policy on the Pi, as in rover_engine. short: only
+    provision, deploy, one fault of a deployment and an armed drive, as CI has no more time. view: with `short`, include
+    the view's service, which other runs always include. faults: include the faults of deployments and the fleet, which
+    run only with torch. say: called with a line for each step.
+    Raises RoverError if it cannot begin: without root, without artifacts, or if packages cannot be installed.
     """
     output, demo = Path(output), Path(demo)
     artifacts = [demo / name for name in ARTIFACTS[engine]]
@@ -136,7 +136,7 @@ class _Run:
             "rover_hz": HZ,
             "rover_ready_s": READY_S,
             "rover_record": True,
-            "rover_view_port": free_port(),  # the network is this machine's, which may have a view of its own
+            "rover_view_port": free_port(),  # a free one, as the network is this machine's, which may run a view too
         }
 
     def all(self, static: Path, other: Path, *, short: bool, view: bool, faults: bool) -> None:
@@ -168,7 +168,7 @@ class _Run:
     # The playbooks
 
     def playbooks(self, pi: Container, static: Path, other: Path) -> float:
-        """All playbooks; when the service could drive for the first time (monotonic seconds)."""
+        """Run all playbooks; return when the service could drive for the first time (monotonic seconds)."""
         gate = self.report.gate
         self.play("provision", pi)
         self.play("deploy", pi, rover_artifact=str(static))
@@ -202,7 +202,7 @@ class _Run:
         return driving_s
 
     def one_fault(self, pi: Container, static: Path) -> None:
-        """A deployment that fails, leaves the rover as it was and is healed by another; it then drives what came."""
+        """Let a deployment fail: the rover must stay as it was, and another deployment must heal it. Then drive."""
         with _bytecode_from_here(pi.root):
             self.play("provision", pi)
         self.play("deploy", pi, rover_artifact=str(static))
@@ -219,14 +219,14 @@ class _Run:
         self.flight(pi)
 
     def quick(self) -> Path:
-        """A policy that an emulated Pi can drive by."""
+        """Make an artifact that is quick enough for an emulated Pi to drive by."""
         engine, suffix = (TORCH, ".pt") if self.engine == "torch" else (ONNXRUNTIME, ONNX_SUFFIX)
         path = self.folder / f"policy_quick{suffix}"
         make_artifact(path, camera="cam_front", size=(72, 128), engine=engine)
         return path
 
     def play(self, book: str, pi: Container, name: str = "", *, check: bool = False, **variables: Any) -> Play:
-        """Runs one, which has to work. Raises EmulationError with the end of its output if not."""
+        """Run a playbook, which has to work. Raises EmulationError with the end of its output if it fails."""
         with self.report.step(name or book) as row:
             done = playbooks.run(book, [pi], folder=self.folder, check=check, variables={**self.variables, **variables})
             self.log.write(f"===== {name or book}\n{done.output}\n")
@@ -237,7 +237,7 @@ class _Run:
         return done
 
     def flight(self, pi: Container) -> None:
-        """What the flight log and the episode say that drive.yml brought home."""
+        """Check the flight log and the episode that drive.yml brought home."""
         fetched = self.folder / "fetched" / ROVER
         log = next(iter(fetched.rglob("flight.log")), None)
         if log is None:
@@ -289,7 +289,7 @@ class _Run:
         self.no_view(pi)
 
     def environment(self, pi: Container) -> None:
-        """What is installed, without the view."""
+        """Check what is installed, without the view."""
         gate, limit_mb = self.report.gate, self.report.gates["environment_mb"][self.engine]
         with self.report.step("environment"):
             installed = self.metrics["environment"] = environment(pi.root, self.engine)
@@ -301,7 +301,7 @@ class _Run:
              not lacks_or_has)  # fmt: skip
 
     def view(self, pi: Container, pins: Pins) -> None:
-        """The view's service, which was provisioned, beside an armed drive of the small policy."""
+        """Prove the provisioned view's service beside an armed drive of the small policy."""
         with self.report.step("the view"):
             installed = environment(pi.root, self.engine)
             needs, unhashed = installed["of_view"], installed["unhashed"]
@@ -310,20 +310,23 @@ class _Run:
             self.rows(view_beside_a_drive(pi, pins, port, stop_s))
 
     def no_view(self, pi: Container) -> None:
-        """Provisioned without it again."""
+        """Provision without the view again, and prove that it is gone."""
         self.variables["rover_view"] = False
         self.play("provision", pi, "provision, without the view")
         with self.report.step("no view"):
             self.rows(view_gone(pi, self.variables["rover_view_port"]))
 
     def rows(self, rows: list[Row]) -> None:
-        """Each is a gate, and they are all in the report's `view`."""
+        """Make a gate of each row, and add them all to the report's `view`."""
         for row in rows:
             self.metrics.setdefault("view", []).append(row._asdict())
             self.report.gate(row.row, row.wanted, row.found, row.holds)
 
     def boot(self, pi: Container, pins: Pins) -> None:
-        """Disabled at boot by default; with rover_start_at_boot it is up, and disarmed, and the car stands."""
+        """Prove that the service is disabled at boot by default, and that with rover_start_at_boot it starts disarmed.
+
+        The car must not move meanwhile.
+        """
         with self.report.step("boot without the service"):
             default = show(pi, "UnitFileState")["UnitFileState"]
         enabled = self.play("provision", pi, "provision, to start at boot", rover_start_at_boot=True)
@@ -341,8 +344,8 @@ class _Run:
         self.report.gate("boot", "disabled by default; enabled it is disarmed", booted, ok)
 
     def deployment_faults(self, pi: Container, static: Path, mixed: Path) -> None:
-        """What can go wrong with a deployment, and a fleet, on rovers that start from what this one has become."""
-        pi.inside("systemctl", "disable", UNIT)  # their own service would only look for a camera
+        """Run the faults of a deployment, and the fleet, on rovers that start from what this one has become."""
+        pi.inside("systemctl", "disable", UNIT)  # the service of those rovers would only look for a camera
         pi.power_off()
         artifacts, least = {"static": static, "mixed": mixed}, self.report.gates["rows"]
         rows = self.metrics["faults"] = []
@@ -363,14 +366,14 @@ class _Run:
 
 @contextlib.contextmanager
 def _bytecode_from_here(root: Path) -> Iterator[None]:
-    """What pip installs is compiled by this machine's Python, if it is the Pi's: emulated, that takes minutes."""
+    """Let this machine's Python compile what pip installs, if it has the Pi's version: emulated, that takes minutes."""
     if not (root / f"usr/lib/python{sys.version_info[0]}.{sys.version_info[1]}").is_dir():
         yield
         return
     with (root / "etc/pip.conf").open("a") as settings:
         settings.write("[install]\nno-compile = no\n")  # a double negation: pip wants "no" for such an option
     yield
-    # A process of its own, because this one has threads; as to pip, a file that cannot be compiled is none of its.
+    # In another process, because this one has threads. A file that cannot be compiled is ignored, as by pip.
     command = [sys.executable, "-m", "compileall", "-q", "-j", "0", "-s", str(root), "-p", "/", f"{root}{VENV}"]
     subprocess.run(command, capture_output=True)
 
@@ -380,7 +383,7 @@ def _bytecode_from_here(root: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _car(pi: Container) -> Iterator[Pins]:
-    """Camera and Arduino, plugged in; what the pins do."""
+    """Plug in a camera and an Arduino, and give what its pins do."""
     with (
         CameraFeed(pi.bench / "camera", *pictures(PLAIN, (180, 320)), rate_hz=HZ),
         EmulatedArduino(every_pulse=False, transmitter=REST_US, ready=True, nice=ARDUINO_NICE) as board,

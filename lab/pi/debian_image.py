@@ -1,11 +1,11 @@
-"""Debian arm64 as a freshly flashed Raspberry Pi OS Lite has it, for the emulated Pis: built once, then cached.
+"""Build Debian arm64 for the emulated Pis, like a freshly flashed Raspberry Pi OS Lite. It is built once, then cached.
 
     with emulation():
         debian_image().root      # /etc, /usr, ... of the Pi, owned by root; never written to
 
-The packages are this machine's own Debian's (12 or 13), fetched by a private apt. dpkg unpacks them natively, which
-under emulation takes minutes; only what they do when they are configured is emulated. Nothing is in it that
-provision.yml has to install.
+The packages are those of this machine's own Debian (12 or 13), fetched by a private apt. dpkg unpacks them natively, as
+that would take minutes under emulation; only their configuration is emulated. The image has nothing that provision.yml
+must install.
 """
 
 import contextlib
@@ -29,8 +29,8 @@ PACKAGES = (
     *("systemd", "systemd-sysv", "dbus", "udev", "libpam-systemd", "kmod", "procps"),
     *("openssh-server", "sudo", "python3", "python3-apt", "iproute2", "netbase", "less"),
 )
-RECIPE = 2  # one more when it is made in another way: older ones are then not used
-FIRST = "base-passwd"  # whose users and groups the other packages' scripts ask for
+RECIPE = 2  # raise it when the image is made in another way, so that older ones are not used
+FIRST = "base-passwd"  # unpacked first, as the other packages' scripts ask for its users and groups
 FORCE = ("architecture", "depends", "overwrite", "unsafe-io")
 GROUPS = "adm,dialout,cdrom,sudo,audio,video,plugdev,games,users,input,render,netdev"  # of Raspberry Pi OS's user
 CONFIGURE = f"""set -e
@@ -38,22 +38,23 @@ dpkg --configure --pending --force-depends
 for group in {GROUPS.replace(",", " ")}; do getent group $group > /dev/null || groupadd --system $group; done
 useradd --create-home --shell /bin/bash --groups {GROUPS} {USER}
 """
-# While the packages are configured: no service is started, and nothing is made of certificates, a minute's work under
-# emulation: a container gets this machine's, and the whole machine has no network.
+# These programs replace the real ones while the packages are configured. So no service is started, and no bundle of
+# certificates is made, which takes a minute under emulation: a container gets this machine's, and the whole machine has
+# no network.
 STAND_INS = {"policy-rc.d": "exit 101", "update-ca-certificates": "exit 0"}
 
 
 class DebianImage(NamedTuple):
-    """root: the file system. key: the private ssh key of its user, USER, who may use sudo without a password."""
+    """The Pi's system. root: its file system. key: the private ssh key of USER, who may use sudo without a password."""
 
     root: Path
     key: Path
 
 
 def debian_image() -> DebianImage:
-    """The Pi's file system and the key to it, from the cache or made now (two minutes, most of them emulated).
+    """Return the Pi's file system and the key to it, from the cache or made now, which takes two minutes.
 
-    Call it within emulation(). Raises EmulationError or DebianError, with what was not to be had.
+    Call it within emulation(). Raises EmulationError or DebianError that says what could not be had.
     """
     recipe = {"made": [PACKAGES, CONFIGURE, RECIPE], "debian": _codename()}
     folder = cached_folder("pi-system", key_of(recipe), _make)
@@ -84,7 +85,7 @@ def _make(folder: Path) -> None:
 
 
 def _unpack(root: Path, packages: list[Path]) -> None:
-    """All files, so that the packages' scripts have what they call, and then by dpkg, so that it knows of them."""
+    """Unpack all files, so that the packages' scripts find what they call; then again with dpkg, so that it knows."""
     (root / "usr").mkdir(parents=True)
     root.chmod(0o755)
     for name in ("bin", "sbin", "lib"):
@@ -101,7 +102,7 @@ def _unpack(root: Path, packages: list[Path]) -> None:
     for name in ("status", "available"):
         (status / name).touch()
     (root / "etc" / "dpkg" / "dpkg.cfg.d").mkdir(parents=True, exist_ok=True)
-    (root / "etc" / "dpkg" / "dpkg.cfg.d" / "emulated").write_text("force-unsafe-io\n")  # a cache loses nothing
+    (root / "etc" / "dpkg" / "dpkg.cfg.d" / "emulated").write_text("force-unsafe-io\n")  # a cache can be made again
     forced = [f"--force-{what}" for what in FORCE]
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C.UTF-8"}
     for part in ([p for p in packages if p.name.startswith(f"{FIRST}_")], packages):
@@ -126,7 +127,7 @@ def _stand_ins(sbin: Path) -> Iterator[None]:
 
 
 def _personalize(root: Path, public_key: str) -> None:
-    """What Raspberry Pi Imager writes: a name, a user with a key, and sudo without a password."""
+    """Write what Raspberry Pi Imager writes: a host name, a user with a key, and sudo without a password."""
     (root / "etc" / "hostname").write_text(f"{HOST_NAME}\n")
     (root / "etc" / "hosts").write_text(f"127.0.0.1\tlocalhost\n127.0.1.1\t{HOST_NAME}\n")
     (root / "etc" / "machine-id").write_text("")  # each boot of a copy makes its own

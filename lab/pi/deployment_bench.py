@@ -1,7 +1,7 @@
-"""A rover that is deployed to while something goes wrong, and the network to it; for its faults, and for a fleet.
+"""The bench for deployments: a rover that is deployed to while something goes wrong, and the network to it.
 
-When a deployment has come to a certain point is seen on the rover's disk, looked at from this machine every millisecond
-or so: no hook in what runs is needed for that.
+The faults of a deployment and the fleet use it. It sees on the rover's disk how far a deployment has come, by looking
+at it from this machine every millisecond or so. So the code that is deployed needs no hook for tests.
 """
 
 import contextlib
@@ -30,19 +30,19 @@ from lab.pi.playbooks import Play
 from rover_lib.onboard.release import POLICY, Releases, pack
 from rover_lib.workshop.cache import cached_folder, key_of
 
-STATE = "var/lib/rover"  # on the rover; models/ is in it, and incoming/ in that
+STATE = "var/lib/rover"  # on the rover; it has models/, which has incoming/
 ROVER = "/opt/rover/venv/bin/rover"
 CHECK = "rover-check@{}.service"
 LOOK_S = 0.001  # between looks at the disk
 PLAY_S = 1800.0
 CHECK_S = 600.0
-INTO_CHECK_S = 1.0  # of a health check, when the power is cut in it
-LIBRARY = "/usr/lib/aarch64-linux-gnu/faketime/libfaketimeMT.so.1"  # of Debian's libfaketime
+INTO_CHECK_S = 1.0  # how long a health check runs before something is done to it
+LIBRARY = "/usr/lib/aarch64-linux-gnu/faketime/libfaketimeMT.so.1"  # from Debian's libfaketime
 CGROUPS = Path("/sys/fs/cgroup")
 
 
 class Missed(EmulationError):
-    """A moment of a deployment that passed unseen: the row says nothing."""
+    """A moment of a deployment passed unseen, so the row proves nothing."""
 
 
 # What is on the disk
@@ -52,9 +52,10 @@ class Missed(EmulationError):
 class Disk:
     """How far a deployment has come, by what is on the rover's disk.
 
-    ready: there is a folder for what arrives. arrived: names of what has. complete: it is all. staging: bytes of the
-    files of a release that has no name yet. staged: its policy is whole. released: it has its name. switched: it is in
-    use. remembered: and was proven again since.
+    ready: whether there is a folder for what arrives. arrived: the names of the files that have arrived. complete:
+    whether these are all. staging: the files of a release that has no name yet, with their bytes. staged: whether its
+    policy is complete. released: whether the release has its name. switched: whether it is in use. remembered: whether
+    it was proven again since then.
     """
 
     ready: bool = False
@@ -68,7 +69,7 @@ class Disk:
 
     @classmethod
     def seen(cls, state: Path, about: Mapping[str, Any]) -> "Disk":
-        """state: the folder of models/. about: what pack() returned."""
+        """Look at the disk now. state: the folder that has models/. about: what pack() returned."""
         models, incoming = state / "models", state / "models" / "incoming" / about["sha256"]
         ready, arrived, staging, current, last = False, (), {}, "", ""
         with contextlib.suppress(OSError):
@@ -85,7 +86,7 @@ class Disk:
         return cls(
             ready=ready,
             arrived=arrived,
-            complete=len(arrived) == about["parts"] + 2,  # and what describes them, and their signature
+            complete=len(arrived) == about["parts"] + 2,  # the parts, the file that describes them, and its signature
             staging=staging,
             staged=staging.get(POLICY) == about["bytes"],
             released=any(True for _ in (models / "releases").glob(f"{name}*/{POLICY}")),
@@ -118,7 +119,7 @@ class Disk:
 
 
 class Line(NamedTuple):
-    """A rover in the table of status.yml. model: the beginning of its name. notes: what is said below its line."""
+    """A rover's line in the table of status.yml. model: the beginning of its name. notes: the lines below that line."""
 
     healthy: bool
     model: str
@@ -127,7 +128,7 @@ class Line(NamedTuple):
 
 
 def line_of(output: str, name: str) -> Line:
-    """A rover's line in what status.yml printed. Raises EmulationError if it has none."""
+    """Find a rover's line in the output of status.yml. Raises EmulationError if there is none."""
     lines = [line.strip().strip('",') for line in output.splitlines() if line.strip().startswith('"')]
     for i, line in enumerate(lines):
         words = line.split()
@@ -143,7 +144,10 @@ def line_of(output: str, name: str) -> Line:
 
 
 def changed_artifact(artifact: Path, target: Path, *, answers: float = 0.0, **changes: Any) -> Path:
-    """The artifact with another manifest, and every checksum right. answers: so far off are its parity vectors."""
+    """Write the artifact with another manifest to `target`, with all checksums right, and return that.
+
+    answers: by how much the plans of its parity vectors are made wrong. changes: of the manifest.
+    """
     with zipfile.ZipFile(artifact) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as new:
         for item in old.infolist():
             content = old.read(item)
@@ -163,10 +167,11 @@ def changed_artifact(artifact: Path, target: Path, *, answers: float = 0.0, **ch
 
 
 class DeploymentBench:
-    """A rover that is deployed to, and the network to it. before, target: the mode in use, and the one to be deployed.
+    """A rover that is deployed to, and the network to it.
 
-    artifacts: two that are fit to be deployed, by their mode. allow: as rover_allow, what they may differ in.
-    packed: what pack() says of them. disk_then: when its power was cut.
+    before, target: the mode in use, and the mode to be deployed. artifacts: two that are fit to be deployed, by mode.
+    allow: in what they may differ, as rover_allow. packed: what pack() returned for each. disk_then: the disk when the
+    power was cut.
     """
 
     before = target = ""
@@ -200,19 +205,19 @@ class DeploymentBench:
 
     @property
     def state(self) -> Path:
-        """The rover's folder of models/; what is mounted there as long as it is on."""
+        """The rover's folder that has models/. While the rover is on, this includes what is mounted there."""
         if self.pi.on:
             return Path(f"/proc/{self.pi.leader}/root/{STATE}")
         return self.pi.root / STATE
 
     @property
     def releases(self) -> Releases:
-        """As this machine reads them; it changes nothing."""
+        """The rover's releases, which this machine only reads."""
         return Releases(self.state / "models")
 
     @property
     def about(self) -> dict[str, Any]:
-        """What pack() says of the model to be deployed."""
+        """What pack() returned for the model to be deployed."""
         return self.packed[self.target]
 
     @property
@@ -225,11 +230,11 @@ class DeploymentBench:
 
     @property
     def released(self) -> Path:
-        """The policy of the release that is deployed, which is there already."""
+        """The policy in the release that is being deployed, which must be on the rover already."""
         return next((self.state / "models" / "releases").glob(f"{self.about['name']}*/{POLICY}"))
 
     def begin(self, fresh: bool = False) -> None:
-        """Of a row: a model that is not in use is to be deployed. fresh: only the one in use is on the rover."""
+        """Begin a row: choose a model that is not in use as the target. fresh: remove all releases not in use."""
         self.before = self._mode_of(self.releases.current or "", "")
         self.target = next(mode for mode in self.artifacts if mode != self.before)
         self.seconds, self.outputs, self.disk_is_small = {}, [], False
@@ -239,7 +244,7 @@ class DeploymentBench:
                     shutil.rmtree(release)
 
     def play(self, book: str, *, others: Sequence[playbooks.Host] = (), name: str = "", **variables: Any) -> Play:
-        """Runs a playbook on this rover, and on others after it. name: of a laptop of its own."""
+        """Run a playbook on this rover, and on others after it. name: a folder of its own, as on another laptop."""
         if self.stop.is_set():
             raise EmulationError("told to stop")
         folder = self.folder / (name or "laptop")
@@ -248,20 +253,20 @@ class DeploymentBench:
         return playbooks.run(book, [self.network, *others], folder=folder, variables=given, timeout_s=PLAY_S)
 
     def deploy(self, artifact: Path | None = None, **more: Any) -> Play:
-        """Runs deploy.yml with an artifact, or with the one to be deployed; what it printed is noted."""
+        """Run deploy.yml with an artifact, or else with the target's; keep what it printed in `outputs`."""
         artifact = artifact or self.artifacts[self.target]
         play = self.play("deploy", rover_artifact=str(artifact), rover_allow=self.allow, **more)
         self.outputs.append(play.output)
         return play
 
     def deploy_until(self, moment: Callable[[Disk], bool], strike: Callable[[], object], **more: Any) -> Play:
-        """Runs deploy.yml, and strikes once at the moment. Raises Missed if it never came."""
+        """Run deploy.yml, and call `strike` once at the moment. Raises Missed if the moment was never seen."""
         over = threading.Event()
 
         def reached() -> bool:
             try:
                 return moment(self.disk)
-            except (OSError, EmulationError):  # it changes while it is read
+            except (OSError, EmulationError):  # the disk changes while it is read
                 return False
 
         def watch() -> bool:
@@ -282,16 +287,16 @@ class DeploymentBench:
         return play
 
     def cut_power(self, moment: Callable[[Disk], bool]) -> None:
-        """Raises Missed if the disk is not as it is at that moment."""
+        """Cut the power. Raises Missed if the disk is then no longer as it is at that moment."""
         self.pi.cut_power()
         self.disk_then = self.disk
         if not moment(self.disk_then):
             raise Missed(f"{self.pi.name}: the power was cut a moment too late", found=vars(self.disk_then))
 
     def set_clock(self, years: int) -> None:
-        """What starts from now on sees another year, until the row is over: by libfaketime, in every aarch64 program.
+        """Set the clock by a number of years, until the row is over: libfaketime shifts it in new aarch64 programs.
 
-        The monotonic clock of what systemd starts stays as it is, as it does when a real clock is set.
+        The monotonic clock of what systemd starts does not change, just as when a real clock is set.
         """
         copied = self.pi.root / LIBRARY.lstrip("/")
         preload, settings = self.pi.root / "etc/ld.so.preload", self.pi.root / "etc/faketimerc"
@@ -303,24 +308,24 @@ class DeploymentBench:
         self.undo.callback(settings.unlink, missing_ok=True)
 
     def proves(self) -> bool:
-        """Whether a health check is at work now, by its control group, which is quicker than to ask systemctl."""
+        """Return whether a health check is running, by its control group, which is quicker than to ask systemctl."""
         tops = [CGROUPS / self.pi.machine, *CGROUPS.glob(f"*/{self.pi.machine}")]  # cgroup v2, and its hierarchies
         return any(True for top in tops for _ in top.glob(f"**/{CHECK.format('*')}"))
 
     def wait_for_check(self) -> None:
-        """Until a health check has loaded something of what it needs. Raises Missed if there is none."""
+        """Wait until a health check has been running for INTO_CHECK_S. Raises Missed if there is none."""
         if not wait_for(self.proves, 5, every_s=0.0):
             raise Missed(f"{self.pi.name}: no health check is at work")
         self.stop.wait(INTO_CHECK_S)
 
     def rover(self, *command: object) -> str:
-        """Runs `rover` on the rover, by hand; what it printed is noted."""
+        """Run `rover` on the rover, as if by hand; return what it printed, and keep that in `outputs`."""
         done = self.pi.inside(ROVER, *command, check=False, timeout_s=CHECK_S)
         self.outputs.append(done.stdout + done.stderr)
         return self.outputs[-1]
 
     def small_disk(self, free: int) -> None:
-        """Models and what arrives are now on a file system with so many bytes free, until the row is over."""
+        """Put models and what arrives on a file system with `free` bytes left, until the row is over."""
         used = sum(p.stat().st_size for p in self.state.rglob("*") if p.is_file() and not p.is_symlink())
         self.pi.inside(
             "sh",
@@ -332,19 +337,19 @@ class DeploymentBench:
         self.disk_is_small = True
 
     def heal(self) -> None:
-        """What a human does about the cause before deploying again: makes room on a small disk."""
+        """Do what a human does about the cause before deploying again: make room on a small disk."""
         if self.disk_is_small:
             self.pi.inside("mount", "-o", "remount,size=1g", f"/{STATE}")
             (self.state / "ballast").unlink(missing_ok=True)
 
     def make_read_only(self) -> None:
-        """As a card does when it comes to its end; until the row is over."""
+        """Make the rover's disk read-only, like that of a dying card, until the row is over."""
         self.pi.inside("mount", "--bind", f"/{STATE}", f"/{STATE}")
         self.pi.inside("mount", "-o", "remount,bind,ro", f"/{STATE}")
         self.undo.callback(self.pi.inside, "umount", "--lazy", f"/{STATE}", check=False)
 
     def clean(self) -> None:
-        """Undoes what the fault has left; what was mounted in a rover that went off is gone."""
+        """Undo what the fault has left. If the rover went off, its mounts are gone anyway, so errors are ignored."""
         with contextlib.suppress(EmulationError, OSError):
             self.undo.close()
 
@@ -355,7 +360,10 @@ class DeploymentBench:
         self.seconds[what] = self.seconds.get(what, 0.0) + time.monotonic() - started
 
     def mode_in_use(self) -> tuple[str, bool]:
-        """The mode of what is in use, "another" or "none" else, and whether its bytes are whole."""
+        """Return the mode of the release in use, and whether its bytes are right.
+
+        The mode is "another" if it is none of our models, and "none" if no release is in use.
+        """
         current = self.releases.current
         if current is None:
             return "none", False
@@ -365,12 +373,12 @@ class DeploymentBench:
         return next((mode for mode, about in self.packed.items() if release.startswith(about["name"])), otherwise)
 
     def healthy(self) -> bool:
-        """Whether what is in use passes its parity vectors, in the service's sandbox."""
+        """Return whether the release in use passes its parity vectors in the service's sandbox."""
         done = self.pi.inside("systemctl", "start", CHECK.format("current"), check=False, timeout_s=CHECK_S)
         return done.returncode == 0
 
     def status(self, healthy: bool) -> tuple[str, str]:
-        """What status.yml shows, and what of it is not so: an empty string if all is."""
+        """Return what status.yml shows, and what of that should be otherwise: an empty string if all is true."""
         line = line_of(self.play("status").output, self.pi.name)
         current = self.releases.current
         mode = self._mode_of(current or "", line.mode)
@@ -386,7 +394,7 @@ class DeploymentBench:
 
 
 def flip(path: Path) -> None:
-    """One bit in the middle of a file, in place."""
+    """Flip one bit in the middle of a file, in place."""
     with path.open("r+b") as f:
         f.seek(path.stat().st_size // 2)
         byte = f.read(1)
@@ -402,7 +410,7 @@ def flip(path: Path) -> None:
 def rovers(
     names: Sequence[str], layers: Sequence[Path], artifacts: Mapping[str, Path]
 ) -> Iterator[list[DeploymentBench]]:
-    """Rovers that are on. Whatever ends the block, nothing of them is left."""
+    """Give rovers that are switched on. Whatever ends the block, nothing of them is left."""
     stop = threading.Event()
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rover-breaks-")))
@@ -418,13 +426,13 @@ def rovers(
 
 
 def in_parallel(task: Callable[[DeploymentBench], Any], benches: Sequence[DeploymentBench]) -> list[Any]:
-    """What the task returns for each rover. Where one raises, all rovers are switched off, and that is raised."""
+    """Do the task for all rovers at once, and return the results. If one raises, all rovers are switched off first."""
     with ThreadPoolExecutor(len(benches)) as pool:
         futures = [pool.submit(task, bench) for bench in benches]
         try:
             wait(futures, return_when=FIRST_EXCEPTION)
             return [future.result() for future in futures]
-        except BaseException:  # ^C too: what waits for a rover that is off does not wait for long
+        except BaseException:  # ^C too. Threads that wait for a rover that is off do not wait for long.
             for bench in benches:
                 bench.stop.set()
                 bench.pi.cut_power()
@@ -432,7 +440,7 @@ def in_parallel(task: Callable[[DeploymentBench], Any], benches: Sequence[Deploy
 
 
 def give_first_model(benches: Sequence[DeploymentBench]) -> None:
-    """Deploys to the rovers that have none of our models in use. Raises EmulationError if that fails."""
+    """Deploy a model to the rovers that have none of ours in use. Raises EmulationError if that fails."""
     without = [bench for bench in benches if bench.mode_in_use()[0] not in bench.artifacts]
     if not without:
         return
@@ -444,7 +452,7 @@ def give_first_model(benches: Sequence[DeploymentBench]) -> None:
 
 
 def _faketime() -> Path:
-    """Debian's libfaketime for aarch64, unpacked, from the cache or made now."""
+    """Return the folder of Debian's unpacked libfaketime for aarch64, from the cache or made now."""
 
     def make(folder: Path) -> None:
         with tempfile.TemporaryDirectory() as scratch:

@@ -1,18 +1,18 @@
-"""What can go wrong with a deployment, on emulated Pis: `make pi-fast` writes the rows to runs/pi-fast.json.
+"""Break deployments on emulated Pis in every way we know: `make pi-fast` writes the rows to runs/pi-fast.json.
 
     artifacts = {"static": Path("policy_static.pt"), "mixed": Path("policy_mixed.pt")}
-    rows = break_deployments(pi.layers, artifacts)      # of a Container that was provisioned, and is off
+    rows = break_deployments(pi.layers, artifacts)      # pi: a Container that was provisioned, and is off
 
-Each fault meets ansible/deploy.yml (or rollback.yml) as a human runs it, against real systemd and sshd, and there is no
-hook for it in what runs: when a deployment has come to a certain point is seen on the rover's disk, looked at from this
-machine every millisecond or so. A row in which the moment was missed is done again. After each fault the rover is
-asked for three things. Its model still passes its parity vectors, in the service's sandbox. What status.yml shows is
-what is on the disk. And deploy.yml, run again, leaves the rover with the new model.
+Each fault happens while ansible/deploy.yml (or rollback.yml) runs as a human runs it, against real systemd and sshd.
+The code that runs has no hook for this: the rover's disk shows how far a deployment has come, and this machine looks at
+it every millisecond or so. If the moment was missed, the row is done again. After each fault three things are checked:
+the rover's model still passes its parity vectors, in the service's sandbox; status.yml shows what is on the disk; and
+deploy.yml, run again, leaves the rover with the new model.
 
-A power cut ends every program of the rover at one moment and leaves its disk as it was. What a real one also takes
-away, writes that were not synced, a container cannot show, because its disk is a layer over a folder of this machine:
-tests/onboard/test_release.py cuts the same commands after every system call that changes something, and there what was
-not synced is lost.
+A power cut ends every program of the rover at one moment and leaves its disk as it was. A real one also loses writes
+that were not synced. A container cannot show that, because its disk is a layer over a folder of this machine. So
+tests/onboard/test_release.py cuts the same commands after every system call that changes something, and loses what was
+not synced.
 """
 
 import contextlib
@@ -44,9 +44,9 @@ from rover_lib.onboard.release import ORIGIN, SPARE_BYTES
 from rover_lib.workshop.program import run
 
 ROOM = 4 << 20  # bytes free on a full disk
-TRIES = 2  # of a row whose moment was missed
-WORKERS = 2  # rovers that are broken at the same time; each keeps a core busy
-RETRY_S = 30  # of trying to reach a rover that does not answer
+TRIES = 2  # how often a row is tried if its moment was missed
+WORKERS = 2  # how many rovers are broken at the same time; each keeps a core busy
+RETRY_S = 30  # how long Ansible tries to reach a rover that does not answer
 NOBODY = 9  # a port on which no sshd listens
 
 Say = Callable[[str], None]
@@ -54,10 +54,11 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class DeploymentFault:
-    """A row. inject: makes a deployment meet it. message: a regular expression of what is printed about it.
+    """A fault of a deployment. inject: runs a deployment and makes the fault happen meanwhile.
 
-    how: it is made. fresh: the model to be deployed is not on the rover yet, so that it travels; otherwise it is there
-    from before, which is quicker.
+    message: a regular expression for what is printed about it. how: it is made, in words. fresh: whether the model to
+    be deployed must not be on the rover yet, so that it travels; otherwise it may be there from before, which is
+    quicker.
     """
 
     name: str
@@ -73,7 +74,10 @@ class DeploymentFault:
 def _strike(
     moment: Callable[[Disk], bool], action: Callable[[DeploymentBench], object], *, in_check: bool = False, **more: Any
 ) -> Callable[[DeploymentBench], None]:
-    """Does something to a rover once its disk is so. in_check: and a second into the health check that begins then."""
+    """Return an inject that does something to a rover at a moment of its deployment.
+
+    in_check: wait until a health check begins at that moment, and then for another second.
+    """
 
     def inject(bench: DeploymentBench) -> None:
         def act() -> None:
@@ -133,7 +137,7 @@ def _lose_ssh_in_transfer(bench: DeploymentBench) -> dict[str, Any]:
     travelled = [name for name, inode in kept.items() if arrived.get(name) != inode]
     if not arrived or set(arrived) & set(travelled):
         raise EmulationError(f"{bench.pi.name}: {sorted(arrived)} had arrived, and {travelled} travelled again")
-    # All that Ansible sends is in these, its modules too.
+    # These megabytes include all that Ansible sends, its modules too.
     sent_mb = [round(first / 1e6, 1), round((bench.network.sent - sent) / 1e6, 1)]
     return {"had_arrived": sorted(arrived), "travelled_then": travelled, "sent_mb": sent_mb}
 
@@ -145,7 +149,10 @@ def _name_another(bench: DeploymentBench) -> None:
 
 
 def _refused(message: str, **changes: Any) -> Callable[[DeploymentBench], None]:
-    """An artifact with another manifest: by the laptop, before anything travels; and by the rover, brought by hand."""
+    """Return an inject for an artifact with a changed manifest, which laptop and rover must both refuse.
+
+    The laptop refuses it before anything travels. Then it is copied to the rover by hand.
+    """
 
     def inject(bench: DeploymentBench) -> None:
         bad = changed_artifact(bench.artifacts[bench.target], bench.folder / "changed.pt", **changes)
@@ -211,7 +218,7 @@ def _roll_back(bench: DeploymentBench) -> None:
 
 
 class Nobody(NamedTuple):
-    """A line of the inventory behind which no rover is."""
+    """A line of the inventory for a rover that does not exist."""
 
     name: str
     key: Path
@@ -230,7 +237,7 @@ def _nobody_there(bench: DeploymentBench) -> dict[str, Any]:
 
 # The table
 
-LOST = "UNREACHABLE!|does not answer any more"  # when ssh ends
+LOST = "UNREACHABLE!|does not answer any more"  # printed when ssh ends
 FULL = "No space left on device"
 IN_CHECK = "a second into its parity vectors"
 OTHER_TORCH, A_LIE = r"made with torch 9\.9\.9, rovers have", "its manifest says dynamic, its code is not"
@@ -309,7 +316,7 @@ FAULTS = [
     ),
     DeploymentFault(
         "network silent in the transfer",
-        # Of each try to reach it again; ssh's own limit is that of inventory.ini.
+        # The limit of each try to reach it again; ssh's own limit is in inventory.ini.
         _strike(Disk.arriving, lambda bench: bench.network.silence(), ansible_ssh_timeout=RETRY_S),
         LOST,
         "out of reach: no packet comes through, and no connection ends",
@@ -406,10 +413,10 @@ def break_deployments(
     done: Callable[[dict[str, Any]], object] = lambda row: None,
     say: Say = lambda text: None,
 ) -> list[dict[str, Any]]:
-    """Every fault, each on one of a few rovers; their rows, in the order of FAULTS.
+    """Run every fault, each on one of a few rovers; return their rows in the order of FAULTS.
 
-    layers: of a Container that was provisioned, and is off. A rover with another model gets the first of the artifacts.
-    done: gets each row once it is there, one at a time. Raises EmulationError if no row can be made at all.
+    layers: of a Container that was provisioned, and is off. A rover with another model first gets the first artifact.
+    done: called with each finished row, one at a time. Raises EmulationError if no row can be made at all.
     """
     waiting = list(FAULTS)
     rows: dict[str, dict[str, Any]] = {}
@@ -431,7 +438,7 @@ def break_deployments(
 
 
 def wrong_rows(rows: Sequence[Mapping[str, Any]], at_least: int) -> list[str]:
-    """What is not as it must be, in sentences. at_least: how many rows there must be."""
+    """Return a sentence for everything that is not as it must be. at_least: how many rows there must be."""
     found = [f"{r['fault']}: {r['error']}" for r in rows if r.get("error")]
     for key, what in (
         ("healthy", "the rover has no model that passes its parity vectors"),
@@ -445,7 +452,7 @@ def wrong_rows(rows: Sequence[Mapping[str, Any]], at_least: int) -> list[str]:
 
 
 def row_of(name: str, bench: DeploymentBench) -> dict[str, Any]:
-    """Of one fault, on a rover that has one of the bench's models."""
+    """Run one fault on a rover that has one of the bench's models, and return its row."""
     return _row(next(fault for fault in FAULTS if fault.name == name), bench)
 
 
@@ -472,7 +479,7 @@ def _row(fault: DeploymentFault, bench: DeploymentBench) -> dict[str, Any]:
 
 
 def _after(fault: DeploymentFault, bench: DeploymentBench) -> dict[str, Any]:
-    """A fault, and what the rover is like after it."""
+    """Make a fault happen; return how the rover is afterwards, and whether deploying again heals it."""
     bench.begin(fault.fresh)
     with bench.timed("fault"):
         details = fault.inject(bench)
@@ -513,7 +520,7 @@ def _after(fault: DeploymentFault, bench: DeploymentBench) -> dict[str, Any]:
 
 
 def _restore(bench: DeploymentBench) -> None:
-    """After a row that did not come to its end."""
+    """Make the rover usable again after a row that did not come to its end."""
     bench.clean()
     bench.network.mend()
     if not bench.pi.on:

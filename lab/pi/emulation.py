@@ -1,4 +1,4 @@
-"""What every emulated Pi needs of this machine: root, Debian packages, a kernel that runs aarch64, control groups."""
+"""Get what every emulated Pi needs from this machine: root, Debian packages, aarch64 programs, control groups."""
 
 import contextlib
 import fcntl
@@ -17,7 +17,7 @@ from rover_lib.onboard.watch import signals
 from rover_lib.workshop.cache import cache_root
 from rover_lib.workshop.program import run
 
-NEEDS = {  # command: its Debian package
+NEEDS = {  # commands, each with its Debian package
     "systemd-nspawn": "systemd-container",
     "qemu-aarch64-static": "qemu-user-static",
     "ssh": "openssh-client",
@@ -25,8 +25,8 @@ NEEDS = {  # command: its Debian package
 }
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 BINFMT_NAME = "rover-aarch64"
-# An ELF file for aarch64. P: keeps argv[0]. F: the interpreter need not be in the container. C: setuid programs, sudo,
-# get their rights.
+# How to recognize an ELF file for aarch64. Of the flags in _register(), P keeps argv[0], F lets the interpreter be
+# outside of the container, and C gives setuid programs such as sudo their rights.
 MAGIC = r"\x7f\x45\x4c\x46\x02\x01\x01\x00\x00\x00\x00\x00\x00\x00\x00\x00\x02\x00\xb7\x00"
 MASK = r"\xff\xff\xff\xff\xff\xff\xff\x00\xff\xff\xff\xff\xff\xff\xff\xff\xfe\xff\xff\xff"
 INTERPRETERS = ("/usr/libexec/qemu-binfmt/aarch64-binfmt-P", "/usr/bin/qemu-aarch64-static")
@@ -34,23 +34,23 @@ RIGHTS = "is this a container without rights?"
 
 
 class EmulationError(RoverError):
-    """An emulated Pi that cannot be made, started or asked here."""
+    """An emulated Pi cannot be made, started or asked here."""
 
 
 def require() -> None:
-    """Makes sure of root and of NEEDS, which are installed. Raises EmulationError."""
+    """Make sure that this is root, and install what is missing of NEEDS. Raises EmulationError or DebianError."""
     make_sure(missing_packages(NEEDS), "an emulated Pi", "an emulated Pi mounts file systems and starts a container")
 
 
 def require_arduino() -> None:
-    """Installs what the emulated Arduino lacks here. Raises DebianError where that cannot be."""
+    """Install what the emulated Arduino lacks here. Raises DebianError if that is not possible."""
     install_packages(arduino.missing_packages(), "the emulated Arduino")
 
 
 def make_sure(missing: list[str], what: str, why: str, error: type[RoverError] = EmulationError) -> None:
-    """Of root, and of Debian packages that `what` lacks here, which are installed. why: what root is for.
+    """Make sure that this is root, and install the Debian packages that `what` lacks here. why: what root is for.
 
-    Raises `error` without root, DebianError for packages that cannot be installed.
+    Raises `error` without root, and DebianError for packages that cannot be installed.
     """
     if os.geteuid() != 0:
         packages = f" (and of the Debian packages {' '.join(missing)})" if missing else ""
@@ -60,7 +60,7 @@ def make_sure(missing: list[str], what: str, why: str, error: type[RoverError] =
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """SIGTERM and SIGHUP end what is inside as ^C does: everything is put away by its own doors."""
+    """Let SIGTERM and SIGHUP end the block as ^C does, so that everything in it is cleaned up."""
 
     def on_signal(number: int, frame: object) -> None:
         raise KeyboardInterrupt(signal.Signals(number).name)
@@ -70,7 +70,7 @@ def interruptible() -> Iterator[None]:
 
 
 def free_port() -> int:
-    """Of the loopback."""
+    """Return a free port of the loopback."""
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         return s.getsockname()[1]
@@ -78,7 +78,7 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def emulation() -> Iterator[None]:
-    """Lets the kernel run aarch64 programs. What it registers is removed by the last process that needs it."""
+    """Let the kernel run aarch64 programs. The last process that needs this removes what was registered."""
     cache_root().mkdir(parents=True, exist_ok=True)
     with (cache_root() / "emulation.lock").open("w") as lock:
         mounted = _mount_binfmt()
@@ -88,7 +88,7 @@ def emulation() -> Iterator[None]:
                 _register()
             yield
         finally:
-            with contextlib.suppress(BlockingIOError):  # another one of ours is at work
+            with contextlib.suppress(BlockingIOError):  # another process of ours still needs it
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 with contextlib.suppress(OSError):
                     (BINFMT / BINFMT_NAME).write_text("-1")
@@ -97,7 +97,7 @@ def emulation() -> Iterator[None]:
 
 
 def wait_for(condition: Callable[[], object], within_s: float, every_s: float = 0.2) -> bool:
-    """Whether it came true in time."""
+    """Wait until the condition is true; return whether that happened in time."""
     end = time.monotonic() + within_s
     while not condition():
         if time.monotonic() > end:
@@ -128,10 +128,11 @@ def _register() -> None:
 
 @contextlib.contextmanager
 def in_cgroup(name: str) -> Iterator[Callable[[], None]]:
-    """A control group of its own, for a process to enter before it becomes something else.
+    """Make a control group, and give a function with which a process enters it before it executes its program.
 
-    Without one, the systemds of two containers would take each other's processes for theirs. It is removed afterwards,
-    with what is left in it killed. Of cgroup v1's controllers none: its cpu lets nobody in who is real-time.
+    Without groups, the systemds of two containers would take each other's processes for their own. Afterwards the group
+    is removed, and what is left in it is killed. None of cgroup v1's controllers is used: its cpu controller admits no
+    real-time processes.
     """
     mounts = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
     folders = [Path(m[1], name) for m in mounts if m[2] == "cgroup2" or (m[2] == "cgroup" and "name=" in m[3])]
@@ -153,7 +154,7 @@ def in_cgroup(name: str) -> Iterator[Callable[[], None]]:
 
 
 def _remove_cgroups(folders: list[Path], tries: int = 100) -> None:
-    """Kills what is in them and removes them, with those below. Raises nothing."""
+    """Kill what is in the groups, and remove them with those below them. Raises nothing."""
     for _ in range(tries):
         left = [f for folder in folders for f in sorted(folder.glob("**/"), reverse=True)]
         for folder in left:

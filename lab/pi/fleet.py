@@ -1,4 +1,4 @@
-"""A fleet of three emulated Pis of which one's disk can be read only: what deploy.yml makes of it.
+"""Deploy to a fleet of three emulated Pis while one of them has a read-only disk, and judge what deploy.yml does.
 
 result = fleet(pi.layers, {"static": Path("policy_static.pt"), "mixed": Path("policy_mixed.pt")})
 """
@@ -19,9 +19,10 @@ ONE_BY_ONE = [1, 1, 1]  # batches
 
 
 def fleet(layers: Sequence[Path], artifacts: Mapping[str, Path], *, say: Say = lambda text: None) -> dict[str, Any]:
-    """deploy.yml on three rovers of which one's disk can be read only, as that of a dying card: a row for each case.
+    """Run deploy.yml on three rovers while one has a read-only disk, like a dying card; return a row for each case.
 
-    Each: broken, exit_code, results (what the report says of each), models, healthy, good (it is as it must be).
+    A case has broken (which rover), batches, exit_code, results (the report's words for each rover), models, healthy,
+    and good (whether everything is as it must be).
     """
     cases = []
     with rovers(NAMES, layers, artifacts) as benches:
@@ -68,7 +69,10 @@ def _case(benches: Sequence[DeploymentBench], broken: str, batches: list[int] | 
 
 
 def wanted_of(broken: str, before: Mapping[str, str], new: str) -> dict[str, tuple[str, str]]:
-    """What the report must begin with, and the model, by rover: all before the broken one get the new model."""
+    """Return by rover how its result must begin, and which model it must have.
+
+    The rovers before the broken one get the new model; the others keep theirs.
+    """
     wanted, failed = {}, False
     for name, model in before.items():
         failed = failed or name == broken
@@ -80,6 +84,6 @@ def wanted_of(broken: str, before: Mapping[str, str], new: str) -> dict[str, tup
 
 
 def results_of(output: str) -> dict[str, str]:
-    """The result that deploy.yml's report has for each rover."""
+    """Return each rover's result in deploy.yml's report."""
     report = output.partition(f"TASK [{REPORT}]")[2].partition("TASK [")[0]
     return {name: json.loads(f'"{result}"') for name, result in re.findall(r'"msg": "([\w.-]+): (.*)"', report)}

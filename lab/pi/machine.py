@@ -1,4 +1,4 @@
-"""A whole emulated Pi in QEMU: four Cortex-A76, a kernel of its own, systemd, sshd, a camera and USB.
+"""Emulate a whole Pi in QEMU: four Cortex-A76, a kernel of its own, systemd, sshd, a camera and USB.
 
     with Machine(card(), folder, slow=20) as pi:
         pi.wait_for_ssh()
@@ -6,12 +6,12 @@
         pi.plug(arduino.port)
 
 Nothing on the host is changed: ssh is on a port of the loopback, the machine reaches no network, and what it writes
-goes to a file of its own over the card, which stays as it was.
+goes to a file of its own that lies over the card, which stays as it was.
 
 The machine is many times slower than a Pi. So its clock runs `slow` times slower than the host's: the device tree
 tells its kernel that the counter of all its clocks and timers counts `slow` times faster than it does. Then a rate of
-30 Hz, a watchdog's 2 s and an Arduino's 150 ms (slowed down alike) stand in a Pi's proportion to its speed, and nothing
-of the rover's has to be told other times. What takes a second for the machine takes `slow` seconds here.
+30 Hz, a watchdog's 2 s and an Arduino's 150 ms (slowed down alike) have the same proportion to its speed as on a Pi,
+and the rover's code needs no other times. A second of the machine takes `slow` seconds here.
 """
 
 import asyncio
@@ -40,7 +40,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.program import last_words, run
 
-PACKAGES = {  # commands, and the Debian packages that have them
+PACKAGES = {  # commands, each with the Debian package that it comes from
     "qemu-system-aarch64": "qemu-system-arm",
     "qemu-img": "qemu-utils",
     "mke2fs": "e2fsprogs",
@@ -49,15 +49,15 @@ PACKAGES = {  # commands, and the Debian packages that have them
     "fdtput": "device-tree-compiler",
     "ssh": "openssh-client",
 }
-RECIPE = 1  # one more when the card is made in another way: older ones are then not used
-CARD_GB = 6  # sparse: it takes what is in it
+RECIPE = 1  # raise it when the card is made in another way, so that older ones are not used
+CARD_GB = 6  # the file is sparse, so it takes only as much as is in it
 MEMORY_MB, CORES, CPU = 3072, 4, "cortex-a76"
-TIMER_HZ = 62_500_000  # of QEMU's Cortex-A76
-SLOWEST = 60  # the device tree has 32 bits for the frequency
+TIMER_HZ = 62_500_000  # the counter's frequency of QEMU's Cortex-A76
+SLOWEST = 60  # the device tree has only 32 bits for the frequency
 DEBS = "/var/lib/rover-debs"  # on the card: the Debian packages that a rover without internet must have
 ROVER_PACKAGES = ("python3-venv", "python3-packaging", "avrdude", "v4l-utils")  # as roles/rover/tasks/system.yml
 KERNEL_PACKAGES = ("linux-image-arm64", "busybox-static")
-# Of the kernel's modules those that the machine has devices for.
+# Only those of the kernel's modules that the machine has devices for.
 MODULES = (
     *("fs", "lib", "crypto", "arch", "net/core", "net/packet", "net/ipv6", "net/unix"),
     *("drivers/virtio", "drivers/block", "drivers/net/virtio_net.ko", "drivers/net/net_failover.ko", "drivers/char"),
@@ -74,7 +74,7 @@ $B mount --move /dev /new/dev; $B mount --move /proc /new/proc; $B mount --move 
 exec $B switch_root /new /lib/systemd/systemd
 """
 NETWORK = "[Match]\nName=e*\n[Network]\nDHCP=ipv4\nLinkLocalAddressing=no\nIPv6AcceptRA=no\n[DHCPv4]\nUseDNS=no\n"
-# They want the network, or work that nobody waits for.
+# Units that need a network, or do work that nobody waits for.
 MASKED = (
     *("apt-daily.timer", "apt-daily-upgrade.timer", "man-db.timer", "e2scrub_all.timer", "e2scrub_reap.service"),
     *("fstrim.timer", "dpkg-db-backup.timer", "systemd-networkd-wait-online.service", "systemd-timesyncd.service"),
@@ -96,7 +96,7 @@ class MachineError(RoverError):
 
 @dataclass(frozen=True)
 class Card:
-    """A card as flashed, and what boots it: kernel, initramfs, the file system, and the key that opens it."""
+    """A card as flashed, with its file system, the kernel and initramfs that boot it, and the key to log in."""
 
     folder: Path
 
@@ -107,9 +107,9 @@ class Card:
 
 
 def card() -> Card:
-    """The card with Debian on it, from the cache or made now (a minute, and what debian_image() takes).
+    """Return the card with Debian on it, from the cache or made now, which takes a minute more than debian_image().
 
-    Debian packages that are missing are installed when this runs as root. Raises RoverError where no card can be made.
+    Missing Debian packages are installed. Raises RoverError if no card can be made; it needs root.
     """
     why = "an emulated Pi's card is written with its owner's rights"
     make_sure(missing_packages(PACKAGES), "the emulated machine", why, MachineError)
@@ -139,8 +139,8 @@ def _make_card(flashed: DebianImage, folder: Path) -> None:
         _configure(root)
         shutil.copy(flashed.key, made.key)
         made.key.chmod(0o600)
-        shutil.copy(f"{flashed.key}.pub", f"{made.key}.pub")  # who deploys signs with it
-        # Without checksums of its own: the kernel would need modules for them before it has the card.
+        shutil.copy(f"{flashed.key}.pub", f"{made.key}.pub")  # deployments are signed with it
+        # Without metadata checksums, for which the kernel would need modules before it has the card.
         options = ["-t", "ext4", "-E", "lazy_itable_init=1,lazy_journal_init=1", "-O", "^metadata_csum"]
         _run("mke2fs", "-q", *options, "-d", root, made.disk, f"{CARD_GB}G")
 
@@ -160,7 +160,7 @@ def _modules(kernel: Path, root: Path, version: str) -> None:
 
 
 def _initramfs(busybox: Path, root: Path, version: str, output: Path, scratch: Path) -> None:
-    """A busybox that loads what is needed to mount the card, and hands over to systemd."""
+    """Make an initramfs: a busybox that loads the modules needed to mount the card, and hands over to systemd."""
     tree = scratch / "initramfs"
     for name in ("bin", "proc", "sys", "dev", "new", "m"):
         (tree / name).mkdir(parents=True)
@@ -188,7 +188,7 @@ def _initramfs(busybox: Path, root: Path, version: str, output: Path, scratch: P
 
 
 def _configure(root: Path) -> None:
-    """What this machine has and a container has not."""
+    """Configure what the machine has and a container has not: file systems, network, host keys."""
     (root / "etc/fstab").write_text("/dev/vda / ext4 noatime 0 1\n")
     (root / "etc/systemd/network").mkdir(parents=True, exist_ok=True)
     (root / "etc/systemd/network/20-wired.network").write_text(NETWORK)
@@ -207,18 +207,18 @@ def _configure(root: Path) -> None:
 
 
 def _run(command: str, *arguments: object) -> str:
-    """A program's output; of root's folders too, which a user's PATH may lack."""
+    """Run a program, also one in root's folders, which a user's PATH may lack; return its output."""
     return run(which(command) or command, *arguments, error=MachineError)
 
 
-# ---- QEMU's own console
+# ---- QEMU's monitor
 
 
-logging.getLogger("qemu.qmp").addHandler(logging.NullHandler())  # what it logs, it raises too
+logging.getLogger("qemu.qmp").addHandler(logging.NullHandler())  # it also raises what it logs
 
 
 class Qmp:
-    """QEMU's machine protocol on a Unix socket: a command and its answer, and what QEMU reports by itself."""
+    """QEMU's machine protocol on a Unix socket: commands with their answers, and events that QEMU reports."""
 
     def __init__(self, path: Path | str, timeout_s: float = QMP_S):
         self._timeout_s = timeout_s
@@ -231,11 +231,11 @@ class Qmp:
             raise
 
     def command(self, name: str, **arguments: object) -> object:
-        """What QEMU returns. Raises MachineError if it refuses, or does not answer any more."""
+        """Send a command, and return QEMU's answer. Raises MachineError if QEMU refuses, or does not answer."""
         return self._run(self._client.execute(name, arguments))
 
     def wait_for(self, event: str, device: str) -> None:
-        """Until QEMU has reported this event of a device. Raises MachineError if it does not."""
+        """Wait until QEMU has reported this event of a device. Raises MachineError if it does not."""
 
         async def wait() -> None:
             async for reported in self._client.events:
@@ -246,7 +246,7 @@ class Qmp:
         self._run(wait())
 
     def close(self) -> None:
-        """Raises nothing."""
+        """End the connection. Raises nothing."""
         with contextlib.suppress(MachineError):
             self._run(self._client.disconnect())
         self._runner.close()
@@ -265,11 +265,11 @@ class Qmp:
 
 
 class Machine:
-    """An emulated Pi that runs; a context manager. name, port, key: for playbooks.run(), and whoever logs in.
+    """A running emulated Pi; a context manager. name, port, key: for playbooks.run(), and to log in.
 
-    card: what it boots from. folder: for its console, its own disk and sockets; emptied of the last two at the end.
-    layer: a disk to build on, of an earlier machine on the same card, instead of the card itself. slow: so many times
-    slower than this host's its clock runs, 1 to 60. drives: more disks, read only: /dev/vdb, /dev/vdc, ...
+    card: what it boots from. folder: gets console.log, and its own disk, which is removed at the end. layer: the disk
+    of an earlier machine on the same card, to start from instead of the card itself. slow: how many times slower than
+    this host's its clock runs, 1 to 60. drives: more disks, which are read-only: /dev/vdb, /dev/vdc, ...
     """
 
     def __init__(
@@ -290,7 +290,8 @@ class Machine:
         self.console = self.folder / "console.log"
         self.disk = self.folder / "disk.qcow2"
         with contextlib.ExitStack() as stack:
-            self._work = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rover-pi-")))  # sockets: short
+            # Not in `folder`, as the paths of sockets must be short.
+            self._work = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rover-pi-")))
             self._errors = stack.enter_context(tempfile.TemporaryFile())
             stack.callback(self.disk.unlink, missing_ok=True)
             base, kind = (layer, "qcow2") if layer else (card.disk, "raw")
@@ -306,7 +307,7 @@ class Machine:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        """Cuts its power, and removes its disk. Raises nothing."""
+        """Cut its power, and remove its disk. Raises nothing."""
         self._stack.close()
 
     def _start(self, drives: Sequence[Path]) -> subprocess.Popen:
@@ -317,12 +318,12 @@ class Machine:
         command: list[object] = ["qemu-system-aarch64", "-machine", "virt", *machine]
         command += ["-accel", "tcg,thread=multi,tb-size=512", "-dtb", tree, "-append", KERNEL_LINE]
         command += ["-kernel", self.card.kernel, "-initrd", self.card.initramfs]
-        # Nothing is synchronized to the host's disk: a machine that ends early is thrown away.
+        # Nothing is synced to the host's disk: the disk of a machine that ends early is thrown away.
         disks = [(self.disk, "format=qcow2,cache=unsafe"), *((d, "format=raw,readonly=on") for d in drives)]
         for i, (file, options) in enumerate(disks):
             command += ["-drive", f"if=none,id=d{i},file={_comma(file)},{options}"]
             command += ["-device", f"virtio-blk-pci,drive=d{i},romfile="]
-        # restrict: it reaches nothing, as at a track; only its ssh is reached.
+        # restrict: the machine reaches no network, as at a track; only its sshd can be reached.
         command += ["-netdev", f"user,id=n,restrict=on,hostfwd=tcp:127.0.0.1:{self.port}-:22"]
         for device in ("virtio-net-pci,netdev=n,romfile=", "virtio-rng-pci", "qemu-xhci,id=xhci"):
             command += ["-device", device]
@@ -332,7 +333,7 @@ class Machine:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._errors,
-            start_new_session=True,  # a terminal's ^C is not for it
+            start_new_session=True,  # so that a terminal's ^C does not reach it
             preexec_fn=_end_with_parent,
         )
 
@@ -357,7 +358,7 @@ class Machine:
 
     @property
     def ssh_options(self) -> list[str]:
-        """For ssh, scp and Ansible; without the port."""
+        """The options for ssh, scp and Ansible, without the port."""
         return [
             *("-i", str(self.card.key), "-o", "IdentitiesOnly=yes", "-o", "BatchMode=yes", "-o", "LogLevel=ERROR"),
             *("-o", "StrictHostKeyChecking=no", "-o", "UserKnownHostsFile=/dev/null", "-o", "ConnectTimeout=60"),
@@ -365,7 +366,7 @@ class Machine:
         ]
 
     def wait_for_ssh(self, timeout_s: float = BOOT_S) -> float:
-        """Seconds until somebody could log in. Raises MachineError if nobody can in time."""
+        """Wait until somebody can log in; return how many seconds that took. Raises MachineError if it takes longer."""
         start = time.monotonic()
         while time.monotonic() - start < timeout_s:
             self._check()
@@ -376,7 +377,10 @@ class Machine:
         raise MachineError(f"no ssh within {timeout_s:g} s; the machine's console is in {self.console}")
 
     def ssh(self, command: str, *, timeout_s: float = 600, check: bool = True, text: str | None = None) -> str:
-        """Runs a shell command as the login user; its stdout, with stderr behind it. MachineError if it fails."""
+        """Run a shell command as the login user; return its stdout, followed by its stderr.
+
+        text: for its stdin. Raises MachineError if it takes longer than timeout_s, or if it fails and check is set.
+        """
         words = ["ssh", *self.ssh_options, "-p", str(self.port), f"{USER}@127.0.0.1", command]
         try:
             done = subprocess.run(
@@ -392,20 +396,20 @@ class Machine:
     # -- USB
 
     def plug(self, port: Path | str) -> None:
-        """Plugs in a USB serial adapter (an FTDI's ids) with what is at a serial port of the host behind it."""
+        """Plug in a USB serial adapter (with an FTDI's ids), and connect a serial port of the host to it."""
         device = {"device": str(Path(port).resolve())}
         self._plug(ADAPTER, "usb-serial", {"type": "serial", "data": device})
 
     def plug_camera(self, socket: Path | str) -> None:
-        """Plugs in the USB device that speaks the usbredir protocol on a Unix socket."""
+        """Plug in the USB device that speaks the usbredir protocol on a Unix socket."""
         address = {"type": "unix", "data": {"path": str(socket)}}
         self._plug(CAMERA, "usb-redir", {"type": "socket", "data": {"addr": address, "server": False}})
 
     def unplug(self, what: str = ADAPTER) -> None:
-        """Pulls it out: ADAPTER or CAMERA."""
+        """Pull out a device: ADAPTER or CAMERA."""
         self._qmp.command("device_del", id=what)
         self._qmp.wait_for("DEVICE_DELETED", device=what)
-        if what == ADAPTER:  # usb-redir takes its wire along
+        if what == ADAPTER:  # usb-redir removes its character device itself
             self._qmp.command("chardev-remove", id=f"{what}-wire")
 
     def _plug(self, what: str, driver: str, backend: dict[str, Any]) -> None:
@@ -415,8 +419,8 @@ class Machine:
     # -- the end
 
     def power_off(self, timeout_s: float = OFF_S) -> None:
-        """Shuts the system down, so that its disk can be a layer for others. Raises MachineError if it does not end."""
-        with contextlib.suppress(MachineError):  # the connection ends with it
+        """Shut the system down, so that its disk can be a layer for others. Raises MachineError if it does not end."""
+        with contextlib.suppress(MachineError):  # the connection ends with the system
             self.ssh("sudo sync; sudo systemctl poweroff", timeout_s=60)
         try:
             self._process.wait(timeout_s)
@@ -442,11 +446,11 @@ class Machine:
 
 
 def _comma(path: Path) -> str:
-    """A path in one of QEMU's options."""
+    """Write a path for one of QEMU's options, in which a comma must be doubled."""
     return str(path.resolve()).replace(",", ",,")
 
 
 def _end_with_parent() -> None:
-    """In QEMU's process: it ends with the thread that started it, also when that is killed."""
+    """Let QEMU, in whose process this runs, end with the thread that started it, even if that is killed."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

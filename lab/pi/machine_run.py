@@ -1,11 +1,11 @@
-"""`make pi`: from a flashed card to servo pulses, on a whole emulated Pi.
+"""`make pi`: go from a flashed card to servo pulses, on a whole emulated Pi.
 
-A camera frame goes in at the kernel's /dev/video0, the INT8 policy runs on four emulated Cortex-A76, commands leave by
-a USB serial adapter, and the project's firmware on an emulated Arduino makes servo pulses of them, each of which is
-held against what the rover says that it commanded. Then cables are pulled while it drives.
+A camera frame goes in at the kernel's /dev/video0, the INT8 policy runs on four emulated Cortex-A76, and commands leave
+by a USB serial adapter. The project's firmware on an emulated Arduino makes servo pulses of them, and each pulse is
+compared with what the rover says that it commanded. Then cables are pulled while it drives.
 
-What it says about time: nothing about a Pi. The machine's clock and the Arduino's run SLOW times slower than the host's
-(machine.py), which makes the machine about as fast as a Pi by its own clock.
+Its times say nothing about a Pi. The machine's clock and the Arduino's run `slow` times slower than the host's
+(machine.py, lab/params.yml), which makes the machine about as fast as a Pi by its own clock.
 """
 
 import contextlib
@@ -38,9 +38,9 @@ STAGE = "pi"
 REPOSITORY = Path(__file__).parents[2]
 PORT, CAMERA, MODEL = "/dev/rover-arduino", "/dev/video0", "/var/lib/rover/models/current/policy.pt"
 SIZE = (640, 360)
-FRAMES = 150  # of the recordings, 5 s
-TWICE = 2  # each: vivid's HDMI has no 30 Hz at this size, only 60
-# The camera: frames that are written to vivid's output come out of its input, as through an HDMI cable.
+FRAMES = 150  # how many of the recordings' are shown, which is 5 s
+TWICE = 2  # each frame is shown twice: vivid's HDMI has no 30 Hz at this size, only 60
+# The camera is the kernel's vivid: frames written to its output come out of its input, as through an HDMI cable.
 SCREEN = "rover-screen"
 SHOW = f"""set -e
 modprobe vivid n_devs=1 node_types=0x101 num_inputs=1 input_types=0x3 num_outputs=1 output_types=0x1
@@ -54,11 +54,11 @@ systemctl reset-failed {SCREEN} 2> /dev/null || true
 systemd-run --quiet --unit={SCREEN} v4l2-ctl -d /dev/video1 --stream-out-mmap --stream-from=/dev/vdb --stream-loop
 """
 HIDE = f"systemctl stop {SCREEN}; modprobe -r vivid"
-WATCH_S = 2.0  # of the rover's time, after a fault
+WATCH_S = 2.0  # how long the pins are watched after a fault, in the rover's time
 
 
 class MachineRunError(RoverError):
-    """A step of the whole machine that did not do what it should."""
+    """A step of the whole machine did not do what it should."""
 
 
 def run_machine(
@@ -69,11 +69,11 @@ def run_machine(
     fresh: bool = False,
     say: Callable[[str], None] = print,
 ) -> PiReport:
-    """All of it; what was found, which is written to `output` even where a step fails.
+    """Run everything; return the report, which is written to `output` even if a step fails.
 
-    artifact: to deploy. recordings: episodes, whose frames the camera shows. fresh: provision anew, even if a card that
-    was provisioned with just this role and these wheels is in the cache. say: output each step. Raises RoverError where
-    it cannot be begun. The machine's console and Ansible's words are beside `output` afterwards if anything failed.
+    artifact: to deploy. recordings: episodes, whose frames the camera shows. fresh: provision a new card, even if one
+    that was provisioned with these requirements is in the cache. say: called with each step. Raises RoverError if it
+    cannot begin. If anything is wrong, the machine's console and Ansible's output are left beside `output`.
     """
     output, artifact, recordings = Path(output), Path(artifact), Path(recordings)
     require_arduino()
@@ -84,7 +84,7 @@ def run_machine(
     shutil.rmtree(kept, ignore_errors=True)
     with (
         interruptible(),
-        tempfile.TemporaryDirectory(prefix=".pi-whole.", dir=_cache()) as scratch,  # large, so not in /tmp
+        tempfile.TemporaryDirectory(prefix=".pi-whole.", dir=_cache()) as scratch,  # too large for /tmp
         tempfile.TemporaryDirectory(prefix="rover-plays-") as ansible,  # ssh's sockets want a short path
     ):
         run = _Run(report, Path(scratch), Path(ansible))
@@ -162,9 +162,9 @@ class _Run:
     # -- provisioning
 
     def provisioned(self, flashed: Card, fresh: bool) -> Path:
-        """The card as provision.yml left it once, with these requirements: from the cache or made now.
+        """Return a card as provision.yml left it with these requirements, from the cache or made now.
 
-        What else is in the role may have changed since, and the rover's own wheel: provision.yml runs on it each time.
+        The rest of the role, and the rover's own wheel, may have changed since. So provision.yml runs on it each time.
         """
         requirements = REPOSITORY / "requirements_pi.txt"
         key = key_of({"card": str(flashed.folder)}, requirements)
@@ -190,7 +190,7 @@ class _Run:
         return folder / "disk.qcow2"
 
     def provision(self) -> dict[str, int]:
-        # Offline: the machine reaches nothing, as at a track, and wheels come from a folder that is fetched once.
+        # Offline: the machine reaches no network, as at a track, and the wheels come from a folder, fetched only once.
         return self.play("provision", rover_offline=True, rover_wheels=cache_root() / "wheels")
 
     # -- driving
@@ -231,7 +231,7 @@ class _Run:
         return read_log(logs[-1])
 
     def fault(self, name: str, pull: Callable[[], object], put_back: Callable[[], object]) -> None:
-        """Pulls something while the car drives: pins, service, and whether all is well once it is back."""
+        """Pull something out while the car drives; judge the pins and the service, and rover doctor once it is back."""
         with self.report.step(name):
             self.sudo(f"systemctl reset-failed {UNIT}; systemctl start {UNIT}", timeout_s=900)
             self.sudo("rover arm-car --yes")
@@ -261,12 +261,12 @@ class _Run:
                 self.wrong(f"{name}: rover doctor is not content after it was put back")
 
     def service(self) -> dict[str, str]:
-        """What systemd knows of it."""
+        """Return what systemd knows about the service."""
         output = self.pi.ssh(f"systemctl show --property=ActiveState,SubState,Result,NRestarts,StatusText {UNIT}")
         return dict(line.partition("=")[::2] for line in output.splitlines() if "=" in line)
 
     def journal(self) -> list[str]:
-        """What the service said last."""
+        """Return the last lines of the service's journal about something that is unplugged, missing or plugged in."""
         output = self.sudo(f"journalctl --unit={UNIT} --output=cat --no-pager --lines=60")
         return [
             line
@@ -275,7 +275,7 @@ class _Run:
         ][-4:]
 
     def doctor(self) -> dict[str, Any]:
-        """`rover doctor` on the rover: whether the car would drive, and each check."""
+        """Run `rover doctor` on the rover; return whether the car would drive, and each check."""
         output = self.pi.ssh(
             f"cd / && sudo -u rover rover doctor {MODEL} --camera {CAMERA} --port {PORT} --json",
             check=False,
@@ -293,7 +293,7 @@ class _Run:
     # -- the machine
 
     def machine(self) -> dict[str, Any]:
-        """What it says that it is."""
+        """Return what the machine says that it is: kernel, cores, SDOT, memory, Debian."""
         output = self.pi.ssh(
             "uname -rm; nproc; grep -m1 ^Features /proc/cpuinfo; head -1 /proc/meminfo; cat /etc/debian_version"
         )
@@ -309,11 +309,11 @@ class _Run:
         }
 
     def clock(self) -> float:
-        """The host's monotonic time at which the machine's was 0, within some milliseconds of the machine's."""
+        """Return the host's monotonic time at which the machine's was 0, to some milliseconds of the machine's time."""
         best = (float("inf"), 0.0)
         for _ in range(10):
             before = time.monotonic()
-            uptime = float(self.pi.ssh("cat /proc/uptime").split()[0]) + 0.005  # it is cut to hundredths
+            uptime = float(self.pi.ssh("cat /proc/uptime").split()[0]) + 0.005  # /proc/uptime is cut off to hundredths
             after = time.monotonic()
             best = min(best, (after - before, (before + after) / 2 - self.slow * uptime))
         return best[1]
@@ -329,7 +329,7 @@ class _Run:
             time.sleep(1)
 
     def play(self, name: str, **variables: object) -> dict[str, int]:
-        """Runs one of ansible/'s playbooks on the machine; its recap. Raises MachineRunError if it fails."""
+        """Run one of ansible/'s playbooks on the machine; return its recap. Raises MachineRunError if it fails."""
         given = {k: str(v) if isinstance(v, Path) else v for k, v in variables.items()}
         play = playbooks.run(name, [self.pi], folder=self.ansible, variables=given)
         (self.folder / f"{name}.log").write_text(play.output)
@@ -342,7 +342,7 @@ class _Run:
 
 
 def _pictures(recordings: Path) -> list[Path]:
-    """The first frames of the recordings."""
+    """Return the paths of the first frames of the recordings."""
     pictures = sorted(recordings.glob("*/frames/*.jpg"))[:FRAMES]
     if not pictures:
         raise MachineRunError(f"{recordings}: no recorded frames in it; make demo leaves some")
@@ -350,7 +350,7 @@ def _pictures(recordings: Path) -> list[Path]:
 
 
 def _frames(recordings: Path, file: Path) -> Path:
-    """The same as vivid takes them: YUYV, one after another."""
+    """Write the same frames to a file as vivid takes them: YUYV, one after another."""
     with file.open("wb") as out:
         for path in _pictures(recordings):
             image = cv2.imread(str(path))

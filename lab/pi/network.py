@@ -1,7 +1,7 @@
-"""The network between the laptop and a rover's sshd, so that it can be cut, go silent and garble what it carries.
+"""Simulate the network between the laptop and a rover's sshd, so that it can be cut, go silent and garble its bytes.
 
 with Network(pi) as network:
-    playbooks.run("deploy", [network], ...)     # a host like the rover itself, by another port
+    playbooks.run("deploy", [network], ...)     # a host like the rover itself, with another port
     network.cut()
 """
 
@@ -19,7 +19,7 @@ CONNECT_S = 5.0
 class Network:
     """Forwards a port of the loopback to a rover's; a context manager.
 
-    name, port, key: of a playbooks.Host. sent: bytes that went to the rover so far, by all connections.
+    name, port, key: make it a playbooks.Host. sent: how many bytes went to the rover so far, on all connections.
     """
 
     def __init__(self, pi: Host):
@@ -45,20 +45,20 @@ class Network:
         self._end_all()
 
     def cut(self) -> None:
-        """Every connection ends now, and there is no new one until it is mended."""
+        """End every connection now, and refuse new ones until mend()."""
         self._cut = True
         self._end_all()
 
     def silence(self) -> None:
-        """Nothing comes through any more, and nobody is told."""
+        """Let nothing through any more, without ending a connection."""
         self._silent = True
 
     def flip(self, after: int = 0) -> None:
-        """Turns one bit of what goes to the rover, so many bytes from now; once."""
+        """Flip one bit, once, of what goes to the rover, when `after` more bytes have gone there."""
         self._flip_after = self.sent + after
 
     def mend(self) -> None:
-        """As new; connections of before are over."""
+        """Restore the network, and end all earlier connections."""
         self._cut = self._silent = False
         self._flip_after = None
         self._end_all()
@@ -106,7 +106,7 @@ class Network:
     def _end(self, *connections: socket.socket) -> None:
         for connection in connections:
             with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)  # wakes who waits for it, which close() would not
+                connection.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits for it, which close() does not
             with self._lock:
                 self._open.discard(connection)
             connection.close()

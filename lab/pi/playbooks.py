@@ -1,4 +1,4 @@
-"""Runs the playbooks of ansible/ as a human would, on rovers given by where their sshd is.
+"""Run the playbooks of ansible/ as a human would, on rovers that are given by the ports of their sshd.
 
 play = run("provision", [pi], folder=tmp)
 play.ok, play.seconds, play.recap["rover1"]["changed"], play.output
@@ -26,7 +26,7 @@ NO_KNOWN_HOSTS = "-o UserKnownHostsFile=/dev/null -o StrictHostKeyChecking=no -o
 
 
 class Host(Protocol):
-    """What the inventory says of a rover: sshd on a port of the loopback, and the key of its user."""
+    """What the inventory says about a rover: the port of its sshd on the loopback, and the key of its user."""
 
     @property
     def name(self) -> str: ...
@@ -48,12 +48,12 @@ class Play:
 
     @property
     def ok(self) -> bool:
-        """Nothing failed, nobody was unreachable."""
+        """Whether nothing failed and every host was reached."""
         return self.code == 0 and bool(self.recap)
 
     @property
     def changed(self) -> int:
-        """Tasks that changed something, on all hosts."""
+        """How many tasks changed something, on all hosts together."""
         return sum(row.get("changed", 0) for row in self.recap.values())
 
     @property
@@ -67,7 +67,7 @@ class Play:
         return self.output.partition("PLAY RECAP")[0].strip()[-3000:]
 
     def row(self) -> dict[str, Any]:
-        """For the report."""
+        """Return this play's row for the report."""
         return {"play": self.book, "ok": self.ok, "seconds": round(self.seconds, 1), "recap": self.recap}
 
 
@@ -80,11 +80,11 @@ def run(
     variables: Mapping[str, Any] | None = None,
     timeout_s: float = 3600,
 ) -> Play:
-    """Runs ansible/<book>.yml on hosts, in this order.
+    """Run ansible/<book>.yml on hosts, in this order.
 
-    folder: for the inventory and Ansible's own files; one for several plays lets them share ssh connections. check: as
-    --check --diff. variables: as -e. A play that fails is no error. Raises EmulationError if there is no Ansible, or if
-    it takes longer than timeout_s.
+    folder: for the inventory and Ansible's own files; plays with the same folder share ssh connections. check: run
+    with --check --diff. variables: passed with -e. A play that fails raises nothing. Raises EmulationError if there is
+    no Ansible, or if the play takes longer than timeout_s.
     """
     program = Path(sys.executable).with_name("ansible-playbook")
     if not program.exists():
@@ -119,7 +119,7 @@ def run(
 
 
 def inventory(hosts: Sequence[Host]) -> str:
-    """The repository's inventory.ini with these hosts in it."""
+    """Return the repository's inventory.ini with these hosts in it."""
     given = configparser.RawConfigParser(allow_no_value=True, delimiters=("=",))
     given.optionxform = str  # type: ignore[assignment,method-assign]  # as its documentation says to keep the case
     given.read(INVENTORY)
@@ -133,7 +133,7 @@ def inventory(hosts: Sequence[Host]) -> str:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Of Ansible: nothing of the user's own settings, and its files in a folder."""
+    """Return Ansible's environment: without the user's own settings for it, and with its files in the folder."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("ANSIBLE")}
     own = {"ANSIBLE_HOME": str(folder), "ANSIBLE_NOCOLOR": "1", "ANSIBLE_LOCAL_TEMP": str(folder / "local")}
     own["ANSIBLE_TIMEOUT"] = "120"  # sudo, emulated on a busy machine, took more than the usual 10 s
@@ -141,7 +141,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 def recap(output: str) -> dict[str, dict[str, int]]:
-    """The counts of Ansible's last lines, by host; empty if it did not come so far."""
+    """Read the counts in Ansible's last lines, by host; empty if it did not get that far."""
     found = {}
     for line in output.partition("PLAY RECAP")[2].splitlines()[1:]:
         name, colon, counts = line.partition(" : ")

@@ -1,4 +1,4 @@
-"""What an emulated Arduino's servo pins did, against what was commanded on another machine with another clock."""
+"""Compare what an emulated Arduino's servo pins did with what another machine, with another clock, commanded."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -12,15 +12,17 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.telemetry import Flight
 from rover_lib.world.standin import PinEvent
 
-# A command counts from the next pulse that begins after it has come, sent anew if need be (loop.RESEND_S), until that
-# of the next command. So a pulse is one of the commands of the last 33 + 18 + 21 ms and some for the serial line.
+# A command holds from the next pulse that begins after it has come, which may need a second sending (loop.RESEND_S),
+# until the first pulse of the next command. So a pulse belongs to one of the commands of the last 33 + 18 + 21 ms, and
+# some more for the serial line.
 HELD_S = 0.1
-ERROR_S = 0.02  # of one clock seen from the other, over ssh: 5 ms by what is read, and half of how long that takes
-READ_S = 0.2  # between readings of the pins
+# How well one clock is known from the other over ssh: 5 ms by the digits that are read, and half of the reading's time.
+ERROR_S = 0.02
+READ_S = 0.2  # the time between readings of the pins
 
 
 class Pins:
-    """Everything that an Arduino's pins do, from now on; a context manager."""
+    """Records everything that an Arduino's pins do from now on; a context manager."""
 
     def __init__(self, board: EmulatedArduino):
         self._board = board
@@ -38,7 +40,7 @@ class Pins:
         self._thread.join()
 
     def since(self, at_s: float) -> list[PinEvent]:
-        """What happened since then. Raises ArduinoError if it has ended."""
+        """Return what has happened since then. Raises ArduinoError if the Arduino has ended."""
         if self._failure:
             raise self._failure
         return [e for e in self._events[:] if e.monotonic_s >= at_s]
@@ -55,13 +57,14 @@ class Pins:
 def compare(
     flight: Flight, events: Sequence[PinEvent], host_s: Callable[[np.ndarray], np.ndarray], slow: float
 ) -> dict[str, Any]:
-    """Each pulse of a drive against the commands that it may be, and each command against the pulses that it caused.
+    """Compare each pulse of a drive with the commands that it may stem from, and each command with its pulses.
 
-    host_s: the rover's monotonic seconds as the host's, by which the events are. slow: seconds of the host in one of
-    the rover's and the Arduino's. worst_us: the largest difference of any pulse from the nearest of its commands, those
-    between two of them being on the way, and of any command from the nearest of its pulses; None where there is nothing
-    to compare. unseen: commands without any pulse in their time. distinct: values among the commands: a servo that
-    stands still proves little.
+    host_s: converts the rover's monotonic seconds to the host's, which the events have. slow: how many seconds of the
+    host are one of the rover's and the Arduino's.
+    Returns commands, pulses, worst_us, unseen and distinct. worst_us: the largest distance of a pulse from the range of
+    its commands (within it, the pulse is on the way from one to another), and of a command from the nearest of its
+    pulses; None if there is nothing to compare, or if any has no counterpart. unseen: how many commands have no pulse
+    in their time. distinct: how many different values were commanded, by pin: a servo that stands still proves little.
     """
     sent_s = host_s(flight.ticks["t_s"] + float(flight.header["start_monotonic_s"]))
     held_s, error_s = HELD_S * slow, ERROR_S * slow
@@ -74,11 +77,11 @@ def compare(
         result["distinct"][pin] = len(np.unique(commanded))
         if not len(sent_s) or not len(pulses):
             return result
-        # From the first command until the last; before and after, the pins are in neutral.
+        # Only from the first command to the last: before and after, the pins are in neutral.
         driven = np.flatnonzero((rose_s > sent_s[0] + held_s) & (rose_s < sent_s[-1]))
         for i in driven:
             choice = commanded[(sent_s > rose_s[i] - held_s) & (sent_s <= rose_s[i] + error_s)]
-            # Between two commands: the firmware limits how fast a pulse changes.
+            # The firmware limits how fast a pulse changes, so it may also lie between two commands.
             off = max(choice.min() - us[i], us[i] - choice.max(), 0.0) if len(choice) else np.inf
             worst.append(float(off))
         result["pulses"] += len(driven)
@@ -91,15 +94,16 @@ def compare(
 
 
 def moving(events: Sequence[PinEvent]) -> list[float]:
-    """When (monotonic seconds) pulses that move the car began."""
+    """Return when (monotonic seconds) the pulses that move the car began."""
     return [e.monotonic_s for e in events if e.pin == "throttle" and e.pulse_us > STOPPED_THROTTLE_US]
 
 
 def stopped(events: Sequence[PinEvent], at_s: float, slow: float = 1.0) -> dict[str, Any]:
-    """How the pins went to neutral after `at_s` (by the host's clock), in the Arduino's milliseconds.
+    """Return how the pins went to neutral after something happened at `at_s` (host's clock), in the Arduino's ms.
 
-    after_line_ms: from the last whole line of the rover until the throttle was off, which the firmware promises after
-    150. after_ms: the same since it happened. steering_us: at the end. Each None if it did not happen.
+    drove: whether the car was moving in the second before. after_ms: from at_s until the throttle was off.
+    after_line_ms: the same from the last whole line of the rover, for which the firmware promises 150. steering_us: at
+    the end. These are None if it did not happen. neutral: whether the throttle is off and the steering centred.
     """
     lines = [e.monotonic_s for e in events if e.kind == "line"]
     throttle = [e for e in events if e.pin == "throttle" and e.kind == "pulse"]

@@ -1,9 +1,9 @@
-"""What holds on an emulated Pi that is provisioned and has a model: its packages, its service's sandbox and restarts.
+"""Examine an emulated Pi that is provisioned and has a model: its packages, its service's sandbox and restarts.
 
     sandbox(pi)["exposure"]             # 0.8, as systemd-analyze says
     hang(pi, pins)["restarted_s"]       # 2.7, by systemd's watchdog
 
-Each returns what it found; container_run.py holds that against the gates.
+Each function returns what it found; container_run.py compares that with the gates.
 """
 
 import contextlib
@@ -24,13 +24,15 @@ from rover_lib.onboard.service import UNIT
 from rover_lib.workshop.wheelhouse import REQUIREMENTS, VIEW
 
 VENV, STATE = "/opt/rover/venv", "/var/lib/rover-drive"
-READY_S = 600  # torch under emulation on a busy machine
+READY_S = 600  # how long the service may take until it can drive, with emulated torch on a busy machine
 
 
 def environment(root: Path, engine: str = "torch") -> dict[str, Any]:
-    """What is installed for the policy: name, version and who vouches for it; unhashed: what nobody does.
+    """Return what is installed for the policy.
 
-    engine: of REQUIREMENTS. others: engines that are there beside it. of_view: what only the view needs.
+    engine: a key of REQUIREMENTS. packages: each with name, version and what vouches for it. unhashed: those for which
+    nothing vouches, and lerobot. lerobot: whether that is installed. missing: needed packages that are not installed.
+    others: engines that are installed beside `engine`. of_view: packages that only the view needs. size_mb: of all.
     """
     site = next((root / VENV.lstrip("/") / "lib").glob("python3*/site-packages"))
     pinned, of_view = hashed(REQUIREMENTS[engine]), hashed(VIEW)
@@ -62,7 +64,7 @@ def environment(root: Path, engine: str = "torch") -> dict[str, Any]:
 
 
 def hashed(requirements: Path) -> dict[str, set[str]]:
-    """Versions by name that a requirements file pins together with at least one hash."""
+    """Return by name the versions that a requirements file pins with at least one hash."""
     found: dict[str, set[str]] = {}
     for entry in re.split(r"\n(?=\S)", requirements.read_text()):
         if (pin := re.match(r"([A-Za-z0-9._-]+)==([^\s;\\]+)", entry)) and "--hash=sha256:" in entry:
@@ -127,16 +129,16 @@ for folder, folders, files in os.walk("/"):
             pass
 print("PROBED", json.dumps({"found": found, "writable": sorted(writable)}))
 """
-OPEN = "/etc/rover-open"  # anybody may write there, outside of the sandbox
-# Its state, its runtime folder (which model it has loaded), and its own /tmp, which nobody else sees and which ends
-# with it.
+OPEN = "/etc/rover-open"  # outside of the sandbox, anybody may write there
+# The service may write its state, its runtime folder (which says what model it has loaded), and its own /tmp, which
+# nobody else sees and which ends with it.
 ALLOWED = (STATE, "/run/rover-drive", "/tmp", "/var/tmp")
 
 
 def sandbox(pi: Container) -> dict[str, Any]:
-    """Probes from within the service's own unit, with nothing but another program to start, and the same outside.
+    """Run probes in the service's own unit, of which only the program is replaced, and run the same probes outside.
 
-    What is refused must be what the sandbox refuses: so each probe has to work for the same user outside of it.
+    A probe proves that the sandbox refuses something only if it works for the same user outside of it.
     """
     (pi.root / PROBE.lstrip("/")).write_text(PROBES)
     homes = ["/home/pi", "/root"]
@@ -181,7 +183,7 @@ def sandbox(pi: Container) -> dict[str, Any]:
 
 
 def unit_for(text: str, argv: str) -> str:
-    """The drive service's unit with another program, that is started once and has nobody to tell."""
+    """Return the drive service's unit for another program, which is started once and sends systemd no notifications."""
     drop = ("ExecStart", "ExecStartPre", "NotifyAccess", "WatchdogSec", "WatchdogSignal", "Restart", "RestartSec",
             "ConditionPathExists", "StartLimitIntervalSec", "StartLimitBurst", "Type", "WantedBy")  # fmt: skip
     lines = [line for line in text.splitlines() if line.partition("=")[0] not in drop]
@@ -190,7 +192,7 @@ def unit_for(text: str, argv: str) -> str:
 
 
 def escaped(argv: str) -> str:
-    """A command for a unit: % and $ mean themselves."""
+    """Escape a command for a unit, so that % and $ stand for themselves."""
     return argv.replace("%", "%%").replace("$", "$$")
 
 
@@ -209,12 +211,12 @@ def _probe(pi: Container, name: str, unit: str) -> dict[str, Any]:
 
 
 def hang(pi: Container, pins: Pins) -> dict[str, Any]:
-    """The loop's process hangs while it drives: SIGSTOP.
+    """Hang the loop's process by SIGSTOP while it drives. All times are in seconds from then.
 
     stopped_s: until the throttle pulses of the Arduino were neutral. killed_s: until systemd's watchdog had killed it.
     restarted_s: until systemd started it again. running_s: until its program ran, after ExecStartPre=, which takes
-    milliseconds on a Pi. ready_s: until it could drive, most of it torch under emulation.
-    disarmed: nobody armed it again, and no pulse moved the car since.
+    milliseconds on a Pi. ready_s: until it could drive, most of which is torch under emulation.
+    disarmed: whether it was ready but not armed afterwards, and no pulse has moved the car from a second after on.
     """
     pi.inside("systemctl", "reset-failed", UNIT, check=False)
     pi.inside("systemctl", "start", UNIT)
@@ -250,7 +252,7 @@ def hang(pi: Container, pins: Pins) -> dict[str, Any]:
 
 
 def start_limit(pi: Container) -> dict[str, Any]:
-    """The camera is gone: tries until systemd leaves it, and what it is then, and ten seconds later."""
+    """Start the service without its camera; return how often systemd tries, and the state 10 s after it gave up."""
     pi.inside("systemctl", "reset-failed", UNIT, check=False)
     camera, away = pi.bench / "camera", pi.bench / "unplugged"
     camera.rename(away)
@@ -276,7 +278,7 @@ def start_limit(pi: Container) -> dict[str, Any]:
 
 
 def show(pi: Container, *names: str, unit: str = UNIT) -> dict[str, str]:
-    """What systemd says of a service, the drive's if no other is named."""
+    """Return what systemd says about a service, by default the drive's."""
     told = pi.inside("systemctl", "show", f"--property={','.join(names)}", unit).stdout
     found = dict(line.partition("=")[::2] for line in told.splitlines())
     return {name: found.get(name, "") for name in names}

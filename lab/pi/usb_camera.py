@@ -1,4 +1,4 @@
-"""A USB camera without one: what QEMU's usb-redir shows the machine as a UVC webcam that gives recorded JPEGs.
+"""Simulate a USB camera: QEMU's usb-redir shows it to the machine as a UVC webcam that gives recorded JPEGs.
 
     with UsbCamera(jpegs, slow=10) as camera:
         pi.plug_camera(camera.path)         # /dev/video0 of the machine, by its kernel's uvcvideo
@@ -25,20 +25,20 @@ MAX_FRAME = WIDTH * HEIGHT * 2
 ENDPOINT, PACKET = 0x81, 512
 VIDEO, CONTROL_INTERFACE, STREAMING_INTERFACE = 14, 0, 1
 
-# Of usbredirproto.h
+# From usbredirproto.h
 HELLO, CONNECT, INTERFACES, ENDPOINTS = 0, 1, 4, 5
 SET_CONFIGURATION, GET_CONFIGURATION, CONFIGURATION = 6, 7, 8
 SET_ALT, GET_ALT, ALT, CANCEL, CONTROL, BULK = 9, 10, 11, 21, 100, 101
 CAPABILITIES = 1 << 1 | 1 << 4 | 1 << 5 | 1 << 6  # device version, packet sizes, 64-bit ids, long bulk packets
-HEADER, FIRST_HEADER = struct.Struct("<IIQ"), struct.Struct("<III")  # greetings come before ids are agreed on
+HEADER, FIRST_HEADER = struct.Struct("<IIQ"), struct.Struct("<III")  # greetings have the first
 CONTROL_HEADER, BULK_HEADER = struct.Struct("<BBBBHHH"), struct.Struct("<BBHIH")
 HIGH_SPEED, BULK_TYPE, NO_TYPE = 2, 2, 255
 OK, CANCELLED, STALL = 0, 1, 4
 
-# Of the USB video class
+# From the USB video class
 GET_DESCRIPTOR, SET_CUR, GET_CUR, GET_LEN = 0x06, 0x01, 0x81, 0x85
 PROBE = struct.Struct("<HBBIHHHHHII")
-INTERVAL = 10_000_000 // RATE_HZ  # of 100 ns
+INTERVAL = 10_000_000 // RATE_HZ  # between frames, in units of 100 ns
 
 
 def _descriptor(*content: int) -> bytes:
@@ -50,12 +50,12 @@ def _words(*values: int) -> bytes:
 
 
 def device_descriptor() -> bytes:
-    """Of the device: a composite one, whose function is said by its interfaces."""
+    """Return the device's descriptor: a composite device, whose interfaces say what it does."""
     return struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x0200, 0xEF, 2, 1, 64, VENDOR, PRODUCT, 0x0100, 1, 2, 0, 1)
 
 
 def configuration_descriptor() -> bytes:
-    """Of its only configuration: a camera, and a stream of MJPEG of one size and rate."""
+    """Return the descriptor of its only configuration: a camera, and an MJPEG stream of one size and rate."""
     camera = _descriptor(0x24, 0x02, 1, *(0x01, 0x02), 0, 0, *[0] * 6, 3, 0, 0, 0)
     screen = _descriptor(0x24, 0x03, 2, *(0x01, 0x01), 0, 1, 0)
     units = camera + screen
@@ -82,12 +82,12 @@ STRINGS = {0: b"\x09\x04", 1: "rover".encode("utf-16-le"), 2: "emulated camera".
 
 
 def probe() -> bytes:
-    """The only stream that there is, as probe and commit say it."""
+    """Return the data of a probe or commit request, which describe the only stream that there is."""
     return PROBE.pack(1, 1, 1, INTERVAL, 0, 0, 0, 0, 0, MAX_FRAME, MAX_FRAME)
 
 
 def control_answer(request_type: int, request: int, value: int, index: int, length: int) -> tuple[int, bytes]:
-    """(status, data) of a control request."""
+    """Answer a control request with (status, data)."""
     if request == GET_DESCRIPTOR and request_type & 0x80:
         kind, which = value >> 8, value & 0xFF
         if kind == 1:
@@ -98,7 +98,7 @@ def control_answer(request_type: int, request: int, value: int, index: int, leng
             text = STRINGS[which]
             return OK, bytes([len(text) + 2, 3, *text])[:length]
         return STALL, b""
-    if request_type & 0x60 == 0x20:  # of a class
+    if request_type & 0x60 == 0x20:  # a request of the device class
         if index & 0xFF != STREAMING_INTERFACE or value >> 8 not in (1, 2):
             return STALL, b""
         if request == GET_LEN:
@@ -110,7 +110,7 @@ def control_answer(request_type: int, request: int, value: int, index: int, leng
 class UsbCamera:
     """A webcam that waits to be plugged in; a context manager. path: of its socket.
 
-    jpegs: its frames, again and again, at RATE_HZ by a clock that runs `slow` times slower than this machine's.
+    jpegs: its frames, which it repeats, at RATE_HZ by a clock that runs `slow` times slower than this machine's.
     """
 
     def __init__(self, jpegs: Sequence[bytes], *, slow: float = 1.0):
@@ -119,7 +119,7 @@ class UsbCamera:
         self._jpegs, self._period_s = list(jpegs), slow / RATE_HZ
         self._folder = tempfile.TemporaryDirectory(prefix="rover-camera-")
         self.path = Path(self._folder.name) / "usb"
-        self.frames = 0  # that went out whole
+        self.frames = 0  # how many were sent completely
         self.failure: str | None = None
         self._listener = socket.socket(socket.AF_UNIX)
         self._listener.bind(str(self.path))
@@ -135,7 +135,7 @@ class UsbCamera:
         self.close()
 
     def close(self) -> None:
-        """Ends it. Raises nothing."""
+        """End the camera. Raises nothing."""
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join(2.0)
@@ -152,15 +152,15 @@ class UsbCamera:
 
 
 class _Plugged:
-    """One time in the socket."""
+    """The camera while it is plugged in: one connection, from plugging in to pulling out."""
 
     def __init__(self, connection: socket.socket, camera: UsbCamera):
         self._connection, self._camera = connection, camera
-        self._header_out = self._header_in = FIRST_HEADER  # of what is sent, and of what comes
+        self._header_out = self._header_in = FIRST_HEADER  # the headers of what is sent, and of what comes
         self._received = bytearray()
-        self._waiting: deque[tuple[int, int]] = deque()  # (id, bytes wanted) of the driver's bulk requests
-        self._payload = b""  # what is left of a frame
-        self._whole = True  # the frame's last packet was short, so the driver knows where it ends
+        self._waiting: deque[tuple[int, int]] = deque()  # the driver's bulk requests as (id, bytes wanted)
+        self._payload = b""  # what is left to send of the present frame
+        self._whole = True  # whether a frame's last, short packet was sent, by which the driver knows that it ends
         self._number = 0
         self._due_s = 0.0
 
@@ -212,12 +212,12 @@ class _Plugged:
             waiting = [w for w in self._waiting if w[0] != number]
             if len(waiting) < len(self._waiting):
                 self._waiting = deque(waiting)
-                self._payload, self._whole = b"", True  # the driver stops; it begins with a frame next time
+                self._payload, self._whole = b"", True  # the driver stops, and begins with a new frame next time
                 self._send(BULK, number, BULK_HEADER.pack(ENDPOINT, CANCELLED, 0, 0, 0))
 
     def _introduce(self) -> None:
         types, interfaces, sizes = bytearray([NO_TYPE] * 32), bytearray(32), [0] * 32
-        types[0] = types[16] = 0  # control, out and in
+        types[0] = types[16] = 0  # control endpoints, out and in
         sizes[0] = sizes[16] = 64
         at = 16 + (ENDPOINT & 0x0F)
         types[at], interfaces[at], sizes[at] = BULK_TYPE, STREAMING_INTERFACE, PACKET
@@ -231,7 +231,7 @@ class _Plugged:
         self._send(CONNECT, 0, struct.pack("<BBBBHHH", HIGH_SPEED, 0xEF, 2, 1, VENDOR, PRODUCT, 0x0100))
 
     def _give(self) -> None:
-        """Answers the driver's requests with the frame that is due."""
+        """Answer the driver's requests with the frame that is due."""
         camera = self._camera
         while self._waiting:
             if self._whole:

@@ -1,7 +1,7 @@
-"""The view as a service on an emulated Pi that was provisioned with rover_view, beside the real drive service.
+"""Prove the view's service beside the real drive service, on an emulated Pi that was provisioned with rover_view.
 
     rows = view_beside_a_drive(pi, pins, port, stop_s=2.0)     # who may look, what is seen, what a stop and a kill do
-    rows += view_gone(pi, port)                                 # once it was provisioned without rover_view again
+    rows += view_gone(pi, port)                                 # after it was provisioned without rover_view again
 
 Each row says what was wanted and what was found; container_run.py makes a gate of each. One line of the unit is not
 proven here: MemoryDenyWriteExecute=, under which no emulator of programs works (container.TRANSLATED).
@@ -30,19 +30,19 @@ from rover_lib.world.standin import PinEvent
 VIEW_UNIT, VIEW_USER = "rover-view.service", "rover-view"
 TOKEN = "/etc/rover/view.token"
 FILES = (f"/etc/systemd/system/{VIEW_UNIT}", TOKEN, "/opt/rover/requirements_pi_view.txt", "/run/rover-view")
-START_S = 180.0  # of its program, emulated on a busy machine
-SEEN_S = 30.0  # until a page shows what has happened
+START_S = 180.0  # how long its program may take to start, emulated on a busy machine
+SEEN_S = 30.0  # how long it may take until a page shows what has happened
 DRIVES_S = 30.0  # from a request until the car drives
-WITHOUT_S = 3.0  # that a drive goes on beside a view that was killed; longer than the Arduino's 150 ms
-STOPPED_S = 2.0  # after a stop in which nothing may move the car any more
-ATTEMPTS = 3  # at a drive that this machine spoilt; one that is spoilt each time fails
+WITHOUT_S = 3.0  # how long a drive must go on after its view was killed; longer than the Arduino's 150 ms
+STOPPED_S = 2.0  # how long after a stop nothing may move the car any more
+ATTEMPTS = 3  # how often a drive is tried if this machine was too busy; if it was each time, the drive fails
 BUSY = ("the Arduino has not answered for", "the newest plan is too old to drive by")
 LOOPBACK = "0100007F"  # 127.0.0.1, as the kernel writes it
 LISTENS = "0A"
 
 
 class Row(NamedTuple):
-    """What was wanted of the view, what was found, and whether that is the same."""
+    """What was wanted of the view, what was found, and whether the wanted holds."""
 
     row: str
     wanted: str
@@ -51,10 +51,10 @@ class Row(NamedTuple):
 
 
 def view_beside_a_drive(pi: Container, pins: Pins, port: int, stop_s: float) -> list[Row]:
-    """All rows of an installed view. port: of its page. stop_s: from a click until the throttle is off, at most.
+    """Return all rows for an installed view. port: of its page. stop_s: how long a stop may take from the click on.
 
-    It starts the drive service and arms the car, and leaves the service stopped. Raises EmulationError where it cannot
-    even look: no view, a car that does not drive.
+    It starts the drive service and arms the car, and leaves the service stopped. Raises EmulationError if nothing can
+    be judged: if there is no view, or the car does not drive.
     """
     token = page_token(pi)
     if not wait_for(lambda: status(port, f"/?token={token}") == 200, START_S, 0.5):
@@ -62,7 +62,7 @@ def view_beside_a_drive(pi: Container, pins: Pins, port: int, stop_s: float) -> 
         raise EmulationError(f"the view serves no page: {told}; {_journal(pi)[-800:]}")
     rows = [_started(pi), _token_is_roots(pi, token), *_doors(port, token)]
     for attempt in range(1, ATTEMPTS + 1):
-        pi.inside("systemctl", "reset-failed", UNIT, VIEW_UNIT, check=False)  # which sets their counts of starts to 0
+        pi.inside("systemctl", "reset-failed", UNIT, VIEW_UNIT, check=False)  # also clears their counts of starts
         pi.inside("systemctl", "start", UNIT)
         try:
             beside = list(_beside(pi, pins, port, token, stop_s))
@@ -75,19 +75,19 @@ def view_beside_a_drive(pi: Container, pins: Pins, port: int, stop_s: float) -> 
 
 
 def spoilt(log: str) -> list[str]:
-    """How drives of a flight log ended because this machine had no time for the emulated Arduino, or for a plan."""
+    """Return how drives in a flight log ended, if this machine had no time for the emulated Arduino or for a plan."""
     return re.findall(rf'"ended: ({"|".join(BUSY)})', log)
 
 
 def view_again(pi: Container, port: int) -> list[Row]:
-    """After a boot: it is served again, by the token that it had."""
+    """Return the rows after a boot: the page must be served again, with the token that it had."""
     token = page_token(pi)
     served = wait_for(lambda: status(port, f"/?token={token}") == 200, START_S, 0.5)
     return [Row("the view after a power cut", "served again", _state(pi), served)]
 
 
 def view_gone(pi: Container, port: int) -> list[Row]:
-    """After provisioning with rover_view=false: nothing of it is left, and the drive service is as it was."""
+    """Return the rows after provisioning with rover_view=false: only the drive service is left, nothing of the view."""
     left = [path for path in FILES if os.path.lexists(pi.root / path.lstrip("/"))]
     left += [f"user {VIEW_USER}"] if _uid(pi, VIEW_USER) is not None else []
     left += ["aiohttp"] if list((pi.root / VENV.lstrip("/")).glob("lib/python3*/site-packages/aiohttp")) else []
@@ -103,7 +103,7 @@ def view_gone(pi: Container, port: int) -> list[Row]:
 
 
 def page_token(pi: Container) -> str:
-    """Of root's file. Raises EmulationError if there is none."""
+    """Read the page's token from root's file. Raises EmulationError if there is none."""
     try:
         return (pi.root / TOKEN.lstrip("/")).read_text().strip()
     except OSError as error:
@@ -111,7 +111,7 @@ def page_token(pi: Container) -> str:
 
 
 def status(port: int, path: str, **headers: str) -> int:
-    """HTTP status that this port of the loopback gives; 0: nobody answers."""
+    """Return the HTTP status with which a port of the loopback answers; 0 if nobody answers."""
     wire = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
     with contextlib.closing(wire), contextlib.suppress(OSError, http.client.HTTPException):
         wire.request("GET", path, headers=headers)
@@ -120,7 +120,7 @@ def status(port: int, path: str, **headers: str) -> int:
 
 
 def listening(port: int, tables: tuple[str, ...] = ("/proc/net/tcp", "/proc/net/tcp6")) -> list[str]:
-    """Addresses at which a port of TCP is listened to, in the kernel's own hexadecimal."""
+    """Return the addresses at which somebody listens to a TCP port, in the kernel's own hexadecimal."""
     found = []
     for table in tables:
         for line in Path(table).read_text().splitlines()[1:]:
@@ -135,7 +135,7 @@ def listening(port: int, tables: tuple[str, ...] = ("/proc/net/tcp", "/proc/net/
 
 
 def _started(pi: Container) -> Row:
-    """A service of its own user, in no group but its own, at boot too."""
+    """The service is active and enabled, with its own user, no other group and no capability."""
     told: dict[str, Any] = {**show(pi, "ActiveState", "UnitFileState", "MainPID", unit=VIEW_UNIT)}
     own = _uid(pi, VIEW_USER)
     with contextlib.suppress(EmulationError, OSError):
@@ -157,7 +157,7 @@ def _token_is_roots(pi: Container, token: str) -> Row:
 
 
 def _doors(port: int, token: str) -> list[Row]:
-    """Who is let in, and where it listens."""
+    """Return the rows about who is let in, and where the view listens."""
     whole = f"/?token={token}"
     own = f"http://127.0.0.1:{port}"
     asked = {
@@ -199,7 +199,7 @@ def _beside(pi: Container, pins: Pins, port: int, token: str, stop_s: float) -> 
 
 
 def _arm(pi: Container, pins: Pins) -> float:
-    """Until the car moves; when it was asked to (monotonic seconds)."""
+    """Arm the car and wait until it moves; return when it was asked to (monotonic seconds)."""
     asked_s = time.monotonic()
     pi.inside(f"{VENV}/bin/rover", "arm-car", "--yes")
     if not wait_for(lambda: moving(pins.since(asked_s)), DRIVES_S):
@@ -208,7 +208,7 @@ def _arm(pi: Container, pins: Pins) -> float:
 
 
 def _killed(pi: Container, pins: Pins, port: int, token: str, armed_s: float, drive: dict[str, str]) -> Iterator[Row]:
-    """The view is killed while the car drives: the drive goes on, and systemd starts the view again."""
+    """Kill the view while the car drives: the drive must go on, and systemd must start the view again."""
     before = show(pi, "MainPID", "NRestarts", unit=VIEW_UNIT)
     os.kill(pi.pid_of(int(before["MainPID"])), signal.SIGKILL)
     at_s = time.monotonic()
@@ -227,7 +227,7 @@ def _killed(pi: Container, pins: Pins, port: int, token: str, armed_s: float, dr
 
 
 def _stop(pi: Container, pins: Pins, page: Page, stop_s: float, armed_s: float, drive: dict[str, str]) -> Iterator[Row]:
-    """The button: the car stops and stays so, and the service waits disarmed."""
+    """Click the button: the car must stop and stay stopped, and the service must wait disarmed."""
     at_s = page.stop()
     seen = _shows(page, lambda newest: newest["phase"] != DRIVING and newest["stopped"])
     time.sleep(STOPPED_S)
@@ -248,7 +248,7 @@ def _stop(pi: Container, pins: Pins, page: Page, stop_s: float, armed_s: float, 
 
 
 def _after_the_drive(log: str) -> Row:
-    """What the flight log says of the view."""
+    """Return the row about what the flight log says about the view."""
     said = {
         "stopped from the view (127.0.0.1)": log.count('"ended: stopped from the view (127.0.0.1)'),
         "the view is gone": log.count('"the view is gone'),
@@ -259,9 +259,9 @@ def _after_the_drive(log: str) -> Row:
 
 
 def throttles(events: Sequence[PinEvent], from_s: float, until_s: float) -> list[float]:
-    """The throttle's pulses (microseconds) in a time: the one that it begins with, and each other one.
+    """Return the throttle's pulses (microseconds) in a span of time: the one at its beginning, and each new one.
 
-    events: from before that time on; of a pulse that stays as it is, the Arduino's emulator tells once.
+    events: from before that span on, as the Arduino's emulator tells only once of a pulse that stays the same.
     """
     pulses = [(e.monotonic_s, e.pulse_us) for e in events if e.pin == "throttle" and e.kind == "pulse"]
     before = [us for at_s, us in pulses if at_s <= from_s]

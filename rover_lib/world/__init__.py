@@ -1,1 +1,1 @@
-"""A balloon world to record, train and drive in. May import onboard and workshop."""
+"""A balloon world to record, train and drive in. This package may import onboard and workshop."""

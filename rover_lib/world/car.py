@@ -1,8 +1,8 @@
-"""The balloon world as a car of its own: a camera to read, a port to talk to, a process that nobody steps.
+"""Run the balloon world as a virtual car: a process with a camera to read and a serial port, which runs in real time.
 
-Whoever drives it uses what drives the real car, onboard's Camera and ServoLink. What moves it are the pulses on the
-pins of its Arduino: the real firmware in simavr, or a stand-in. It needs neither torch nor LeRobot, so that it starts
-in a second and stays small.
+It is driven by the same code as the real car, onboard's Camera and ServoLink. The pulses on the pins of its Arduino
+move it; that Arduino is the real firmware in simavr, or a stand-in. The process imports neither torch nor LeRobot, so
+that it starts in a second and needs little memory.
 """
 
 import contextlib
@@ -39,24 +39,24 @@ from rover_lib.world.trial import Trajectory, wilson_interval
 from rover_lib.world.world import FRAME_HEIGHT, FRAME_WIDTH, World
 
 HOLD_S = 1.0
-STEPS_PER_S = 100  # of the physics, at least
+STEPS_PER_S = 100  # steps of the physics a second, at least
 KEEP_DRIVES = 8
 KEEP_OUTCOMES = 1000
-STANDSTILL_S = 0.5  # a machine that stopped for longer has stopped the world too
-NOISE = 3  # grey levels of the camera's noise: two frames of a car that stands still are never the same
-SHIFTS = 256  # of the noise, in either direction: enough that the same one hardly comes again
-PIPE_BYTES = 1 << 20  # a frame fits in whole
-NICE = 5  # what drives goes first; a camera may be late
-PRIORITY = 1  # of real time, below the loop that drives it
-START_S = 60.0  # a busy machine takes its time to import all that
+STANDSTILL_S = 0.5  # if the machine stopped for longer than this, the world stopped too for the time beyond it
+NOISE = 3  # the noise's grey levels, 0 to 2; with noise, two frames of a car that stands still are never the same
+SHIFTS = 256  # by how many pixels the noise may be shifted, in both directions, so that one shift rarely comes again
+PIPE_BYTES = 1 << 20  # room for a whole frame
+NICE = 5  # the code that drives the car goes first; the camera may be late
+PRIORITY = 1  # of real-time scheduling, below that of the loop that drives the car
+START_S = 60.0  # a busy machine needs long to import everything
 ANSWER_S = 5.0
 STAND_IN = "rover_lib.world.standin:StandIn"
 
 
 class FramePipe:
-    """The writing end of a FIFO of MJPEG. Never waits: one frame is on its way at a time, others find no room.
+    """The writing end of a FIFO of MJPEG. It never waits: while the reader has not taken a frame, others are refused.
 
-    path: the FIFO, made if it is not there.
+    path: of the FIFO, which is made if it does not exist.
     """
 
     def __init__(self, path: Path | str):
@@ -85,13 +85,13 @@ class FramePipe:
 
     @property
     def empty(self) -> bool:
-        """Whether the reader took what was written."""
+        """Whether the reader has taken everything that was written."""
         if self._fd < 0:
             return True
         return struct.unpack("i", fcntl.ioctl(self._fd, termios.FIONREAD, bytes(4)))[0] == 0
 
     def write(self, jpeg: bytes) -> bool:
-        """Writes a frame, at most 1 MiB, if somebody reads and took the one before. Whether it did."""
+        """Write a frame of at most 1 MiB if a reader is there and has taken the previous one; return whether it did."""
         if not self.read or not self.empty:
             return False
         try:
@@ -100,25 +100,26 @@ class FramePipe:
             return False
 
     def close(self) -> None:
-        """The reader comes to the end of the file, "unplugged"; the next write opens it anew."""
+        """Close the pipe, so that the reader comes to the end of the file, "unplugged". The next write reopens it."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
 
 def jpeg_of(picture: bytes | np.ndarray) -> bytes:
-    """A frame, (h, w, 3) uint8 BGR, as JPEG; bytes are taken for one."""
+    """Compress a frame, (h, w, 3) uint8 BGR, to a JPEG. Bytes are taken for a JPEG and returned as they are."""
     if isinstance(picture, bytes):
         return picture
     return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 class CameraFeed:
-    """A camera without a camera: a thread that writes pictures into a FIFO, at a rate.
+    """A simulated camera: a thread that writes pictures into a FIFO at a fixed rate.
 
-    path: the FIFO, made if it is not there. pictures: JPEGs, or frames (h, w, 3) uint8 BGR, shown in turn and over
-    again; a single one is the same frame again and again. written, dropped: frames, so far; dropped are those for which
-    the reader was too slow. late_s: may be set; the delay of each frame after it was due.
+    path: of the FIFO, which is made if it does not exist. pictures: JPEGs, or frames (h, w, 3) uint8 BGR. They are
+    shown in turn, then again from the first; with a single one, every frame is the same. written, dropped: how many
+    frames so far were written, or dropped because the reader was too slow. late_s: how long after its due time each
+    frame is written; you may set it.
     """
 
     def __init__(self, path: Path | str, *pictures: bytes | np.ndarray, rate_hz: float = 30.0):
@@ -141,24 +142,27 @@ class CameraFeed:
         self.close()
 
     def show(self, *pictures: bytes | np.ndarray) -> None:
-        """Changes the pictures, from the next frame on; ends freeze, pause and black. None: nothing is written."""
+        """Show these pictures from the next frame on, and end freeze(), pause() and black().
+
+        Without pictures nothing is written.
+        """
         self._pictures = tuple(jpeg_of(picture) for picture in pictures)
         self._frozen = self._paused = False
 
     def freeze(self) -> None:
-        """The same frame again and again, until show()."""
+        """Repeat the same frame until show()."""
         self._frozen = True
 
     def black(self) -> None:
-        """Black frames, until show()."""
+        """Show black frames until show()."""
         self.show(np.zeros((FRAME_HEIGHT, FRAME_WIDTH, 3), np.uint8))
 
     def pause(self) -> None:
-        """Nothing comes any more, but the camera stays plugged in, until show()."""
+        """Write no frames until show(), as a camera that stays plugged in but sends nothing."""
         self._paused = True
 
     def close(self) -> None:
-        """Unplugged: the reader comes to the end of the file. A new feed on the same path plugs it in again."""
+        """Unplug the camera: the reader comes to the end of the file. A new feed on the same path plugs it in again."""
         self._closing.set()
         self._thread.join()
         self._pipe.close()
@@ -174,7 +178,8 @@ class CameraFeed:
             while waiting and waiting[0][0] <= time.monotonic():
                 _, pictures, moves = waiting.popleft()
                 if self._pipe.read:
-                    # The next one when this one was taken: a slow reader would see the same few again and again.
+                    # Go on to the next picture only once this one was written. If refused pictures were skipped, a
+                    # slow reader would see only the same few of them.
                     if self._pipe.write(pictures[(self._next + moves) % len(pictures)]):
                         self._next += moves
                         self.written += 1
@@ -184,9 +189,11 @@ class CameraFeed:
 
 @dataclass(frozen=True)
 class Drive:
-    """One world, driven to its end. outcome: 'hit', 'left' or 'timeout'. nearest_m: camera to balloon, at its least.
+    """One world, driven to its end.
 
-    released_s: time.monotonic() at which the car was let go. trajectory: one point per 1 / rate_hz from then on.
+    outcome: 'hit', 'left' or 'timeout'. nearest_m: the least distance between camera and balloon.
+    released_s: time.monotonic() when the car was let go. trajectory: from then on, a point for each frame of the camera
+    (every 1 / rate_hz seconds), and the last one.
     """
 
     seed: int
@@ -199,13 +206,15 @@ class Drive:
 
 @dataclass(frozen=True)
 class CarReport:
-    """What became of a virtual car so far.
+    """What a virtual car has done so far.
 
-    hits, trials: of the worlds that have ended. wilson: 95 % interval of the share of hits, None before the first.
-    outcomes: (seed, outcome) of the last 1000 worlds. drives: the last 8. frames: written to the camera; dropped: those
-    that its reader was too slow for; late: those that this machine was too slow for.
-    Of the world that it is in now, its seed, whether the car is held, distance and bearing (positive to the left) of
-    the balloon, and the speed. finished: all the worlds that were asked for have ended.
+    trials, hits: how many worlds have ended, and how many of them with a hit. wilson: the 95 % interval of the share of
+    hits, None before the first world has ended. outcomes: (seed, outcome) of the last 1000 worlds. drives: the last 8.
+    frames: how many were written to the camera; dropped: how many were not, because the reader was too slow;
+    late: how many were left out, because this machine was too slow.
+    seed, held, distance_m, bearing_rad and speed_mps describe the present world: its seed, whether the car is held, the
+    balloon's distance and bearing (positive to the left), and the car's speed. finished: whether all the worlds that
+    were asked for have ended.
     """
 
     hits: int
@@ -225,14 +234,14 @@ class CarReport:
 
 
 class VirtualCar:
-    """A car in balloon worlds of seeds from `seed` on, one after the other, in real time, in a process of its own.
+    """A process in which a car drives through balloon worlds in real time, one after the other, from `seed` on.
 
-    camera: path of a FIFO of MJPEG, for a Camera. port: of its Arduino, for a ServoLink. pid: of the process.
+    camera: the path of a FIFO of MJPEG, for a Camera. port: of its Arduino, for a ServoLink. pid: of the process.
 
-    The first world begins when the pins first ask for motion. A world ends by a hit, past the balloon ('left'), or
-    after 8 s. Then the car stands in the next one, and is held for hold_s, so that a plan for what it sees now is in
-    force when it is let go. worlds: after that many it stays where it is; None: it goes on.
-    It ends with this process, at the latest a frame later.
+    The first world begins when the pins first ask for motion. A world ends when the car hits the balloon, passes it or
+    leaves the arena ('left'), or after 8 s. Then the car stands in the next world and is held there for hold_s, so that
+    it is let go with a plan for what it sees there. worlds: after how many worlds the car stays where it is; None: it
+    never does. The process ends when this process ends, at most a frame later.
     """
 
     def __init__(
@@ -245,10 +254,11 @@ class VirtualCar:
         hold_s: float = HOLD_S,
         nice: int = NICE,
     ):
-        """board: module:function that makes the car's Arduino in its process, with a port and pulses() as StandIn has.
+        """Start the process.
 
-        rate_hz: of the camera. nice: of the process. Raises WorldError for numbers that make no drive or if the process
-        does not start.
+        board: 'module:function' that makes the car's Arduino in that process, with a port and pulses() as StandIn has.
+        rate_hz: of the camera. nice: of the thread that moves the car and draws. Raises WorldError for numbers outside
+        their ranges, or if the process does not start.
         """
         if seed < 0 or not 1 <= rate_hz <= 120 or hold_s < 0 or (worlds is not None and worlds < 1):
             raise WorldError(
@@ -292,16 +302,19 @@ class VirtualCar:
         self.close()
 
     def check(self) -> None:
-        """Raises WorldError if its process has ended. Costs nothing."""
+        """Raise WorldError if the process has ended. Costs almost nothing."""
         self._process.check()
 
     def report(self) -> CarReport:
-        """What became of it so far; waits for a frame's time. Raises WorldError if its process is gone or hangs."""
+        """Ask the process what the car has done so far, which takes up to a frame's time.
+
+        Raises WorldError if the process has ended or hangs.
+        """
         with self._talking:
             self._asked += 1
             self._process.send_line(f"report {self._asked}")
             while (answer := self._answer(ANSWER_S))["asked"] != self._asked:
-                pass  # an answer that came too late
+                pass  # this answers an earlier call, which did not wait long enough
         report = answer["report"]
         drives = []
         for drive in report.pop("drives"):
@@ -313,12 +326,12 @@ class VirtualCar:
         return CarReport(wilson=wilson, outcomes=outcomes, drives=drives, **report)
 
     def summary(self) -> dict[str, Any]:
-        """What a drive's report has of it: hits, trials, camera_late. Raises as report()."""
+        """Return what the report of a drive says about this car: hits, trials and camera_late. Raises as report()."""
         report = self.report()
         return {"hits": report.hits, "trials": report.trials, "camera_late": report.late}
 
     def close(self) -> None:
-        """Ends it. Raises nothing."""
+        """End the process. Raises nothing."""
         self._process.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -335,22 +348,22 @@ class VirtualCar:
         return json.loads(line)
 
 
-# ---- in the process
+# ---- what runs in the process
 
 
 class Board(Protocol):
-    """A virtual car's Arduino: a context manager with the port to drive it by, and what its pins did."""
+    """A virtual car's Arduino: a context manager that knows its serial port and what happened on its pins."""
 
     port: str
 
     def __enter__(self) -> "Board": ...
     def __exit__(self, *exc: object) -> None: ...
     def pulses(self) -> list[PinEvent]:
-        """What happened on the pins since the last call."""
+        """Return what happened on the pins since the last call."""
 
 
 class _Pins:
-    """What the servo pins ask for, over time."""
+    """Which actions the pulses on the servo pins stand for, over time."""
 
     def __init__(self, board: Board):
         self._board = board
@@ -363,20 +376,21 @@ class _Pins:
         self._coming.extend(event for event in self._board.pulses() if event.kind in ("pulse", "reset"))
 
     def action(self, at_s: float) -> tuple[float, float]:
-        """(steering, throttle) that the last whole pulses before a time stand for; no pulses are neutral."""
+        """Return the (steering, throttle) of the last pulses that had ended by at_s; neutral if there were none."""
         while self._coming and self._coming[0].end_s <= at_s:
             event = self._coming.popleft()
             if event.kind == "reset":
                 self._action = dict(zip(self._action, NEUTRAL, strict=True))
             else:
-                # By the nominal period: the first pulse after a reset has none, and the servo measures the pulse.
+                # Computed with the nominal period: the first pulse after a reset has no period, and a servo only
+                # measures the pulse.
                 self._action[event.pin] = self._calibration.channel(event.pin).action(event.pulse_us) or 0.0
                 self.asked_for_motion |= event.pin == "throttle" and self._calibration.throttle.moves(event.pulse_us)
         return self._action["steering"], self._action["throttle"]
 
 
 class _Car:
-    """The worlds, one after the other, moved by the pins."""
+    """A car that the pins drive through one world after the other."""
 
     def __init__(self, pins: _Pins, seed: int, rate_hz: float, worlds: int | None, hold_s: float):
         self._pins = pins
@@ -384,7 +398,7 @@ class _Car:
         self._dt = 1 / (rate_hz * self._steps_per_frame)
         self._worlds, self._hold_s = worlds, hold_s
         self.world = World(seed)
-        self._now = time.monotonic()  # up to which it was moved
+        self._now = time.monotonic()  # the time up to which the car was moved
         self._release_s = self._released_s = math.inf
         self.held = True
         self.finished = False
@@ -393,7 +407,7 @@ class _Car:
         self.drives: deque[dict[str, Any]] = deque(maxlen=KEEP_DRIVES)
 
     def move(self, until_s: float) -> None:
-        """Catches up with the time."""
+        """Move the car on to the time until_s."""
         if until_s - self._now > STANDSTILL_S:
             self._now = until_s - STANDSTILL_S
         self._pins.collect()
@@ -456,7 +470,7 @@ class _Car:
 
 
 class _Sensor:
-    """The noise of a camera's sensor: crops of one larger picture of it, which is cheap."""
+    """The noise of a camera's sensor. Each frame gets a crop of one larger picture of noise, which is cheap."""
 
     def __init__(self) -> None:
         self._rng = np.random.default_rng()
@@ -469,12 +483,13 @@ class _Sensor:
 
 
 def _run(car: _Car, pipe: FramePipe, rate_hz: float, parent: int) -> None:
-    """Frames at absolute deadlines, until the parent has had enough or is gone."""
+    """Move the car and write frames at absolute deadlines, until the parent closes standard input or has ended."""
     frames = dropped = late = 0
     sensor = _Sensor()
     asked = b""
     due = time.monotonic()
-    while os.getppid() == parent:  # another child of it may hold the other end of standard input open
+    # Standard input alone does not tell that the parent has ended: another child of it may hold the other end open.
+    while os.getppid() == parent:
         while select.select([0], [], [], max(0.0, due - time.monotonic()))[0]:
             data = os.read(0, 4096)
             if not data:
@@ -485,7 +500,7 @@ def _run(car: _Car, pipe: FramePipe, rate_hz: float, parent: int) -> None:
                 print(json.dumps({"asked": int(line.split()[1]), "report": report}), flush=True)
         car.move(due)
         if pipe.read:
-            # Nothing is drawn that nobody would see.
+            # Do not draw what nobody would see.
             if pipe.empty and pipe.write(jpeg_of(sensor.see(car.world.render()))):
                 frames += 1
             else:
@@ -497,24 +512,25 @@ def _run(car: _Car, pipe: FramePipe, rate_hz: float, parent: int) -> None:
 
 
 def main() -> None:
-    """What VirtualCar starts."""
+    """Run the process that VirtualCar starts."""
     options = json.loads(sys.argv[1])
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
-    with contextlib.suppress(OSError):  # a real car does not wait for this machine; for root only
+    # A real car does not wait for this machine, so neither should this one. Only root may ask for that.
+    with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
     try:
         module, _, name = options["board"].partition(":")
         board: Board = getattr(importlib.import_module(module), name)()
         with board, contextlib.closing(FramePipe(options["camera"])) as pipe:
-            # Of this thread only: the stand-in's, like the emulator's process, keeps its turn.
+            # This concerns only the present thread: the stand-in's thread and the emulator's process keep their turn.
             os.nice(options["nice"])
             rate_hz = options["rate_hz"]
             car = _Car(_Pins(board), options["seed"], rate_hz, options["worlds"], options["hold_s"])
             print(json.dumps({"port": board.port}), flush=True)
             _run(car, pipe, rate_hz, options["parent"])
     finally:
-        shutil.rmtree(options["folder"], ignore_errors=True)  # a parent that was killed cannot
+        shutil.rmtree(options["folder"], ignore_errors=True)  # in case the parent was killed and cannot do it
 
 
 if __name__ == "__main__":

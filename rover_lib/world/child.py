@@ -1,4 +1,4 @@
-"""A process beside this one: started, talked to and ended, with its last words in the errors."""
+"""Start a process beside this one, talk to it and end it. Errors quote the last lines that it printed."""
 
 import contextlib
 import fcntl
@@ -19,7 +19,7 @@ STOP_S = 5.0
 class Child:
     """A program that runs until it is closed.
 
-    A terminal's ^C is not for it. pid: its process. What it prints on standard error is kept for the errors.
+    A terminal's ^C does not reach it. pid: of its process. What it prints on standard error is kept for the errors.
     """
 
     def __init__(
@@ -30,10 +30,11 @@ class Child:
         talks: bool = False,
         env: Mapping[str, str] | None = None,
     ):
-        """name: in errors, such as 'the virtual car'. error: what to raise.
+        """Start the command.
 
-        talks: by lines, on its standard input and output; the end of its input tells it to end. Otherwise it has
-        neither, and SIGTERM tells it. env: variables beside this process's own.
+        name: for errors, such as 'the virtual car'. error: the class to raise. talks: whether it talks by lines on its
+        standard input and output; then the end of its input tells it to end. Otherwise it has neither, and SIGTERM
+        tells it. env: variables in addition to this process's own.
         """
         self.name = name
         self._error = error
@@ -52,32 +53,32 @@ class Child:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
+        """Whether the process has not ended yet."""
         return self.process.poll() is None
 
     def check(self) -> None:
-        """Raises the error of ended() if it is not running. Costs nothing."""
+        """Raise the error of ended() if the process is not running. Costs almost nothing."""
         if not self.running:
             raise self.ended()
 
     def wait(self, within_s: float) -> int | None:
-        """Its exit code; None if it has not ended by then."""
+        """Wait for the end; return the exit code, or None if the process has not ended within that time."""
         try:
             return self.process.wait(within_s)
         except subprocess.TimeoutExpired:
             return None
 
     def send_line(self, text: str) -> None:
-        """Writes a line to its standard input. Raises the error of ended() if nobody reads it any more."""
+        """Write a line to its standard input. Raises the error of ended() if nobody reads that any more."""
         try:
             self._pipe(self.process.stdin).write(f"{text}\n".encode())
         except (OSError, ValueError):
             raise self.ended() from None
 
     def read(self, within_s: float = 0.0) -> bytes:
-        """What it has printed on standard output since the last call; b"" if nothing comes within that time.
+        """Return what it printed on standard output since the last call; b"" if nothing comes within that time.
 
-        Raises the error of ended() once all is read of a process that has ended.
+        Raises the error of ended() if the process has ended and everything it printed has been read.
         """
         output = self._pipe(self.process.stdout)
         try:
@@ -91,33 +92,33 @@ class Child:
         return data
 
     def keep_unread(self, size: int) -> None:
-        """Its standard output holds that many bytes that nobody has read yet."""
+        """Let its standard output hold up to `size` bytes that nobody has read yet."""
         fcntl.fcntl(self._pipe(self.process.stdout), fcntl.F_SETPIPE_SZ, size)
 
     def errors(self) -> list[str]:
-        """The lines that it has printed on standard error."""
+        """Return the lines that it has printed on standard error."""
         size = os.fstat(self._errors.fileno()).st_size
         return os.pread(self._errors.fileno(), size, 0).decode(errors="replace").splitlines()
 
     def last_words(self) -> str:
-        """The last of these lines, in one."""
+        """Return the last of these lines, joined to one."""
         return last_words("\n".join(self.errors()))
 
     def ended(self) -> RoverError:
-        """The error that says how it ended; waits for that if it is about to."""
+        """Return the error that says how the process ended. Waits up to 5 s for that, if it is just about to."""
         if self._errors.closed:
             return self._error(f"{self.name} was closed", remedy="make a new one")
         code = self.wait(STOP_S)
         return self._error(f"{self.name} has ended (exit status {code}): {self.last_words()}", remedy="start a new one")
 
     def close(self) -> None:
-        """Ends it, with SIGKILL if it does not want to. Raises nothing, and may be called again."""
+        """End the process, with SIGKILL if it does not end within 5 s. Raises nothing, and may be called again."""
         if self.process.stdin:
             with contextlib.suppress(OSError):
                 self.process.stdin.close()
         elif self.running:
             with contextlib.suppress(ProcessLookupError):
-                self.process.send_signal(signal.SIGCONT)  # or it would not see the other
+                self.process.send_signal(signal.SIGCONT)  # a stopped process would not notice SIGTERM
                 self.process.terminate()
         if self.wait(STOP_S) is None:
             self.process.kill()

@@ -1,4 +1,4 @@
-"""Which student may take its teacher's place? By rule: limits in params.yml's section `students`, rows of distill.json.
+"""Which student may take its teacher's place? A rule decides: it holds distill.json's rows to limits from params.yml.
 
 verdict = recommendation(rows, params()["students"])
 """
@@ -12,20 +12,23 @@ from rover_lib.workshop.compare import gate
 from rover_lib.workshop.judge import shown_pct, worst
 
 NOBODY_DROVE = "Nobody drove: judged by errors on recordings alone."
-DRIVES = {"": "left alone", "pushed_": "pushed"}  # what the keys of a row begin with
+DRIVES = {"": "left alone", "pushed_": "pushed"}  # how a row's keys begin, and the words for that kind of drive
 
 
 def sign_test(only_one: int, only_other: int) -> float:
-    """How often chance alone gives two policies at least so uneven a share of the worlds that only one of them hits.
+    """Return p: how likely chance alone divides the worlds that only one of two policies hits at least as unevenly.
 
-    The exact two-sided sign test on discordant pairs (McNemar's exact test); 1 where there are none.
+    This is the exact two-sided sign test on discordant pairs (McNemar's exact test); p is 1 if there are none.
     """
     n, fewer = only_one + only_other, min(only_one, only_other)
     return min(1.0, 2 * sum(math.comb(n, k) for k in range(fewer + 1)) / 2**n)
 
 
 def paired(row: Mapping[str, Any], teacher: Mapping[str, Any], drive: str) -> dict[str, Any] | None:
-    """The same worlds, driven by both: which only one of them hit. drive: of DRIVES; None where one was not driven."""
+    """Compare a student with its teacher in the same worlds: count the worlds that only one of them hit.
+
+    drive: a key of DRIVES. Returns None if either did not drive that way.
+    """
     if row[f"{drive}missed"] is None or teacher[f"{drive}missed"] is None:
         return None
     own, teachers = set(row[f"{drive}missed"]), set(teacher[f"{drive}missed"])
@@ -38,15 +41,18 @@ def paired(row: Mapping[str, Any], teacher: Mapping[str, Any], drive: str) -> di
 
 
 def points_above(row: Mapping[str, Any], teacher: Mapping[str, Any]) -> float | None:
-    """How much further than its teacher a student is from the recordings, in points of percent; the worse action."""
+    """Return by how many percentage points a student's error to the recordings exceeds its teacher's; the worst action.
+
+    None if no action's error is known for both.
+    """
     keys = [key for key in row if key.startswith("recorded_") and key.endswith("_pct")]
     return worst(row[key] - teacher[key] for key in keys if row[key] is not None and teacher[key] is not None)
 
 
 def gates_of(row: Mapping[str, Any], teacher: Mapping[str, Any], limits: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """A student held to the rule, as `compare.gate` rows. limits: params.yml's section `students`.
+    """Hold a student to the rule; return rows of `compare.gate`. limits: params.yml's section `students`.
 
-    Drives are judged where anybody drove: there a drive that is missing is neither passed nor failed.
+    Drives are judged only if the teacher drove. Then a kind of drive that is missing neither passes nor fails.
     """
     rows = []
     for drive, how in DRIVES.items() if teacher["trials"] else ():
@@ -59,21 +65,21 @@ def gates_of(row: Mapping[str, Any], teacher: Mapping[str, Any], limits: Mapping
 
 
 def work_key(rows: Sequence[Mapping[str, Any]]) -> str:
-    """What says which row is fastest: instructions where all are counted, else multiply-accumulates."""
+    """Return the key that decides which row is fastest: instructions if all are counted, else multiply-accumulates."""
     return "gmac" if any(row["instructions_g"] is None for row in rows) else "instructions_g"
 
 
 def recommendation(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any]) -> dict[str, Any]:
-    """The fastest student that passes each gate, or the teacher if none does. rows: of distill.json, the teacher first.
+    """Choose the fastest student that passes every gate, or the teacher if none does.
 
-    {"name", "fastest_by", "gates": of all students}.
+    rows: of distill.json, the teacher first. Returns {"name", "fastest_by", "gates": of all students}.
     """
     teacher, *students = rows
     gates = {row["name"]: gates_of(row, teacher, limits) for row in students}
     key = work_key(rows)
     passed = [row for row in students if all(g["passed"] for g in gates[row["name"]])]
     fastest = min(passed, key=lambda row: row[key], default=teacher)
-    return {"name": fastest["name"], "fastest_by": key, "gates": [g for found in gates.values() for g in found]}
+    return {"name": fastest["name"], "fastest_by": key, "gates": [g for its_gates in gates.values() for g in its_gates]}
 
 
 # --- in words ---------------------------------------------------------------------------------------------------------
@@ -86,7 +92,7 @@ def shape_of(row: Mapping[str, Any]) -> str:
 
 
 def table(metrics: Mapping[str, Any]) -> Table:
-    """A teacher and its students, a row each. metrics: of distill.json."""
+    """Show a teacher and its students as a table, a row each. metrics: of distill.json."""
     actions = _actions(metrics["students"][0])
     header = ("", "MB", "GMAC", "10^9 instructions", "ms, computed", "left alone", "pushed")
     rows = []
@@ -103,7 +109,7 @@ def table(metrics: Mapping[str, Any]) -> Table:
 
 
 def sentences(metrics: Mapping[str, Any]) -> list[str]:
-    """The recommendation in plain English, a sentence to a line. metrics: of distill.json."""
+    """Say the recommendation in plain English, a sentence to a line. metrics: of distill.json."""
     teacher, *students = metrics["students"]
     verdict, limits = metrics["recommendation"], metrics["limits"]
     lines = [_rule(limits, bool(teacher["trials"]))]

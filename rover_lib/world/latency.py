@@ -1,9 +1,9 @@
-"""How late may a plan be? Drives through balloon worlds in virtual time, with an inference as slow as one likes.
+"""How late may a plan be? Drive through balloon worlds in virtual time, with an inference as slow as you choose.
 
     reports = run_latencies([policy], [Condition(0.0, settings), Condition(0.15, settings)], worlds=40)
 
-The very loop of the car drives: `onboard.loop.drive` with its PolicyPilot, on a virtual clock. What stands in are the
-camera and the planner's thread. Nothing waits, and nothing depends on how fast this machine is.
+The car's own loop drives: `onboard.loop.drive` with its PolicyPilot, on a virtual clock. Only the camera and the
+planner's thread are replaced. Nothing waits, and no result depends on how fast this machine is.
 """
 
 import copy
@@ -35,14 +35,14 @@ from rover_lib.world.trial import Trajectory, wilson_interval
 from rover_lib.world.world import RATE_HZ, CarState, World
 
 LATENCY_MOST_S = 5.0
-ROUNDING = 1e-6  # of times, in ticks
+ROUNDING = 1e-6  # how far times may be rounded, in ticks
 ENSEMBLE = 0.01  # LeRobot's coefficient
 JUDGED_MS = 150.0
 SEED = 10_000
 
 
 class Plans(Protocol):
-    """What can be driven: an artifact's Policy, or anything with these two. rate_hz: of a plan's actions."""
+    """What can drive: an artifact's Policy, or anything else with these two. rate_hz: of a plan's actions."""
 
     rate_hz: float
 
@@ -51,9 +51,10 @@ class Plans(Protocol):
 
 @dataclass(frozen=True)
 class Condition:
-    """What a drive is driven with.
+    """The circumstances of a drive.
 
-    latency_s: from a look at the newest frame to the plan, 0: within the same tick. pushes, decoys: as World's.
+    latency_s: from taking the newest frame to having its plan; with 0 the plan is there within the same tick.
+    pushes, decoys: World's shoves and decoys.
     """
 
     latency_s: float
@@ -68,10 +69,10 @@ class Condition:
 
 @dataclass(frozen=True)
 class LateDrive:
-    """One world's drive. outcome: 'hit', 'left', 'timeout', or 'stopped' if a plan became too old to drive by.
+    """The drive in one world. outcome: 'hit', 'left', 'timeout', or 'stopped' if a plan became too old to drive by.
 
-    nearest_m: camera to balloon, at its least. trajectory: one point per tick. orders: what was commanded, at each
-    tick. plans: all that there were, and where the car was when each of them looked.
+    nearest_m: the least distance between camera and balloon. trajectory: one point per tick. orders: what was commanded
+    at each tick. plans: all plans, each with the car's state when its frame was taken.
     """
 
     seed: int
@@ -85,7 +86,7 @@ class LateDrive:
 
 @dataclass(frozen=True)
 class LatencyReport:
-    """Of one condition. wilson: 95 % interval of the share of hits."""
+    """All drives under one condition. wilson: 95 % interval of the share of hits."""
 
     condition: Condition
     hits: int
@@ -94,7 +95,7 @@ class LatencyReport:
     per_world: list[LateDrive]
 
     def summary(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the counts and times for JSON."""
         ages_ms = 1e3 * np.array([o.age_s for d in self.per_world for o in d.orders])
         outcomes = [d.outcome for d in self.per_world]
         times_s = [d.duration_s for d in self.per_world if d.outcome == "hit"]
@@ -121,9 +122,9 @@ Watch = Callable[[Order], bool]
 
 
 class _Car:
-    """A world, and what looks at it: the loop's camera, planner, clock and sleep, of which only sleep() moves the time.
+    """A world, and the loop's camera, planner, clock and sleep in it. Only sleep() moves the time on.
 
-    Frames come at the ticks. The car is held until the first plan is there, as that of `rover drive --world` is.
+    Frames come at the ticks. The car is held until the first plan is there, like the car of `rover drive --world`.
     """
 
     wanted_hz = RATE_HZ
@@ -133,7 +134,7 @@ class _Car:
         self.command: Order | None = None
         self.plans: list[tuple[Plan, CarState]] = []
         self._policy, self._latency_s, self._commanded = policy, latency_s, commanded
-        self._tick, self._looked_at = 0, -1  # time, and that of the newest frame that was looked at
+        self._tick, self._looked_at = 0, -1  # the present tick, and the tick of the last frame that was planned from
         self._coming: tuple[Plan, CarState] | None = None
         self._think(ROUNDING)
 
@@ -151,7 +152,7 @@ class _Car:
             self._think(self._tick + ROUNDING)
 
     def latest(self) -> Frame:
-        # The loop only asks whether the camera is frozen or black: nothing is drawn for it.
+        # The loop only asks whether the camera is frozen or black, so nothing needs to be drawn for it.
         return Frame(np.empty((0, 0, 3), np.uint8), self.clock(), self._tick + 1, 0, 255.0, 255.0)
 
     @property
@@ -167,7 +168,7 @@ class _Car:
         return self.newest()
 
     def _think(self, until_tick: float) -> None:
-        """What Planner's thread does until then: a plan is there, and at once it looks at the newest frame."""
+        """Do what Planner's thread does up to `until_tick`: when a plan is ready, begin one from the newest frame."""
         now_s = self.clock()
         while True:
             if self._coming:
@@ -177,7 +178,7 @@ class _Car:
                 self.plans.append(self._coming)
                 now_s, self._coming = max(now_s, plan.ready_s), None
             if self._looked_at == self._tick:
-                return  # it waits for another frame
+                return  # the planner waits for another frame
             self._looked_at = self._tick
             state = self._commanded.state(self.clock(), self._policy.rate_hz)
             actions = self._policy.predict_unclipped(self.world.render(), state)
@@ -186,24 +187,24 @@ class _Car:
 
 
 class _Pilot(PolicyPilot):
-    """Whose orders move the car, and are kept. watch: see `drive_in`."""
+    """A pilot whose orders move the virtual car and are kept. watch: see `drive_in`."""
 
     def __init__(self, car: _Car, commanded: Commanded, settings: Settings, rate_hz: float, watch: Watch | None):
         camera_and_planner: Any = car
         super().__init__(camera_and_planner, camera_and_planner, commanded, settings, rate_hz)
         self.orders: list[Order] = []
-        self._car, self._asked = car, watch
+        self._car, self._watch = car, watch
 
     def sent(self, at_s: float, order: Order) -> None:
         super().sent(at_s, order)
         self._car.command = order
         self.orders.append(order)
-        if self._asked and self._asked(order):
-            self._car.stop.set()  # after this tick
+        if self._watch and self._watch(order):
+            self._car.stop.set()  # the drive ends after this tick
 
 
 class _NoLog:
-    """In a flight log's place."""
+    """A flight log that keeps nothing."""
 
     start_s = 0.0
 
@@ -214,7 +215,7 @@ class _NoLog:
 
 @dataclass(frozen=True)
 class Driven:
-    """How a policy drove in a world. outcome: as LateDrive's, or 'taken over'. orders, plans: as LateDrive's."""
+    """How a policy drove in a world. All fields are as LateDrive's, but the outcome may also be 'taken over'."""
 
     outcome: str
     orders: list[Order]
@@ -222,10 +223,11 @@ class Driven:
 
 
 def drive_in(policy: Plans, world: World, condition: Condition, watch: Watch | None = None) -> Driven:
-    """Drive through a world, whose pushes and decoys are its own, at the condition's latency, until it has ended.
+    """Drive through a world until it has ended, with the condition's latency and settings.
 
-    watch: sees every order when it is sent, before the car moves by it; true ends the drive after that tick, because
-    somebody takes over. Raises PolicyError for a plan that no car may be driven by.
+    Pushes and decoys are those of the world, not the condition's. watch: called with every order when it is sent,
+    before the car moves by it; if it returns true, somebody takes over and the drive ends after that tick. Raises
+    PolicyError for a plan that no car may be driven by.
     """
     commanded = Commanded()
     car = _Car(world, policy, condition.latency_s, commanded)
@@ -234,14 +236,14 @@ def drive_in(policy: Plans, world: World, condition: Condition, watch: Watch | N
         drive(pilot, None, _NoLog(), rate_hz=RATE_HZ, until=Until(stop=car.stop), clock=car.clock, sleep=car.sleep)
         outcome = str(world.outcome) if world.done else "taken over"
     except DriveFault as fault:
-        if fault.__cause__:  # the policy failed: it is not that a plan is too old
+        if fault.__cause__:  # the policy failed; without a cause, a plan had become too old
             raise fault.__cause__ from None
         outcome = "stopped"
     return Driven(outcome, pilot.orders, car.plans)
 
 
 def drive_late(policy: Plans, seed: int, condition: Condition) -> LateDrive:
-    """One drive through the world of that seed. Raises PolicyError for a plan that no car may be driven by."""
+    """Drive through the world of that seed. Raises PolicyError for a plan that no car may be driven by."""
     world = World(seed, condition.pushes, condition.decoys)
     driven = drive_in(policy, world, condition)
     path = Trajectory.of(world)
@@ -257,10 +259,10 @@ def run_latencies(
     seed: int = SEED,
     progress: Progress = silent,
 ) -> list[LatencyReport]:
-    """Drive through `worlds` worlds, of seeds from `seed` on, under each condition; reports in their order.
+    """Drive through `worlds` worlds with the seeds from `seed` on under each condition; return a report for each.
 
-    policies: the same one, once for each thread that drives: results do not depend on how many there are.
-    Raises WorldError for parameters that make no trial, RoverError for what a policy raises.
+    policies: the same policy, loaded once for each thread that drives. Results do not depend on how many there are.
+    Raises WorldError if there is no policy, no world, or the seed is negative, and RoverError for what a policy raises.
     """
     if worlds < 1 or seed < 0 or not policies:
         raise WorldError("drives need a policy, at least 1 world and a seed from 0", found=f"{worlds} and {seed}")
@@ -293,15 +295,15 @@ def run_latencies(
 
 
 def beside_path(drive: LateDrive, other: LateDrive) -> float:
-    """How far, at most, a drive's path is beside another one's, in metres; when it was where does not matter."""
+    """Return how far a drive's path is from another one's at most, in metres. Times do not matter, only places."""
     a, b = drive.trajectory, other.trajectory
     return float(np.hypot(a.x_m[:, None] - b.x_m, a.y_m[:, None] - b.y_m).min(1).max())
 
 
 def from_above(drive: LateDrive, condition: Condition) -> dict[str, Any]:
-    """A drive and its plans for a figure, in JSON's types and metres.
+    """Return a drive and its plans for a figure, in JSON's types and metres.
 
-    Where a plan leads to: the world's own car follows it from the place where it looked, unpushed.
+    A plan's path is that of the world's own car, which follows the plan, unpushed, from where its frame was taken.
     """
 
     def path(x_m: Iterable[float], y_m: Iterable[float]) -> dict[str, list[float]]:
@@ -336,13 +338,14 @@ def measured(
     shown_ms: float | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """How a run's static policy drives when its plans are late: the content of drive.json, stage 'drive'.
+    """Measure how a run's static policy drives when its plans are late; write and return drive.json, stage 'drive'.
 
-    Each latency with and without compensation, as params.yml's section `drive` has everything else; those of
-    pushed_latencies_ms once more with that many pushes in each world; and LeRobot's temporal ensembling at the first
-    latency. shown_ms: of this latency the world whose drives part most is kept, with its plans.
+    It drives at each of latencies_ms with and without compensation, other settings being those of params.yml's section
+    `drive`; at each of pushed_latencies_ms the same way, with `pushes` pushes in each world; and at the first latency
+    with LeRobot's temporal ensembling. shown_ms: for this latency, keep the world in which the drives with and without
+    compensation differ most, with their plans.
     A drive.json that was made of the same policy and parameters is read, not made again.
-    Sets torch to one thread: there is one for each world. Raises WorldError if there is no policy, or nothing to do.
+    Sets torch to one thread, as worlds are driven in parallel. Raises WorldError if there is no policy or no latency.
     """
     run_dir, p = Path(run_dir), params()
     artifact, path = run_dir / f"policy_{GATED}.pt", run_dir / "drive.json"
@@ -361,7 +364,7 @@ def measured(
         "drive": p["drive"],
         "hits_lost_at_150_ms": limit,
     }
-    inputs = {artifact.name: content_hash(artifact)}  # the same policy exported again is the same
+    inputs = {artifact.name: content_hash(artifact)}  # unchanged if the same policy is exported again
     with suppress(RoverError):
         there = read_stage(path, "drive")
         if (there["params"], there["inputs"]) == (plain(given), inputs):
@@ -370,12 +373,12 @@ def measured(
     conditions = []
     for ms, count in [(ms, 0) for ms in latencies_ms] + [(ms, pushes) for ms in pushed_latencies_ms]:
         conditions.append(Condition(ms / 1e3, replace(settings, compensate=True), count))
-        if ms:  # for a plan that takes no time there is nothing to make up
+        if ms:  # a plan that takes no time leaves nothing to compensate
             conditions.append(Condition(ms / 1e3, replace(settings, compensate=False), count))
     conditions.append(Condition(latencies_ms[0] / 1e3, replace(settings, ensemble=ENSEMBLE)))
     policies = [load_policy(artifact, threads=1) for _ in range(os.cpu_count() or 1)]
     reports = run_latencies(policies, conditions, worlds, progress=progress)
-    first: dict[int, LatencyReport] = {}  # by pushes: the first latency's, with compensation
+    first: dict[int, LatencyReport] = {}  # for each number of pushes, the report of its first latency, compensated
     rows = []
     for report in reports:
         base = first.setdefault(report.condition.pushes, report)
@@ -391,7 +394,7 @@ def measured(
 
 
 def _shown(reports: Sequence[LatencyReport], shown_ms: float | None) -> list[dict[str, Any]]:
-    """Of one latency, the world in which the drives with and without compensation part most."""
+    """Return, for one latency, the world in which the drives with and without compensation differ most."""
     pair = [
         r
         for r in reports
@@ -404,7 +407,10 @@ def _shown(reports: Sequence[LatencyReport], shown_ms: float | None) -> list[dic
 
 
 def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]:
-    """What params.yml promises of late plans: hits lost at 150 ms against 0 ms, compensated. rows: of drive.json."""
+    """Judge what params.yml promises for late plans: how many hits are lost at 150 ms, compensated, compared with 0 ms.
+
+    rows: of drive.json.
+    """
 
     def hits(latency_ms: float) -> int | None:
         for row in rows:
@@ -418,7 +424,7 @@ def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]
 
 
 def table(content: Mapping[str, Any]) -> Table:
-    """drive.json for a reader."""
+    """Show the content of drive.json as a table."""
     rows = []
     for r in content["metrics"]["rows"]:
         how = [f"{r['pushes']} pushes"] if r["pushes"] else ["left alone"]

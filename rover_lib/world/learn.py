@@ -1,12 +1,13 @@
-"""Does a car that was corrected drive better? Rounds of drives, takeovers and learning, beside demonstrations.
+"""Does a car drive better once it was corrected? Compare rounds of takeovers and learning with demonstrations.
 
     content = measured("runs/demo", "runs/demo-learn")
 
-In each round the policy drives, late and pushed, and an expert takes over where a human would and drives on to the end.
-From all that was recorded so far the first checkpoint learns on. The other arm learns the same way from as many seconds
-of the same expert, who drives whole drives in such worlds. Both are judged in worlds that taught nobody.
+In each round the policy drives with late plans and is pushed. An expert takes over where a human would, and drives on
+to the end. Then the first checkpoint is trained further on everything recorded so far. The other arm learns the same
+way, but from as many seconds of whole drives by the same expert in such worlds. Both are judged in worlds in which
+neither learned.
 
-All that drives is the static INT8 artifact: what would drive the car.
+Every policy drives as its static INT8 artifact, which is what would drive the car.
 """
 
 import json
@@ -47,17 +48,17 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 CORRECTED, DEMONSTRATED = ARMS = ("corrected", "demonstrated")
-BEFORE = "before"  # the policy that all began with
+BEFORE = "before"  # the policy that both arms begin with
 PUSHED, ALONE, DECOY = "pushed", "alone", "decoy"
 ROUNDS, DRIVES, WORLDS, OTHER_WORLDS = 3, 20, 200, 100
-FIRST_LEARNED = 2_000_000  # worlds to learn in: far from those of recordings and trials
+FIRST_LEARNED = 2_000_000  # seeds of the worlds to learn in, far from those of recordings and trials
 FIRST_DEMONSTRATED = 3_000_000
-FIRST_DRIVE = datetime(2025, 6, 1, 12, tzinfo=UTC)  # made up, so that a seed's recording has the same bytes every time
+FIRST_DRIVE = datetime(2025, 6, 1, 12, tzinfo=UTC)  # invented, so that a seed's recording always has the same bytes
 BETWEEN_DRIVES = timedelta(seconds=30)
 GATED_WORLDS = 40
-CHANCE = 0.05  # a sign test's p below which a difference is one
+CHANCE = 0.05  # a difference counts if its sign test's p is below this
 HALF_A_TICK_S = 0.5 / RATE_HZ
-JUDGED_FRAMES = 2  # of an old episode that is held out: here worlds judge
+JUDGED_FRAMES = 2  # held-out frames of old episodes; two are enough, as worlds judge here
 CHECKPOINT, EPISODES, ARTIFACT = "best_model.pth", "episodes", "policy_static.pt"
 JUDGING = ("worlds", "other_worlds")
 BEGUN, DRIVES_FILE = "experiment.json", "drives.jsonl"
@@ -65,17 +66,17 @@ BEGUN, DRIVES_FILE = "experiment.json", "drives.jsonl"
 
 @dataclass(frozen=True)
 class Human:
-    """When somebody beside the track takes over: once the car has steered otherwise than they would for some time.
+    """Somebody beside the track, who takes over once the car has steered differently from how they would for some time.
 
-    off: by how much, of full steering. for_s: how long, with the time that they need to react; what ends sooner is no
-    reason.
+    off: by how much it must differ, as a share of full steering. for_s: for how long without a break, which includes
+    the time that they need to react.
     """
 
     off: float = 0.25
     for_s: float = 0.4
 
     def watching(self, world: World) -> Callable[[Order], bool]:
-        """Asked at every tick of a drive through that world; true when they take over."""
+        """Return a function to call with each tick's order in that world; it returns true when the human takes over."""
         ticks = 0
 
         def takes_over(order: Order) -> bool:
@@ -88,7 +89,11 @@ class Human:
 
 @dataclass(frozen=True)
 class Corrected:
-    """A drive with a human beside it. outcome: of the whole, as LateDrive's. taken_over_s: None where nobody had to."""
+    """A drive that a human watched.
+
+    outcome: of the whole drive, as LateDrive's. taken_over_s: when the human took over, None if nobody had to.
+    human_s: for how long the human drove.
+    """
 
     seed: int
     outcome: str
@@ -99,7 +104,7 @@ class Corrected:
 def drive_corrected(
     policy: Plans, folder: Path, index: int, seed: int, condition: Condition, human: Human
 ) -> Corrected:
-    """Record a drive, number `index`, in which the expert takes over where that human would, and drives to the end."""
+    """Record drive number `index`: the policy drives until `human` would take over, then the expert, to the end."""
     world = World(seed, condition.pushes, condition.decoys)
     takes_over = human.watching(world)
     with WorldEpisode(folder, _start(index), world) as episode:
@@ -118,7 +123,7 @@ def drive_corrected(
 
 
 def demonstrate(folder: Path, index: int, seed: int, condition: Condition, most_s: float) -> float:
-    """Record a whole drive of the expert, or its first most_s seconds. Returns how many there are."""
+    """Record a whole drive of the expert, or its first most_s seconds. Returns how many seconds were recorded."""
     world = World(seed, condition.pushes, condition.decoys)
     with WorldEpisode(folder, _start(index), world) as episode:
         while not world.done and world.state.time_s < most_s - HALF_A_TICK_S:
@@ -128,9 +133,13 @@ def demonstrate(folder: Path, index: int, seed: int, condition: Condition, most_
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is tried: rounds of that many drives; worlds that judge when pushed, and other_worlds when left alone and
-    with decoys, the first of them notebook 07's. pushes and decoys: of a world; every second one to learn in has both.
-    samples: frames at most of each round, and of what the policy began with, steps: of learning, the recipe's if None.
+    """How much is driven, learned and judged.
+
+    rounds, drives: the number of rounds, and of drives in each. worlds: how many judge a policy that is pushed;
+    other_worlds: how many judge it left alone, and how many with decoys. The first of all these are notebook 07's.
+    pushes, decoys: in a world; of the worlds to learn in, all have the pushes and every second one the decoys too.
+    samples: how many frames of each round, and of the first recordings, are learned from at most. steps: of learning;
+    the recipe's if None.
     """
 
     rounds: int = ROUNDS
@@ -153,7 +162,7 @@ class Experiment:
         return Settings.of(params()["drive"])
 
     def learned_in(self, number: int) -> Condition:
-        """Of a round's drive."""
+        """Return the condition of a round's drive by its number."""
         return Condition(self.latency_ms / 1e3, self.settings(), self.pushes, self.decoys if number % 2 else 0)
 
     def judged_in(self) -> dict[str, Condition]:
@@ -161,7 +170,7 @@ class Experiment:
         return {PUSHED: replace(alone, pushes=self.pushes), ALONE: alone, DECOY: replace(alone, decoys=self.decoys)}
 
     def recipe(self) -> FinetuneRecipe:
-        """For both arms, and all recordings of the rounds are learned from: worlds judge here."""
+        """Return the recipe for both arms. It learns from all recordings of the rounds, as worlds judge here."""
         alike = {"correction_weight": 1.0, "held_out_share": 0.0, "judged_frames": JUDGED_FRAMES}
         recipe = FinetuneRecipe.of(params(), samples=self.samples, **alike)
         return recipe.of_steps(self.steps) if self.steps else recipe
@@ -170,13 +179,13 @@ class Experiment:
 def measured(
     run_dir: Path | str, out_dir: Path | str, experiment: Experiment | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Both arms, round by round: the content of learn.json in the run's folder, stage 'learn'.
+    """Run both arms, round by round; write and return learn.json in the run's folder, stage 'learn'.
 
-    run_dir: with best_model.pth, episodes/ and policy_static.pt, as `make demo` leaves them. out_dir: what is
-    recorded, learned and driven on the way; ended at any moment, the same call goes on there. A learn.json made of the
-    same is read.
-    Raises WorldError where the run lacks something or out_dir is of another experiment, and what reading, learning and
-    driving raise.
+    run_dir: has best_model.pth, episodes/ and policy_static.pt, as `make demo` leaves them. out_dir: keeps what is
+    recorded, learned and driven on the way; after an end at any moment, the same call goes on from there. A learn.json
+    that was made from the same files and parameters is read, not made again.
+    Raises WorldError if the run lacks a file or out_dir belongs to another experiment, and whatever reading, learning
+    and driving raise.
     """
     experiment = experiment or Experiment()
     run_dir, out_dir = Path(run_dir).resolve(), Path(out_dir).resolve()
@@ -201,13 +210,13 @@ def measured(
 
 
 def left(run_dir: Path | str) -> dict[str, Any] | None:
-    """What `measured` left in a run's folder, None where there is nothing."""
+    """Read what `measured` left in a run's folder; None if there is nothing."""
     path = Path(run_dir) / "learn.json"
     return read_stage(path, "learn") if path.is_file() else None
 
 
 def _begin(out_dir: Path, made_of: dict[str, Any]) -> None:
-    """What is in out_dir belongs to one experiment."""
+    """Note in out_dir which experiment it belongs to. Raises WorldError if it holds another one or something else."""
     path = out_dir / BEGUN
     if path.is_file() and json.loads(path.read_text()) != made_of:
         raise WorldError(
@@ -223,14 +232,14 @@ def _begin(out_dir: Path, made_of: dict[str, Any]) -> None:
 
 
 class _Lab:
-    """One experiment in its folder: <arm>-<round>/ has episodes and drives.jsonl, learned/<arm>-<round>/ a policy."""
+    """An experiment in its folder: <arm>-<round>/ has episodes and drives.jsonl, learned/<arm>-<round>/ a policy."""
 
     def __init__(self, experiment: Experiment, run_dir: Path, folder: Path, progress: Progress):
         self.experiment, self.run_dir = experiment, run_dir
         self.folder, self.progress = folder, progress
 
     def policies(self) -> dict[str, Path]:
-        """All artifacts, by name."""
+        """Return the paths of all artifacts by the policies' names."""
         learned = {_name(arm, n): self._learned(arm, n) for arm in ARMS for n in range(1, self.experiment.rounds + 1)}
         return {BEFORE: self.run_dir / ARTIFACT, **learned}
 
@@ -238,7 +247,7 @@ class _Lab:
         return self.folder / "learned" / _name(arm, number) / ARTIFACT
 
     def round(self, number: int) -> dict[str, Any]:
-        """Drive, correct, learn on; then as many seconds of demonstrations, and learn on from those."""
+        """Drive and correct, then record as many seconds of demonstrations, and train both arms further."""
         before = self.run_dir / ARTIFACT if number == 1 else self._learned(CORRECTED, number - 1)
         drives = self._drive(before, number)
         human_s = sum(d["human_s"] for d in drives)
@@ -262,7 +271,7 @@ class _Lab:
         }
 
     def _learn(self, arm: str, number: int, recorded: Sequence[Path]) -> None:
-        """A policy that has learned on from these, and its artifact."""
+        """Train the first checkpoint further on these recordings too, and make the artifact."""
         target = self._learned(arm, number)
         if not (target.parent / "finetune.json").is_file():
             finetune(
@@ -278,7 +287,7 @@ class _Lab:
         make_artifact(learned, target, pipeline.Recipe.of(params()), progress=self.progress)
 
     def _drive(self, artifact: Path, number: int) -> list[dict[str, Any]]:
-        """A round's drives with a human beside them, those that are not recorded yet."""
+        """Return a round's drives with a human beside the track, and first record those that are missing."""
         folder = self.folder / _name(CORRECTED, number)
         done = _swept(folder)
         missing = [i for i in range(self.experiment.drives) if i not in done]
@@ -296,7 +305,7 @@ class _Lab:
         return [rows[i] for i in range(self.experiment.drives)]
 
     def _demonstrate(self, number: int, most_s: float) -> None:
-        """As many seconds of whole drives of the expert; the last one is cut."""
+        """Record most_s seconds of whole drives by the expert; the last drive is cut."""
         folder = self.folder / _name(DEMONSTRATED, number)
         _swept(folder)
         i, left_s = 0, most_s
@@ -311,7 +320,7 @@ class _Lab:
             i += 1
 
     def judge(self) -> None:
-        """Drive all policies through the worlds that judge, those that have not been."""
+        """Drive every policy through those of the judging worlds that it has not driven yet."""
         conditions = self.experiment.judged_in()
 
         def outcome_of(driver: Policy, asked: tuple[str, int]) -> str:
@@ -328,11 +337,11 @@ class _Lab:
                 _append(self.folder / f"{name}.jsonl", {"how": how, "seed": seed, "outcome": outcome})
 
     def seeds(self, how: str) -> range:
-        """Of the worlds that judge under a condition."""
+        """Return the seeds of the worlds that judge under a condition."""
         return range(SEED, SEED + (self.experiment.worlds if how == PUSHED else self.experiment.other_worlds))
 
     def outcomes(self, name: str) -> dict[str, dict[int, str]]:
-        """Of a policy, by condition and seed, in the worlds that judge; more of them may have been driven before."""
+        """Return a policy's outcomes by condition and seed, only for the worlds that judge: its file may have more."""
         found: dict[str, dict[int, str]] = {how: {} for how in self.experiment.judged_in()}
         for row in _rows(self.folder / f"{name}.jsonl"):
             if row["seed"] in self.seeds(row["how"]):
@@ -345,7 +354,7 @@ def _name(arm: str, number: int) -> str:
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
-    """Lines of a file; one that a kill tore is none."""
+    """Return the rows of a file. A line that is torn, because a process was killed, is left out."""
     rows = []
     for line in path.read_text().splitlines() if path.is_file() else ():
         with suppress(ValueError):
@@ -356,16 +365,16 @@ def _rows(path: Path) -> list[dict[str, Any]]:
 def _append(path: Path, row: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
-        file.write("\n" + json.dumps(plain(row)) + "\n")  # begins with one, in case the last was torn
+        file.write("\n" + json.dumps(plain(row)) + "\n")  # starts with a line break, in case the last line was torn
 
 
 def _drives_of(folder: Path, wanted: str = "drive") -> dict[int, dict[str, Any]]:
-    """A folder's drives by number, of which `wanted` is said and not 0 (or is their number)."""
+    """Return a folder's drives by number: all, or only those whose value of the key `wanted` is not 0."""
     return {r["drive"]: r for r in _rows(folder / DRIVES_FILE) if wanted == "drive" or r[wanted]}
 
 
 def _swept(folder: Path) -> dict[int, dict[str, Any]]:
-    """The drives that are whole; what a killed process left of others is removed."""
+    """Return the drives that are complete, and remove what a killed process left of others."""
     done = _drives_of(folder)
     number = int(folder.name.rpartition("-")[2])
     kept = {episode_name(_start(1000 * number + i)) for i in done}
@@ -376,11 +385,11 @@ def _swept(folder: Path) -> dict[int, dict[str, Any]]:
 
 
 def _start(index: int) -> datetime:
-    """When a drive began, in a made-up calendar."""
+    """Return when a drive began, by an invented calendar."""
     return FIRST_DRIVE + index * BETWEEN_DRIVES
 
 
-# --- what is said of it -----------------------------------------------------------------------------------------------
+# --- the results ------------------------------------------------------------------------------------------------------
 
 
 def _metrics(lab: _Lab, rounds: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -389,10 +398,10 @@ def _metrics(lab: _Lab, rounds: Sequence[dict[str, Any]]) -> dict[str, Any]:
     rows = []
     for name in lab.policies():
         arm, _, number = name.partition("-")
-        found = {how: [s for s, o in sorted(by.items()) if o != "hit"] for how, by in lab.outcomes(name).items()}
         row: dict[str, Any] = {"name": name, "arm": arm, "round": int(number or 0)}
         row["human_s"] = spent[int(number) - 1] if number else 0.0
-        for how, missed in found.items():
+        for how, outcomes in lab.outcomes(name).items():
+            missed = [seed for seed, outcome in sorted(outcomes.items()) if outcome != "hit"]
             trials = len(lab.seeds(how))
             hits = trials - len(missed)
             low, high = wilson_interval(hits, trials)
@@ -415,7 +424,7 @@ def _metrics(lab: _Lab, rounds: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _pair(row: Mapping[str, Any], other: Mapping[str, Any], how: str) -> dict[str, Any]:
-    """The same worlds, driven by both: which only one of them hit."""
+    """Compare two policies in the same worlds: count the worlds that only one of them hit."""
     own, others = set(row[how]["missed"]), set(other[how]["missed"])
     only, only_other = len(others - own), len(own - others)
     return {
@@ -429,7 +438,10 @@ def _pair(row: Mapping[str, Any], other: Mapping[str, Any], how: str) -> dict[st
 
 
 def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What was promised of the last round; of notebook 07's 40 worlds, if all were driven. rows: of learn.json."""
+    """Judge the last round by what was promised: hits in notebook 07's 40 worlds, and a sign test in all worlds.
+
+    rows: of learn.json. Hits are judged only if all of those 40 worlds were driven.
+    """
     last = [row for row in rows if row["arm"] == CORRECTED][-1]
     hits = {how: last[how]["hits_of_40"] if last[how]["trials"] >= GATED_WORLDS else None for how in (PUSHED, ALONE)}
     lost = None if hits[ALONE] is None else rows[0][ALONE]["hits_of_40"] - hits[ALONE]
@@ -447,7 +459,7 @@ HOW = {PUSHED: "pushed", ALONE: "left alone", DECOY: "beside a red thing that is
 
 
 def sentences(metrics: Mapping[str, Any]) -> list[str]:
-    """What came of it, in plain English, whichever way. metrics: of learn.json."""
+    """Say in plain English what the experiment showed, whatever it was. metrics: of learn.json."""
     rows = metrics["policies"]
     last = max(row["round"] for row in rows)
     seconds = next(row["human_s"] for row in rows if row["round"] == last)
@@ -470,7 +482,7 @@ def sentences(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def table(content: Mapping[str, Any] | None) -> Table:
-    """learn.json for a reader; a sentence where there is none."""
+    """Show the content of learn.json as a table; None gives an empty one with a sentence that says what to do."""
     rows = []
     for row in content["metrics"]["policies"] if content else ():
         hits = (
@@ -484,7 +496,7 @@ def table(content: Mapping[str, Any] | None) -> Table:
 
 
 def rounds_table(content: Mapping[str, Any] | None) -> Table:
-    """What each round cost; a sentence where there is none."""
+    """Show what each round cost as a table; None gives an empty one with a sentence that says what to do."""
     rows = [
         (str(r["round"]), f"{r['takeovers']} of {r['drives']}", f"{r['human_s']:.1f}", str(r["missed"]))
         for r in (content["metrics"]["rounds"] if content else ())

@@ -1,4 +1,4 @@
-"""Episodes of an expert in balloon worlds, in the user's format, and the cache of what was made."""
+"""Record an expert's drives through balloon worlds as episodes in the user's format, and keep them in the cache."""
 
 import json
 import os
@@ -26,13 +26,13 @@ from rover_lib.world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World, exp
 
 LABEL = "hit red balloon"
 JPEG_QUALITY = 85
-SHOVES = 2  # without them an expert never shows how to come back, and the policy never learns to
+SHOVES = 2  # without shoves the expert never shows how to come back on course, and the policy never learns it
 MARKER = ".recorded.json"
-# Made up, so that a seed's recording has the same bytes every time.
+# An invented time, so that a seed's recording has the same bytes every time.
 FIRST_DRIVE = datetime(2025, 1, 1, 12, tzinfo=UTC)
 BETWEEN_DRIVES = timedelta(seconds=30)
 FIRST_WORLD = 1_000_000  # far from the worlds that trials drive in
-CONTROL_LATENCY_S = 0.004  # the serial line delivers a control a little after the frame that it belongs to
+CONTROL_LATENCY_S = 0.004  # how long after its frame a control arrives over the serial line
 
 
 def record_episodes(
@@ -41,10 +41,10 @@ def record_episodes(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Path:
-    """Let the expert drive `count` worlds, with shoves that it corrects; one episode folder per drive.
+    """Let the expert drive through `count` worlds, with shoves that it corrects; record an episode folder per drive.
 
-    out_dir: appears complete; if it holds the same recording already it is left as it is.
-    Returns out_dir. The same count and seed give the same bytes on one machine.
+    out_dir: appears complete or not at all; if it already holds the same recording, it is left as it is.
+    Returns out_dir. On one machine the same count and seed give the same bytes.
     Raises WorldError for a count below 1, a negative seed, or an out_dir with something else in it.
     """
     out_dir = Path(out_dir)
@@ -69,7 +69,7 @@ def record_episodes(
     out_dir.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=out_dir.parent, prefix=f".{out_dir.name}."))
     try:
-        # Copied, not linked: who damages an episode to see what happens must not damage the cache.
+        # Copied and not linked: somebody who damages an episode to see what happens must not damage the cache.
         copy = shutil.copytree(made, temporary / "episodes")
         if out_dir.is_dir():
             out_dir.rmdir()
@@ -90,7 +90,7 @@ def _marker_of(folder: Path) -> str | None:
 
 
 def _record_all(folder: Path, count: int, seed: int, key: str, progress: Progress) -> None:
-    # OpenCV lets go of the interpreter's lock while it draws and compresses, so threads help.
+    # OpenCV releases the interpreter's lock while it draws and compresses, so threads help.
     with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
         drives = pool.map(lambda index: record_drive(folder, index, seed), range(count))
         hits = sum(progress(drives, desc="recording", total=count))
@@ -98,24 +98,24 @@ def _record_all(folder: Path, count: int, seed: int, key: str, progress: Progres
 
 
 def record_drive(folder: Path, index: int, seed: int) -> bool:
-    """Record drive number `index` of a seed into folder/episode_YYYYMMDD_HHMMSS. Returns whether it hit."""
+    """Record drive number `index` of a seed into folder/episode_YYYYMMDD_HHMMSS; return whether it hit the balloon."""
     world = World(FIRST_WORLD * (seed + 1) + index, shoves=SHOVES)
     with WorldEpisode(folder, FIRST_DRIVE + timedelta(days=seed) + index * BETWEEN_DRIVES, world) as episode:
         while not world.done:
-            # The car obeys what was sent, and what was measured of it is what is recorded.
+            # The car drives by what the recording says: the action as the Arduino measures it.
             world.step(*episode.tick(*expert(world)))
     return world.hit
 
 
 def episode_name(start: datetime) -> str:
-    """The folder of a drive that began then."""
+    """Return the name of the folder of a drive that began at `start`."""
     return f"episode_{start:%Y%m%d_%H%M%S}"
 
 
 class WorldEpisode:
-    """The recording of a drive in a world, folder/episode_YYYYMMDD_HHMMSS of its start; there when it ends well.
+    """Record a drive in a world into folder/episode_YYYYMMDD_HHMMSS, named by its start.
 
-    Raises EpisodeError as EpisodeWriter does.
+    A context manager; the folder appears when it is left without an error. Raises EpisodeError as EpisodeWriter does.
     """
 
     def __init__(self, folder: Path, start: datetime, world: World):
@@ -137,9 +137,9 @@ class WorldEpisode:
         self.writer.__exit__(*error)
 
     def tick(self, steering: float, throttle: float, **extra: Any) -> tuple[float, float]:
-        """What the camera sees now, and what is commanded. Returns that as it is measured, (steering, throttle).
+        """Record what the camera sees now and what is commanded.
 
-        extra: further columns of the control.
+        extra: further columns of the control. Returns (steering, throttle) as the Arduino would measure them.
         """
         t_s = self._world.state.time_s
         self.writer.frame(self._start_s + t_s, self._world.render())
@@ -153,5 +153,5 @@ class WorldEpisode:
 
 
 def _measured_us(pulse_us: float) -> int:
-    """A pulse as the Arduino's timer counts it."""
+    """Round a pulse to the steps of the Arduino's timer."""
     return int(np.round(pulse_us / ARDUINO_STEP_US)) * ARDUINO_STEP_US

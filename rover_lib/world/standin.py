@@ -1,4 +1,4 @@
-"""A stand-in for the rover's Arduino, in Python: a serial port that a ServoLink opens, and what its servo pins do."""
+"""Stand in for the rover's Arduino, in Python: offer a serial port to a ServoLink, and tell what the servo pins do."""
 
 import contextlib
 import os
@@ -17,19 +17,19 @@ from typing import Any, NamedTuple
 from rover_lib.onboard.car import DEFAULT_NUMBERS, this_car
 from rover_lib.onboard.servo_link import FIRMWARE_VERSION, PROTOCOL_VERSION
 
-BOOT_S = 0.2  # of the boot loader; a board's takes 1 to 2 s
+BOOT_S = 0.2  # how long the boot loader runs; a real board's takes 1 to 2 s
 _NEUTRAL = this_car().pwm.neutral()
 REST_US = (float(_NEUTRAL.steering_us), float(_NEUTRAL.throttle_us))  # a transmitter whose sticks nobody touches
 
 
 class PinEvent(NamedTuple):
-    """Something on the servo pins, or that explains what they do.
+    """Something that happened on the servo pins, or that explains what they do.
 
-    kind: 'pulse'; 'cut', a pulse that a reset ended; 'line', one of the host came in whole; 'reset', the pins float;
-    'open', of the port; 'stall', this machine had no time for the Arduino, pulse_us is for how long; 'lost', events
-    that were not read in time, pulse_us is their count. pin: 'steering', 'throttle' or ''. monotonic_s:
-    time.monotonic() at which the pin rose, or it happened. period_us: since the pin rose before that, 0 for the first
-    after a reset.
+    kind: 'pulse'; 'cut': a reset ended a pulse; 'line': a whole line of the host has arrived; 'reset': from now on the
+    pins float; 'open': somebody opened the port; 'stall': this machine had no time for the Arduino, for pulse_us;
+    'lost': events were not read in time, and pulse_us is their number. pin: 'steering', 'throttle' or ''.
+    monotonic_s: time.monotonic() when the pin rose, or when the event happened. period_us: the time since the pin rose
+    before that, 0 for the first pulse after a reset; from a StandIn always the nominal period.
     """
 
     monotonic_s: float
@@ -40,13 +40,13 @@ class PinEvent(NamedTuple):
 
     @property
     def end_s(self) -> float:
-        """When the pin fell: from then on the servo knows the pulse."""
+        """When the pin fell (time.monotonic()); from then on the servo knows the pulse's length."""
         return self.monotonic_s + self.pulse_us * 1e-6 if self.pin else self.monotonic_s
 
 
 _NUMBER = r"(0|[1-9][0-9]{0,9})"
 _COMMAND = re.compile(rf">([ACDLN]) {_NUMBER} {_NUMBER}((?: {_NUMBER})*)", re.ASCII)
-_NUMBERS = {"A": 2, "C": 9, "D": 3, "N": 0, "L": 1}  # after boot and sequence
+_NUMBERS = {"A": 2, "C": 9, "D": 3, "N": 0, "L": 1}  # how many numbers follow boot and sequence
 _STATUS_S = 0.02
 _TIMEOUT_S = 0.150
 LATE_MS = 150
@@ -56,14 +56,14 @@ _LINE_MAX = 96
 
 
 class StandIn:
-    """A stand-in for the Arduino, for machines without simavr: protocol version 3 of firmware/README.md on a pty.
+    """A stand-in for the Arduino, for machines without simavr. It speaks protocol 3 of firmware/README.md on a pty.
 
-    It is no firmware and proves nothing about the firmware. Like it, it resets when its port is opened and DTR was not
-    left up, starts in manual with a transmitter at rest, drives only when armed, within range and its throttle's cap,
-    rejects what is old, late or another start's, and is in neutral 150 ms after the last command, until it is armed
-    again. Unlike it, there is no human who could take over, but one who has always just wiggled the stick when the host
-    wants to arm; no watchdog, no limit to how fast a pulse may change, a line may take as long as it likes, and a pulse
-    starts when its command comes.
+    It is not the firmware and proves nothing about it. Like the firmware, it resets when its port is opened, unless DTR
+    was left up; it starts in manual, with a transmitter at rest; it drives only when armed, within the ranges and the
+    throttle's cap; it rejects commands that are old, late or meant for another start; and 150 ms after the last command
+    it goes to neutral until it is armed again. Unlike with the firmware, no human can take over, but one has always
+    just wiggled the stick when the host wants to arm; there is no watchdog and no limit to how fast a pulse may change;
+    a line may take any time to arrive; and a pulse starts as soon as its command comes.
     """
 
     def __init__(self, boot_s: float = BOOT_S):
@@ -71,7 +71,7 @@ class StandIn:
         self._master, slave = pty.openpty()
         tty.setraw(slave)
         attributes = termios.tcgetattr(slave)
-        attributes[2] |= termios.HUPCL  # as a serial port has it
+        attributes[2] |= termios.HUPCL  # as on a serial port
         termios.tcsetattr(slave, termios.TCSANOW, attributes)
         self.port = os.ttyname(slave)
         os.close(slave)  # so that POLLHUP tells whether somebody has the port open
@@ -91,11 +91,11 @@ class StandIn:
         self.close()
 
     def pulses(self) -> list[PinEvent]:
-        """What changed on the pins since the last call; at most 10,000 events are kept."""
+        """Return what changed on the pins since the last call; at most 10,000 events are kept."""
         return [self._events.popleft() for _ in range(len(self._events))]
 
     def close(self) -> None:
-        """Unplugs it."""
+        """Unplug the Arduino."""
         if not self._closing.is_set():
             self._closing.set()
             self._thread.join()
@@ -108,7 +108,7 @@ class StandIn:
         self._take_car(DEFAULT_NUMBERS)
         self._result, self._state, self._reason = "-", "M", "r"
         self._bad = self._old = self._out_of_range = 0
-        self._line: bytes | None = None  # what came since a '>'
+        self._line: bytes | None = None  # what has arrived since the last '>'; None if no line has begun
         self._started = time.monotonic()
         self._commanded = self._status_due = 0.0
         self._pins = ()
@@ -125,7 +125,7 @@ class StandIn:
             events = dict(poller.poll(wait_s * 1000)).get(self._master, 0)
             was_open, is_open = is_open, not events & select.POLLHUP
             if not is_open:
-                if was_open:  # the master tells the settings of the other end
+                if was_open:  # tcgetattr of the master gives the settings of the other end
                     dtr = not termios.tcgetattr(self._master)[2] & termios.HUPCL
                 self._check_timeout()
                 time.sleep(0.005)
@@ -135,7 +135,7 @@ class StandIn:
             if not was_open and not dtr:
                 self._reset()
                 self._closing.wait(self._boot_s)
-                self._read()  # the boot loader has it
+                self._read()  # the boot loader swallows what came meanwhile
                 self._started = time.monotonic()
                 self._send("")  # ends a line that the reset cut
                 self._hello("e")
@@ -229,7 +229,7 @@ class StandIn:
             self._commanded = time.monotonic()
             low, high = self._neutral[1] - self._cap_us, self._neutral[1] + self._cap_us
             self._set_pins(pulses[0], min(max(pulses[1], low), high))
-        elif not armed:  # a host that repeats itself renews nothing
+        elif not armed:  # arming again while armed does not renew the deadline
             self._commanded = time.monotonic()
             self._enter("A", "a")
         return "k"
@@ -241,7 +241,10 @@ class StandIn:
         return "k"
 
     def _take_car(self, numbers: tuple[int, ...]) -> None:
-        """The pins are that car's. No limits are here: the host refuses a car that has none."""
+        """Use that car's neutral, ranges, periods and cap from now on.
+
+        They are not checked here, unlike in the firmware: the host refuses a car with numbers that it does not allow.
+        """
         self._car_id = zlib.crc32(struct.pack("<9H", *numbers))
         self._periods_us = numbers[0], numbers[4]
         self._neutral = numbers[2], numbers[6]

@@ -1,9 +1,10 @@
-"""Can a smaller policy drive the same? A teacher and its students, judged on recordings and driven side by side.
+"""Can a smaller policy drive the same? Judge a teacher and its students on recordings, and drive them side by side.
 
     content = measured("runs/full", ["runs/fast", "runs/faster"])
 
-All that is said is of the artifact that would drive the car, a run's policy_static.pt. What was driven or planned once
-stays in the cache, by the artifact's content, so that whoever is ended goes on, and another student costs only itself.
+All results concern the artifact that would drive the car, a run's policy_static.pt. Every drive and plan stays in the
+cache, keyed by the artifact's content. So a process that was ended goes on where it was, and a further student costs
+only its own drives and plans.
 """
 
 import json
@@ -58,7 +59,10 @@ ESTIMATED = (
 
 @dataclass(frozen=True)
 class _Run:
-    """A run's static artifact. shape: of a row of distill.json; counts: of arm.json, None where it was not counted."""
+    """A run's static artifact.
+
+    shape: its row of distill.json. counts: its instructions from arm.json, None if they were not counted.
+    """
 
     name: str
     artifact: Path
@@ -68,7 +72,7 @@ class _Run:
 
     @property
     def computed_ms(self) -> list[float] | None:
-        """Low and high."""
+        """The low and the high end of the computed latency on a Pi 5; None if instructions were not counted."""
         return [self.counts["computed_pi5_ms"][end] for end in ("low", "high")] if self.counts else None
 
     @property
@@ -85,14 +89,14 @@ def measured(
     held_out_frames: int = HELD_OUT_FRAMES,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """A teacher's run and its students' runs side by side: the content of distill.json in the teacher's folder.
+    """Compare a teacher's run with its students' runs; write and return distill.json in the teacher's folder.
 
     students: folders that `rover distill` left, each with a policy_static.pt. episodes: the recordings to judge with,
-    those of the teacher's run if None. worlds: driven twice by each, left alone as `run_trials` does, and pushed at
-    the latency computed for it; 0 where there is no world, as for a real car's policy: then nobody drives.
-    held_out_frames: at most.
+    those of the teacher's run if None. worlds: how many each policy drives through twice, left alone as in
+    `run_trials`, and pushed at the latency computed for it. With 0 nobody drives, as there is no world for a real
+    car's policy. held_out_frames: how many to judge with at most.
     Sets torch to one thread. Raises DistillError for runs that do not belong together or lack a file, and
-    what reading them raises.
+    whatever reading them raises.
     """
     folder, p = Path(run_dir).resolve(), params()
     runs = _runs(folder, [Path(student).resolve() for student in students])
@@ -133,7 +137,7 @@ def measured(
 
 
 def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
-    """The teacher's run and its students', the teacher first, in proof that they belong together."""
+    """Read the teacher's run and its students', the teacher first, and check that they belong together."""
     names = [student.name for student in students]
     if not names or len({*names, TEACHER}) <= len(names):
         raise DistillError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
@@ -166,7 +170,7 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
 
 
 def _distilled(student: Path) -> dict[str, Any]:
-    """The distill.json that `rover distill` left."""
+    """Read the distill.json that `rover distill` left in a student's run."""
     path = student / "distill.json"
     if not path.is_file():
         raise DistillError(f"{student}: no distill.json in it", remedy="'rover distill' makes a student")
@@ -182,7 +186,7 @@ def _artifact_of(run_dir: Path) -> Path:
 
 
 def _counts(run_dir: Path) -> dict[str, Any] | None:
-    """What arm.json says of policy_static.pt; None if it was not counted, or was another file then."""
+    """Return what arm.json says about policy_static.pt; None if nothing was counted, or it was another file then."""
     if not (path := run_dir / "arm.json").is_file():
         return None
     arm = read_stage(path, "arm")
@@ -191,7 +195,7 @@ def _counts(run_dir: Path) -> dict[str, Any] | None:
 
 
 def _source_of(run_dir: Path, episodes: Path | str | None) -> Source:
-    """What the teacher's run loaded, or other recordings, read as those were."""
+    """Return the recordings that the teacher's run loaded; or, if `episodes` is given, those, read the same way."""
     if (run_dir / "load.json").is_file():
         return Source.loaded(read_stage(run_dir / "load.json", "load")["params"], episodes)
     if not episodes:
@@ -206,7 +210,7 @@ def _row(run: _Run) -> dict[str, Any]:
         "height": camera["height"],
         "width": camera["width"],
         **{key: run.shape[key] for key in ("decoder_layers", "feedforward", "qat")},
-        "backbone_channels": run.shape.get("backbone_channels"),  # students of before had all
+        "backbone_channels": run.shape.get("backbone_channels"),  # older students have all channels
         "gmac": run.manifest["gmac"],
         "instructions_g": run.counts and run.counts["instructions_g"],
         "simd_g": run.counts and run.counts["simd_g"],
@@ -216,10 +220,10 @@ def _row(run: _Run) -> dict[str, Any]:
 
 
 def everywhere(artifact: Path, asked: Sequence[K], do: Callable[[Policy, K], V]) -> Iterator[tuple[K, V]]:
-    """(question, answer) of each, as they come: a policy in one thread on each core.
+    """Call do(policy, question) for each question, on every core a policy of one thread; yield (question, answer).
 
-    Not one policy on all cores: torch's second thread, once it was there, spins between inferences, which costs several
-    times what it brings to a small policy.
+    The answers come in the order in which they are ready. One policy on all cores would be slower: once torch has a
+    second thread, it spins between inferences, which costs several times what it gains for a small policy.
     """
     free: queue.SimpleQueue[Policy] = queue.SimpleQueue()
     cores = min(os.cpu_count() or 1, len(asked))
@@ -248,7 +252,7 @@ def everywhere(artifact: Path, asked: Sequence[K], do: Callable[[Policy, K], V])
 def _errors(
     folder: Path, runs: Sequence[_Run], samples: Sequence[Sample], recordings: Recordings, progress: Progress
 ) -> list[dict[str, float | None]]:
-    """Of each artifact: to the plans of the teacher's policy_fp32.pt, and to the recordings."""
+    """Return each artifact's errors against the plans of the teacher's policy_fp32.pt and against the recordings."""
     reference = folder / "policy_fp32.pt"
     if not reference.is_file():
         remedy = f"'rover quantize CHECKPOINT EPISODES --mode fp32 -o {reference}' makes it"
@@ -259,7 +263,7 @@ def _errors(
 
 
 def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progress) -> np.ndarray:
-    """(n, C, A) float32 of what an artifact plans on the samples. Kept in the cache."""
+    """Return what an artifact plans for the samples, (n, C, A) float32, from the cache if it is there."""
     frames = [(str(s.frame_path), s.frame_path.stat().st_size, s.frame_name, s.state.tolist()) for s in samples]
     planned_by = {"artifact": content_hash(artifact), "torch": torch.__version__, **car_in_key()}
     key = key_of(planned_by | {"frames": frames}, preprocess)
@@ -278,7 +282,7 @@ def _plan(policy: Policy, sample: Sample) -> np.ndarray:
 
 # --- in worlds --------------------------------------------------------------------------------------------------------
 
-Drive = Callable[[Policy, int], str]  # through the world of a seed; returns the outcome
+Drive = Callable[[Policy, int], str]  # drives a policy through the world of a seed and returns the outcome
 
 
 def _left_alone(policy: Policy, seed: int) -> str:
@@ -290,7 +294,7 @@ def _pushed(policy: Policy, seed: int, *, condition: Condition) -> str:
 
 
 def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress) -> dict[str, Any]:
-    """A row's hits, of drives left alone and pushed; null where nobody drove. pushed_ms: None where it is not known."""
+    """Return a row's hits, left alone and pushed; all None if nobody drove. pushed_ms: None if it is not known."""
     how = params()["drive"]
     asked: dict[str, Drive] = {}
     if worlds:
@@ -324,7 +328,10 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
 def _driven(
     run: _Run, asked: Mapping[str, Drive], files: Mapping[str, Path], seeds: range, progress: Progress
 ) -> dict[str, dict[int, str]]:
-    """Outcomes by seed of each kind of drive. What a file has is not driven again, and a drive that ends is in it."""
+    """Return the outcomes by seed of each kind of drive.
+
+    Drives that are in the files are not repeated, and each new one is written to its file as soon as it has ended.
+    """
     kept = {name: _read(path) for name, path in files.items()}
     missing = [(name, seed) for name in asked for seed in seeds if seed not in kept[name]]
     driven = everywhere(run.artifact, missing, lambda policy, drive: asked[drive[0]](policy, drive[1]))
@@ -335,7 +342,7 @@ def _driven(
 
 
 def _read(path: Path) -> dict[int, str]:
-    """Outcomes by seed. A line that a kill tore is none."""
+    """Read outcomes by seed. A line that is torn, because a process was killed, is left out."""
     drives = {}
     for line in path.read_text().splitlines() if path.exists() else ():
         try:
@@ -349,4 +356,4 @@ def _read(path: Path) -> dict[int, str]:
 def _append(path: Path, drive: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
-        file.write("\n" + json.dumps(drive) + "\n")  # begins with one, in case the last was torn
+        file.write("\n" + json.dumps(drive) + "\n")  # starts with a line break, in case the last line was torn

@@ -1,11 +1,12 @@
-"""Train LeRobot's own ACTPolicy on recordings; write a checkpoint as the user's trainer writes it.
+"""Train LeRobot's own ACTPolicy on recordings, and write a checkpoint in the format of the user's trainer.
 
-From scratch, without downloads, a ResNet with frozen batch norm learns nothing. So there are three phases:
-the backbone alone with live batch norm, predicting the chunk; the transformer on the frozen backbone's
-features, computed once; then all together at a tenth of the rate.
+Nothing is downloaded, so the ResNet starts from random weights, and with frozen batch norm it would learn nothing. So
+there are three phases: the backbone alone, with live batch norm, learns to predict the chunk; then the transformer
+learns on the frozen backbone's features, which are computed once; then both learn together at a tenth of the rate.
 
-ACT's positions are relative to the picture and no weight depends on its size. So the real car's policy is trained so at
-a quarter of its pixels, which takes a quarter of the time, and carried to its own size by a few steps there.
+ACT's position codes are relative to the picture, and no weight depends on the picture's size. So the real car's policy
+goes through these phases at a quarter of its pixels, which takes a quarter of the time, and a few more steps at its own
+size carry it there.
 """
 
 import math
@@ -62,17 +63,18 @@ from rover_lib.workshop.training import (
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
-# Below it two threads wait for each other longer than they compute: 40 times slower on a busy machine.
+# Below this width, two threads wait for each other longer than they compute: 40 times slower on a busy machine.
 SMALL_DIM = 256
-RESNET18_MACS = 37e3  # multiply-accumulates per pixel
+RESNET18_MACS = 37e3  # multiply-accumulates per pixel of the picture
 
 
 @dataclass(frozen=True)
 class TrainingRecipe:
     """How long and how fast each phase trains.
 
-    samples: how many of the recordings' are used at most; feature_samples: of these, for the transformer. judged: how
-    many others give best_val_loss. at: (height, width) of the pictures until `carry_steps` at the policy's own size.
+    *_rate: the learning rates. samples: how many of the recordings' samples are used at most; feature_samples: how many
+    of these train the transformer. judged: how many other samples give best_val_loss. at: (height, width) of the
+    pictures in all three phases; then `carry_steps` follow at the policy's own size. None: its own size from the start.
     """
 
     backbone_steps: int
@@ -86,16 +88,16 @@ class TrainingRecipe:
     judged: int
     backbone_rate: float = 1e-3
     transformer_rate: float = 5e-4
-    transformer_warmup: int = 0  # steps; 0: a twentieth of them
+    transformer_warmup: int = 0  # in steps; 0 stands for a twentieth of transformer_steps
     at: tuple[int, int] | None = None
     carry_steps: int = 0
 
     def of_steps(self, steps: int) -> "TrainingRecipe":
-        """The same recipe with that many steps in all, at least one in each phase that it has."""
+        """Return the same recipe with `steps` steps in all, and at least one in each phase that it has."""
         names = "backbone_steps", "transformer_steps", "together_steps", "carry_steps"
         planned = {name: getattr(self, name) for name in names if getattr(self, name)}
         shorter = {name: max(1, round(steps * n / sum(planned.values()))) for name, n in planned.items()}
-        # A few steps only show that it runs: of few frames each.
+        # So few steps only show that training works, so a few frames are enough for each.
         sizes = "batch", "transformer_batch", "together_batch"
         batches = {name: min(getattr(self, name), max(2, steps // 8)) for name in sizes}
         samples = min(self.samples, max(4 * self.batch, steps * self.batch))
@@ -140,8 +142,8 @@ RECIPES = {
     ("full", "cpu"): FULL,
     ("full", "cuda"): FULL_GPU,
 }
-# A cached checkpoint of minutes is made anew with each change of the code that makes it. One of an hour or more is
-# when this is raised: by whoever changes what the same recipe gives.
+# A cached checkpoint that takes minutes is made anew after each change of the code that makes it. One that takes an
+# hour or more is made anew only when this number is raised. Raise it when you change what the same recipe results in.
 FULL_VERSION = 1
 
 
@@ -157,15 +159,15 @@ def train(
     """Train a policy on recordings and write its checkpoint in the format of the user's trainer.
 
     size: 'small' (72x128, minutes on two cores) or 'full' (the user's policy, 360x640).
-    steps: optimiser steps of all three phases together; the recipe's when left out.
-    device: 'cpu', 'cuda' or None for the best there is.
-    The calibration part of params.yml's split is trained on, the choosing part gives best_val_loss, and the
-    held-out part is left alone, so that it may judge later.
-    Returns out_path, which appears complete or not at all. The same input gives the same weights on one
-    machine, also when it was ended at any moment and started again: it goes on where it was. A checkpoint that was
-    made before is taken from the cache.
-    Raises WorldError for an unknown size, device or steps, EpisodeError for recordings that cannot be used,
-    TrainingError if another process trains the same.
+    steps: optimiser steps of all phases together; those of the recipe when left out.
+    device: 'cpu', 'cuda', or None for cuda where torch finds it and cpu elsewhere.
+    The calibration part of params.yml's split trains the policy, the choosing part gives best_val_loss, and the
+    held-out part is left alone, so that it can judge the policy later.
+    Returns out_path, which appears complete or not at all. On one machine the same input gives the same weights, even
+    if training was ended at any moment and started again, as it goes on where it was. A checkpoint that was made before
+    is taken from the cache.
+    Raises WorldError for a size, device, steps or seed that it cannot use, EpisodeError for recordings that cannot be
+    used, and TrainingError if another process trains the same.
     """
     out_path, episodes_dir = Path(out_path), Path(episodes_dir)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -204,7 +206,8 @@ def train(
                 device=device,
                 seed=seed,
             )
-            with atomic_path(folder / "best_model.pth") as temporary:  # on the disk before what it came from is removed
+            # It must be on the disk before the unfinished training, which it comes from, is removed.
+            with atomic_path(folder / "best_model.pth") as temporary:
                 torch.save({**trained, "config": config}, temporary)
 
     made = cached_folder("checkpoint", key, make) / "best_model.pth"
@@ -215,19 +218,19 @@ def train(
 
 
 def _files(episodes_dir: Path) -> list[Path]:
-    """All files of the recordings, hidden ones left out."""
+    """Return all files of the recordings except hidden ones."""
     return sorted(p for p in episodes_dir.rglob("*") if p.is_file() and not p.name.startswith("."))
 
 
 @dataclass(frozen=True)
 class _Training:
-    """What every phase works with."""
+    """What every phase works with. plan: the number of steps and the cost of a step of each phase; see `_plan`."""
 
-    size: ActConfig  # as trained first; the policy's own may be larger
+    size: ActConfig  # with the pictures' size in the three phases; the policy's own may be larger
     policy: "ACTPolicy"
     data: Frames
     recipe: TrainingRecipe
-    loss_weights: Tensor  # (2,), on the device that is trained on
+    loss_weights: Tensor  # (2,), on the device where training takes place
     rng: np.random.Generator
     saved: Resumable
     plan: dict[str, tuple[int, int]]
@@ -237,10 +240,11 @@ class _Training:
         return self.loss_weights.device
 
     def rows(self, batch: int, of: int) -> np.ndarray:
+        """Draw `batch` of the numbers below `of`, each at most once."""
         return self.rng.choice(of, min(batch, of), replace=False)
 
     def batch(self, count: int) -> dict[str, Tensor]:
-        """The next one of frames."""
+        """Draw the next batch of `count` frames."""
         return batch_of(self.data, self.rows(count, len(self.data)), self.rng, self.device)
 
     def steps(self, phase: str, **parts: Any) -> Iterator[int]:
@@ -254,7 +258,7 @@ class _Training:
 def _train(
     episodes_dir: Path, size: ActConfig, recipe: TrainingRecipe, seed: int, device: torch.device, saved: Resumable
 ) -> dict[str, Any]:
-    """All of the checkpoint but its config."""
+    """Train, and return everything in the checkpoint except its config."""
     p = params()["calibration"]
     recordings = load_recordings(episodes_dir, size.chunk, p["sync_s"], saved.progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
@@ -262,7 +266,7 @@ def _train(
     first = replace(size, image_sizes=(recipe.at,)) if recipe.at else size
     samples = thinned(parts.calibration, recipe.samples)
     data = frames_of(samples, *first.image_sizes[0])
-    if not recipe.at:  # steps are short: reading would take longer
+    if not recipe.at:  # a small policy's step is so short that reading its frames from the disk would take longer
         data = in_memory(data, "reading frames", saved.progress)
     judges = frames_of(thinned(parts.choosing, recipe.judged), *size.image_sizes[0])
     spread = recorded_spread(data)
@@ -272,7 +276,8 @@ def _train(
 
     with seeded(seed):
         policy = lerobot_act(size)
-        with torch.no_grad():  # starts at the mean action, give or take: a fresh head plans wild ones
+        # Start with plans near the mean action: those of an untrained head are wild.
+        with torch.no_grad():
             policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
             policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
         policy.to(device)
@@ -281,7 +286,7 @@ def _train(
         _train_transformer(training)
         last = "all together"
         if recipe.at:
-            _train_together(training, last)  # its optimiser is not kept: it is twice as large as the policy
+            _train_together(training, last)  # do not keep its optimiser, which is twice as large as the policy
             training = replace(training, data=frames_of(samples, *size.image_sizes[0]))
             last = "at full size"
         optimizer, scheduler = _train_together(training, last)
@@ -300,7 +305,10 @@ def _train(
 def _plan(
     size: ActConfig, first: ActConfig, recipe: TrainingRecipe, frames: int, judges: int
 ) -> dict[str, tuple[int, int]]:
-    """Each phase's steps, and what one costs, in 10^9 multiply-accumulates: for the bar, so roughly."""
+    """Return each phase's number of steps, and the cost of one in 10^9 multiply-accumulates.
+
+    The costs are only for the progress bar, so they are rough.
+    """
 
     def g(config: ActConfig, passes: int, batch: int, backbone: bool = True, transformer: bool = True) -> int:
         ((height, width),) = config.image_sizes
@@ -314,7 +322,7 @@ def _plan(
     batch = recipe.batch
     features = -(-min(frames, recipe.feature_samples) // batch)
     forward = g(first, 1, batch, transformer=False)
-    train = 3  # passes: forward, and backward to inputs and to weights
+    train = 3  # passes: forward, backward to the inputs, and backward to the weights
     return {
         "backbone": (recipe.backbone_steps, train * forward),
         "statistics": (16 if frames >= 16 * batch else 4, forward),
@@ -328,14 +336,14 @@ def _plan(
 
 
 class _ChunkFromFeatures(nn.Module):
-    """The throw-away head of the first phase: feature map to chunk, position by position."""
+    """The backbone with the first phase's throw-away head, which maps the features at all positions to a chunk."""
 
     def __init__(self, backbone: nn.Module, size: ActConfig, features: int = 512, width_after: int = 32):
         super().__init__()
         self.backbone, self.chunk = backbone, size.chunk
         convolution = nn.Conv2d(features, width_after, 1)
         last = nn.Linear(width_after * math.prod(size.grid(*size.image_sizes[0])), 2 * size.chunk)
-        nn.init.zeros_(last.weight)  # from "no action": actions are small, and an untrained head's are not
+        nn.init.zeros_(last.weight)  # start with "no action": real actions are small, and an untrained head's are not
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(convolution, nn.ReLU(), nn.Flatten(), last)
 
@@ -344,7 +352,7 @@ class _ChunkFromFeatures(nn.Module):
 
 
 def _train_backbone(training: _Training) -> None:
-    """Phase one: live batch norm; its statistics, measured on the data, become the frozen ones."""
+    """Phase one: train the backbone with live batch norm, then measure on the data the statistics that stay frozen."""
     recipe = training.recipe
     import torchvision
 
@@ -361,7 +369,7 @@ def _train_backbone(training: _Training) -> None:
     norms = [m for m in live.modules() if isinstance(m, nn.BatchNorm2d)]
     for norm in norms:
         norm.reset_running_stats()
-        norm.momentum = None  # a plain mean over the batches below
+        norm.momentum = None  # torch then takes the plain mean over the batches below
     for _ in training.steps("statistics", backbone=live):
         with torch.no_grad():
             live(training.batch(recipe.batch)[IMAGE])
@@ -370,7 +378,7 @@ def _train_backbone(training: _Training) -> None:
 
 
 def _train_transformer(training: _Training) -> None:
-    """Phase two: all but the backbone, on features computed once, of each frame as it is and mirrored."""
+    """Phase two: train all but the backbone on features that are computed once, of each frame as it is and mirrored."""
     policy, backbone = training.policy, training.policy.model.backbone.eval()
     chosen = np.asarray(thinned(range(len(training.data)), training.recipe.feature_samples))
     views = {view: _features(training, view, chosen, backbone) for view in ("plain", "mirrored")}
@@ -382,7 +390,10 @@ def _train_transformer(training: _Training) -> None:
 
 
 def _features(training: _Training, view: str, chosen: np.ndarray, backbone: nn.Module) -> RowFile:
-    """The frozen backbone's feature map of these rows' frames, on disk."""
+    """Compute the frozen backbone's feature maps of the chosen rows' frames, into a file.
+
+    view: 'plain' or 'mirrored'. chosen: (n,) row numbers.
+    """
     batch, (size,) = training.recipe.batch, training.size.image_sizes
     channels = training.policy.model.encoder_img_feat_input_proj.in_channels
     maps = RowFile(training.saved.folder / f"{view}.rows", (channels, *training.size.grid(*size)))
@@ -418,7 +429,7 @@ def _transformer_steps(training: _Training, chosen: np.ndarray, views: dict[str,
 
 
 def _train_together(training: _Training, phase: str) -> tuple[torch.optim.Optimizer, Any]:
-    """Phase three: all parameters, at a tenth of the rate. Returns what the checkpoint keeps of it."""
+    """Phase three: train all parameters at a tenth of the rate. Returns the optimiser and scheduler, to be saved."""
     policy, recipe = training.policy, training.recipe
     policy.train()
     optimizer, scheduler = optimiser(policy.parameters(), recipe.transformer_rate / 10, training.plan[phase][0])

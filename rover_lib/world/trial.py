@@ -1,4 +1,4 @@
-"""Drive a policy through balloon worlds that it has not seen, and count."""
+"""Drive a policy through balloon worlds that it has not seen, and count the hits."""
 
 import math
 import os
@@ -15,7 +15,7 @@ from rover_lib.world.world import RATE_HZ, World
 
 
 class Drives(Protocol):
-    """What can be driven: an artifact's Policy, or anything with these two."""
+    """What can drive: an artifact's Policy, or anything else with this attribute and this method."""
 
     chunk: int
 
@@ -24,7 +24,10 @@ class Drives(Protocol):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A drive from above, (n,) arrays in metres, with what was commanded; balloon_xy_m: (x, y)."""
+    """A drive as seen from above: (n,) arrays of positions in metres and of commanded actions.
+
+    balloon_xy_m: the balloon's (x, y).
+    """
 
     x_m: np.ndarray
     y_m: np.ndarray
@@ -34,7 +37,7 @@ class Trajectory:
 
     @classmethod
     def of(cls, world: World) -> "Trajectory":
-        """All that was driven in a world."""
+        """Return everything that was driven in a world so far."""
         track = world.trajectory
         return cls(
             np.array([s.x_m for s in track]),
@@ -47,7 +50,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class WorldResult:
-    """One world's drive. outcome: 'hit', 'left' or 'timeout'. nearest_m: camera to balloon, at its least."""
+    """The drive in one world. outcome: 'hit', 'left' or 'timeout'. nearest_m: least distance from camera to balloon."""
 
     seed: int
     outcome: str
@@ -59,7 +62,7 @@ class WorldResult:
 
 @dataclass(frozen=True)
 class TrialReport:
-    """wilson: 95 % interval of the share of hits. frames: (frame_bgr, state) pairs from the drives."""
+    """How a policy drove. wilson: 95 % interval of the share of hits. frames: some (frame_bgr, state) of the drives."""
 
     hits: int
     trials: int
@@ -69,9 +72,9 @@ class TrialReport:
 
 
 def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
-    """Where the true share of hits lies, by Wilson's score interval (95 % with the default z).
+    """Return the interval in which the true share of hits lies, by Wilson's score (95 % with the default z).
 
-    Raises WorldError for counts that are no counts.
+    Raises WorldError unless 0 <= hits <= trials and there is at least one trial.
     """
     if not 0 <= hits <= trials or trials < 1:
         raise WorldError("an interval needs 0 <= hits <= trials and a trial", found=f"{hits} of {trials}")
@@ -90,12 +93,12 @@ def run_trials(
     progress: Progress = silent,
     keep_frames: int = 200,
 ) -> TrialReport:
-    """Drive through `worlds` worlds, of seeds from `seed` on, in closed loop at 30 Hz.
+    """Drive through `worlds` worlds with the seeds from `seed` on, in closed loop at 30 Hz.
 
-    replan_every: actions of each chunk that are driven before the next frame is looked at. The state is the action
-    commanded before, neutral at the start. keep_frames: most (frame_bgr, state) pairs to keep, evenly from all that the
-    policy was shown.
-    Raises WorldError for parameters that make no trial, or for actions that are not finite.
+    replan_every: how many actions of each chunk are driven before the policy sees the next frame. Its state is the
+    action commanded before, neutral at the start. keep_frames: how many (frame_bgr, state) pairs to keep at most; they
+    are spread evenly over all that the policy was shown.
+    Raises WorldError for parameters outside their ranges, or if a plan's shape is wrong or its actions are not finite.
     """
     if worlds < 1 or seed < 0 or keep_frames < 0:
         raise WorldError("trials need at least 1 world and a seed from 0", found=f"{worlds} and {seed}")
@@ -104,7 +107,7 @@ def run_trials(
     seeds = range(seed, seed + worlds)
     results: list[WorldResult] = []
     seen: list[tuple[np.ndarray, np.ndarray]] = []
-    stride = 1  # doubled when too many are kept, so that memory is bounded and all drives are in it
+    stride = 1  # doubles whenever too many are kept, so that memory is bounded and the pairs come from all drives
     shown = 0
     for world_seed in progress(seeds, desc="driving", total=worlds):
         result, pairs = _drive(policy, World(world_seed), replan_every)
@@ -121,7 +124,10 @@ def run_trials(
 
 
 def run_trials_of(policies: Mapping[str, Drives], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
-    """`run_trials` for several policies at once, a thread for each core; the same worlds and results as one by one."""
+    """Do `run_trials` for several policies at once, on a thread for each core.
+
+    Worlds and results are the same as one by one.
+    """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         running = {name: pool.submit(run_trials, policy, worlds, **options) for name, policy in policies.items()}
         return {name: trial.result() for name, trial in running.items()}

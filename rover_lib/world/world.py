@@ -1,9 +1,9 @@
-"""A balloon world: what a small car with a front camera sees and does, deterministic by seed.
+"""Simulate a balloon world: how a small car moves in it and what its front camera sees. The seed determines everything.
 
 A car stands on a floor, a red balloon floats some metres ahead, and the task is to drive into it. Floor,
-wall, light and the objects that are not red balloons differ from seed to seed. Lengths are metres, angles
-radians (positive to the left), actions the policy's: steering in [-1, 1] (positive to the left), throttle in
-[0, 1], or from -1 of a car with reverse. Wheelbase and field of view are car.yml's.
+wall, light and the objects that are not red balloons differ from seed to seed. Lengths are in metres, angles in
+radians (positive to the left). Actions are the policy's: steering in [-1, 1] (positive to the left), throttle in
+[0, 1], or in [-1, 1] if the car has a reverse gear. Wheelbase and field of view come from car.yml.
 """
 
 import math
@@ -16,42 +16,42 @@ import numpy as np
 from rover_lib.onboard.car import this_car
 from rover_lib.onboard.errors import WorldError
 
-_CAR = this_car()  # whose wheels, camera and throttle
+_CAR = this_car()  # its wheelbase, focal length and limits of the throttle are used here
 
 RATE_HZ = 30.0
 FRAME_HEIGHT, FRAME_WIDTH = 360, 640
 TIMEOUT_S = 8.0
 
-# Car. Full steering turns the wheels by 34 degrees, a throttle of 0.09 (a drive's most in real recordings) is
-# 1.1 m/s.
+# The car. Full steering turns the wheels by 34 degrees. A throttle of 0.09, the highest in real recordings of drives,
+# gives 1.1 m/s.
 WHEELBASE_M = _CAR.wheelbase_m
 WHEEL_ANGLE_RAD = 0.6
 STEERING_LAG_S = 0.12
 SPEED_PER_THROTTLE_MPS = 12.0
 SPEED_LAG_S = 0.2
 
-# Expert.
+# The expert.
 STEERING_MOST = 0.65
 THROTTLE_MOST = 0.09
 THROTTLE_RISE_PER_S = 0.20  # from a stand to full in half a second
 THROTTLE_FALL_PER_S = 0.30
 
-# Camera, a pinhole above the front bumper that looks straight ahead, with the horizon above the middle.
+# The camera: a pinhole above the front bumper. It looks straight ahead, and the horizon is above the picture's middle.
 FOCAL_PX = _CAR.focal_px
 HORIZON_ROW = 125
 CENTRE_COLUMN = FRAME_WIDTH / 2
 CAMERA_HEIGHT_M = 0.20
 
 BALLOON_RADIUS_M = 0.16
-BALLOON_HEIGHT_M = 0.24  # its centre
-HIT_DISTANCE_M = 0.30  # camera to the balloon's centre: the bumper touches it
+BALLOON_HEIGHT_M = 0.24  # of its centre above the floor
+HIT_DISTANCE_M = 0.30  # from the camera to the balloon's centre; at this distance the bumper touches the balloon
 ARENA_RADIUS_M = 7.0
 
-DECOY_ASIDE_RAD = 0.25  # between decoy and balloon, at least, as seen from the start
+DECOY_ASIDE_RAD = 0.25  # the least angle between a decoy and the balloon, as seen from the start
 
 FLOOR_PX_PER_M = 160
 FLOOR_TILE_PX = 640
-FAR_ROWS = 24  # below the horizon, drawn from a blurred floor: a sharp one would flicker
+FAR_ROWS = 24  # rows below the horizon that show a blurred floor, as a sharp one would flicker so far away
 
 _DISTRACTOR_BGR = (
     (190, 90, 30),
@@ -67,7 +67,7 @@ _DISTRACTOR_BGR = (
 
 @dataclass(frozen=True)
 class CarState:
-    """Where the car is and what it does. `steering` lags behind `steering_command`, in the same unit."""
+    """Where the car is and how it moves. `steering` follows `steering_command` with a lag, in the same unit."""
 
     x_m: float = 0.0
     y_m: float = 0.0
@@ -81,7 +81,7 @@ class CarState:
 
 @dataclass(frozen=True)
 class Thing:
-    """Something on the floor: kind is 'balloon', 'box' or 'cone'; its colour is BGR."""
+    """Something that stands on the floor. kind: 'balloon', 'box' or 'cone'. colour: BGR, 0 to 255."""
 
     kind: str
     x_m: float
@@ -104,9 +104,9 @@ class Shove:
 class World:
     """One drive to one balloon.
 
-    seed: everything that is random follows from it. shoves: how many pushes the car gets on its way. decoys: how many
+    seed: determines everything that is random. shoves: how many pushes the car gets on its way. decoys: how many
     red things stand about that are no balloons; without them nothing but the balloon is red.
-    Frames and motion depend on nothing but these and the actions given.
+    Frames and motion depend only on these three and on the actions given.
     """
 
     def __init__(self, seed: int, shoves: int = 0, decoys: int = 0):
@@ -129,7 +129,8 @@ class World:
         self.distractors = tuple(_distractors(rng, self.balloon))
         self.distractors += tuple(_decoys(np.random.default_rng([seed, 20_253]), self.balloon, decoys))
         self.trajectory = [self.state]
-        self.outcome: str | None = None  # 'hit', 'left' (past it or out of the arena), 'timeout'
+        # 'hit', 'left' (the car passed the balloon or left the arena) or 'timeout'
+        self.outcome: str | None = None
         self._shoves = tuple(_shoves(np.random.default_rng([seed, 20_252]), shoves))
         self._floor, self._far_floor = _floor(rng)
         self._wall = _wall(rng)
@@ -146,7 +147,7 @@ class World:
         return self.outcome is not None
 
     def step(self, steering: float, throttle: float, dt: float = 1 / RATE_HZ) -> None:
-        """Drive for dt seconds. Raises WorldError for an action outside its range, or after the end."""
+        """Drive for dt seconds. Raises WorldError for an action outside its range, or if the drive has ended."""
         (_, least), _ = _CAR.limits
         if not (-1 <= steering <= 1 and least <= throttle <= 1):
             found = f"({steering}, {throttle})"
@@ -185,7 +186,7 @@ class World:
             self.outcome = "timeout"
 
     def balloon_seen(self) -> tuple[float, float]:
-        """Distance in metres and bearing in radians (positive to the left) of the balloon from the camera."""
+        """Return the balloon's distance in metres and bearing in radians (positive to the left) from the camera."""
         ahead, left = self._local(self.balloon.x_m, self.balloon.y_m)
         return math.hypot(ahead, left), math.atan2(left, ahead)
 
@@ -195,7 +196,7 @@ class World:
         return cos * dx + sin * dy, cos * dy - sin * dx
 
     def render(self) -> np.ndarray:
-        """What the front camera sees now: (360, 640, 3) uint8 BGR."""
+        """Draw what the front camera sees now: (360, 640, 3) uint8 BGR."""
         frame = np.empty((FRAME_HEIGHT, FRAME_WIDTH, 3), np.uint8)
         self._draw_wall(frame)
         self._draw_floor(frame)
@@ -204,7 +205,7 @@ class World:
             ahead, left = self._local(thing.x_m, thing.y_m)
             if ahead > 0.12 and abs(left) < 1.2 * ahead + 0.5:
                 seen.append((ahead, left, thing))
-        for ahead, left, thing in sorted(seen, key=lambda s: -s[0]):  # the far ones first: the near ones hide them
+        for ahead, left, thing in sorted(seen, key=lambda s: -s[0]):  # far things first, so that near ones hide them
             _draw_thing(frame, ahead, left, thing)
         depth, rate, phase = self._flicker
         gain = self._gain * (1 + depth * math.sin(rate * self.state.time_s + phase))
@@ -218,7 +219,7 @@ class World:
     def _draw_floor(self, frame: np.ndarray) -> None:
         s = self.state
         cos, sin = math.cos(s.heading_rad), math.sin(s.heading_rad)
-        # Below the horizon a pixel (u, v) is the floor at ahead = f h / (v - v0), left = (u0 - u) h / (v - v0).
+        # Below the horizon a pixel (u, v) shows the floor at ahead = f h / (v - v0), left = (u0 - u) h / (v - v0).
         to_local = np.array(
             [
                 [0, 0, FOCAL_PX * CAMERA_HEIGHT_M],
@@ -245,9 +246,9 @@ class World:
 
 
 def expert(world: World) -> tuple[float, float]:
-    """What a good driver does now: (steering, throttle).
+    """Return what a good driver does now: (steering, throttle).
 
-    Steers towards the balloon; drives off gently, slows in a turn and before the balloon.
+    The driver steers towards the balloon, starts gently, and slows down in a turn and near the balloon.
     """
     distance, bearing = world.balloon_seen()
     steering = float(np.clip(1.1 * bearing, -STEERING_MOST, STEERING_MOST))
@@ -277,7 +278,7 @@ def _distractors(rng: np.random.Generator, balloon: Thing) -> Iterator[Thing]:
 
 
 def _decoys(rng: np.random.Generator, balloon: Thing, count: int) -> Iterator[Thing]:
-    """Boxes and cones in a balloon's red, about as far away as the balloon and well beside the way to it."""
+    """Yield boxes and cones in a balloon's red, about as far away as the balloon and well beside the way to it."""
     to_balloon, bearing = math.hypot(balloon.x_m, balloon.y_m), math.atan2(balloon.y_m, balloon.x_m)
     for _ in range(count):
         kind = str(rng.choice(["box", "cone"]))
@@ -297,7 +298,7 @@ def _shoves(rng: np.random.Generator, count: int) -> Iterator[Shove]:
 
 
 def _noise(rng: np.random.Generator, size: int, cells: int) -> np.ndarray:
-    """(size, size) float32 in about [-1, 1], smooth over size / cells pixels, without a seam."""
+    """Return (size, size) float32 noise in about [-1, 1], smooth over size / cells pixels, that repeats seamlessly."""
     grid = rng.uniform(-1, 1, (cells, cells)).astype(np.float32)
     wrapped = np.pad(grid, 2, mode="wrap")
     cell = size // cells
@@ -306,7 +307,7 @@ def _noise(rng: np.random.Generator, size: int, cells: int) -> np.ndarray:
 
 
 def _floor(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A floor that repeats every four metres, (640, 640, 3) uint8, and the same blurred and smaller."""
+    """Return a floor that repeats every four metres, (640, 640, 3) uint8, and a blurred one of (80, 80, 3)."""
     size = FLOOR_TILE_PX
     base = rng.uniform(70, 170) + rng.uniform(-22, 22, 3)
     shade = _noise(rng, size, 10) * rng.uniform(4, 16) + _noise(rng, size, 80) * rng.uniform(2, 10)
@@ -330,7 +331,10 @@ def _floor(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _wall(rng: np.random.Generator) -> np.ndarray:
-    """A panorama above the horizon, (125, 2513 + 640, 3) uint8: its start is repeated at its end."""
+    """Return the panorama above the horizon, (125, w + 640, 3) uint8, whose first 640 columns are repeated at its end.
+
+    w: the columns of a whole turn, 2 pi focal lengths.
+    """
     width = round(2 * math.pi * FOCAL_PX)
     top, bottom = (rng.uniform(90, 220) + rng.uniform(-25, 25, 3) for _ in range(2))
     ramp = np.linspace(0, 1, HORIZON_ROW)[:, None, None]
@@ -348,7 +352,7 @@ def _wall(rng: np.random.Generator) -> np.ndarray:
 
 
 def _light(rng: np.random.Generator) -> np.ndarray:
-    """How each pixel is lit, (360, 640, 3) uint8, 128 is as it is: a slope, a tint, dark corners."""
+    """Return how each pixel is lit, (360, 640, 3) uint8, where 128 changes nothing: a slope, a tint, dark corners."""
     x = np.linspace(-1, 1, FRAME_WIDTH)[None]
     y = np.linspace(-1, 1, FRAME_HEIGHT)[:, None]
     slope = 1 + rng.uniform(-0.2, 0.2) * x + rng.uniform(-0.15, 0.15) * y - rng.uniform(0, 0.12) * (x**2 + y**2)
@@ -356,7 +360,7 @@ def _light(rng: np.random.Generator) -> np.ndarray:
     return np.clip(128 * slope[..., None] * tint, 0, 255).astype(np.uint8)
 
 
-_SHIFT = 3  # drawn in eighths of a pixel, so that a thing moves smoothly
+_SHIFT = 3  # coordinates are in eighths of a pixel, so that a thing moves smoothly
 _ONE = 1 << _SHIFT
 
 
@@ -396,7 +400,7 @@ def _draw_shadow(frame: np.ndarray, column: float, foot: float, radius_m: float,
 
 
 def _draw_sphere(frame: np.ndarray, column: float, row: float, radius: float, colour: tuple[int, int, int]) -> None:
-    """A balloon: a little taller than wide, dark at its rim, with a highlight towards the upper left."""
+    """Draw a balloon: a little taller than wide, dark at its rim, with a highlight towards the upper left."""
     rings = int(np.clip(radius / 8, 3, 14))  # enough that a near balloon shows no steps
     for i in range(rings):
         share = i / (rings - 1)

@@ -1,6 +1,6 @@
-"""What everything that runs inside the emulated Pi does alike: it loads, predicts, tells the plugin what to count.
+"""Load a policy and predict inside the emulated Pi, and tell the plugin what to count. All guest scripts share this.
 
-Loading is section 0 of the plugin's counts, the first `counted` inferences are sections 1, 2, ... Each line on stdout
+Loading is section 0 of the plugin's counts; the first `counted` inferences are sections 1, 2, ... Each line on stdout
 says what begins.
 """
 
@@ -14,20 +14,20 @@ from typing import Any
 import cv2
 import numpy as np
 
-GETPPID, MARK = 173, 0xC0FFEE  # as in count.c; without the plugin it is a system call that does nothing
+GETPPID, MARK = 173, 0xC0FFEE  # as in count.c; without the plugin this system call has no effect
 libc = ctypes.CDLL(None)
 
-# frame (h, w, 3) uint8 BGR, or one by each camera's name; state (S,) -> (chunk, A) float32
+# frame, state -> (chunk, A) float32. frame: (h, w, 3) uint8 BGR, or a dict of these by camera name. state: (S,).
 Predict = Callable[[Any, np.ndarray], np.ndarray]
 
 
 def mark(starts: bool, section: int) -> None:
-    """Count from here on, or up to here."""
+    """Tell the plugin that a section starts here, or that it ends here."""
     libc.syscall(GETPPID, ctypes.c_ulong(MARK), ctypes.c_ulong(starts), ctypes.c_ulong(section))
 
 
 def loaded(load: Callable[[], Any]) -> Any:
-    """What `load` returns, counted."""
+    """Call `load`, count that as section 0, and return its result."""
     print("load", flush=True)
     mark(True, 0)
     result = load()
@@ -39,8 +39,8 @@ def predict_all(predict: Predict, observations: str, folder: str, counted: int) 
     """Predict each observation, and leave `chunks.npy` (n, chunk, A) float32 in the folder.
 
     observations: an npz of `state` (n, S) float32 and `frame_0000`... (h, w, 3) uint8 BGR, or `frame_0000.<camera>`...
-    where there are several cameras; they are predicted in that order, and again from the first if there are fewer than
-    `counted`. A frame is read outside of what is counted.
+    for several cameras. They are predicted in that order, and again from the first if there are fewer than `counted`.
+    Reading a frame is not counted.
     """
     chunks = []
     with np.load(observations) as seen:
@@ -59,7 +59,7 @@ def predict_all(predict: Predict, observations: str, folder: str, counted: int) 
 
 
 def frame_of(seen: Any, number: int) -> Any:
-    """A frame of an npz; of several cameras a dict by their names."""
+    """Return a frame of an npz, or for several cameras a dict of frames by their names."""
     name = f"frame_{number:04d}"
     if name in seen:
         return seen[name]
@@ -67,7 +67,10 @@ def frame_of(seen: Any, number: int) -> Any:
 
 
 def leave(folder: str, threads: int, **versions: str) -> None:
-    """Leave `maps` (where what is loaded) and `versions.json` in the folder. threads: that did the work."""
+    """Leave `maps` (which files are loaded where) and `versions.json` in the folder.
+
+    threads: how many did the work.
+    """
     versions |= {"python": platform.python_version(), "numpy": np.__version__, "cv2": cv2.__version__}
     versions |= {"machine": platform.machine(), "libc": " ".join(platform.libc_ver())}
     (Path(folder) / "versions.json").write_text(json.dumps(versions | {"threads": threads}))

@@ -1,13 +1,13 @@
-"""Runs inside the emulated Pi: one artifact through rover_lib.onboard alone, as a Pi would run it.
+"""Run one artifact inside the emulated Pi, with rover_lib.onboard alone, as a Pi would run it.
 
     predict.py ARTIFACT OBSERVATIONS FOLDER COUNTED
     predict.py --backbone ENGINE MODULE INPUTS
 
-What it reads, counts, prints and leaves in FOLDER is told in inferences.py; preparing a frame is counted too.
+inferences.py explains what it reads, counts, prints and leaves in FOLDER. Preparing a frame is counted too.
 
-The second form runs a TorchScript part of a policy, for its bits and not for a count: INPUTS is an npz of `state`
-(n, S) and prepared frames `frame_0000.<camera>`..., in the order in which the part takes them; leaves `backbone.npy`
-(n, ...) of what it gave, in its folder.
+The second form runs a TorchScript part of a policy to get its bits, not to count. INPUTS is an npz of `state` (n, S)
+and prepared frames `frame_0000.<camera>`..., in the order in which the part takes them. It leaves the part's outputs as
+`backbone.npy` (n, ...) in the current folder.
 """
 
 import sys
@@ -29,7 +29,7 @@ def main(artifact: str, observations: str, folder: str, counted: str) -> None:
 
 
 def backbone(engine: str, module: str, inputs: str) -> None:
-    import torch  # here, because an artifact of the other engine must not pay for it
+    import torch  # imported only here, so that an artifact of the other engine does not pay for it
 
     torch.backends.quantized.engine = engine
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Every fault of a drive, by whose fault it is: one module a kind, and a row is added where its kind is."""
+"""All faults of a drive, in a module for each kind: whatever is at fault. Add a row to the module of its kind."""
 
 from lab.driving.row import FaultRow
 from lab.driving.rows import firmware, host, link, operator, perception, policy, receiver, view

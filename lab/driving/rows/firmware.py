@@ -1,4 +1,4 @@
-"""The Arduino itself: reset, hung."""
+"""Faults of the Arduino itself: it is reset, or it hangs."""
 
 from lab.driving.bench import DrivingBench
 from lab.driving.pins import STOPPED

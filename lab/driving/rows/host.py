@@ -1,4 +1,4 @@
-"""The process that drives and the machine under it."""
+"""Faults of the process that drives, and of the machine that it runs on."""
 
 import contextlib
 import os
@@ -74,7 +74,7 @@ def _starve(bench: DrivingBench) -> None:
     for _ in range(4):
         busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
         bench.undo.callback(busy.wait)
-        bench.undo.callback(busy.kill)  # this one first
+        bench.undo.callback(busy.kill)  # added last, so it is called before wait
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, busy.pid, 0)
 

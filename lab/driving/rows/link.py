@@ -1,4 +1,4 @@
-"""The cable and what goes over it: cut, stuck, garbled, replayed, another's."""
+"""Faults of the cable and of what it carries: cut, stuck, garbled, late, replayed, or from another program."""
 
 import random
 import time
@@ -41,7 +41,7 @@ COMMANDS_LOST = "the Arduino stops the car 150 ms after the last command that ca
     "each line to the Arduino is later than the one before, by 8 ms; counted from the first that is 150 ms late",
 )
 def _fall_behind(bench: DrivingBench) -> float:
-    """Slowly, so that lines go on coming: a cable that is 2 s late at once is silent for the Arduino, which stops."""
+    """Fall behind slowly, so that lines keep coming. A cable that is 2 s late at once is silent for the Arduino."""
     behind = 0.25  # seconds in each second
     bench.cable.to_arduino = lagging(behind)
     bench.wait(LATE_S / behind)

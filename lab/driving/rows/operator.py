@@ -1,4 +1,4 @@
-"""Who started the drive, and ends it from outside."""
+"""Signals by which the operator, or the system, ends a drive from outside."""
 
 import signal
 from typing import Any

@@ -1,6 +1,7 @@
-"""What the camera shows: nothing, the same again, too late, something else.
+"""Faults of what the camera shows: nothing, always the same, too late, or something useless.
 
-Time stamps that are old or stand still are no rows: a FIFO has none. tests/onboard/test_camera.py has them.
+There are no rows about time stamps that are old or stand still, as a FIFO has none; tests/onboard/test_camera.py tests
+those.
 """
 
 import numpy as np

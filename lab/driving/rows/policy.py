@@ -1,4 +1,4 @@
-"""What predicts: it raises, hangs, gives nonsense, dies, or its file changes."""
+"""Faults of the policy: it raises, hangs, gives nonsense or dies, or its file changes."""
 
 import os
 import signal

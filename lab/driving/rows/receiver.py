@@ -1,4 +1,4 @@
-"""The transmitter and the human who holds it, as the receiver hears them."""
+"""Faults of transmitter and receiver, and what the human who holds the transmitter does."""
 
 from lab.driving.bench import DrivingBench
 from lab.driving.pins import HUMAN, NEUTRAL_US, PERIOD_US, REFUSED, STOPPED
@@ -6,11 +6,11 @@ from lab.driving.row import FaultKind
 from rover_lib.world.standin import REST_US
 
 FAULTS = FaultKind("receiver")
-PRESET_US = 280  # of throttle, from rest
+PRESET_US = 280  # by how much a preset throttle is above rest
 
 
 def _moved(steering_us: float, throttle_us: float) -> tuple[float, float]:
-    """The transmitter's pulses with the sticks so far from rest."""
+    """Return the transmitter's pulses with the sticks moved from rest by that much."""
     return REST_US[0] + steering_us, REST_US[1] + throttle_us
 
 
@@ -62,7 +62,7 @@ def _begin_with_presets(bench: DrivingBench) -> None:
 @FAULTS.add("nobody wiggles the stick", REFUSED, "nobody has just wiggled", "pulses that stay what they are")
 def _no_gesture(bench: DrivingBench) -> None:
     bench.arduino.ready(False)
-    bench.arduino.reset()  # one from before would count for 30 s
+    bench.arduino.reset()  # forgets earlier gestures, which count for 30 s
 
 
 def _by_human(name: str, sent_us: tuple[float, float], human_us: tuple[float, float]) -> None:
@@ -71,8 +71,9 @@ def _by_human(name: str, sent_us: tuple[float, float], human_us: tuple[float, fl
     )
 
 
-# A slow throttle takes longer than the gate to have been at rest: there he moves the steering alone.
+# With slow throttle pulses the throttle needs longer to count as at rest than the gate allows for a takeover. So the
+# human moves only the steering there.
 _STEERED = _moved(144, 20 if PERIOD_US["throttle"] < 3000 else 0)
 _by_human("human takes over by steering", _STEERED, _STEERED)
-# His throttle passes once it has been at rest: a receiver without its transmitter looks the same.
+# The human's throttle passes only after it has been at rest, as a receiver without its transmitter looks the same.
 _by_human("human takes over by throttle", _moved(14, 80), (_moved(14, 0)[0], NEUTRAL_US["throttle"]))

@@ -1,4 +1,4 @@
-"""Who looks on: a view may stop the car, and whatever else becomes of it, the drive goes on."""
+"""Faults of the view: it may stop the car, but whatever else happens to it, the drive goes on."""
 
 import signal
 import threading
@@ -15,7 +15,7 @@ GOES_ON = "none: no view takes the drive's time"
 
 
 def _open(bench: DrivingBench) -> tuple[ViewServer, Page]:
-    """A view and a page that shows the drive."""
+    """Open a view, and a page that shows the drive."""
     view = ViewServer(bench.view)
     bench.undo.callback(view.close)
     page = bench.undo.enter_context(Page(view.url))

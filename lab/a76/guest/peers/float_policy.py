@@ -1,4 +1,4 @@
-"""What the engines' own tools start from: our float policy, and the frames that calibrated ours."""
+"""Give the engines' own tools what they start from: our float policy, and the frames that calibrated our artifact."""
 
 from collections.abc import Iterator
 
@@ -12,16 +12,17 @@ from rover_lib.workshop.checkpoint import load_checkpoint
 
 
 def float_policy(checkpoint: str) -> tuple[ACT, tuple[Tensor, Tensor]]:
-    """The policy, (state (1, S), planes (1, 3, height, width)) -> (1, C, A), all float32, and inputs as an example."""
+    """Load the policy, (state (1, S), planes (1, 3, height, width)) -> (1, C, A), all float32, with example inputs."""
     found = load_checkpoint(checkpoint)
     model = ACT(found.config, found.weights)
-    model.image_input = nn.ModuleList(pixels.norm for pixels in model.image_input)  # planes come from outside
+    # Only the normalisation of the images stays in the model: the planes are made outside of it.
+    model.image_input = nn.ModuleList(pixels.norm for pixels in model.image_input)
     height, width = found.config.image_sizes[0]
     return model, (torch.zeros(1, len(found.config.state_names)), torch.full((1, 3, height, width), 128.0))
 
 
 def observations(calibration: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Recorded (state, planes) of an npz of `state` (n, S) float32 and `frames` (n, height, width, 3) uint8 RGB."""
+    """Yield (state, planes) from an npz of `state` (n, S) float32 and `frames` (n, height, width, 3) uint8 RGB."""
     with np.load(calibration) as seen:
         states, frames = seen["state"], seen["frames"]
     for state, frame in zip(states, frames, strict=True):

@@ -1,10 +1,10 @@
-"""Runs inside the emulated Pi: another engine on its own form of the policy, one thread, no torch in the process.
+"""Run another engine inside the emulated Pi, on its own form of the policy, in one thread and without torch.
 
     guest.py ARTIFACT OBSERVATIONS FOLDER COUNTED ENGINE HEIGHT WIDTH
 
-ENGINE is onnxruntime (ARTIFACT an .onnx) or executorch (a .pte); both take `state` (1, S) float32 and `frame`
-(1, 3, HEIGHT, WIDTH) float32 (see planes.py) and give (1, chunk, A) float32. The rest is as in ../inferences.py: a BGR
-frame of the camera goes in, actions come out, and all between is counted.
+ENGINE is onnxruntime (ARTIFACT is an .onnx) or executorch (a .pte). Both take `state` (1, S) float32 and `frame`
+(1, 3, HEIGHT, WIDTH) float32 (see planes.py) and give (1, chunk, A) float32. The rest is as in ../inferences.py: a
+camera's BGR frame goes in, actions come out, and everything in between is counted.
 """
 
 import ctypes
@@ -30,7 +30,7 @@ Run = Callable[[np.ndarray, np.ndarray], np.ndarray]  # state (1, S), planes -> 
 
 
 def ticks() -> dict[str, int]:
-    """Processor time that each thread of the process has used, in the kernel's ticks."""
+    """Return the processor time that each thread of the process has used, in the kernel's ticks."""
     used = {}
     for task in Path("/proc/self/task").iterdir():
         fields = (task / "stat").read_text().rpartition(")")[2].split()
@@ -39,7 +39,7 @@ def ticks() -> dict[str, int]:
 
 
 def worked(before: dict[str, int], after: dict[str, int]) -> int:
-    """How many threads did the work: the emulator's own, and those that only wait, used next to nothing."""
+    """Return how many threads did the work. The emulator's own, and those that only wait, used next to nothing."""
     used = [count - before.get(thread, 0) for thread, count in after.items()]
     return sum(u > 0.05 * sum(used) for u in used)
 
@@ -54,7 +54,7 @@ def onnxruntime(artifact: str) -> Run:
 
 
 def executorch(artifact: str) -> Run:
-    import executorch  # for its place only: the runtime is C++ (see executorch.cpp)
+    import executorch  # only to find its folder: the runtime is C++ (see executorch.cpp)
 
     library = ctypes.CDLL(str(Path(next(iter(executorch.__path__))).parent / "policy.so"))
     library.policy_load.restype = ctypes.c_void_p

@@ -1,13 +1,13 @@
-"""A policy for ExecuTorch: static INT8 by its XNNPACK quantizer, lowered to XNNPACK.
+"""Make a policy for ExecuTorch: static INT8 by its XNNPACK quantizer, lowered to XNNPACK.
 
     make_executorch.py CHECKPOINT CALIBRATION ARTIFACT
 
-Runs on the workstation with ExecuTorch's packages before ours (see lab/a76/peers.py); arguments and the
-printed JSON line are those of make_onnxruntime.py, ARTIFACT is a .pte.
+It runs on the workstation with ExecuTorch's packages before ours (see lab/a76/peers.py). Arguments and the printed JSON
+line are those of make_onnxruntime.py, but ARTIFACT is a .pte.
 
-The quantizer's own recipe: symmetric INT8 weights per channel, INT8 activations, ranges by histogram. It is set for the
-whole graph, with a filter: by module type or name it passes over convolutions without a word. What is INT8 and what is
-float is as in make_onnxruntime.py.
+The recipe is the quantizer's own: symmetric INT8 weights per channel, INT8 activations, ranges by histogram. It is set
+for the whole graph, with a filter: if it is set by module type or name, the quantizer silently skips convolutions.
+The same parts are INT8 or float as in make_onnxruntime.py.
 """
 
 import json
@@ -32,18 +32,18 @@ from rover_lib.workshop.act import Residual
 INT8 = tuple(f"{c.__module__}.{c.__qualname__}" for c in (nn.Conv2d, nn.Linear, nn.ReLU, nn.MaxPool2d, Residual))
 STAYS_FLOAT = ("head", "state_project")
 LAYERS = ("aten.conv2d", "aten.linear")
-PRODUCTS = ("aten.convolution", "aten.linear", "aten.addmm", "aten.mm")  # what those are after export
+PRODUCTS = ("aten.convolution", "aten.linear", "aten.addmm", "aten.mm")  # what LAYERS become after export
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """F.scaled_dot_product_attention without its care for rows that are all masked, which costs ten operators."""
+    """Do F.scaled_dot_product_attention without its ten operators that care for rows in which all is masked."""
     return (q * q.shape[-1] ** -0.5 @ k.transpose(-2, -1)).softmax(-1) @ v
 
 
 def is_int8(node: torch.fx.Node) -> bool:
-    """The quantizer's filter: whether it may quantize a node, by the module that the node comes from."""
+    """Return whether the quantizer may quantize a node, by the module that the node comes from."""
     stack = list(node.meta.get("nn_module_stack", {}).values())
-    if node.op != "call_function" or not stack:  # weights, and what has no module: part of the others' patterns
+    if node.op != "call_function" or not stack:  # weights, and nodes without a module: parts of other nodes' patterns
         return True
     name, kind = stack[-1]
     kind = kind if isinstance(kind, str) else f"{kind.__module__}.{kind.__qualname__}"
@@ -51,7 +51,7 @@ def is_int8(node: torch.fx.Node) -> bool:
 
 
 def layers_of(graph: torch.fx.Graph) -> dict[str, bool]:
-    """Each convolution and linear by its module's name: whether both its input and its weight come out of INT8."""
+    """Return for each convolution and linear layer, by its module, whether its input and weight both come from INT8."""
     found = {}
     for node in graph.nodes:
         if node.op == "call_function" and str(node.target).startswith(LAYERS):
@@ -67,7 +67,7 @@ def main(checkpoint: str, calibration: str, artifact: str) -> None:
     quantizer = XNNPACKQuantizer().set_global(get_symmetric_quantization_config(is_per_channel=True))
     quantizer.set_filter_function(is_int8)
     with torch.no_grad():
-        with patch.object(F, "scaled_dot_product_attention", attention):  # here alone: ExecuTorch's passes use it too
+        with patch.object(F, "scaled_dot_product_attention", attention):  # only here, as ExecuTorch's passes use it too
             graph = torch.export.export(model, example).module()
         graph = prepare_pt2e(graph, quantizer)
         for observation in observations(calibration):

@@ -1,15 +1,15 @@
-"""A policy for ONNX Runtime: exported in float, then static INT8 by its own tools.
+"""Make a policy for ONNX Runtime: export it in float, then quantize it to static INT8 with ONNX Runtime's own tools.
 
     make_onnxruntime.py CHECKPOINT CALIBRATION ARTIFACT
 
-Runs on the workstation with ONNX Runtime's packages before ours (see lab/a76/peers.py). CALIBRATION: see
-float_policy.observations. Writes ARTIFACT, an .onnx of inputs `state` and `frame`, and prints one JSON line:
-{"int8_layers": how many convolutions and linears became INT8, "float_layers": [the others], "versions"}.
+It runs on the workstation with ONNX Runtime's packages before ours (see lab/a76/peers.py). CALIBRATION: see
+float_policy.observations. Writes ARTIFACT, an .onnx with the inputs `state` and `frame`, and prints one JSON line:
+{"int8_layers": how many convolutions and linear layers became INT8, "float_layers": [the others], "versions"}.
 
-As ONNX Runtime's documentation has it for ARM: QDQ, symmetric INT8 weights per channel, signed activations, ranges by
-minimum and maximum. Adds of the backbone are INT8 too, so that nothing is float between its convolutions. Float stay
-attention's products, the transformer's residual stream and, since that is best for its accuracy, the two-row head and
-the state's projection: with those two in INT8, throttle was four times as far off on the demo's policy.
+The recipe is what ONNX Runtime's documentation advises for ARM: QDQ, symmetric INT8 weights per channel, signed
+activations, ranges by minimum and maximum. The backbone's additions are INT8 too, so that nothing is float between its
+convolutions. Attention's products and the transformer's residual stream stay float. So do the two-row head and the
+state's projection, for accuracy: with these two in INT8, the demo policy's throttle was four times as far off.
 """
 
 import json
@@ -33,7 +33,7 @@ OPSET = 17
 
 
 class Recorded(CalibrationDataReader):
-    """The calibration frames, one by one."""
+    """A reader that gives the calibration frames one by one."""
 
     def __init__(self, calibration: str):
         self.rest = observations(calibration)
@@ -44,13 +44,14 @@ class Recorded(CalibrationDataReader):
 
 
 def stays_float(graph: onnx.GraphProto) -> list[str]:
-    """Nodes that quantize_static shall leave alone, by what they compute."""
+    """Return the nodes that quantize_static shall leave in float, chosen by what they compute."""
     constants = {i.name for i in graph.initializer}
     users = Counter(name for node in graph.node for name in node.input)
-    used_by = {name: node.op_type for node in graph.node for name in node.input}  # of a value that has one user
+    used_by = {name: node.op_type for node in graph.node for name in node.input}  # right for values with one user
     found = []
     for node in graph.node:
-        product = node.op_type in LAYERS and node.input[1] not in constants  # a constant query comes first
+        # A product has no constant as its second input; a constant query would be its first.
+        product = node.op_type in LAYERS and node.input[1] not in constants
         residual = node.op_type == "Add" and not (users[node.output[0]] == 1 and used_by[node.output[0]] == "Relu")
         if product or residual or "/head/" in node.name or "/state_project/" in node.name:
             found.append(node.name)
@@ -58,7 +59,7 @@ def stays_float(graph: onnx.GraphProto) -> list[str]:
 
 
 def layers_of(graph: onnx.GraphProto) -> dict[str, bool]:
-    """Each convolution and linear by name: whether both its input and its weight come out of INT8."""
+    """Return for each convolution and linear layer, by name, whether its input and weight both come out of INT8."""
     constants = {i.name for i in graph.initializer}
     from_int8 = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}
     layers = (n for n in graph.node if n.op_type in LAYERS and from_int8.get(n.input[1], n.input[1]) in constants)
@@ -66,7 +67,7 @@ def layers_of(graph: onnx.GraphProto) -> dict[str, bool]:
 
 
 def main(checkpoint: str, calibration: str, artifact: str) -> None:
-    warnings.simplefilter("ignore")  # of the trace: shapes are constants here, and meant to be
+    warnings.simplefilter("ignore")  # the trace warns that shapes become constants, which is intended
     model, example = float_policy(checkpoint)
     with tempfile.TemporaryDirectory() as scratch:
         exported, prepared = Path(scratch) / "float.onnx", Path(scratch) / "prepared.onnx"
