@@ -1,5 +1,8 @@
 """What many tests share: one tiny policy, its calibration and its artifacts, and the demo's run."""
 
+import contextlib
+import ctypes
+import gc
 import os
 import sys
 from collections.abc import Callable
@@ -13,6 +16,7 @@ from hypothesis import settings
 sys.modules["rfc3987_syntax"] = None  # type: ignore[assignment]
 # In a container there may be nobody but root.
 os.environ.setdefault("ROVER_AS_ROOT", "1")
+LARGE_BYTES = 2e9  # of memory, for a process that tests
 # How long an example takes is the machine's affair: another program's turn is no failure.
 settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")
@@ -31,6 +35,17 @@ def _one_thread():
     import torch
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _free_memory():
+    """After a file that used large policies, give their memory back: a worker would end with more than 5 GB."""
+    yield
+    pages = Path("/proc/self/statm")  # on Linux; glibc alone can be asked
+    if pages.is_file() and int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > LARGE_BYTES:
+        gc.collect()  # policies that nobody uses any more lie in cycles
+        with contextlib.suppress(AttributeError, OSError):
+            ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 @pytest.fixture(scope="session")
