@@ -4,14 +4,14 @@ VENV := .venv
 ROVER := $(VENV)/bin/rover
 LAB := $(VENV)/bin/python -m lab
 READY := $(VENV)/.ready
-# A file of tests, or a notebook, to each core; more processes than four would want more memory than they save time.
-# In the order of the folders: ansible and lab have the longest files, and one of them at the end would run alone.
+# Each process runs whole test files or notebooks. More than four processes would cost more memory than they save time.
+# They go in the order of the folders: ansible and lab have the longest files, which would run alone if they came last.
 PYTEST := $(VENV)/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 NAME ?= mine
 DEMO := runs/demo/.made
-# In a container there may be nobody but root, and what is loaded here was made here; see onboard/confine.py.
+# A container may have no user but root. Root may load artifacts here, as they were made here; see onboard/confine.py.
 export ROVER_AS_ROOT := 1
-# Some containers' images forbid Python to keep what it compiles: then every process compiles torch anew, for 2 s.
+# Some container images forbid Python to store its bytecode; then every process compiles torch again, which takes 2 s.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help demo watch run test test-fast check-release coverage lint lab arm faults faults-cars random pi-fast pi firmware flash notebooks tables docs clean
@@ -39,9 +39,9 @@ help:
 	@echo "                                            and the JSON behind them into results/, and the pages' tables from it"
 	@echo "make tables                                 the pages' tables alone"
 
-# ensurepip on its own says why it failed, which venv hides; where it cannot (a full disk, no bundled wheels), the pip of
-# $(PYTHON) fills the environment. An environment that was begun and has no pip gets one.
-# uv installs the CUDA build of torch, gigabytes that its wheel insists on, in a minute where pip takes several.
+# ensurepip is called on its own because venv hides why it failed. If it fails (a full disk, no bundled wheels), the
+# pip of $(PYTHON) installs pip into the environment. An unfinished environment without pip gets one this way too.
+# The wheel of torch requires gigabytes of CUDA packages: uv installs them in a minute, pip in several.
 $(READY): pyproject.toml lerobot_robot_rover/pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and f"Python 3.11 to 3.13 is needed, found {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv --without-pip $(VENV)
@@ -75,19 +75,19 @@ lint: $(READY)
 	$(VENV)/bin/mypy
 	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware lab lerobot_robot_rover notebooks rover_lib tests
 
-# The demo is the tests' whole run; tests/test_demo.py holds it to the gates of params.yml. For tests it is made again only
-# if something that it is made from has changed since: the demo takes minutes, and most of a day's changes are to tests.
+# The tests use the demo as their example of a whole run, and tests/test_demo.py holds it to the gates of params.yml.
+# The demo takes minutes, and most changes are to tests; so it is made again only if one of its sources has changed.
 $(DEMO): $(READY) $(shell find rover_lib notebooks -name '*.py' -o -name '*.ipynb' -o -name '*.html') $(wildcard params.yml car.yml)
 	$(MAKE) demo
 
 test: lint $(DEMO)
 	$(PYTEST)
 
-# Without nbval, whose import is three seconds in each process: no notebook is among these.
+# No notebook is among these tests, so they do without nbval, whose import takes three seconds in each process.
 test-fast: $(READY)
 	$(PYTEST) -p no:nbval --override-ini 'addopts=-q -rs --strict-markers' -m 'not slow and not emulated and not release' tests
 
-# Real time, whole fleets and whole machines: for a quiet machine, before something is given to others.
+# Tests in real time, of whole fleets and of whole machines. Run them on a quiet machine before each release.
 check-release: lint $(DEMO)
 	$(VENV)/bin/pytest -m release tests
 	$(VENV)/bin/pytest notebooks
@@ -96,7 +96,7 @@ check-release: lint $(DEMO)
 coverage: $(DEMO)
 	$(VENV)/bin/pytest --cov=rover_lib --cov=lab --cov=lerobot_robot_rover --cov-report=term
 
-# NAME=full needs no checkpoint: it makes one. policy_static.onnx.zip is the last that is made of it.
+# NAME=full needs no checkpoint: it makes one. The last file that it makes is policy_static.onnx.zip.
 arm: $(READY)
 	@test '$(NAME)' != full -o -f runs/full/policy_static.onnx.zip || $(LAB) full runs/full $(if $(LEARNED),--learned)
 	$(LAB) arm 'runs/$(NAME)' $(if $(PEERS),--peers)
@@ -111,12 +111,12 @@ faults-cars: $(READY)
 random: $(READY)
 	$(LAB) random runs/random.json
 
-# The demo's artifacts are deployed.
+# This deploys the demo's artifacts.
 pi-fast: $(READY)
 	@test -f runs/demo/policy_mixed.pt || $(MAKE) demo
 	$(LAB) pi fast runs/pi-fast.json
 
-# The demo's artifact is deployed, and its recordings are what the camera sees.
+# This deploys the demo's artifact, and the emulated camera shows the demo's recordings.
 pi: $(READY)
 	@test -f runs/demo/policy_static.pt || $(MAKE) demo
 	$(LAB) pi whole runs/pi.json
@@ -127,7 +127,7 @@ firmware:
 flash:
 	$(MAKE) -C firmware flash PORT='$(PORT)'
 
-# The executed notebooks of a run, or where there is none of that name, those of the repository.
+# This opens a run's executed notebooks; without NAME, and if there is no run of the default name, the repository's.
 lab: $(READY)
 	@test '$(origin NAME)' != 'command line' -o -f 'runs/$(NAME)/01_load.ipynb' || { echo 'there is no run runs/$(NAME): rover list' >&2; exit 2; }
 	$(VENV)/bin/jupyter lab $(if $(wildcard runs/$(NAME)/01_load.ipynb),'runs/$(NAME)',notebooks)
@@ -139,7 +139,7 @@ notebooks: demo
 tables: $(READY)
 	$(VENV)/bin/python -m rover_lib.workshop.tables
 
-# What the pages link to travels with them; a link to anything else ends the build.
+# The pages, and all that they link to. A link to anything else fails the build.
 PAGES = *.md params.yml lab/params.yml docs/* ansible/README.md firmware/README.md lab/README.md notebooks/*.ipynb pictures/* results/*/*.json
 
 docs: $(READY)
