@@ -11,7 +11,7 @@ BEGIN, END = "<!-- variables -->\n", "<!-- end of variables -->\n"
 
 
 def table() -> str:
-    """A row for each variable, in the order of the specs."""
+    """Return the table: a row for each variable, in the order of the specs."""
     rows: dict[str, dict] = {}
     used: dict[str, list[str]] = {}
     for entry, spec in yaml.safe_load(SPECS.read_text())["argument_specs"].items():
@@ -35,7 +35,7 @@ def _shown(value: object) -> str:
 
 
 def filled(readme: str) -> str:
-    """The README with the table of today."""
+    """Return the README with the present table in it."""
     before, _, rest = readme.partition(BEGIN)
     _, _, after = rest.partition(END)
     return f"{before}{BEGIN}\n{table()}\n{END}{after}"
