@@ -1,7 +1,7 @@
 #include "protocol.h"
 
 uint32_t crc32(const char *text, size_t length) {
-    /* Half a byte at a time: bit by bit, a status took half of the loop's time. */
+    /* Half a byte at a time, because bit by bit a status took half of the loop's time. */
     static const uint32_t OF_NIBBLE[16] = {
         0x00000000, 0x1DB71064, 0x3B6E20C8, 0x26D930AC, 0x76DC4190, 0x6B6B51F4, 0x4DB26158, 0x5005713C,
         0xEDB88320, 0xF00F9344, 0xD6D6A3E8, 0xCB61B38C, 0x9B64C2B0, 0x86D3D2D4, 0xA00AE278, 0xBDBDF21C,
@@ -34,7 +34,7 @@ static bool take_number(const char **at, const char *end, uint32_t *number) {
     return true;
 }
 
-/* line: all of it, from '>' to before its end. */
+/* line: the whole line, from '>' on, without its line feed. */
 static bool parse(const char *line, uint8_t length, struct command *command) {
     if (length < 2 + 9) return false;
     const char *end = line + length - 9; /* where '*' must be */
@@ -122,7 +122,7 @@ void line_text(struct line *line, const char *text) {
 }
 
 void line_number(struct line *line, uint32_t number) {
-    /* By subtraction: the chip divides 32 bits in 40 us, and a status has 60 digits. */
+    /* By subtraction, because a 32-bit division takes the chip 40 us, and a status has 60 digits. */
     static const uint32_t POWERS[] = {1000000000, 100000000, 10000000, 1000000, 100000, 10000, 1000, 100, 10};
     bool begun = false;
     line_char(line, ' ');

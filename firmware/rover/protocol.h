@@ -32,8 +32,8 @@ enum command_kind {
 struct command {
     char kind;
     uint32_t boot, sequence;           /* not in COMMAND_HELLO */
-    uint32_t heard_ms;                 /* in COMMAND_ARM and COMMAND_DRIVE: of the newest status that the host has seen */
-    uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE, COMMAND_LOWER; any number, vehicle.c knows which are safe */
+    uint32_t heard_ms;                 /* in COMMAND_ARM and COMMAND_DRIVE: the time in the newest status that the host has read */
+    uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE; the second in COMMAND_LOWER too. Any number: vehicle.c checks it */
     uint32_t car;                      /* in COMMAND_ARM: which one the host means */
     uint16_t numbers[CAR_NUMBERS];     /* in COMMAND_CAR: the car, in the order of struct car */
 };
@@ -43,7 +43,7 @@ enum reading { READING, READ_COMMAND, READ_BAD };
 struct reader {
     char line[HOST_LINE_MAX];
     uint8_t length;       /* 0: waiting for a '>' */
-    bool noise;           /* bytes that belong to no line came since the last end of a line */
+    bool noise;           /* since the last end of a line, bytes came that belong to no line */
     uint32_t started_ms;
 };
 
@@ -51,13 +51,13 @@ struct reader {
 uint32_t crc32(const char *text, size_t length);
 
 /* Takes one byte. READ_COMMAND once per whole, fresh, well-formed line, which is then in *command; READ_BAD once per
- * line that was not; READING in between. Any bytes at all may be given, and a '>' always starts a new line. */
+ * line that is not; READING in between. Any bytes at all may be given, and a '>' always starts a new line. */
 enum reading reader_take(struct reader *reader, uint8_t byte, uint32_t now_ms, struct command *command);
 
-/* A line of the Arduino, built from its parts. Parts that do not fit make line_end return 0: no line then. */
+/* A line of the Arduino, built from its parts. If they do not fit, line_end returns 0 and there is no line to send. */
 struct line {
     char text[BOARD_LINE_MAX + 1];
-    uint8_t length; /* more than BOARD_LINE_MAX: did not fit */
+    uint8_t length; /* more than BOARD_LINE_MAX: the line did not fit */
 };
 
 void line_begin(struct line *line, char kind);

@@ -20,7 +20,7 @@ void setup() {
   hello_due = true;
 }
 
-/* Whether the byte ended a line: reading that is enough work for one turn of the loop. */
+/* Returns whether the byte ended a line, because reading a line is enough work for one turn of the loop. */
 static bool take(uint8_t byte, uint32_t now_ms) {
   struct command command;
   switch (reader_take(&reader, byte, now_ms, &command)) {
@@ -54,7 +54,8 @@ void loop() {
   vehicle_tick(&vehicle, now_ms);
   pulses_set(&vehicle.car, vehicle.steering_us, vehicle.throttle_us);
 
-  /* A line that finds no room is tried again; a status is then the newest. One of these three a turn. */
+  /* Each turn of the loop reads a line, sends a hello or sends a status, but only one of these. A line without room is sent
+   in a later turn, a status with the values of then. */
   if (!read && hello_due) {
     if (serial_put(line.text, vehicle_hello(&vehicle, reset_cause(), &line))) hello_due = false;
   } else if (!read && (status_due || now_ms - status_ms >= STATUS_MS)) {

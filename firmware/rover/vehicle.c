@@ -85,7 +85,7 @@ static void forget_signal(struct vehicle *vehicle, struct received *received) {
     vehicle->sides[0].seen = vehicle->sides[1].seen = false;
 }
 
-/* Who comes back after a loss may be a receiver that makes up pulses, its transmitter switched off. */
+/* A signal that returns after a loss may come from a receiver that makes up pulses while its transmitter is off. */
 static void judge_signal(struct vehicle *vehicle, uint32_t now_ms) {
     for (uint8_t channel = STEERING; channel <= THROTTLE; channel++) {
         struct received *received = &vehicle->received[channel];
@@ -98,7 +98,7 @@ static bool has_signal(const struct vehicle *vehicle) {
     return vehicle->received[STEERING].present && vehicle->received[THROTTLE].present;
 }
 
-/* Whether a stick has moved from where it was on arming. */
+/* Notes a steering pulse. Returns whether the stick has moved from where it was on arming, as see_throttle() does. */
 static bool see_steering(struct vehicle *vehicle, uint16_t pulse_us, uint32_t now_ms) {
     if (pulse_us <= neutral_us(vehicle, STEERING) - WIGGLE_US) vehicle->sides[0] = (struct side){true, now_ms};
     if (pulse_us >= neutral_us(vehicle, STEERING) + WIGGLE_US) vehicle->sides[1] = (struct side){true, now_ms};
@@ -127,7 +127,7 @@ void vehicle_received(struct vehicle *vehicle, enum channel channel, uint16_t pu
                                                                : !within(pulse_us, PULSE_MIN_US, PULSE_MAX_US))
         return;
     if (distance(period_us, nominal) > nominal / 4) return;
-    judge_signal(vehicle, now_ms); /* before this pulse makes it good again */
+    judge_signal(vehicle, now_ms); /* before this pulse hides that the signal was lost */
     struct received *received = &vehicle->received[channel];
     uint8_t pulses = signal_pulses(vehicle, channel);
     received->pulse_us = pulse_us;
@@ -148,7 +148,7 @@ enum missing vehicle_missing(const struct vehicle *vehicle, uint32_t now_ms) {
 }
 
 static char arm(struct vehicle *vehicle, uint32_t car, uint32_t now_ms) {
-    if (vehicle->state == AUTONOMOUS) return DONE; /* the host repeats itself: renews nothing */
+    if (vehicle->state == AUTONOMOUS) return DONE; /* the host repeats itself, which renews nothing */
     if (!vehicle->car_told || car != vehicle->car_id) return OTHER_CAR;
     enum missing missing = vehicle_missing(vehicle, now_ms);
     if (missing != NOTHING) return (char)missing;
@@ -160,7 +160,7 @@ static char arm(struct vehicle *vehicle, uint32_t car, uint32_t now_ms) {
     return DONE;
 }
 
-/* in_turn: it is the next after the last one, so that none was lost between them. */
+/* in_turn: the command directly follows the last one, so that none was lost between them. */
 static enum result drive(struct vehicle *vehicle, const struct command *command, bool in_turn, uint32_t now_ms) {
     const struct servo *steering = &vehicle->car.servos[STEERING], *throttle = &vehicle->car.servos[THROTTLE];
     if (!within(command->steering_us, steering->min_us, steering->max_us) ||
@@ -171,7 +171,7 @@ static enum result drive(struct vehicle *vehicle, const struct command *command,
     if (vehicle->state != AUTONOMOUS) return IGNORED;
     vehicle->wanted_us[STEERING] = (uint16_t)command->steering_us;
     vehicle->wanted_us[THROTTLE] = towards(throttle->neutral_us, (uint16_t)command->throttle_us, vehicle->cap_us);
-    /* What it is asked by is as old as what its host has heard: from then on it holds for FRESH_MS and the timeout. */
+    /* A drive is as old as the newest status that its host has heard: from then on it holds for FRESH_MS and the timeout. */
     bool fresh = now_ms - command->heard_ms <= FRESH_MS;
     vehicle->commanded_ms = fresh ? now_ms : command->heard_ms + FRESH_MS;
     if (in_turn && now_ms - vehicle->driven_ms > PAUSE_MS) {
@@ -194,7 +194,7 @@ static enum result lower_cap(struct vehicle *vehicle, uint32_t throttle_us) {
     return DONE;
 }
 
-/* Another car's pins are another's: what was seen of the transmitter, and of its human, counts no more. */
+/* With another car, nothing counts any more that was seen of the transmitter and of the human at it. */
 static enum result take_car(struct vehicle *vehicle, const uint16_t *numbers) {
     struct car car;
     memcpy(&car, numbers, sizeof car);
@@ -224,7 +224,7 @@ static enum result neutral(struct vehicle *vehicle) {
 }
 
 void vehicle_command(struct vehicle *vehicle, const struct command *command, uint32_t now_ms) {
-    /* What came too late must not be saved by what comes now. */
+    /* First, so that a command that comes now cannot save one that timed out. */
     vehicle_tick(vehicle, now_ms);
     uint32_t ahead = command->sequence - vehicle->sequence;
     bool in_turn = ahead == 1;
@@ -254,7 +254,6 @@ void vehicle_command(struct vehicle *vehicle, const struct command *command, uin
     }
 }
 
-/* No servo, and no car, should be asked for more at once. */
 void vehicle_tick(struct vehicle *vehicle, uint32_t now_ms) {
     judge_signal(vehicle, now_ms);
     for (struct side *side = vehicle->sides; side < vehicle->sides + 2; side++)
@@ -270,6 +269,7 @@ void vehicle_tick(struct vehicle *vehicle, uint32_t now_ms) {
             vehicle->wary = false;
     }
     if (vehicle->state == AUTONOMOUS) {
+        /* No servo and no car should have to move faster than this. */
         uint32_t ms = now_ms - vehicle->slewed_ms;
         vehicle->slewed_ms = now_ms;
         uint16_t *wanted_us = vehicle->wanted_us;
