@@ -49,7 +49,7 @@ void watchdog_feed() { wdt_reset(); }
 
 /* ---- the car ---------------------------------------------------------------------------------------------------- */
 
-/* So that the pins have the car's neutral again right after a watchdog reset, and not the default's. */
+/* Kept so that right after a watchdog reset the pins have this car's neutral, not the default's. */
 static struct car kept __attribute__((section(".noinit")));
 static uint32_t kept_check __attribute__((section(".noinit")));
 
@@ -69,13 +69,13 @@ void car_keep(const struct car *car) {
 static const uint16_t STEP_US = 4, ROUND = 256, HALF_ROUND = 128;
 
 static volatile uint32_t period_start;   /* of Timer1's period, in its ticks of 0.5 us; wraps after 36 minutes */
-static volatile uint16_t steering_ticks; /* of Timer1's period that is on: the timer is also the clock */
-static uint16_t throttle_period;         /* us, that Timer2 has now */
+static volatile uint16_t steering_ticks; /* of the present period of Timer1, which is also the clock */
+static uint16_t throttle_period;         /* us, of Timer2 now */
 static uint16_t throttle_neutral;        /* steps, of that car */
 static bool fast;
 static volatile uint16_t slow_period, slow_high; /* steps; from the next rising edge on */
 static volatile uint16_t slow_low, slow_left;    /* of the period that is on; from the next match to the next edge */
-static volatile bool slow_rises;                 /* the next edge does */
+static volatile bool slow_rises;                 /* whether the next edge rises */
 
 /* Timer2, from its start: a throttle's neutral. The pin is low, and interrupts are off. */
 static void throttle_begin(const struct car *car) {
@@ -83,7 +83,7 @@ static void throttle_begin(const struct car *car) {
     throttle_period = throttle->period_us;
     throttle_neutral = throttle->neutral_us / STEP_US;
     fast = throttle_is_fast(car);
-    TCCR2A = 0; /* stopped and in normal mode first: only there OCR2x take effect at once */
+    TCCR2A = 0; /* stopped and in normal mode first, because only then OCR2x take effect at once */
     TCCR2B = 0;
     TIMSK2 = 0;
     ASSR = 0;
@@ -120,7 +120,7 @@ void pulses_begin(const struct car *car) {
     TCCR1B = _BV(WGM13) | _BV(WGM12) | _BV(CS11) | _BV(ICNC1) | _BV(ICES1); /* 16 MHz / 8 */
 }
 
-/* A match of the slow throttle has just been. Lets other interrupts in at once, and has time before the next one. */
+/* Runs just after a match of the slow throttle. It lets other interrupts in at once, as the next match is not near. */
 ISR(TIMER2_COMPB_vect, ISR_NOBLOCK) {
     bool rises = slow_rises;
     uint16_t left = slow_left;
@@ -213,7 +213,7 @@ ISR(TIMER1_OVF_vect, ISR_NAKED) {
 
 EMPTY_INTERRUPT(TIMER2_OVF_vect) /* wakes loop() every 1016 us; of a slow throttle, its matches do */
 
-/* Ticks at which TCNT1 was `tick`, at most half a period ago. With interrupts off. */
+/* The ticks when TCNT1 was `tick`, at most half a period ago. Call it with interrupts off. */
 static inline uint32_t ticks_at(uint16_t tick) {
     uint32_t start = period_start;
     if ((TIFR1 & _BV(TOV1)) && tick < steering_ticks / 2) start += steering_ticks;

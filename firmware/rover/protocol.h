@@ -32,8 +32,8 @@ enum command_kind {
 struct command {
     char kind;
     uint32_t boot, sequence;           /* not in COMMAND_HELLO */
-    uint32_t heard_ms;                 /* in COMMAND_ARM and COMMAND_DRIVE: the time in the newest status that the host has read */
-    uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE; the second in COMMAND_LOWER too. Any number: vehicle.c checks it */
+    uint32_t heard_ms;                 /* in COMMAND_ARM, COMMAND_DRIVE: time of the newest status that the host read */
+    uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE, the throttle in COMMAND_LOWER; vehicle.c checks them */
     uint32_t car;                      /* in COMMAND_ARM: which one the host means */
     uint16_t numbers[CAR_NUMBERS];     /* in COMMAND_CAR: the car, in the order of struct car */
 };

@@ -171,7 +171,7 @@ static enum result drive(struct vehicle *vehicle, const struct command *command,
     if (vehicle->state != AUTONOMOUS) return IGNORED;
     vehicle->wanted_us[STEERING] = (uint16_t)command->steering_us;
     vehicle->wanted_us[THROTTLE] = towards(throttle->neutral_us, (uint16_t)command->throttle_us, vehicle->cap_us);
-    /* A drive is as old as the newest status that its host has heard: from then on it holds for FRESH_MS and the timeout. */
+    /* A drive is as old as the newest status its host has heard: from then it holds for FRESH_MS and the timeout. */
     bool fresh = now_ms - command->heard_ms <= FRESH_MS;
     vehicle->commanded_ms = fresh ? now_ms : command->heard_ms + FRESH_MS;
     if (in_turn && now_ms - vehicle->driven_ms > PAUSE_MS) {

@@ -55,7 +55,7 @@ enum {
     LET_GO_MS = 250,
     COMMAND_TIMEOUT_MS = 150,
     LATE_MS = 150,             /* a drive or arm is late if its host has not heard from us for longer than this */
-    FRESH_MS = 50,             /* a drive holds in full if its host has heard from us within this time, otherwise for less */
+    FRESH_MS = 50,             /* a drive holds in full if its host has heard from us within this, otherwise for less */
     /* A host that pauses for longer than PAUSE_MS and then drives on has no time for the car. During the next WARY_MS a
      * pause of WARY_TIMEOUT_MS stops it; that leaves 12 ms to spare at 30 commands a second. */
     PAUSE_MS = 100,

@@ -1,22 +1,22 @@
 /* The rover's sketch for this machine: firmware/rover/rover.ino itself, with a board of virtual time around it.
  *
  * A start of the board is this library loaded anew, so that every variable is as after power-on. A millisecond is one
- * turn of the sketch's loop. What is not here is the chip: judge that by simavr. */
+ * turn of the sketch's loop. The chip itself is not emulated here: test that with simavr. */
 #include <string.h>
 
 #include "rover.ino"
 
 struct event {
     uint32_t at_ms;
-    uint16_t steering_us, throttle_us; /* of the pins */
+    uint16_t steering_us, throttle_us; /* on the pins */
     char state, reason, result, missing;
     bool signals[2];
 };
 
 struct transmitted {
     uint16_t pulse_us;   /* 0: none */
-    uint16_t one_in;     /* only one pulse in so many comes */
-    uint16_t misread_in; /* one pulse in so many is read as one at rest; 0: none */
+    uint16_t one_in;     /* only one in this many pulses comes */
+    uint16_t misread_in; /* one in this many pulses is read as one at rest; 0: none */
 };
 
 static const uint32_t PERIOD_US[2] = {STEERING_PERIOD_US, THROTTLE_PERIOD_US};
@@ -117,7 +117,7 @@ void board_give(const char *bytes, int length) {
     }
 }
 
-/* Lets up to so many milliseconds pass, and stops after one in which the sketch has said something. How many passed. */
+/* Lets up to `ms` milliseconds pass, but stops after one in which the sketch has said something. Returns how many passed. */
 int board_run(int ms) {
     for (int n = 1; n <= ms; n++) {
         now++;

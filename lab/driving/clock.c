@@ -1,4 +1,4 @@
-/* Preloaded into a program: what stepping the system's clock does to it, without stepping it for all the others. */
+/* Preloaded into a program, this shows it a stepped system clock without stepping the clock for all other programs. */
 #define _GNU_SOURCE
 #include <fcntl.h>
 #include <stdlib.h>
