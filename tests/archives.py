@@ -1,4 +1,4 @@
-"""Artifacts that were changed after they were made: by their records, with every checksum right."""
+"""Artifacts whose records are changed after they were made. The checksums of the archive stay right."""
 
 import io
 import json
@@ -12,7 +12,11 @@ Edit = Callable[[bytes], bytes | None]
 
 
 def rewritten(source: Path, target: Path, change: Mapping[str, Edit], add: Mapping[str, bytes] | None = None) -> Path:
-    """A copy of an artifact with records replaced, by the end of their names, or left out, and with others added."""
+    """Write a copy of an artifact to `target`, and return its path.
+
+    change: the end of a record's name -> its edit, which returns the new content, or None to leave the record out.
+    add: name -> content of further records.
+    """
     with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
         for item in old.infolist():
             content: bytes | None = old.read(item)
@@ -27,12 +31,12 @@ def rewritten(source: Path, target: Path, change: Mapping[str, Edit], add: Mappi
 
 
 def manifest_with(**values: object) -> Edit:
-    """Other values in a manifest; ... takes one out."""
+    """Return an edit that sets values in a manifest. The value `...` removes an entry."""
     return lambda raw: json.dumps({k: v for k, v in (json.loads(raw) | values).items() if v is not ...}).encode()
 
 
 def vectors_with(change: Callable[[dict[str, np.ndarray]], object]) -> Edit:
-    """Other parity vectors."""
+    """Return an edit that lets `change` alter the parity vectors in place."""
 
     def edit(raw: bytes) -> bytes:
         vectors = dict(np.load(io.BytesIO(raw)))

@@ -1,4 +1,4 @@
-"""A real browser without a window, by its debugging protocol: Debian's chromium, where it is installed."""
+"""A real browser without a window: Debian's chromium, if it is installed, controlled through its debugging protocol."""
 
 import asyncio
 import json
@@ -31,24 +31,27 @@ class Tab:
         return answer["result"]
 
     async def value(self, expression: str) -> Any:
-        """Of JavaScript, in the page."""
+        """Evaluate JavaScript in the page and return its value."""
         found = await self.ask("Runtime.evaluate", expression=expression, returnByValue=True)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
     async def text(self, name: str) -> str:
-        """What an element shows, by its id."""
+        """Return the text of the element with this id."""
         return await self.value(f"document.getElementById({name!r}).textContent")
 
     async def until(self, expression: str, seconds: float = 120.0) -> None:
-        """Waits until something holds; what cannot be evaluated yet, because the page is not there, does not."""
+        """Wait until a JavaScript expression is true.
+
+        While it cannot be evaluated, because the page has not loaded, it counts as false.
+        """
         end = time.monotonic() + seconds
         while not await self.value(f"(() => {{ try {{ return {expression}; }} catch (error) {{ return false; }} }})()"):
             assert time.monotonic() < end, f"{expression}: {await self.value('document.body.innerText')}"
             await asyncio.sleep(0.1)
 
     async def click(self, name: str) -> None:
-        """With the mouse, in the middle of an element."""
+        """Click with the mouse on the middle of the element with this id."""
         box = json.loads(
             await self.value(f"JSON.stringify(document.getElementById({name!r}).getBoundingClientRect().toJSON())")
         )
@@ -58,7 +61,7 @@ class Tab:
 
 
 class Browser:
-    """Chromium with a profile of its own in a folder; an async context manager."""
+    """Chromium with a profile of its own, which it keeps in `folder`. An async context manager."""
 
     def __init__(self, folder: Path):
         self._folder = folder

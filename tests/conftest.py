@@ -1,4 +1,4 @@
-"""What many tests share: one tiny policy, its calibration and its artifacts, and the demo's run."""
+"""Fixtures that many tests share: a tiny policy, its calibration, its artifacts, and the demo's run."""
 
 import contextlib
 import ctypes
@@ -12,18 +12,22 @@ import pytest
 from filelock import FileLock
 from hypothesis import settings
 
-# jsonschema, which reads notebooks, compiles a grammar of URLs where it finds one: 2 s in each process, for nothing.
+# nbformat checks notebooks with jsonschema, which compiles the grammar of this package if it is installed. That would
+# take 2 s in each process, and no test needs it.
 sys.modules["rfc3987_syntax"] = None  # type: ignore[assignment]
-# In a container there may be nobody but root.
+# In a container, root may be the only user.
 os.environ.setdefault("ROVER_AS_ROOT", "1")
-LARGE_BYTES = 2e9  # of memory, for a process that tests
-# How long an example takes is the machine's affair: another program's turn is no failure.
+LARGE_BYTES = 2e9  # a test process that holds more than this gives memory back
+# No deadline for hypothesis's examples: one that waits for another program's turn has not failed.
 settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")
 
 
 def pytest_collection_modifyitems(items):
-    """What drives by the demo's policy starts processes that import torch, and a kit takes ten seconds: not quick."""
+    """Mark the tests that use the demo's run or Hailo's kit as slow.
+
+    Driving with the demo's policy starts processes that import torch, and a kit takes ten seconds to make.
+    """
     for item in items:
         if {"demo_run", "hailo_kit"} & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
@@ -31,7 +35,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread():
-    """Tests are small: threads would only wait for each other."""
+    """Let torch use one thread: the tests are so small that several would only wait for each other."""
     import torch
 
     torch.set_num_threads(1)
@@ -39,18 +43,18 @@ def _one_thread():
 
 @pytest.fixture(scope="module", autouse=True)
 def _free_memory():
-    """After a file that used large policies, give their memory back: a worker would end with more than 5 GB."""
+    """Give memory back after each test file that used large policies; otherwise a worker ends with more than 5 GB."""
     yield
-    pages = Path("/proc/self/statm")  # on Linux; glibc alone can be asked
+    pages = Path("/proc/self/statm")  # only Linux has it; and of the C libraries, only glibc has malloc_trim
     if pages.is_file() and int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > LARGE_BYTES:
-        gc.collect()  # policies that nobody uses any more lie in cycles
+        gc.collect()  # unused policies are kept alive by reference cycles
         with contextlib.suppress(AttributeError, OSError):
             ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory) -> Callable[[str, Callable[[Path], None]], Path]:
-    """made_once(name, make): a folder that make(folder) has filled once for all processes of this run of pytest."""
+    """made_once(name, make) returns a folder that make(folder) filled once for all processes of this run of pytest."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
@@ -76,7 +80,7 @@ def tiny_policy():
 
 @pytest.fixture(scope="session")
 def full_policy():
-    """Of the user's size: 84 million parameters."""
+    """A policy of the user's size: 84 million parameters."""
     from policies import FULL, lerobot_policy
 
     return lerobot_policy(**FULL)
@@ -111,7 +115,7 @@ def calibration(tiny):
 
 @pytest.fixture(scope="session")
 def artifacts(made_once, request) -> dict[str, Path]:
-    """One artifact per mode of the tiny policy."""
+    """One artifact of the tiny policy per mode."""
 
     def make(folder: Path) -> None:
         from policies import memory_samples
@@ -138,7 +142,7 @@ def artifacts(made_once, request) -> dict[str, Path]:
 
 @pytest.fixture(scope="session")
 def hailo_kit(tiny, tmp_path_factory) -> Path:
-    """The tiny policy for Hailo's compiler. Who writes into it takes a copy."""
+    """A kit of the tiny policy for Hailo's compiler. A test that writes into it must copy it first."""
     from hailo_kit import make_kit, normalised
 
     return make_kit(normalised(tiny), tmp_path_factory.mktemp("hailo") / "kit")
@@ -146,7 +150,7 @@ def hailo_kit(tiny, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def onnx_static(tiny, calibration, tmp_path_factory) -> Path:
-    """The artifact of `artifacts["static"]`, for ONNX Runtime."""
+    """The same policy as `artifacts["static"]`, exported for ONNX Runtime."""
     from policies import memory_samples
 
     from rover_lib.workshop.export import export
@@ -162,7 +166,7 @@ def onnx_static(tiny, calibration, tmp_path_factory) -> Path:
 def demo_run() -> Path:
     """The folder of the demo's run, which `make test` makes before it calls pytest.
 
-    Without it tests skip, so that pytest by hand does not begin with minutes of training.
+    Tests that need it are skipped if it is missing, so that calling pytest by hand does not start minutes of training.
     """
     folder = Path(__file__).parents[1] / "runs" / "demo"
     if not (folder / "compare.json").exists():

@@ -1,4 +1,4 @@
-"""A kit of a tiny policy whose state, actions and colours are all normalised in some way, and what it was made of."""
+"""A kit of a tiny policy whose state, actions and colours are all normalised, and what the kit is made from."""
 
 from dataclasses import replace
 from pathlib import Path

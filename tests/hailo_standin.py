@@ -1,9 +1,10 @@
-"""Stand-ins for Hailo's two Python packages, which nobody here has: what their documentation says, and no more.
+"""Stand-ins for Hailo's two Python packages, which nobody here has. They do what the documentation says, and no more.
 
-`hailo_sdk_client` (the compiler): ClientRunner keeps an ONNX file, the lines of a model script that change a network's
-input, and hands both out as a "HEF". `hailo_platform` (the driver's): runs such a HEF in ONNX Runtime, behind the
-interface of hailort v4.23 and v5.2 (hailo_platform/pyhailort/pyhailort.py), channels last, with its checks of buffers.
-Nothing is quantized: what differs from the policy is an error of the kit or of the runner.
+`hailo_sdk_client` is the compiler: its ClientRunner keeps an ONNX file and those lines of a model script that change a
+network's input, and writes both into a "HEF". `hailo_platform` belongs to the driver: it runs such a HEF in ONNX
+Runtime, behind the interface of hailort v4.23 and v5.2 (hailo_platform/pyhailort/pyhailort.py), with channels last and
+with the same checks of buffers. Nothing is quantized, so that any difference from the policy is an error of the kit or
+of the runner.
 """
 
 import contextlib
@@ -36,7 +37,7 @@ class FormatType(Enum):
 
 
 class Network:
-    """What a "HEF" holds: an ONNX model, and per input what the model script does to it."""
+    """The content of a "HEF": an ONNX model and, for each input, what the model script does to it."""
 
     def __init__(self, hef: bytes):
         if not hef.startswith(MAGIC):
@@ -47,7 +48,7 @@ class Network:
         self.session = onnxruntime.InferenceSession(hef[start + size :], providers=["CPUExecutionProvider"])
 
     def infer(self, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
-        """By the compiler's names, (h, w, c) each; outputs the same way."""
+        """Run the network. inputs: by the compiler's names, (h, w, c) each. Returns the outputs in the same layout."""
         given = {}
         for layer, value in inputs.items():
             about = self.about["inputs"][layer]
@@ -59,7 +60,7 @@ class Network:
 
 
 class Stream:
-    """Of a model (set_format_type) and of bindings (set_buffer, get_buffer)."""
+    """One input or output, of a model (set_format_type) or of bindings (set_buffer, get_buffer)."""
 
     def __init__(self, name: str, shape: tuple[int, ...]):
         self.name, self.shape, self.type, self._buffer = name, list(shape), FormatType.UINT8, None
@@ -124,7 +125,7 @@ class InferModel:
 
 
 class Configured:
-    fails = False  # a chip that answers no more
+    fails = False  # True: the chip no longer answers
 
     def __init__(self, model: InferModel):
         self._model = model
@@ -160,8 +161,8 @@ class InferenceContext(Enum):
 
 
 class ClientRunner:
-    renamed: ClassVar[dict[str, str]] = {}  # layers that this compiler calls otherwise, by the name expected
-    calibrated: ClassVar[dict[str, np.ndarray]] = {}  # what the last one was given
+    renamed: ClassVar[dict[str, str]] = {}  # expected name of a layer -> what this compiler calls it
+    calibrated: ClassVar[dict[str, np.ndarray]] = {}  # the data given to the last optimize()
 
     def __init__(self, hw_arch: str):
         assert hw_arch in ("hailo8", "hailo8l", "hailo10h")
@@ -199,7 +200,7 @@ class ClientRunner:
         Path(path).write_bytes(b"stand-in HAR")
 
     def load_model_script(self, path: str) -> None:
-        """Knows the commands that the zoo's scripts have, and that a layer must exist to be named."""
+        """Accept only the commands that the model zoo's scripts use, and only names of layers that exist."""
         self._script = Path(path).read_text()
         for line in self._script.splitlines():
             command = line.partition("#")[0].strip()
@@ -253,7 +254,7 @@ class ClientRunner:
 
 
 def install(monkeypatch) -> None:
-    """Both packages, for as long as the test runs; the compiler says that it is 3.33.0."""
+    """Install both packages until the test ends. The compiler's version reads 3.33.0."""
     platform, client = types.ModuleType("hailo_platform"), types.ModuleType("hailo_sdk_client")
     for thing in (VDevice, FormatType, HailoRTException):
         setattr(platform, thing.__name__, thing)

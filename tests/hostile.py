@@ -9,7 +9,7 @@ from PIL import Image
 
 
 def scene(seed=0, size=(640, 360)) -> np.ndarray:
-    """A picture with something on it, (height, width, 3) uint8, always the same for a seed."""
+    """Return a picture with something on it, (height, width, 3) uint8, always the same for a seed."""
     width, height = size
     coarse = np.random.default_rng(seed).integers(20, 235, (9, 16, 3), np.uint8)
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -20,25 +20,28 @@ def jpeg(image, quality=90, *more) -> bytes:
 
 
 def cut(data, share=2 / 3) -> bytes:
-    """The first part, closed with an end marker, so that OpenCV and Pillow take it for a picture."""
+    """Return the first part of a JPEG, closed with an end marker, so that OpenCV and Pillow take it for a picture."""
     return data[: int(len(data) * share)] + b"\xff\xd9"
 
 
 def claims(data, width, height) -> bytes:
-    """The same data under a header that claims another size."""
+    """Return the same JPEG under a header that claims another size."""
     at = next(data.find(marker) for marker in (b"\xff\xc0", b"\xff\xc2") if marker in data)
     return data[: at + 5] + struct.pack(">HH", height, width) + data[at + 9 :]
 
 
 def grey(size) -> bytes:
-    """All of a grey picture of size x size pixels, without making one: a block of it is the bits 001010."""
+    """Return the complete JPEG of a grey picture of size x size pixels, without making the picture.
+
+    Each of its blocks of 8x8 pixels is the bits 001010, so that four blocks are three bytes.
+    """
     small = jpeg(np.full((8, 8), 128, np.uint8))
     header = claims(small, size, size)[: small.index(b"\xff\xda") + 10]
     return header + b"\x28\xa2\x8a" * (size * size // 64 // 4) + b"\xff\xd9"
 
 
 def progressive(image, last_scans=1) -> bytes:
-    """With its last scan that many times over."""
+    """Return a progressive JPEG in which the last scan is repeated `last_scans` times."""
     out = io.BytesIO()
     Image.fromarray(image).save(out, "JPEG", progressive=True)
     data = out.getvalue()
@@ -48,7 +51,7 @@ def progressive(image, last_scans=1) -> bytes:
 
 WHOLE = jpeg(scene())
 RESTARTS = jpeg(scene(), 90, cv2.IMWRITE_JPEG_RST_INTERVAL, 4)
-SCAN = WHOLE.index(b"\xff\xda") + 14  # where the picture's own data begins
+SCAN = WHOLE.index(b"\xff\xda") + 14  # where the compressed pixels begin
 
 HOSTILE = {
     "nothing": b"",

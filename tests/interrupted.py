@@ -1,4 +1,4 @@
-"""A learning that is ended in the middle: at a chosen call, with every step saved that was made before."""
+"""Interrupt a training at a chosen call, with every step before it saved."""
 
 from functools import partial
 from typing import Any
@@ -9,7 +9,9 @@ from rover_lib.workshop import training
 
 
 def interrupt(patch: pytest.MonkeyPatch, owner: Any, name: str, at: int = 1) -> list[int]:
-    """Let the at-th call of owner.name raise KeyboardInterrupt, and all others be made. Returns a list of the calls."""
+    """Let the at-th call of owner.name raise KeyboardInterrupt; all others are made. Returns a list that grows by one
+    entry with each call.
+    """
     calls: list[int] = []
     real = getattr(owner, name)
 
@@ -24,6 +26,6 @@ def interrupt(patch: pytest.MonkeyPatch, owner: Any, name: str, at: int = 1) -> 
 
 
 def save_each_step(patch: pytest.MonkeyPatch, module: Any) -> None:
-    """What module trains is saved after every step, however long that takes."""
+    """Let the trainings of `module` save after every step, however long that takes."""
     patch.setattr(module, "Resumable", partial(training.Resumable, every_s=0.0))
     patch.setattr(training, "SAVING_SHARE", 1e9)

@@ -1,6 +1,7 @@
-"""What a test needs of the machine: packages, without which it is skipped with the reason; and to be in time.
+"""What tests need from the machine: Debian packages, and enough time.
 
-Debian packages cannot come with pip; .ci/run installs them, so that none of these tests skips there.
+A test whose packages are missing is skipped, and the reason names them. pip cannot install Debian packages; .ci/run
+does, so that none of these tests is skipped there.
 """
 
 import contextlib
@@ -24,7 +25,7 @@ from lab.debian import missing_packages
 QEMU_MISSING = missing_packages(core.NEEDS)
 qemu = pytest.mark.skipif(bool(QEMU_MISSING), reason=f"needs the Debian packages {' '.join(QEMU_MISSING)}")
 
-# The firmware's own source is compiled for this machine.
+# Some tests compile the firmware's source for this machine.
 gcc = pytest.mark.skipif(not shutil.which("gcc"), reason="needs the Debian packages gcc libc6-dev")
 
 SIMAVR_MISSING = emulator.missing_packages()
@@ -32,11 +33,11 @@ simavr = pytest.mark.skipif(bool(SIMAVR_MISSING), reason=f"needs the Debian pack
 
 ATTEMPTS = 5
 BEAT_S = 0.02
-LATE_S = 0.06  # with a command every 20 ms, half of the 150 ms after which an Arduino stops
+LATE_S = 0.06  # with the 20 ms between two commands, about half of the 150 ms after which an Arduino stops
 
 
 def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
-    """Waits until something holds, which has to come."""
+    """Wait until the condition holds. Fails if it does not within `seconds`."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it did not happen"
@@ -44,7 +45,7 @@ def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
 
 
 def ended(pid: int) -> bool:
-    """Whether a process is no more, or only waits for its parent to notice."""
+    """Whether a process has ended. A zombie, which only waits for its parent to notice, has."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:
@@ -52,16 +53,16 @@ def ended(pid: int) -> bool:
 
 
 class Late(AssertionError):
-    """This machine did not let a test do something in time."""
+    """This machine was too busy for a test to do something in time."""
 
 
 def keep_sending(
     send: Callable[[], object], seconds: float = 20.0, condition: Callable[[], object] | None = None
 ) -> None:
-    """Sends every 20 ms for that long, or until something holds, which has to come. For a test in real time.
+    """For a test in real time: send every 20 ms for `seconds`, or until the condition holds.
 
-    Raises Late where it could not: 150 ms after the last command the Arduino stops, as it must, and what the test would
-    judge is no longer what it has sent.
+    Fails if there is a condition and it does not hold by then. Raises Late if more than 120 ms passed between two
+    commands: after 150 ms the Arduino stops, as it must, and the test would no longer judge what it sent.
     """
     last = time.monotonic()
     end = last + seconds
@@ -77,7 +78,7 @@ def keep_sending(
 
 
 class Heartbeat:
-    """How late a thread that wakes up every 20 ms comes; late_s: at its worst."""
+    """A thread that wakes up every 20 ms and measures how late it does. late_s: the largest delay so far."""
 
     def __init__(self) -> None:
         self.late_s = 0.0
@@ -102,25 +103,25 @@ class Heartbeat:
 
 @contextlib.contextmanager
 def in_turn():
-    """Inside, no other test in real time runs on this machine, of this suite or of another.
+    """While inside, no other test in real time runs on this machine, whether of this test run or of another.
 
-    What runs at real-time priority keeps a processor for up to 100 ms from what else does, and an Arduino that waits as
-    long stops its car.
+    A thread at real-time priority can keep a processor from another such thread for up to 100 ms, and an Arduino that
+    waits that long stops its car.
     """
     with (Path(tempfile.gettempdir()) / f"rover-real-time-{os.getuid()}.lock").open("w") as turn:
         fcntl.flock(turn, fcntl.LOCK_EX)
         try:
             yield
         finally:
-            fcntl.flock(turn, fcntl.LOCK_UN)  # a forked child may hold the file open
+            fcntl.flock(turn, fcntl.LOCK_UN)  # explicitly, because a forked child may still hold the file open
 
 
 @contextlib.contextmanager
 def boosted_priority():
-    """Inside, this thread goes before ordinary ones, if this user may.
+    """While inside, this thread goes before ordinary ones, if this user is allowed to do so.
 
-    What it starts does not, unless it asks for that: a program that loads torch would keep every car of this machine
-    waiting.
+    Processes and threads that it starts have ordinary priority, unless they ask for more: a program that loads torch
+    would otherwise keep every car on this machine waiting.
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(0.0005)
@@ -135,9 +136,9 @@ def boosted_priority():
 
 
 def real_time(test: Callable[..., None]) -> Callable[..., None]:
-    """A test in real time: repeated if it failed while this machine was measurably late, and only then.
+    """Decorate a test in real time: repeat it if it failed while this machine was measurably late, and only then.
 
-    A sender that is late is a test of nothing: the Arduino rightly stops. After ATTEMPTS it fails, and says so.
+    A late sender tests nothing, because the Arduino rightly stops. After ATTEMPTS failures the test fails and says why.
     """
 
     @functools.wraps(test)

@@ -1,6 +1,6 @@
-"""Policies and recordings that are small enough for tests, and made by the same tools as real ones."""
+"""Policies and samples that are small enough for tests; the policies are made by the same tools as real ones."""
 
-# LeRobot takes ten seconds to import in each process that collects tests: whoever needs it imports it in its functions.
+# LeRobot takes ten seconds to import, and every process that collects tests would pay for it: import it in functions.
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +26,7 @@ FULL = {"cameras": {"observation.images.cam_front": (360, 640)}, "n_decoder_laye
 
 
 def smooth_frame(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """A picture with structure at several sizes, (height, width, 3) uint8."""
+    """Return a picture of smooth random patches, (height, width, 3) uint8."""
     coarse = rng.random((5, 9, 3)).astype(np.float32)
     return (cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 1) * 255).astype(np.uint8)
 
@@ -34,7 +34,10 @@ def smooth_frame(rng: np.random.Generator, height: int, width: int) -> np.ndarra
 def lerobot_policy(
     cameras: dict[str, tuple[int, int]] | None = None, states: int = 2, actions: int = 2, seed: int = 0, **config
 ) -> "ACTPolicy":
-    """LeRobot's own policy with random weights, in eval mode; frozen statistics set so that its features are alive."""
+    """Return LeRobot's own policy with random weights, in eval mode.
+
+    The statistics of its frozen batch norms are set from pictures, so that its features do not vanish.
+    """
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy
@@ -70,7 +73,7 @@ def lerobot_policy(
     ]
     with torch.no_grad():
         policy.model.backbone(torch.from_numpy(x))
-        for p in policy.parameters():  # biases of zero and norms of one would hide errors too
+        for p in policy.parameters():  # biases of 0 and norms of 1 would hide errors too
             if p.dim() == 1:
                 p.add_(torch.randn_like(p) * 0.05)
     for hook in hooks:
@@ -104,7 +107,7 @@ def trainer_config(policy: "ACTPolicy") -> dict:
 
 
 def trainer_content(policy: "ACTPolicy") -> dict:
-    """What the user's trainer saves, optimizer and numpy scalar included."""
+    """Return what the user's trainer saves, including the optimizer's state and a numpy scalar."""
     optimizer = torch.optim.AdamW([policy.model.action_head.weight], lr=1e-4)
     policy.model.action_head.weight.grad = torch.ones_like(policy.model.action_head.weight)
     optimizer.step()
@@ -119,7 +122,7 @@ def trainer_content(policy: "ACTPolicy") -> dict:
 
 
 def of_a_cars_size(path: Path) -> Path:
-    """A trainer's file of a tiny policy whose plans are of a car's size, and differ from frame to frame."""
+    """Write a trainer's file of a tiny policy whose actions are as large as a car's and differ from frame to frame."""
     policy = lerobot_policy(**TINY)
     with torch.no_grad():
         policy.model.action_head.weight.mul_(torch.tensor([[0.05], [0.005]]))
@@ -130,7 +133,7 @@ def of_a_cars_size(path: Path) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class MemorySample:
-    """A recorded sample without files."""
+    """A sample like a recorded one, but without files."""
 
     state: np.ndarray
     picture: np.ndarray

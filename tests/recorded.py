@@ -1,4 +1,4 @@
-"""Recordings for tests: a real one where it is there, and small ones that are made."""
+"""Recordings for tests: a real one, if there is one, and small ones that are made here."""
 
 import math
 from pathlib import Path
@@ -14,7 +14,7 @@ REPO = Path(__file__).resolve().parents[1]
 
 
 def real_episode() -> Path:
-    """Folder of a real recording in shared/, in or beside the checkout. Skips the test where there is none."""
+    """Return the folder of a real recording in shared/, in or beside the checkout. Skips the test if there is none."""
     for base in (REPO, REPO.parent):
         found = sorted((base / "shared" / "sample_episode").glob("episode_*/episode_data.json"))
         if found:
@@ -23,7 +23,7 @@ def real_episode() -> Path:
 
 
 def record_drives(root: Path, drives: int = 4, frames: int = 24) -> Path:
-    """Drives whose steering and throttle change, and whose pictures do."""
+    """Record drives in which steering, throttle and pictures change. Returns `root`."""
     rng, pwm = np.random.default_rng(0), PwmCalibration()
     for drive in range(drives):
         with EpisodeWriter(root / f"episode_{drive}", About(""), resolution=(96, 54)) as writer:

@@ -1,4 +1,4 @@
-"""Work of a sweep that takes no time; in a module of its own, as worker processes import it by name."""
+"""Jobs of a sweep that take no time. They have a module of their own because worker processes import it by name."""
 
 import json
 import os
@@ -18,7 +18,10 @@ def _stage(folder: Path, name: str, stage: str, metrics: dict, **inputs: str) ->
 
 @dataclass(frozen=True)
 class Stub:
-    """Writes down what it does in `log`. dies: the seed whose first try ends its worker. fails: that never works."""
+    """Work that only notes in `log` what it does.
+
+    dies: the seed whose first try kills its worker. fails: the seed for which every try raises ValueError.
+    """
 
     log: Path
     dies: int = -1

@@ -1,4 +1,4 @@
-"""The demo's run, made by `make demo`, held to the gates of params.yml."""
+"""The demo's run, made by `make demo`, must pass the gates of params.yml."""
 
 import nbformat
 import pytest
@@ -55,7 +55,7 @@ def test_drives_by_plans_that_are_150_ms_late_as_by_fresh_ones(demo_run):
     assert fresh["trials"] == late["trials"] == 40
     assert fresh["hits"] >= params()["gates"]["fp32_hits"]
     assert late["hits"] >= fresh["hits"] - params()["gates"]["hits_lost_at_150_ms"]
-    assert fresh["plan_age_max_ms"] == 0 and late["plan_age_min_ms"] >= 150  # the loop really drove by late plans
+    assert fresh["plan_age_max_ms"] == 0 and late["plan_age_min_ms"] >= 150  # the loop really drove with late plans
     assert all(g["passed"] for g in metrics["gates"])
 
 
@@ -67,13 +67,13 @@ def test_late_plans_are_drawn(demo_run):
 
 
 def test_a_student_of_its_own_is_judged_beside_it(demo_run):
-    """Of a few steps: it need not be as good, but what is said of it must be what was seen."""
+    """It is trained for a few steps only, so it need not be as good; but the report must say what was measured."""
     metrics = stage_of(demo_run, "distill")["metrics"]
     teacher, student = metrics["students"]
     assert (student["name"], student["width"], student["feedforward"]) == ("demo-small", 96, 256)
     assert student["gmac"] < 0.6 * teacher["gmac"]
     assert teacher["trials"] == teacher["pushed_trials"] == student["trials"] == student["pushed_trials"] == 20
-    assert teacher["hits"] >= 18 and student["hits"] >= 10  # it looks where the balloon is
+    assert teacher["hits"] >= 18 and student["hits"] >= 10  # both look where the balloon is
     assert teacher["teacher_steering_pct"] < 0.5 < student["teacher_steering_pct"] < 10
     gates = frontier.gates_of(student, teacher, params()["students"])
     assert metrics["recommendation"]["gates"] == gates
@@ -86,7 +86,7 @@ def test_a_student_of_its_own_is_judged_beside_it(demo_run):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_outputs_that_never_change_are_those_committed(demo_run, name):
-    """The cells that nbval would compare, were it to execute again what the demo has just executed."""
+    """These are the cells that nbval would compare if it executed again what the demo has just executed."""
     ran, committed = (nbformat.read(f / f"{name}.ipynb", as_version=4) for f in (demo_run, NOTEBOOKS))
     found = {c.id: text_of(c) for c in ran.cells if "NBVAL_CHECK_OUTPUT" in c.source}
     for cell in committed.cells:

@@ -1,4 +1,4 @@
-"""The pages: each is one click from README, no link is dead, and what they tell people to type is there."""
+"""The pages: each is one click from README, no link is dead, and the commands and options that they show exist."""
 
 import re
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
 def anchors(page):
-    """Of its headings, as GitHub makes them."""
+    """Return the anchors of a page's headings, as GitHub makes them."""
     titles = re.findall(r"^#+ (.+)$", page.read_text(), re.M)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
@@ -44,7 +44,7 @@ def test_troubleshooting_names_lines_that_the_doctor_has():
 
 
 def typed(page: Path) -> Iterator[list[str]]:
-    """The words of each command in a page's indented lines and between backticks, without `sudo` and comments."""
+    """Yield the words of each command in a page's indented lines and between backticks, without `sudo` and comments."""
     text = page.read_text().replace("\\\n", " ")
     for code in re.findall(r"^    (\S.*)$", text, re.M) + re.findall(r"`([^`\n]+)`", text):
         for command in re.split(r"&&|[;|]", code.partition(" #")[0]):
@@ -53,7 +53,7 @@ def typed(page: Path) -> Iterator[list[str]]:
 
 
 def unknown_in(group: click.Command, words: list[str]) -> list[str]:
-    """The command, or the options, of these words that a command line does not have."""
+    """Return the command among these words, or else the options, that `group` does not have."""
     while isinstance(group, click.Group) and words and not words[0].startswith("-"):
         if words[0] not in group.commands:
             return words[:1]

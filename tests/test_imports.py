@@ -1,4 +1,4 @@
-"""Imports go one way: the rover's part needs nothing of a workstation, and nothing needs the laboratory."""
+"""Imports go one way: the rover's part needs nothing from the workstation's, and nothing needs the laboratory."""
 
 import ast
 import functools
@@ -10,11 +10,11 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = ("rover_lib.onboard", "rover_lib.workshop", "rover_lib.world", "rover_lib.cli", "lab")  # the lowest first
 PLUGIN = "lerobot_robot_rover"  # for LeRobot's commands
-ROOMS = ("lab.debian", "lab.arduino", "lab.driving", "lab.a76", "lab.pi", "lab.__main__")  # of the laboratory, the same
+ROOMS = ("lab.debian", "lab.arduino", "lab.driving", "lab.a76", "lab.pi", "lab.__main__")  # the laboratory's
 ONBOARD_NEEDS = {
     "torch",
     "onnxruntime",
-    "hailo_platform",  # of Hailo's own packages, where there is such a card
+    "hailo_platform",  # one of Hailo's own packages, which a Pi with its card has
     "numpy",
     "cv2",
     "simplejpeg",
@@ -22,7 +22,7 @@ ONBOARD_NEEDS = {
     "yaml",
     "systemd_watchdog",
     "click",
-    "aiohttp",  # of the extra view, which view.py alone imports
+    "aiohttp",  # of the extra `view`; only view.py imports it
     "rover_lib",
 }
 
@@ -35,7 +35,7 @@ def modules() -> dict[str, Path]:
 
 @functools.cache
 def imported(path: Path) -> set[str]:
-    """Every name that a file imports, those for functions and for type checkers alone too."""
+    """Return every name that a file imports, also inside functions and only for type checkers."""
     names, waiting = set(), [ast.parse(path.read_text())]
     while waiting:
         node = waiting.pop()
@@ -49,7 +49,7 @@ def imported(path: Path) -> set[str]:
 
 
 def ours(path: Path) -> set[str]:
-    """The modules of this repository that a file imports."""
+    """Return the modules of this repository that a file imports."""
     known = modules()
     names = imported(path)
     return {n if n in known else n.rpartition(".")[0] for n in names if n.split(".")[0] in ("rover_lib", PLUGIN, "lab")}
@@ -73,7 +73,7 @@ def test_imports_go_one_way(places):
 
 
 def test_no_module_imports_itself_in_a_circle():
-    """Not even inside of functions, or for type checkers alone."""
+    """Imports inside functions and only for type checkers count too."""
     arrows = {name: ours(path) for name, path in modules().items()}
     while leaves := [n for n, targets in arrows.items() if not targets & arrows.keys() - {n}]:
         for leaf in leaves:
@@ -90,7 +90,7 @@ def test_onboard_needs_only_what_a_rover_has():
 
 
 def test_the_plugin_for_lerobot_stands_on_onboard_alone():
-    """It goes where a rover's wheel and LeRobot are; nothing of ours needs it."""
+    """It is installed next to a rover's wheel and LeRobot; no other package of ours needs it."""
     for name, path in modules().items():
         for other in ours(path):
             if name.split(".")[0] == PLUGIN:

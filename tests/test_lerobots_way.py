@@ -1,4 +1,4 @@
-"""LeRobot's own way, end to end and without network: recordings, a dataset, lerobot-train, rover run, a drive."""
+"""LeRobot's own way, end to end and without a network: recordings, a dataset, lerobot-train, rover run, a drive."""
 
 import json
 import os
@@ -21,14 +21,14 @@ BIN = Path(sys.executable).parent
 
 
 def rover(*words):
-    """What a command printed. Its exit status is checked."""
+    """Run a `rover` command, check its exit status, and return what it printed."""
     result = CliRunner().invoke(main, [str(word) for word in words], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.output
 
 
 def lerobot_train(dataset, out, *options, cache, timeout=1800):
-    """LeRobot's own command, on a dataset of this machine, in a process of its own; returns what it leaves."""
+    """Run LeRobot's own command offline, in a process of its own. Returns the folder of the last checkpoint."""
     offline = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
     words = [
         *("--policy.device=cpu", "--policy.push_to_hub=false", "--wandb.enable=false", "--num_workers=0"),
@@ -43,7 +43,7 @@ def lerobot_train(dataset, out, *options, cache, timeout=1800):
 
 @pytest.fixture(scope="module", params=["images", "video"])
 def artifact(request, tmp_path_factory):
-    """What rover makes of what LeRobot trained, on a dataset of this kind."""
+    """The static artifact that rover makes of a policy that LeRobot trained on a dataset of images, or of video."""
     folder = tmp_path_factory.mktemp(request.param)
     cache, recorded, dataset = folder / "cache", folder / "mine", folder / "dataset"
     with pytest.MonkeyPatch.context() as patch:
@@ -61,7 +61,7 @@ def artifact(request, tmp_path_factory):
         assert last.resolve().name == "000002"
         words = json.loads(rover("inspect", folder / "train", "--json"))["checkpoint"]
         assert words["format"] == "lerobot" and words["normalisation"]["action"].startswith("output * (")
-        if request.param == "video":  # only the pictures are read otherwise: the notebooks need not show it once more
+        if request.param == "video":  # only reading the pictures differs, so the notebooks need not run again
             rover("quantize", last, dataset, "-o", folder / "policy_static.pt", "--samples", 6)
             return folder / "policy_static.pt"
         rover("run", last, dataset, "--name", "a", "--runs-dir", folder, "--samples", 6, "--iterations", 2)
@@ -83,10 +83,10 @@ def test_from_recordings_to_a_drive(artifact, tmp_path):
 
 
 def start_of(checkpoint, dataset, folder):
-    """A LeRobot policy of the demo's shape, without a VAE, with its backbone and nothing else of what it has learned.
+    """Save a LeRobot policy of the demo's shape, without a VAE, that has the demo's trained backbone and nothing else.
 
-    A backbone that knows nothing learns little while its batch norm is frozen, which is why LeRobot downloads one.
-    lerobot-train takes no --policy.path without processors.
+    An untrained backbone learns little while its batch norm is frozen, which is why LeRobot downloads a trained one.
+    The processors are saved too, because lerobot-train accepts no --policy.path without them. Returns the folder.
     """
     import torch
     from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata

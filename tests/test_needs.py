@@ -1,4 +1,4 @@
-"""The tests' own way with a busy machine: a test in real time is repeated while it is late, and never skipped."""
+"""How the tests deal with a busy machine: a test in real time is repeated while the machine is late, never skipped."""
 
 import subprocess
 import sys
@@ -38,7 +38,7 @@ def test_it_fails_in_the_end_and_says_why():
 
 
 def test_one_at_a_time(tmp_path, monkeypatch):
-    """Of all workers and suites of this machine; the one here is a process of its own."""
+    """Among all workers and test runs on this machine. Here a separate process stands for another test run."""
     monkeypatch.setattr(needs.tempfile, "gettempdir", lambda: str(tmp_path))
     program = f"""
 import sys, tempfile
@@ -62,7 +62,7 @@ def test_a_heartbeat_knows_that_nobody_had_a_turn():
     with needs.Heartbeat() as heartbeat:
         time.sleep(0.1)
         begin = time.monotonic()
-        sum(range(20_000_000))  # in C: it does not give the interpreter back
+        sum(range(20_000_000))  # runs in C, without letting other threads have the interpreter
         took = time.monotonic() - begin
         time.sleep(0.1)
     assert heartbeat.late_s > 0.5 * took

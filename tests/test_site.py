@@ -1,4 +1,4 @@
-"""The site that `make docs` builds: strictly, so that a dead link ends it, and with nothing from elsewhere."""
+"""The site that `make docs` builds. A dead link ends the build, and no page loads anything from another site."""
 
 import re
 import shutil
@@ -26,7 +26,7 @@ ELSEWHERE = re.compile(r"""<(?:script|img|iframe|link)\b[^>]*\b(?:src|href)=["']
 
 
 def gather(folder: Path) -> None:
-    """A copy of what `make docs` reads."""
+    """Copy what `make docs` reads into a folder."""
     for path in (path for pattern in (*GATHERED, *READMES) for path in ROOT.glob(pattern)):
         target = folder / path.relative_to(ROOT)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -37,7 +37,7 @@ def gather(folder: Path) -> None:
 
 
 def make_docs(folder: Path) -> subprocess.CompletedProcess:
-    """By the packages of this environment, which make is told not to set up again."""
+    """Run `make docs` with the packages of this environment. make is told that the environment is already set up."""
     command = ["make", f"VENV={sys.prefix}", f"--old-file={sys.prefix}/.ready", "docs"]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True)
 

@@ -1,4 +1,4 @@
-"""An emulated Arduino for tests: the firmware as it is flashed, in simavr, with pulses measured on its pins."""
+"""An emulated Arduino for tests: simavr runs the firmware as it is flashed, and pulses are measured on its pins."""
 
 import atexit
 import ctypes
@@ -26,12 +26,12 @@ def _folder() -> Path:
 
 
 def firmware() -> Path:
-    """The compiled sketch, an ELF file."""
+    """Return the compiled sketch, an ELF file."""
     return arduino.build().firmware
 
 
 def compiled(name: str, *arguments: object) -> Path:
-    """What gcc makes of `arguments`, with warnings as errors."""
+    """Compile `arguments` with gcc, unless that was done before, and return the path. Warnings are errors."""
     path = _folder() / name
     if not path.exists():
         arduino.compile_c(*arduino.CC, "-I", REPOSITORY / "firmware/rover", "-o", path, *arguments)
@@ -74,12 +74,12 @@ def _library() -> ctypes.CDLL:
 
 
 def line(body: str) -> bytes:
-    """A line of the protocol, by zlib: independent of both sides' own code."""
+    """Return a line of the protocol. zlib makes its CRC, independently of both sides' own code."""
     return f"{body}*{zlib.crc32(body.encode()):08X}\n".encode()
 
 
 def body_of(text: bytes) -> str | None:
-    """What is in a line, None if its CRC is wrong."""
+    """Return a line without its CRC, or None if the CRC is wrong."""
     body, _, crc = text.decode("ascii", "replace").rpartition("*")
     return body if crc == f"{zlib.crc32(body.encode()):08X}" else None
 
@@ -99,7 +99,10 @@ def status_of(body: str) -> SimpleNamespace:
 
 
 class Uno:
-    """The board, stepped. `events`: all that was measured, in the order of its end; `lines`: all that it sent."""
+    """The board, which runs only when told to.
+
+    events: all measurements, in the order in which they ended. lines: all lines that it sent, without their CRC.
+    """
 
     def __init__(self):
         self._c = _library()
@@ -110,8 +113,8 @@ class Uno:
         self._rest = b""
         self.sequence = 0
         self.boot = None
-        self.car_id = car.this_car().id  # that the host means when it arms
-        self.heard_ms = None  # what the host says that it heard; None: of the newest status
+        self.car_id = car.this_car().id  # the car that the host names when it arms
+        self.heard_ms = None  # the status time that the host says it heard last; None: the newest status's
 
     def close(self) -> None:
         if self._uno:
@@ -123,7 +126,7 @@ class Uno:
         return self._c.uno_now_us(self._uno)
 
     def run_ms(self, ms: float) -> list[SimpleNamespace]:
-        """Lets time pass; the events that it brought."""
+        """Let time pass, and return the new events."""
         state = self._c.uno_run_us(self._uno, ms * 1000)
         assert state == 0, f"the firmware stopped: simavr's state {state}"
         buffer, new = (_Event * 512)(), []
@@ -153,7 +156,7 @@ class Uno:
         self._c.uno_send(self._uno, (ctypes.c_uint16 * len(data))(*(b | flag for b in data)), len(data))
 
     def command(self, kind: str, *values: int, boot: int | None = None, sequence: int | None = None) -> bytes:
-        """Sends the next command: "A", "N", "L" with a throttle, "D" with two pulses, "C". Returns its line."""
+        """Send the next command: "A", "N", "L" with a throttle, "D" with two pulses, "C". Returns its line."""
         text = self.next_line(kind, *values, boot=boot, sequence=sequence)
         if sequence is None:
             self.sequence += 1
@@ -161,7 +164,7 @@ class Uno:
         return text
 
     def next_line(self, kind: str, *values: int, boot: int | None = None, sequence: int | None = None) -> bytes:
-        """What command() would send now."""
+        """Return the line that command() would send now."""
         if kind == "A":
             values = (self.car_id, *values)
         if kind in "AD":
@@ -172,14 +175,14 @@ class Uno:
     def transmitter(
         self, steering_us: float | None = None, throttle_us: float | None = None, **period_us: float
     ) -> None:
-        """The human's sticks, from their next pulse on; 0 is no signal, None leaves a channel as it is."""
+        """Move the human's sticks, from their next pulse on. 0 means no signal, None leaves a channel as it is."""
         for channel, pulse_us in enumerate((steering_us, throttle_us)):
             if pulse_us is not None:
                 period = period_us.get(f"{'throttle' if channel else 'steering'}_period_us", 0)
                 self._c.uno_transmitter(self._uno, channel, pulse_us, period)
 
     def wiggle(self) -> None:
-        """The human moves the steering stick to both sides, and lets go of it until that counts."""
+        """Let the human move the steering stick to both sides and let go of it, and run until that has counted."""
         self._c.uno_wiggle(self._uno)
         self.run_ms(450)
 
@@ -187,16 +190,16 @@ class Uno:
         self._c.uno_reset(self._uno)
 
     def hang(self) -> None:
-        """loop() becomes an endless loop, until the next reset."""
+        """Turn loop() into an endless loop until the next reset."""
         self._c.uno_hang(self._uno, symbol("loop"))
 
     def watch_loop(self) -> None:
-        """From now on the loop's longest turn is measured, until it has nothing to do but sleep."""
+        """From now on, measure the longest turn of loop(), up to where it has nothing left to do but sleep."""
         self._c.uno_watch(self._uno, symbol("loop"), symbol("_Z4restv"))
 
     @property
     def longest_ms(self) -> float:
-        """Of the loop's turns, since watch_loop()."""
+        """The longest turn of loop() since watch_loop()."""
         return self._c.uno_longest_us(self._uno) / 1000
 
     @property
@@ -205,7 +208,7 @@ class Uno:
         return status_of(next(body for body in reversed(self.lines) if body.startswith("<S ")))
 
     def drive(self, steering_us: int, throttle_us: int, ms: float, every_ms: float = 33) -> list[SimpleNamespace]:
-        """Commands at a rate, for a time."""
+        """Send drive commands every `every_ms` for `ms`, and return the events."""
         end, events = self.now_us + ms * 1000, []
         while self.now_us < end:
             self.command("D", steering_us, throttle_us)
@@ -214,7 +217,7 @@ class Uno:
 
 
 def pulses(events: list[SimpleNamespace], pin: str, after_us: float = 0) -> list[SimpleNamespace]:
-    """The whole pulses of "steering" or "throttle" that began after a time."""
+    """Return the whole pulses of "steering" or "throttle" that began at `after_us` or later."""
     return [e for e in events if e.kind == PULSE and e.channel == PIN[pin] and e.at_us >= after_us]
 
 

@@ -1,4 +1,4 @@
-"""Machines that are not there: one that tells nothing, and a Raspberry Pi; and the keys of laptops."""
+"""Fake hosts, one that tells nothing and a Raspberry Pi; and the ssh keys of laptops."""
 
 import stat
 import subprocess
@@ -17,7 +17,7 @@ def bare_host(tmp_path):
 
 @pytest.fixture
 def pi_host(tmp_path):
-    """A Raspberry Pi's files, and a vcgencmd that says it has been throttled."""
+    """A Raspberry Pi's files, and a vcgencmd which says that the Pi has been throttled."""
     zone = tmp_path / "sys/class/thermal/thermal_zone0"
     zone.mkdir(parents=True)
     (zone / "type").write_text("cpu-thermal\n")
@@ -43,7 +43,7 @@ def pi_host(tmp_path):
 
 @pytest.fixture(scope="session")
 def keys(tmp_path_factory) -> Path:
-    """A folder with the ssh keys `ours` and `theirs`, and `signers`, the file of a rover that knows the first."""
+    """A folder with the ssh keys `ours` and `theirs`, and `signers`, the file of a rover that accepts only `ours`."""
     folder = tmp_path_factory.mktemp("keys")
     for name in ("ours", "theirs"):
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", folder / name], check=True)

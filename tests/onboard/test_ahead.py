@@ -1,4 +1,4 @@
-"""Where a plan leads: against the balloon world's physics and camera, whose car the default is."""
+"""Where a plan leads, compared with the physics and camera of the balloon world, whose car is the default."""
 
 import math
 from dataclasses import replace
@@ -19,7 +19,7 @@ ASPECT = w.FRAME_WIDTH / w.FRAME_HEIGHT
 def test_the_track_is_the_worlds(steering):
     world = w.World(1)
     speed = 0.08 * w.SPEED_PER_THROTTLE_MPS
-    world.state = replace(world.state, steering=steering, speed_mps=speed)  # as it has been going for a while
+    world.state = replace(world.state, steering=steering, speed_mps=speed)  # it has driven like this for a while
     for _ in range(30):
         world.step(steering, 0.08)
     x, y, heading = SHAPE.track([(steering, 0.08)] * 30, STEP_S)[-1]
@@ -36,7 +36,7 @@ def test_it_is_drawn_where_the_worlds_camera_sees_the_floor():
         ahead = w.FOCAL_PX * w.CAMERA_HEIGHT_M / (v - w.HORIZON_ROW)
         left = (w.CENTRE_COLUMN - u) * w.CAMERA_HEIGHT_M / (v - w.HORIZON_ROW)
         assert (ahead, left) == pytest.approx((x, y), abs=0.02)
-        assert a < c  # the left wheel's way is left of the right one's
+        assert a < c  # the left wheel's track is left of the right one's
 
 
 def test_a_car_that_stands_leads_nowhere():

@@ -1,4 +1,4 @@
-"""A car that is not the first: its recordings, its artifacts, its reverse, and a drive on another one."""
+"""A car other than the first: its recordings, its artifacts, its reverse, and its policy on a different car."""
 
 import json
 from dataclasses import replace
@@ -63,7 +63,9 @@ def test_a_recording_of_the_first_car_is_as_ever(tmp_path):
 
 
 def test_samples_know_their_car_whatever_this_machine_has(tmp_path):
-    """Without a car.yml here: plans of a car with reverse are clipped to what that car can do, and drawn with it."""
+    """There is no car.yml here. Plans of a car with reverse are still clipped to that car's limits, and drawn with its
+    pulses.
+    """
     episode(tmp_path, CRAWLER)
     recordings = load_recordings(tmp_path)
     assert car_of_samples(recordings.samples) == CRAWLER
@@ -118,10 +120,10 @@ def test_plans_with_reverse():
     chunk = np.tile([0.2, -0.6], (8, 1))
     follower = Follower(Settings(blend_ticks=0, throttle_limit=0.3), 30.0)
     follower.add(Plan(1, 0.0, 0.0, chunk, CRAWLER.limits), 0.0)
-    assert follower.command(0.0).throttle == -0.3  # the limit is either way
+    assert follower.command(0.0).throttle == -0.3  # the limit holds in both directions
     follower = Follower(Settings(blend_ticks=0, throttle_limit=0.3), 30.0)
     follower.add(Plan(1, 0.0, 0.0, chunk + np.array([0, 0.4])), 0.0)
-    assert follower.command(0.0).throttle == 0.0  # the first car has none
+    assert follower.command(0.0).throttle == 0.0  # the first car has no reverse
 
 
 def test_a_replay_with_reverse_is_limited_on_both_sides():

@@ -1,4 +1,4 @@
-"""The artifact alone: what it holds, what it refuses, and that it drives without the workshop."""
+"""The artifact alone: what it holds, what loading it refuses, and that it drives without the workshop."""
 
 import ast
 import io
@@ -56,10 +56,10 @@ def test_drives(artifacts, mode):
     chunk = policy.predict_chunk(FRAME, STATE)
     assert chunk.shape == (policy.chunk, 2) and chunk.dtype == np.float32
     assert (np.abs(chunk[:, 0]) <= 1).all() and (chunk[:, 1] >= 0).all() and (chunk[:, 1] <= 1).all()
-    assert np.array_equal(chunk, policy.predict_chunk(FRAME, STATE))  # no state is kept
-    assert not np.array_equal(chunk, policy.predict_chunk(255 - FRAME, STATE))  # it looks
+    assert np.array_equal(chunk, policy.predict_chunk(FRAME, STATE))  # nothing is kept between two calls
+    assert not np.array_equal(chunk, policy.predict_chunk(255 - FRAME, STATE))  # the picture matters
     big = np.repeat(np.repeat(FRAME, 5, 0), 5, 1)
-    assert np.allclose(policy.predict_chunk(big, STATE), chunk, atol=1e-5)  # any size of camera
+    assert np.allclose(policy.predict_chunk(big, STATE), chunk, atol=1e-5)  # the camera may have any size
 
 
 def test_equals_the_policy_it_was_made_of(tiny, artifacts):
@@ -74,7 +74,7 @@ def test_equals_the_policy_it_was_made_of(tiny, artifacts):
 
 
 def test_a_policy_of_gelu_drives_and_is_packed(tiny, tmp_path):
-    """For an operator that has changed since, as gelu has, torch names a record of its archive otherwise."""
+    """If an operator has changed since it was new, as gelu has, torch names a record of its archive differently."""
     from rover_lib.workshop.act import ACT, inputs_of
     from rover_lib.workshop.export import export
 
@@ -126,9 +126,9 @@ def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(arti
     total = sum(w.untyped_storage().nbytes() for w in weights)
     assert all(w.int_repr().any() for w in weights)
     given = memory.give_back_packed_weights(module)
-    assert 0.9 * total < given <= total  # all but the ends that are no whole page
+    assert 0.9 * total < given <= total  # all but the two ends, which are no whole pages
     largest = max(weights, key=torch.Tensor.numel)
-    assert largest.numel() > 1e6 and largest.int_repr().count_nonzero() <= 2 * mmap.PAGESIZE  # the ends
+    assert largest.numel() > 1e6 and largest.int_repr().count_nonzero() <= 2 * mmap.PAGESIZE  # only the ends are left
     assert np.array_equal(policy.predict_chunk(frame, state), before)
 
 
@@ -196,7 +196,7 @@ def test_refuses_damaged_files(artifacts, tmp_path):
     for content in (b"", b"text", whole[: len(whole) // 2]):
         path.write_bytes(content)
         refused(path)
-    for at in range(0, len(whole), len(whole) // 25):  # a flipped byte anywhere, in weights too
+    for at in range(0, len(whole), len(whole) // 25):  # flip a bit anywhere, in weights too
         flipped = bytearray(whole)
         flipped[at] ^= 0x10
         path.write_bytes(flipped)
@@ -204,7 +204,7 @@ def test_refuses_damaged_files(artifacts, tmp_path):
             same = np.array_equal(load_policy(path).predict_chunk(FRAME, STATE), reference(artifacts))
         except ArtifactError:
             continue
-        assert same  # only bytes that mean nothing (padding between records) may pass
+        assert same  # a flip may pass only in bytes without a meaning, such as padding between records
 
 
 def reference(artifacts):
@@ -226,7 +226,7 @@ def test_refuses_files_without_manifest_or_vectors(artifacts, tmp_path):
     pickled = io.BytesIO()
     np.savez(pickled, state=np.array([{}], object), chunk=np.zeros(1))
     evil = rewritten(artifacts["fp32"], tmp_path / "d.pt", {"parity.npz": lambda raw: pickled.getvalue()})
-    assert "parity vectors" in refused(evil)  # no pickled objects, ever
+    assert "parity vectors" in refused(evil)  # pickled objects are never loaded
 
 
 def test_nothing_is_left_when_writing_fails(artifacts, tmp_path, monkeypatch):
@@ -248,7 +248,7 @@ def test_nothing_is_left_when_writing_fails(artifacts, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_drives_in_a_clean_environment(artifacts, tmp_path):
-    """torch, numpy and opencv only, as on the Pi: no lerobot, no torchvision, no workshop."""
+    """It has only torch, numpy and opencv: no lerobot, no torchvision, no workshop."""
     versions = {n: __import__(m).__version__ for n, m in {"torch": "torch", "numpy": "numpy"}.items()}
     from importlib.metadata import version
 
@@ -280,7 +280,7 @@ print("drove")
 
 
 def test_a_parser_that_fails_by_itself_is_asked_again(artifacts, monkeypatch):
-    """Python 3.11's does, at times, where several threads parse; seen when policies were loaded beside each other."""
+    """Python 3.11's sometimes does when several threads parse; seen when policies were loaded at the same time."""
     parse, failures = ast.parse, iter(["depth mismatch", "depth mismatch"])
 
     def failing(*args):
@@ -288,7 +288,7 @@ def test_a_parser_that_fails_by_itself_is_asked_again(artifacts, monkeypatch):
             raise SystemError(text)
         return parse(*args)
 
-    with monkeypatch.context() as patched:  # pytest parses too
+    with monkeypatch.context() as patched:  # only here, because pytest parses too
         patched.setattr(ast, "parse", failing)
         artifact.check_artifact(artifacts["static"])
 

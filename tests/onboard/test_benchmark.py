@@ -1,4 +1,4 @@
-"""The benchmark: on fake clocks and hosts to the digit, and once on the real ones."""
+"""The benchmark: exact with fake clocks and hosts, and once with real ones."""
 
 import json
 import math
@@ -33,7 +33,7 @@ GATES = {
 
 
 class Machine:
-    """Time that only passes when somebody computes or sleeps, and a host that warms up with it."""
+    """Clocks that advance only when a policy computes or the benchmark sleeps."""
 
     def __init__(self):
         self.now_s = self.cpu_s = 0.0
@@ -190,7 +190,7 @@ def test_what_a_host_cannot_tell_is_none(machine, bare_host):
     metrics = machine.benchmark({"a": machine.policy("a", [10])}, bare_host, iterations=2)
     for key in ("temperature_c", "clock_mhz", "throttled", "throttled_means", "cpu_per_core_pct", "floor_ms"):
         assert metrics[key] is None, key
-    assert metrics["peak_memory_mb"] > 10  # of the process, from the system's accounts
+    assert metrics["peak_memory_mb"] > 10  # this process's, as the operating system counts it
     assert metrics["artifacts"]["a"]["peak_memory_mb"] is None
 
 
@@ -201,7 +201,7 @@ def test_what_a_pi_tells(machine, pi_host):
     assert metrics["throttled"] == "0x50000"
     assert metrics["throttled_means"] == ["under-voltage since the start", "throttled since the start"]
     assert metrics["peak_memory_mb"] == pytest.approx(409.6)
-    assert metrics["cpu_per_core_pct"] == [0, 0]  # its ticks stand still
+    assert metrics["cpu_per_core_pct"] == [0, 0]  # its tick counts stand still
 
 
 def test_soak_has_a_time_series(machine, pi_host):
@@ -210,7 +210,7 @@ def test_soak_has_a_time_series(machine, pi_host):
     assert metrics["rounds"] == 25
     assert metrics["wall_s"] == pytest.approx(10)
     series = metrics["series"]
-    assert len(series) == 9  # every second, in whole rounds of 0.4 s, and the rest
+    assert len(series) == 9  # one about every second, after whole rounds of 0.4 s, and one for the rest
     times_s = [p["t_s"] for p in series]
     assert times_s == sorted(times_s)
     assert times_s[-1] == pytest.approx(10)
@@ -249,7 +249,7 @@ def test_missed_deadlines_are_counted_and_not_made_up_for(machine, bare_host):
     metrics = machine.benchmark(policy, bare_host, warmup=0, iterations=5, rate_hz=10)
     assert metrics["missed_deadlines"] == 2
     assert machine.log == [("a", k % 3) for k in range(5)]
-    assert metrics["wall_s"] == pytest.approx(0.61)  # 0, 0.1, 0.2 to 0.55, at once, 0.6
+    assert metrics["wall_s"] == pytest.approx(0.61)  # calls start at 0, 0.1, 0.2 (until 0.55), 0.55 at once, and 0.6 s
 
 
 def test_progress_is_called_like_tqdm(machine, bare_host):

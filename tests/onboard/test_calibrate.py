@@ -1,4 +1,6 @@
-"""`rover calibrate`: a human's sticks, through the firmware's own state machine, become a car.yml, or a sentence."""
+"""`rover calibrate`: what a human does with the sticks, seen through the firmware's own state machine, becomes a
+car.yml, or a sentence that says why not.
+"""
 
 from functools import partial
 
@@ -21,7 +23,7 @@ OURS = {"rest": (1456, 120), "left": 1948, "right": 1008, "forward": 640, "back"
 
 
 class Desk:
-    """A transmitter on a desk, whose human does what he is asked, and the Arduino that it talks to."""
+    """A transmitter on a desk, a human who does what he is asked, and the Arduino that receives it."""
 
     def __init__(self, sticks, periods_us=(20000, 20000)):
         self.board, self.sticks, self.asked = NativeArduino(), dict(sticks), []
@@ -63,7 +65,7 @@ def test_a_crawler():
 
 
 def test_an_inverted_transmitter():
-    """Left is what the human called left, whichever pulse that is."""
+    """Left is where the human's stick was when asked for left, whichever pulse that gives."""
     car = Desk(CRAWLER | {"left": 1012, "right": 1996, "forward": 1004, "back": 1990}).measure()
     assert car.pwm.pulses(1, 1).steering_us == 1012
     assert car.pwm.pulses(1, 1).throttle_us == 1004
@@ -122,11 +124,11 @@ def test_a_stick_that_moves_is_not_measured():
 
 @pytest.fixture
 def run(monkeypatch, tmp_path):
-    """Runs `rover calibrate` on a desk; gives its result and the file."""
+    """run(desk, *options) runs `rover calibrate` and returns its result and the path of car.yml."""
     path = tmp_path / "etc" / "car.yml"
     monkeypatch.setattr(car_module, "PLACES", (tmp_path / "checkout" / "car.yml", path))
     monkeypatch.delenv(car_module.FILE_VARIABLE, raising=False)
-    # The board's time goes on as its status is read.
+    # The board's time advances whenever its status is read, so measure() need not sleep.
     monkeypatch.setattr(module, "measure", partial(measure, sleep=lambda seconds: None))
 
     def run(desk, *options):
@@ -153,7 +155,7 @@ def test_the_command_writes_what_it_measured(run):
     assert result.exit_code == 0, result.output
     car = read_car(path)
     assert (car.name, car.field_of_view_deg, car.wheelbase_m, car.cap_us) == ("crawler", 100, 0.3, 99)
-    assert desk.board.hello.car == car.id  # and not one of those that were tried
+    assert desk.board.hello.car == car.id  # and not one of the cars that were tried before
 
 
 def test_it_replaces_nothing_without_force(run):

@@ -1,4 +1,4 @@
-"""The newest frame: of folders, videos, streams through a FIFO, and of what stops or changes."""
+"""The newest frame: from folders, films and streams through a FIFO, also when these stop or change."""
 
 import os
 import threading
@@ -27,7 +27,7 @@ def fifo(tmp_path):
 
 
 class Writer:
-    """The other end of a FIFO, opened as soon as somebody reads."""
+    """The other end of a FIFO. The first write opens it, and waits until somebody reads."""
 
     def __init__(self, path):
         self._path, self.fd = path, None
@@ -143,7 +143,7 @@ def test_a_folder_and_its_end(tmp_path):
 
 
 def test_a_film_begins_when_it_is_told_to():
-    """Until then its pictures come again and again, so that arming may take its time; then once, from the first on."""
+    """Until then its pictures repeat, so that arming may take its time; then each comes once, from the first on."""
     begun, pictures = threading.Event(), [b"a", b"b", b"c"]
     reader = c._paced(lambda: iter(pictures), 1000, threading.Event(), begun)
     assert [next(reader)[0] for _ in range(7)] == [b"a", b"b", b"c", b"a", b"b", b"c", b"a"]
@@ -165,7 +165,7 @@ def test_a_film_that_begins_again_is_no_frozen_camera():
         return shown
 
     assert repeats() == [0] * 6
-    assert repeats() == [1, 2, 3, 4, 5, 6]  # nobody drives by it yet
+    assert repeats() == [1, 2, 3, 4, 5, 6]  # these do no harm: nobody drives with it yet
     camera.begin()
     assert repeats() == [0] * 6
     assert repeats() == [1, 2, 3, 4, 5, 6]
@@ -199,11 +199,11 @@ def test_a_reader_that_breaks(fifo, monkeypatch):
         camera.wait(1, 1.0)
 
 
-# ---- what is no frame, in a time of its own
+# ---- what is no frame, on a virtual clock
 
 
 class Clock:
-    """Monotonic and wall clock of a machine, in one."""
+    """A machine's monotonic clock and its wall clock."""
 
     def __init__(self):
         self.now_s, self.wall_ahead_s = 5000.0, 1.7e9
@@ -216,14 +216,14 @@ class Clock:
 
 
 class Readings:
-    """A camera that is read without a thread: what it gives, and what becomes of it."""
+    """A camera that is read without a thread: the frames that it gives, and the error that ends it."""
 
     def __init__(self):
         self.clock = Clock()
         self.camera = Camera("camera", clock=self.clock, wall_clock=self.clock.wall)
 
     def read(self, pictures, stamp=lambda now_s, i: None):
-        """(number, repeats, age in s) of the newest frame after each picture, at 30 Hz, until reading fails."""
+        """Read at 30 Hz until it fails. Returns (number, repeats, age in s) of the newest frame after each picture."""
         newest = []
 
         def reader():
@@ -249,7 +249,7 @@ def readings():
 
 
 def live(count, seed=0):
-    """Pictures of a still scene with a sensor's noise."""
+    """Return pictures of a still scene with a sensor's noise."""
     rng = np.random.default_rng(seed)
     scene = hostile.scene(size=(160, 90))
     return [hostile.jpeg(cv2.add(scene, rng.integers(0, 3, scene.shape, np.uint8))) for _ in range(count)]
@@ -282,7 +282,7 @@ def test_damaged_pictures_are_left_out_and_four_in_a_row_are_a_fault(readings):
     good = live(20)
     damaged = [hostile.cut(picture) for picture in good]
     newest = readings.read([*good[:5], *damaged[5:8], *good[8:12], *damaged[12:]])
-    assert len(newest) == 15  # the fourth ends it, 0.13 s after the first
+    assert len(newest) == 15  # the fourth of them ends it, 0.13 s after the last good one
     assert newest[7][0] == 5 and newest[11][0] == 9
     assert "4 pictures in a row were no frames: a JPEG is damaged or cut short" in readings.ended
 
@@ -315,7 +315,7 @@ CLOCKS = {
 def test_the_clock_of_a_cameras_time_stamps_is_found(readings, kind):
     newest = readings.read(live(10), CLOCKS[kind])
     assert readings.camera.time_stamps == kind
-    assert [number for number, _, _ in newest] == [1, 2, 3, 4, 5, 6]  # five decide
+    assert [number for number, _, _ in newest] == [1, 2, 3, 4, 5, 6]  # the first five only decide the clock
     assert all(age_s == pytest.approx(0.0 if kind == "no" else LATE_S, abs=1e-5) for _, _, age_s in newest)
 
 
@@ -347,7 +347,7 @@ def test_one_late_frame_among_the_first_does_not_decide(readings):
 def test_the_wall_clock_may_be_set(readings):
     def stamp(now_s, i):
         if i == 12:
-            readings.clock.wall_ahead_s += 3600  # while this frame is on its way
+            readings.clock.wall_ahead_s += 3600  # the clock is set while this frame is on its way
             return now_s - 3600 + readings.clock.wall_ahead_s - 3600
         return readings.clock.wall() - 0.02
 
@@ -365,7 +365,7 @@ def test_a_camera_whose_pictures_are_none_says_why(fifo, writer, monkeypatch):
 
 
 class Device:
-    """OpenCV's V4L2 device, as far as it is used here."""
+    """The part of OpenCV's V4L2 device that is used here."""
 
     def __init__(self, fourcc, picture):
         self.fourcc, self.picture, self.converts = fourcc, picture, True
@@ -393,7 +393,7 @@ class Device:
 
 @pytest.mark.parametrize("fourcc", ["MJPG", "YUYV"])
 def test_jpegs_of_a_device_are_decoded_here_and_others_by_opencv(monkeypatch, fourcc):
-    """OpenCV gives a device's JPEG as (1, bytes) uint8 if it is told not to convert it."""
+    """OpenCV gives a device's JPEG as (1, bytes) uint8 if told not to convert it."""
     device = Device(cv2.VideoWriter.fourcc(*fourcc), np.frombuffer(hostile.WHOLE, np.uint8)[None])
     monkeypatch.setattr(cv2, "VideoCapture", device)
     picture, stamp_s = next(c._v4l2("/dev/video0", (640, 360), 30))

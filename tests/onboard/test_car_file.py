@@ -1,4 +1,4 @@
-"""car.yml: the car that it describes, and what it may not be."""
+"""car.yml: the car that it describes, and the contents that are refused."""
 
 import copy
 
@@ -23,7 +23,7 @@ CRAWLER = {
 
 
 def changed(where, value):
-    """CRAWLER with another value, None: without it."""
+    """Return CRAWLER with one value changed, or without it if `value` is None."""
     content = copy.deepcopy(CRAWLER)
     *sections, key = where.split(".")
     section = content
@@ -94,7 +94,7 @@ def test_an_action_comes_back_from_its_pulse(steering, throttle, inverted):
         content["steering"] |= {"left_us": 1100, "right_us": 2000}
     pwm = Car.of(content).pwm
     pulses = pwm.pulses(steering, throttle)
-    # A receiver's frame may be a little longer or shorter; a servo knows the pulse alone.
+    # A receiver's period may be a little longer or shorter; only the pulse counts for a servo.
     actions = pwm.actions_from_pulses(pulses.steering_us, pulses.throttle_us, 19000, 22000)
     assert actions.steering == pytest.approx(steering, abs=0.6 / 400)
     assert actions.throttle == pytest.approx(throttle, abs=0.6 / 500)

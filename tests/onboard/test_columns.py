@@ -1,4 +1,4 @@
-"""Tables of text: columns under each other, a dash where nothing was measured, ratios to the first."""
+"""Tables of text: aligned columns, a dash where nothing was measured, ratios to the first row."""
 
 from rover_lib.onboard.columns import aligned, benchmark_rows, number, ratio
 

@@ -1,4 +1,4 @@
-"""What a confined process can still do, on this machine's kernel, and by the filter of each processor."""
+"""What a confined process can still do: on this machine's kernel, and according to each processor's filter."""
 
 import json
 import os
@@ -105,7 +105,7 @@ def test_a_confined_process_computes_and_does_nothing_else(tmp_path):
 
 
 def judged(processor: str, call: tuple[int | None, ...] | int, *arguments: int, architecture: int | None = None) -> int:
-    """What the filter says of a system call: a machine for the four instructions that it has."""
+    """Return the filter's answer to a system call, by interpreting the four kinds of instructions that it has."""
     column, own = confine.PROCESSORS[processor]
     number = call if isinstance(call, int) else call[column]
     given = (*arguments, *([0] * (6 - len(arguments))))
@@ -130,11 +130,11 @@ def test_the_filter_of_each_processor(processor):
         if call[column] is not None:
             assert judged(processor, call) == ALLOWED
             assert judged(processor, call, architecture=0x40000003) == REFUSED  # another processor's numbers
-            assert judged(processor, call[column] | 1 << 30) == REFUSED  # x86-64's other numbering
+            assert judged(processor, call[column] | 1 << 30) == REFUSED  # x32, the other numbering on x86-64
     assert judged(processor, confine.OPENAT, 0, 0, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW) == ALLOWED
     for flags in (os.O_WRONLY, os.O_RDWR, os.O_CREAT, os.O_TRUNC, os.O_RDWR | os.O_NOCTTY, 0o20200001):
         assert judged(processor, confine.OPENAT, 0, 0, flags) == REFUSED
-    assert judged(processor, confine.CLONE, 0x3D0F00) == ALLOWED  # pthread_create's
+    assert judged(processor, confine.CLONE, 0x3D0F00) == ALLOWED  # the flags of pthread_create
     assert judged(processor, confine.CLONE, 17) == judged(processor, confine.CLONE, 0x4111) == REFUSED  # fork, vfork
     assert judged(processor, confine.CLONE3) == UNKNOWN
     assert judged(processor, confine.PRLIMIT, 0) == ALLOWED and judged(processor, confine.PRLIMIT, 1) == REFUSED

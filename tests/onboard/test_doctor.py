@@ -1,4 +1,4 @@
-"""The doctor on machines that are made up: a healthy rover, and one with each thing wrong."""
+"""The doctor on invented machines: a healthy rover, and rovers with one thing wrong each."""
 
 import errno
 import json
@@ -40,7 +40,7 @@ def verdicts(checks):
 
 @pytest.fixture
 def proc(tmp_path):
-    """A process table of its own: nobody runs."""
+    """An empty process table."""
     folder = tmp_path / "no processes"
     folder.mkdir()
     return folder
@@ -62,7 +62,7 @@ def test_access_by_the_devices_own_group(tmp_path, monkeypatch):
     assert check.verdict == "fail"
     assert check.found.endswith("which belongs to group plugdev")
     assert check.remedy == "sudo usermod -aG plugdev somebody, then log in again"
-    # added since the login: /etc/group has it, this process not
+    # The user was added after the login: /etc/group has him, but this process is not in the group.
     monkeypatch.setattr(doctor.grp, "getgrnam", lambda name: group(name, [user]))
     monkeypatch.setattr(doctor, "_groups", lambda: {"users"})
     check = only(doctor.access("group video", device, "video"))
@@ -82,7 +82,7 @@ def test_access_to_a_device_that_is_not_there(tmp_path, monkeypatch):
 
 
 class Kernel:
-    """V4L2's answers for nodes by path; a node without one refuses."""
+    """V4L2's answers for each node. A node whose answer is None refuses."""
 
     def __init__(self, nodes):
         self.nodes = nodes
@@ -148,7 +148,7 @@ def test_sizes_in_steps(tmp_path):
         if request == doctor.VIDIOC_QUERYCAP:
             data[:] = struct.pack("<16s32s32sIII12x", b"rp1-cfe", b"rp1", b"", 0, 0x1000, 0)
         elif request == doctor.VIDIOC_ENUM_FMT:
-            assert struct.unpack_from("<I", data, 4)[0] == 9  # several planes
+            assert struct.unpack_from("<I", data, 4)[0] == 9  # V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE
             data[44:48] = b"pGAA"
         else:
             struct.pack_into("<I6I", data, 8, 3, 16, 16384, 1, 16, 8192, 1)
@@ -166,7 +166,7 @@ def test_no_camera(tmp_path):
 
 
 class FakeCamera:
-    """Frames that come at a rate, on a clock of their own."""
+    """A camera whose frames come at a rate, on a clock of its own."""
 
     time_stamps = "monotonic"
 
@@ -240,7 +240,7 @@ def test_frames_are_measured_through_the_cameras_own_reader(tmp_path, proc, quic
     for k in range(40):
         cv2.imwrite(str(tmp_path / f"{k:03d}.jpg"), np.full((90, 160, 3), 100 + k, np.uint8))
     check = only(doctor.camera_rate(tmp_path, rate_hz=50, proc_root=proc))
-    assert check.verdict in ("ok", "warning")  # a busy machine paces late, and then makes up for it
+    assert check.verdict in ("ok", "warning")  # a busy machine is late with frames, and then catches up
     assert re.search(r"160x90, no time stamps, \d+\.\d frames a second", check.found)
 
 
@@ -266,7 +266,7 @@ class holding:
 
 
 def talking(receiver):
-    """A board that says its status, with the receiver's pulses, at each question."""
+    """Return a function with which a board answers each question by a status with the receiver's pulses."""
 
     def answer(board, body):
         board.say(f"<S 7 99 {board.sequence} k M r w 1456 120 238 {receiver} 0 0 0 0")
@@ -309,7 +309,7 @@ RESTING = "1456 21316 120 1016"
     ],
 )
 def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_transmitter, verdicts, found):
-    """What its receiver sends without the transmitter decides whether a car without a driver stands."""
+    """What the receiver sends when the transmitter is off decides whether the car then stands still."""
     monkeypatch.setattr(doctor, "SIGNAL_S", 0.2)
     monkeypatch.setattr(doctor, "RITUAL_S", 0.2)
     now, asked, done = {"missing": "w", "receiver": RESTING}, [], threading.Event()
@@ -320,7 +320,7 @@ def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_trans
             now["missing"] = wiggled
         if "transmitter off" in text:
             now.update(missing="s", receiver=without_transmitter)
-        time.sleep(0.05)  # a status or two
+        time.sleep(0.05)  # time for a few statuses
 
     with board_of() as board:
 
@@ -375,7 +375,7 @@ def test_a_port_that_somebody_else_has_is_left_alone(tmp_path):
 
 def test_modem_manager(proc):
     assert only(doctor.modem_manager(proc)).verdict == "ok"
-    (proc / "7").mkdir()  # ended meanwhile
+    (proc / "7").mkdir()  # a process that has just ended
     for number, name in (("8", "sh"), ("9", "ModemManager")):
         (proc / number).mkdir()
         (proc / number / "comm").write_text(f"{name}\n")
@@ -528,7 +528,7 @@ def test_a_desktop_cannot_drive(tmp_path):
     lines = result.stdout.splitlines()
     assert all(re.match(r"(ok {7}|warning {2}|fail {5}|        )\S* *", line) for line in lines)
     starts = {re.match(r"\w+ +(group \w+|\S+) +", line).end() for line in lines if not line.startswith(" ")}
-    assert starts == {9 + doctor.NAME_WIDTH + 1}  # what was found stands in one column
+    assert starts == {9 + doctor.NAME_WIDTH + 1}  # the texts of `found` are aligned in one column
     found = json.loads(rover("doctor", "--json", "--camera", tmp_path / "video0", "--port", tmp_path / "none").stdout)
     assert found["drives"] is False
     assert {"name", "verdict", "found", "remedy"} == set(found["checks"][0])

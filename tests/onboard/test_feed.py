@@ -1,4 +1,4 @@
-"""What a drive gives a view, and that no view can move a tick: the loop in a clock of its own, over a real socket."""
+"""What a drive sends to a view, and that no view can delay a tick. The loop has a virtual clock, the socket is real."""
 
 import contextlib
 import json
@@ -24,7 +24,7 @@ TICKS = 90
 
 
 class Clock:
-    """Time that passes only while somebody sleeps."""
+    """A clock that advances only while somebody sleeps."""
 
     def __init__(self):
         self.now = 1000.0
@@ -79,7 +79,7 @@ class Pilot:
 
 
 class Eyes:
-    """frame: what it sees; an exception is raised."""
+    """A camera. frame: its newest frame, or an exception to raise."""
 
     def __init__(self, frame=None):
         self.frame = frame or Frame(np.zeros((36, 64, 3), np.uint8), 999.95, 5, 0, 100.0, 40.0, JPEG)
@@ -91,7 +91,7 @@ class Eyes:
 
 
 class Listener:
-    """A view's socket. hello(): the drive's end of it, once it has come."""
+    """A view's socket. hello(): the connection to the drive, None until the drive has connected."""
 
     def __init__(self, place):
         self.place = place
@@ -114,7 +114,7 @@ class Listener:
 
     def messages(self):
         found = []
-        for _ in range(2):  # a socket that was closed with something unread in it says so first
+        for _ in range(2):  # if the other end closed with something unread, the first read fails
             with contextlib.suppress(BlockingIOError, ConnectionResetError):
                 found += self.read()
         return found
@@ -134,7 +134,7 @@ class Listener:
 
 
 class Bench:
-    """A drive with a feed; `each` is called whenever the loop sleeps."""
+    """A drive with a feed. each: called whenever the loop sleeps."""
 
     def __init__(self, folder, each=lambda: None, eyes=None):
         self.clock, self.report, self.place = Clock(), Report(), folder / "view"
@@ -160,7 +160,7 @@ class Bench:
 
 @pytest.fixture
 def alone(tmp_path):
-    """What the link hears of a drive that nobody watches, and when."""
+    """What the link hears, and when, in a drive that nobody watches."""
     folder = tmp_path / "alone"
     folder.mkdir()
     return Bench(folder).drive()
@@ -180,7 +180,7 @@ def test_a_message_is_the_flight_logs_tick_with_its_plan_and_picture(tmp_path, l
     seen += listener.messages()
     logged = read_log(bench.path).ticks
     driving = [m for m, _ in seen if m["phase"] == f.DRIVING]
-    assert len(driving) == TICKS // 3  # ten a second, of thirty
+    assert len(driving) == TICKS // 3  # ten messages a second at thirty ticks a second
     for message in driving:
         row = int(np.argmin(np.abs(logged["t_s"] - message["tick"]["t_s"])))
         assert logged["t_s"][row] == pytest.approx(message["tick"]["t_s"], abs=1e-3)
@@ -211,7 +211,7 @@ def test_a_stop_ends_the_drive_before_its_next_command_and_is_logged(tmp_path, l
     assert bench.report.ended == "stopped from the view (192.168.1.7)"
     assert "ended: stopped from the view (192.168.1.7)" in [e.text for e in read_log(bench.path).events]
     last = (seen + listener.messages())[-1][0]
-    assert (last["phase"], last["pins"]) == (f.ENDED, [1456, 120])  # which is how the page knows that it stands
+    assert (last["phase"], last["pins"]) == (f.ENDED, [1456, 120])  # from this the page knows that the car stands
 
 
 NOT_A_STOP = [b"stop", b"arm", b"STOP 1.2.3.4", b"stop 1.2.3.4 arm", b"stop 1.2.3.4\n", b"steer 1", b"\0" * 64]
@@ -231,11 +231,11 @@ def test_nothing_else_does_anything(tmp_path, listener, alone, message):
 def test_a_view_that_reads_nothing_costs_nothing(tmp_path, listener, alone):
     bench = Bench(tmp_path, listener.hello, Eyes(replace(Eyes().frame, jpeg=bytes(60_000))))
     assert bench.drive() == alone
-    assert bench.feed.dropped >= 29 and len(listener.messages()) == 1  # none waits behind another
+    assert bench.feed.dropped >= 29 and len(listener.messages()) == 1  # no message waits behind another
 
 
 def test_a_view_that_never_accepts_costs_nothing(tmp_path, listener, alone):
-    """As one that is stopped by SIGSTOP; three more wait before it, and the backlog is full."""
+    """A view that SIGSTOP has stopped is like this. Three others have connected earlier, and fill the backlog."""
     others = [socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK) for _ in range(3)]
     for other in others:
         other.connect_ex(str(listener.place))

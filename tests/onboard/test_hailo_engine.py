@@ -22,7 +22,7 @@ from rover_lib.workshop.hailo import compile as hailo_compile
 
 @pytest.fixture(scope="module")
 def packed(hailo_kit, tmp_path_factory):
-    """Both networks, compiled and packed."""
+    """The artifacts of both networks, compiled and packed."""
     kit = shutil.copytree(hailo_kit, tmp_path_factory.mktemp("packed") / "kit")
     with pytest.MonkeyPatch.context() as monkeypatch:
         hailo_standin.install(monkeypatch)
@@ -39,7 +39,7 @@ def hailort(monkeypatch):
 
 
 def repacked(path, folder, **records: bytes):
-    """The artifact with other records."""
+    """Return a copy of the artifact with some records replaced."""
     changed = folder / path.name
     with zipfile.ZipFile(path) as old, zipfile.ZipFile(changed, "w") as new:
         for name in old.namelist():
@@ -56,7 +56,7 @@ def test_is_the_policy(packed, tiny, network):
         state, frame = inputs_of(sample, act.config)
         expected = predictions(model, [(state, frame)])[0].numpy()
         assert expected.std() > 1e-3
-        for _ in range(2):  # the buffers are the same in each inference
+        for _ in range(2):  # twice, because each inference uses the same buffers
             assert np.abs(policy.run(state[0].numpy(), [frame.numpy()]) - expected).max() < 1e-5
     policy.set_threads(2)
     assert policy.threads == 2
@@ -64,7 +64,7 @@ def test_is_the_policy(packed, tiny, network):
 
 
 def test_a_wrong_hef_is_refused_by_its_parity(packed, tmp_path):
-    """As of a network that was right in the emulator: here, one that takes all colours for black."""
+    """Its network may have been right in the emulator. This one takes all colours for black."""
     with zipfile.ZipFile(packed["backbone"]) as z:
         hef = z.read("archive/network.hef")
     assert hef.count(b"[123.675, 116.28, 103.53]") == 1

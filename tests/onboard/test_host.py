@@ -1,4 +1,4 @@
-"""What a machine tells about itself: of one that tells nothing, and of a Raspberry Pi."""
+"""What a machine tells about itself: one that tells nothing, and a Raspberry Pi."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from rover_lib.onboard.host import Host, throttled_means
 def test_what_a_host_cannot_tell_is_none(bare_host):
     assert bare_host.reading() == {"temperature_c": None, "clock_mhz": None, "throttled": None}
     assert bare_host.core_ticks() is None
-    assert bare_host.process_peak_memory_mb() > 10  # from the system's accounts
+    assert bare_host.process_peak_memory_mb() > 10  # as the operating system counts it
 
 
 def test_what_a_pi_tells(pi_host):
@@ -24,7 +24,7 @@ def test_broken_readings_are_none(pi_host):
     assert pi_host.throttled() is None
     Path(pi_host.vcgencmd).write_text("#!/bin/sh\necho throttled=0x\n")
     assert pi_host.throttled() is None
-    assert Host(vcgencmd=str(pi_host.proc_root)).throttled() is None  # no program
+    assert Host(vcgencmd=str(pi_host.proc_root)).throttled() is None  # a folder is no program
 
 
 def test_throttled_means():

@@ -1,7 +1,7 @@
-"""Artifacts that somebody made to harm: none runs, none is staged, none costs much.
+"""Artifacts that somebody made to do harm: none is used, nothing harmful in them runs, and none costs much.
 
-Each is staged on a rover in a process of its own, with a limit of memory and of time; what comes through is proven
-there as rover-check@ does it, confined.
+Each is staged as on a rover, in a process of its own, whose memory and time are judged. If staging accepts it, its
+parity vectors are run there, confined, as rover-check@ does it.
 """
 
 import contextlib
@@ -33,16 +33,16 @@ from rover_lib.onboard.host import Host
 from rover_lib.onboard.release import Expected, ReleaseError, Releases, check_signature, pack, sign
 from rover_lib.onboard.torch_engine import load as _load  # noqa: F401, torch is imported before limits, as by verify
 
-pytestmark = pytest.mark.slow  # each has a process of its own, and there are 140
+pytestmark = pytest.mark.slow  # there are 140, each with a process of its own
 
 MOST_MB, MOST_S = 300.0, 5.0
 EITHER = Expected(modes=("fp32", "static"))
-HARM = "harm"  # what a hostile program writes, in the working folder
+HARM = "harm"  # the file that a hostile program would write into the working folder
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a rover made of an artifact: whether it was staged, what was said, and what that cost."""
+    """What a rover did with an artifact: whether it was staged, the error's sentence, and the cost."""
 
     staged: bool
     sentence: str
@@ -51,15 +51,15 @@ class Outcome:
 
 
 def own_s() -> float:
-    """A clock that stands still while this process waits for a processor that other programs have."""
+    """Read a clock that stands still while this process waits for a processor that other programs use."""
     stat = Path("/proc/self/schedstat")  # not every kernel has it
     waited_ns = int(stat.read_text().split()[1]) if stat.exists() else 0
     return time.monotonic() - waited_ns / 1e9
 
 
 def judge(path: Path, folder: Path, proof: bool) -> tuple[bool, str, float, float]:
-    """In a process of its own: an Outcome's values."""
-    signal.alarm(30)  # of one that waits
+    """Stage an artifact, and run it if `proof`; return the values of an Outcome. Needs a process of its own."""
+    signal.alarm(30)  # ends a process that waits for ever, which takes no CPU time
     resource.setrlimit(resource.RLIMIT_CPU, (20, 20))
     before_mb, start, staged, sentence = Host().process_peak_memory_mb(), own_s(), False, ""
     try:
@@ -77,17 +77,17 @@ def judge(path: Path, folder: Path, proof: bool) -> tuple[bool, str, float, floa
 
 
 def judged(path: Path, folder: Path, proof: bool = False) -> Outcome:
-    """path: of an artifact, or of a folder of parts. proof: run it, too, if it is staged.
+    """Judge an artifact in another process. path: an artifact or a folder of parts. proof: if it is staged, run it too.
 
-    What is run is so by a new interpreter, as on a rover: a process that was forked off one with many tests behind it
-    may take what those have freed, beyond its limit. A fork is quicker for the others; but it may wait for ever for a
-    lock that a thread of this process held just then, so that only a new interpreter has the last word.
+    A new interpreter runs it, as on a rover: a process forked from this one could use memory that earlier tests have
+    freed, beyond its limit. If nothing is run, a fork does, and is quicker. But it may wait for ever for a lock that
+    another thread of this process held at that moment; so if a fork gives no answer, a new interpreter tries again.
     """
     if not proof:
         reading, writing = os.pipe()
         pid = os.fork()
         if pid == 0:
-            gc.disable()  # what other tests left: a session of ONNX Runtime waits for its threads, which a fork lacks
+            gc.disable()  # freeing another test's ONNX Runtime session waits for its threads, which a fork lacks
             with contextlib.suppress(BaseException):
                 os.close(reading)
                 os.write(writing, json.dumps(judge(path, folder, proof)).encode())
@@ -108,7 +108,10 @@ def judged(path: Path, folder: Path, proof: bool = False) -> Outcome:
 
 
 def refused(path: Path, folder: Path, message: str, *, staged: bool = False) -> None:
-    """It is refused with a sentence that has this in it, cheaply, and nothing of it was run."""
+    """Assert that it is refused cheaply, with a sentence that contains `message`, and that nothing harmful was run.
+
+    staged: whether it is only refused when it is run, after staging has accepted it.
+    """
     with contextlib.chdir(folder):
         outcome = judged(path, folder, proof=staged)
     assert message in outcome.sentence and "\n" not in outcome.sentence, outcome
@@ -123,7 +126,7 @@ def hostile(artifacts, folder: Path, change: dict[str, Edit], add: dict[str, byt
 
 # Operators, and a program of another form
 
-LINES = {  # put before the end of a program, whose answer is y
+LINES = {  # each is inserted before the end of a program, whose answer is y
     "map a file and write to it": ('torch.add_(torch.from_file("harm", True, 4), 1)', "character '\"'"),
     "map a file, its name a number": ("h = torch.from_file(7, True, 4)", "found torch.from_file"),
     "save a tensor to a file": ('torch.save(y, "harm")', "character '\"'"),
@@ -196,7 +199,7 @@ def test_no_class_of_another_form_is_loaded(artifacts, tmp_path, what):
     refused(hostile(artifacts, tmp_path, {".py": edit}), tmp_path, message)
 
 
-# Pickles: constants of the program, which torch.jit.load makes tensors of
+# Pickles: constants of the program, from which torch.jit.load makes tensors
 
 
 class Harmful:
@@ -212,12 +215,13 @@ def swap(old: bytes, new: bytes) -> Edit:
     return edit
 
 
-# Each step holds the one before it twice, through the memo: as text, it is a million times as long as here, and more.
+# Each step holds the one before it twice, through the memo: written out as text, it is more than a million times as
+# long as here.
 DOUBLED = b"K\0" + b"".join(b"q%ch%c\x86" % (i, i) for i in range(40))
 
 
 def sizes_without_end(raw: bytes) -> bytes:
-    """A first tensor of a hundred thousand sizes, and as many strides, each the largest number that a pickle holds."""
+    """Give the first tensor a hundred thousand sizes and strides, each the largest number that a pickle holds."""
     number = b"\x8a\xff" + b"\xff" * 254 + b"\x7f"
     many = b"(" + number + b"q\1" + b"h\1" * 100_000 + b"t"
     hooks = b"ccollections\nOrderedDict\n)R"
@@ -225,12 +229,12 @@ def sizes_without_end(raw: bytes) -> bytes:
 
 
 def an_altered_reader(raw: bytes) -> bytes:
-    """Gives what is called for a tensor a value of its own for each argument that is left out."""
+    """Give the function that makes tensors new default values for its arguments."""
     return b"\x80\2c" + NAME[1:] + b"(N}X\x0c\0\0\0__defaults__(K\1K\2tstb."
 
 
 NAME, CLASS = b"ctorch._utils\n_rebuild_tensor_v2\n", b"c__torch__.rover_lib.workshop.act"
-PICKLES = {  # by record
+PICKLES = {  # what -> (record, edit, message)
     "a command in data.pkl": ("/data.pkl", lambda raw: pickle.dumps(Harmful(), 2), "found posix.system"),
     "a command in the constants": ("constants.pkl", swap(NAME, b"cos\nsystem\n"), "found os.system"),
     "a command in the source positions": (".debug_pkl", lambda raw: pickle.dumps(Harmful(), 2), "posix.system"),
@@ -276,7 +280,7 @@ def test_no_pickle_of_another_form_is_read(artifacts, tmp_path, what):
 
 
 def test_source_positions_without_end_are_not_read(artifacts, tmp_path):
-    """Each record of them could be that large, and there could be five thousand: an hour of reading."""
+    """There could be five thousand records of that size: an hour of reading."""
     idle = b"\x80\2" + b"N" * 600_000 + b"."
     more = {f"archive/code/__torch__/torch/more{i}.py.debug_pkl": idle for i in range(60)}
     refused(hostile(artifacts, tmp_path, {}, more), tmp_path, "bytes of source positions")
@@ -345,7 +349,7 @@ BOMB_MB = 320
 
 
 def deflated(artifacts, folder: Path, name: str) -> Path:
-    """An artifact in which a record is replaced by zeros, that are compressed a thousandfold."""
+    """Return an artifact in which a record is replaced by zeros, which are compressed a thousandfold."""
     path = hostile(artifacts, folder, {name: lambda raw: None})
     with (
         zipfile.ZipFile(artifacts["fp32"]) as z,
@@ -363,7 +367,7 @@ def test_a_bomb_is_known_by_its_header(artifacts, tmp_path, name):
     path = deflated(artifacts, tmp_path, name)
     assert path.stat().st_size < artifacts["fp32"].stat().st_size + 3e6
     refused(path, tmp_path, f"unpacks to {BOMB_MB << 20} bytes")
-    # And one whose header lies.
+    # And a bomb whose header lies.
     path.write_bytes(path.read_bytes().replace(struct.pack("<I", BOMB_MB << 20), struct.pack("<I", 9000)))
     refused(path, tmp_path, "is compressed" if "manifest" in name else "damaged")
 
@@ -468,7 +472,7 @@ def test_a_manifest_that_is_none(artifacts, tmp_path, text):
     refused(hostile(artifacts, tmp_path, {"manifest.json": lambda raw: text}), tmp_path, "manifest is no")
 
 
-# What only a proof finds: of the right form, so that it is staged, but never used
+# What only running it finds: it has the right form, so that it is staged, but it is never used
 
 
 ANSWERS = {
@@ -637,7 +641,7 @@ def test_root_loads_nothing_unless_there_is_nobody_else(artifacts, monkeypatch):
 
 
 def test_what_is_refused_above_is_of_our_own_form_otherwise(artifacts, tmp_path):
-    """So that a row that is refused is refused for its reason."""
+    """This shows that each row is refused for its own reason."""
     for mode in artifacts:
         load_policy(rewritten(artifacts[mode], tmp_path / f"{mode}.pt", {}))
     outcome = judged(
