@@ -1,4 +1,4 @@
-"""The inference-only ACT against LeRobot's own forward."""
+"""Compare the inference-only ACT with LeRobot's own forward."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def saved(policy, folder, stats=None):
 
 
 def saved_processors(policy, folder, stats):
-    """The processors; what has no statistics is not normalised, and they say so."""
+    """Save and return LeRobot's two processors. A feature without statistics gets the mode IDENTITY: not normalised."""
     from lerobot.configs.types import NormalizationMode
     from lerobot.policies.act.processor_act import make_act_pre_post_processors
 
@@ -76,7 +76,7 @@ def image_stats(policy, mean=IMAGENET_MEAN, std=IMAGENET_STD):
     return {k: stats for k in policy.config.image_features}
 
 
-# Normalised zero, LeRobot's padding, is a whole pixel here, so that columns can be exact at the border too.
+# LeRobot pads with normalised zeros. With this mean, zero is a whole pixel, so columns can be exact at the border too.
 WHOLE_MEAN = (124 / 255, 116 / 255, 104 / 255)
 
 
@@ -132,7 +132,7 @@ def test_lerobots_processors_end_up_inside(mode, tmp_path):
     ],
 )
 def test_columns_are_the_pixels_where_the_border_can_be_a_colour(mean, std, columns):
-    """The first convolution over columns, against the one over normalised pixels, away from the border."""
+    """Away from the border, the first convolution gives the same over columns as over normalised pixels."""
     norm = Affine(tuple(1 / s for s in std), tuple(-m / s for m, s in zip(mean, std, strict=True)))
     assert fits_columns(replace(ActConfig(), image_norm=(norm,))) == columns
     if not columns:
@@ -168,7 +168,7 @@ def test_cameras_that_are_normalised_differently_keep_the_float_stem():
 
 @pytest.mark.slow
 def test_counts_the_full_policys_arithmetic(full_policy):
-    """15.02 G multiply-accumulates in LeRobot's own forward, as torch counts them; ours does less, never more."""
+    """torch counts 15.02 G multiply-accumulates in LeRobot's own forward; ours may do fewer, never more."""
     weights = {k.removeprefix("model."): v for k, v in full_policy.state_dict().items()}
     counts = multiply_accumulates(ACT(ActConfig(), weights))
     batch = {"observation.images.cam_front": torch.zeros(1, 3, 360, 640), "observation.state": torch.zeros(1, 2)}

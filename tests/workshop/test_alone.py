@@ -1,4 +1,4 @@
-"""Two commands that make the same thing at once do not take it from each other."""
+"""Two commands that make the same thing at once do not disturb each other."""
 
 import contextlib
 import subprocess
@@ -40,7 +40,7 @@ def test_what_a_killed_process_left_goes_first(tmp_path):
 
 
 def test_a_folder_that_vanishes_while_it_is_taken_is_made_again(tmp_path, monkeypatch):
-    """As the other one ends: what was locked is no longer what the path names."""
+    """This happens when the other command ends: the folder that we locked is no longer the one at that path."""
     real, left = alone.fcntl.flock, [1]
 
     def locked(*args):
@@ -64,7 +64,7 @@ def test_a_file_in_the_runs_place_is_refused_before_any_work(tmp_path):
 
 
 def test_a_run_that_is_a_link_is_made_where_the_link_leads(tmp_path):
-    """Beside the link is another disk, from which nothing can be renamed."""
+    """The link may lie on another disk than the run, and nothing can be renamed from one disk to another."""
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "mine").symlink_to("../disk/large")
     for _ in ("not there yet", "there"):
@@ -88,7 +88,7 @@ def write(folder, *names, text):
 
 
 def make(folder):
-    """Folders and files in the place of each other, one that is new, and one whose predecessor goes without."""
+    """Make a run that replaces a file by a folder and a folder by a file, adds one, and leaves no report.html."""
     with made_beside(folder, lambda folder: [folder / "report.html", folder / "figures"]) as new:
         write(new, "figures/one", "pretrained_model/config.json", "policy_mixed.pt", "fast.json", text="new")
 
@@ -114,7 +114,7 @@ def test_what_is_made_beside_takes_its_place(tmp_path, before):
 
 @pytest.mark.parametrize("count", range(10))
 def test_an_interrupt_or_a_kill_while_it_takes_its_place_costs_nothing(tmp_path, before, monkeypatch, count):
-    """A student's files and its predecessor's lay among each other, and neither could be told from the other."""
+    """A student's files were once mixed with its predecessor's, and nobody could tell which were whose."""
     rename, moved = Path.rename, []
 
     def ends(path, target):
@@ -128,19 +128,19 @@ def test_an_interrupt_or_a_kill_while_it_takes_its_place_costs_nothing(tmp_path,
         moved.clear()
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(Path, "rename", ends)
-            if killed:  # who is killed puts nothing back
+            if killed:  # a killed process puts nothing back
                 patch.setattr(alone, "_put_back", lambda *_: None)
             make(tmp_path / "mine")
         if killed:
             with contextlib.suppress(RuntimeError), made_beside(tmp_path / "mine"):
-                raise RuntimeError  # the next one puts it back, whatever it comes to itself
+                raise RuntimeError  # the next process puts it back, even if it fails itself
         assert whole(tmp_path) == as_it_was
     make(tmp_path / "mine")
     assert whole(tmp_path / "mine") == NEW
 
 
 def test_where_nothing_was_it_appears_at_once(tmp_path, monkeypatch):
-    """Interrupted between two files, it left a half that the next command took for the whole."""
+    """When it was interrupted between two files, it once left a half that the next command took for the whole."""
     rename, seen = Path.rename, []
 
     def observed(path, target):

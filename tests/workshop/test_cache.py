@@ -1,4 +1,4 @@
-"""The cache: where the user says, made once, keyed by what made it."""
+"""The cache is where the user says; each entry is made once, and its key says what it was made from."""
 
 import json
 from pathlib import Path

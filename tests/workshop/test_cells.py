@@ -1,4 +1,4 @@
-"""Tables for notebooks: their cells can be copied, and what is in them is text."""
+"""Tables for notebooks: their cells can be copied, and their content is text."""
 
 import io
 import json
@@ -84,12 +84,12 @@ def test_a_slider_is_for_somebody_who_can_move_it(monkeypatch):
     drawn = []
     monkeypatch.delenv("JPY_SESSION_NAME", raising=False)
     monkeypatch.delenv(TTY_VARIABLE, raising=False)
-    assert browse.browse(3, drawn.append) is None  # papermill, nbval
+    assert browse.browse(3, drawn.append) is None  # as under papermill and nbval
     monkeypatch.setenv("JPY_SESSION_NAME", "/notebooks/01_load.ipynb")
     slider, _ = browse.browse(3, drawn.append, "tick").children
     assert (slider.min, slider.max, slider.description) == (0, 2, "tick") and drawn == [0]
     slider.value = 2
     assert drawn == [0, 2]
     assert browse.browse(0, drawn.append) is None
-    monkeypatch.setenv(TTY_VARIABLE, "/dev/pts/0")  # `rover run`, from a terminal in JupyterLab
+    monkeypatch.setenv(TTY_VARIABLE, "/dev/pts/0")  # as in `rover run` from a terminal in JupyterLab
     assert browse.browse(3, drawn.append) is None

@@ -1,4 +1,4 @@
-"""A backbone does without channels: in LeRobot's shape nothing else changes, and training keeps it so."""
+"""Channels are left out of a backbone: LeRobot's shape stays, nothing else changes, and training keeps them out."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -24,7 +24,10 @@ PARTS = ("conv1.weight", "bn1.weight", "bn1.bias")
 
 @pytest.fixture(scope="module")
 def thin(tiny):
-    """The tiny policy with every second inner channel zero, in half of the blocks by ReLU: its bias is below zero."""
+    """Return the tiny policy with every second inner channel zero.
+
+    In half of the blocks the bias is negative, so that only the ReLU makes the channel zero.
+    """
     weights = {k: v.clone() for k, v in tiny.weights.items()}
     for i, name in enumerate(BLOCKS):
         for part in PARTS:
@@ -34,7 +37,7 @@ def thin(tiny):
 
 
 def lerobots(checkpoint, samples):
-    """(n, C, A) of LeRobot's own forward."""
+    """Return the chunks, (n, C, A), that LeRobot's own forward plans."""
     policy = BatchedPolicy(checkpoint.config, checkpoint.weights)
     states, frames = zip(*(inputs_of(s, checkpoint.config) for s in samples), strict=True)
     with torch.inference_mode():
@@ -51,7 +54,7 @@ def test_channels_that_are_always_zero_are_not_there_and_nothing_changes(tiny, t
 
 
 def test_a_channel_that_is_constant_but_not_zero_stays(thin):
-    """Its reader is at the picture's border too, where it meets zeros."""
+    """The convolution that reads the channel meets padding zeros at the picture's border, not the constant."""
     weights = {k: v.clone() for k, v in thin.weights.items()}
     weights["backbone.layer4.1.bn1.bias"][::2] = 1
     steady, samples = replace(thin, weights=weights), memory_samples(2)
@@ -63,7 +66,7 @@ def test_a_channel_that_is_constant_but_not_zero_stays(thin):
 
 def test_half_of_the_channels_is_half_of_the_blocks_arithmetic(tiny, thin):
     whole, half = (multiply_accumulates(ACT(c.config, c.weights)) for c in (tiny, thin))
-    assert half["backbone.layer1"] * 2 == whole["backbone.layer1"]  # the other stages have shortcuts
+    assert half["backbone.layer1"] * 2 == whole["backbone.layer1"]  # the other stages have shortcuts, which stay
     assert 0.5 < half["backbone.layer4"] / whole["backbone.layer4"] < 0.51
     assert {k: n for k, n in half.items() if "layer" not in k} == {k: n for k, n in whole.items() if "layer" not in k}
 
@@ -85,7 +88,7 @@ def test_int8_that_can_be_trained_does_without_them_too(thin):
 
 
 def test_training_leaves_zeros_alone(thin):
-    """Zero filter, zero batch norm and zero reader: none of them has a gradient, nor any decay."""
+    """If a channel's filter, batch norm and reader are all zero, none of them gets a gradient or decays."""
     weights = {k: v.clone() for k, v in thin.weights.items()}
     for name in BLOCKS:
         weights[f"{name}.bn1.bias"][::2] = 0
@@ -118,7 +121,7 @@ def patches_of(h):
 
 @pytest.fixture
 def block():
-    """A block's weights by LeRobot's names, and 8 channels: 4 are mixtures of the others, and one is constant."""
+    """Return a block's weights by LeRobot's names, and 8 channels: 4 mix the other 4, of which one is constant."""
     generator = torch.Generator().manual_seed(0)
     h = torch.rand(20, 8, 5, 6, generator=generator)
     h[:, [1, 3, 4, 7]] = torch.einsum("oi,nihw->nohw", torch.rand(4, 4, generator=generator), h[:, [0, 2, 5, 6]])
@@ -132,7 +135,7 @@ def block():
 
 
 def test_what_others_can_say_goes_first(block):
-    """All that changes is in four channels and their mixtures: four that stay must span it."""
+    """Everything that varies is in four channels and their mixtures, so the four that stay must span it."""
     kept = _chosen(block.gram, block.weights["b.conv2.weight"], 4)
     values = block.h.transpose(0, 1).flatten(1)
     centred = values - values.mean(1, keepdim=True)
@@ -141,7 +144,7 @@ def test_what_others_can_say_goes_first(block):
 
 
 def test_the_reader_is_refitted_by_least_squares(block):
-    """Against torch's lstsq on the patches themselves."""
+    """Compare with torch's lstsq on the patches themselves."""
     kept, before = torch.tensor([0, 2]), {k: v.clone() for k, v in block.weights.items()}
     errors = _leave_out(block.weights, "b", kept, block.gram)
     w = block.weights
@@ -160,14 +163,14 @@ def test_the_reader_is_refitted_by_least_squares(block):
     off = (own + own_shift - wanted - shift).norm()
     assert best.norm() <= off < 1.01 * best.norm()
     assert errors["error_refit_pct"] < errors["error_pct"]
-    gain = (before["b.bn2.weight"] / (before["b.bn2.running_var"] + 1e-5).sqrt())[:, None]  # of the norm behind it
+    gain = (before["b.bn2.weight"] / (before["b.bn2.running_var"] + 1e-5).sqrt())[:, None]  # of the next batch norm
     share = ((own + own_shift - wanted - shift) / gain).norm() / (wanted / gain).norm()
     assert errors["error_refit_pct"] == pytest.approx(100 * share.item(), rel=1e-2)
 
 
 @pytest.mark.slow
 def test_a_policy_in_lerobots_shape_that_computes_half(tiny):
-    """INT8 of it acts, and is half as large in the blocks."""
+    """Its INT8 layers in the blocks have half the channels, and its plans are LeRobot's."""
     pictures = torch.stack([inputs_of(s, tiny.config)[1] for s in memory_samples(16)])
     made, notes = without_channels(tiny.weights, tiny.config, 0.5, pictures.split(4), np.random.default_rng(0))
     assert {k: v.shape for k, v in made.items()} == {k: v.shape for k, v in tiny.weights.items()}

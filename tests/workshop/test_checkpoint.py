@@ -1,4 +1,4 @@
-"""Checkpoints in, and every way in which one can be wrong."""
+"""Checkpoints are read, and every way in which one can be wrong is refused."""
 
 import json
 import math
@@ -51,7 +51,7 @@ def test_reads_the_trainers_file(tiny, tiny_policy):
     assert r["parameters"] - r["parameters_acting"] == r["parameters_by_part"]["vae (training only)"] > 0
     assert r["best_val_loss"] == pytest.approx(0.15) and r["epoch"] == 7
     assert r["optimizer_mb"] > 0
-    # What is not weights or optimizer is names and numbers: the sum must explain the file.
+    # Beside weights and optimizer a file has only names and a few numbers, so the sum must explain its size.
     assert r["file_mb"] == pytest.approx(r["weights_mb"] + r["optimizer_mb"], rel=0.02)
 
 
@@ -65,7 +65,7 @@ def test_without_its_optimizer_it_is_the_same_policy(tiny, tiny_policy, tmp_path
 
 
 def test_reads_scalars_of_old_and_new_numpy(tiny_policy, tmp_path):
-    """best_val_loss is a numpy float64: numpy 1 pickled it as numpy.core, numpy 2 as numpy._core."""
+    """best_val_loss is a numpy float64, which numpy 1 pickles as numpy.core and numpy 2 as numpy._core."""
     new = write(trainer_content(tiny_policy), tmp_path / "new.pth")
     old = tmp_path / "old.pth"
     with zipfile.ZipFile(new) as source, zipfile.ZipFile(old, "w") as target:
@@ -129,7 +129,7 @@ def test_refuses_what_makes_no_policy(change, says, tmp_path):
         (lambda c: c["model_state_dict"].update({"model.extra": torch.zeros(1)}), "unknown: extra"),
         (lambda c: c["model_state_dict"].update({BIAS: torch.full((64,), np.nan)}), "NaN or Inf in decoder.norm.bias"),
         (lambda c: c["model_state_dict"].update({BIAS: torch.full((64,), np.inf)}), "NaN or Inf"),
-        # finite, but not as the float32 that drives
+        # finite here, but not in float32, in which the policy drives
         (lambda c: c["model_state_dict"].update({BIAS: torch.full((64,), 1e300, dtype=torch.float64)}), "NaN or Inf"),
     ],
 )
@@ -148,7 +148,7 @@ def test_refuses_damaged_files(tiny_file, tmp_path):
     path.write_bytes(whole[: len(whole) // 2])
     refused(path)
     flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 0xFF  # one byte of one weight: torch.load would take it
+    flipped[len(whole) // 2] ^= 0xFF  # one byte of one weight: torch.load would accept it
     path.write_bytes(flipped)
     assert "checksum" in refused(path)
     path.write_bytes(pickle.dumps({"config": {}}))
@@ -214,7 +214,7 @@ def test_at_another_size_it_is_lerobots_policy_of_that_size(tiny, size):
     (sample,) = memory_samples(1, *size)
     with torch.inference_mode():
         found = ours(*inputs_of(sample, other.config))[0].numpy()
-    lerobot._low, lerobot._high = -np.inf, np.inf  # what is clipped would be the same anyway
+    lerobot._low, lerobot._high = -np.inf, np.inf  # clipped plans would be equal in any case
     expected = lerobot.predict_chunk(sample.picture, sample.state)
     assert np.abs(found - expected).max() < 1e-5 < np.abs(found).max()
 
@@ -240,7 +240,7 @@ def test_another_size_is_for_one_camera(tiny):
 
 # ---- files that lie: refused in a sentence with a remedy, in less than a second or two -------------------------------
 
-QUICKLY_S = 2.0  # of this process: no more than an honest file of the same size takes
+QUICKLY_S = 2.0  # of this process's CPU time: no more than an honest file of the same size takes
 WILD = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 
 
@@ -256,7 +256,7 @@ def refused_quickly(path) -> CheckpointError:
 
 
 def small(**changes):
-    """A trainer's content with one small weight: wrong as a whole, and quick to write."""
+    """Return a trainer's content with only three small weights: an incomplete policy that is quick to write."""
     config = {"image_width": 128, "image_height": 72, "chunk_size": 32, "hidden_size": 64, "n_encoder_layers": 1,
               "n_decoder_layers": 2, "n_heads": 4, "feedforward_dim": 128, "vision_encoder": "resnet18"}  # fmt: skip
     weights = {
@@ -302,7 +302,7 @@ def test_a_million_layers_are_not_built(key, tmp_path):
 HOLDS_ITSELF: list = []
 HOLDS_ITSELF.append(HOLDS_ITSELF)
 DOUBLED: list = [1]
-for _ in range(60):  # 2**60 numbers, in sixty lists
+for _ in range(60):  # 2**60 numbers if walked, in sixty lists
     DOUBLED = [DOUBLED, DOUBLED]
 
 
@@ -323,12 +323,12 @@ def test_a_loss_that_is_no_number_is_refused(value, tmp_path):
 )
 @pytest.mark.parametrize("key", ["n_obs_steps", "image_height", "hidden_size", "n_decoder_layers", "vision_encoder"])
 def test_a_config_of_odd_values_is_refused(key, value, tmp_path):
-    if key != "n_obs_steps" or value is not True:  # which is one
+    if key != "n_obs_steps" or value is not True:  # True equals 1, which is right for n_obs_steps
         refused_quickly(write(small(config={key: value}), tmp_path / "bad.pth"))
 
 
 def test_the_report_is_finite_and_plain(tiny_policy, tmp_path):
-    """What else is in a trainer's file is reported as far as JSON can hold it, and never walked without end."""
+    """The other content of a trainer's file is reported as far as JSON can hold it, and is never walked without end."""
     content = trainer_content(tiny_policy)
     content["config"] |= {
         "history": HOLDS_ITSELF,
@@ -353,7 +353,7 @@ def test_the_format_before_zip_files_is_refused_by_its_name(tmp_path):
 
 
 def rewritten(path, change, compression=zipfile.ZIP_STORED):
-    """The same archive with another pickle in it, and right checksums."""
+    """Copy an archive with its pickle changed, and with correct checksums."""
     other = path.with_suffix(".changed.pth")
     with zipfile.ZipFile(path) as source, zipfile.ZipFile(other, "w", compression) as target:
         for name in source.namelist():
@@ -394,7 +394,7 @@ def changed(data: bytes, changes) -> bytes:
 
 @WILD
 @given(changes=CHANGES)
-@example(changes=[(-38, 1)])  # on another disk, says its end
+@example(changes=[(-38, 1)])  # the end of this archive says that it is on another disk
 def test_wild_bytes_in_an_archive(small_file, changes):
     path = small_file.with_name("wild.pth")
     path.write_bytes(changed(small_file.read_bytes(), changes))
@@ -410,13 +410,13 @@ def test_wild_bytes_in_a_pickle(small_file, changes):
 def test_inspecting_a_damaged_archive_is_a_sentence(small_file, tmp_path):
     path = tmp_path / "damaged.pth"
     data = small_file.read_bytes()
-    at = data.index(b"PK\x01\x02")  # the directory at the archive's end
+    at = data.index(b"PK\x01\x02")  # where the archive's directory begins
     path.write_bytes(data[:at] + b"PK\xff\xff" + data[at + 4 :])
     result = CliRunner().invoke(main, ["inspect", str(path)])
     assert result.exit_code == 1 and "damaged (Bad magic number for central directory)" in result.output
 
 
-# ---- the same of LeRobot's folder --------------------------------------------------------------------------------
+# ---- the same for LeRobot's folder -------------------------------------------------------------------------------
 
 
 def safetensors(header: bytes, data: bytes = b"", length: int | None = None) -> bytes:
@@ -425,7 +425,7 @@ def safetensors(header: bytes, data: bytes = b"", length: int | None = None) -> 
 
 @pytest.fixture(scope="module")
 def small_folder(tmp_path_factory):
-    """LeRobot's files with three weights: wrong as a whole, and quick to read."""
+    """Write LeRobot's files with only three weights: an incomplete policy that is quick to read."""
     path = tmp_path_factory.mktemp("lerobot")
     features = {"observation.images.front": {"type": "VISUAL", "shape": [3, 72, 128]},
                 "observation.state": {"type": "STATE", "shape": [2]}}  # fmt: skip
@@ -490,7 +490,7 @@ ODD = st.one_of(
 
 
 def places(content, path=()):
-    """The path of every value in nested JSON."""
+    """Yield the path of every value in nested JSON."""
     yield path
     items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
     for key, value in items:
@@ -500,7 +500,7 @@ def places(content, path=()):
 @WILD
 @given(data=st.data(), file=st.sampled_from(["config.json", "policy_preprocessor.json", "policy_postprocessor.json"]))
 def test_wild_values_in_a_folder(small_folder, data, file):
-    """One value of its JSON replaced by an odd one: refused, if not for this then for the weights that it lacks."""
+    """With one value of its JSON replaced by an odd one it is refused, if not for this then for its missing weights."""
     path = small_folder / file
     before = path.read_text()
     content = json.loads(before)
@@ -556,11 +556,11 @@ def test_features_that_the_weights_do_not_have_are_refused(copied):
 
 RAW = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
 INNER, OUTER = "policy_preprocessor.json", "policy_postprocessor.json"
-ONLY_WEIGHTS = "config and weights do not agree (missing: "  # what is left to say of the small folder
+ONLY_WEIGHTS = "config and weights do not agree (missing: "  # the small folder's only remaining fault
 
 
 def in_step(change):
-    """To an edit of a processor file: of its normaliser."""
+    """Return an edit of a processor file that applies `change` to its normaliser."""
     return lambda content: change(content["steps"][0])
 
 
@@ -613,7 +613,10 @@ def test_statistics_that_nothing_has_are_refused(copied, key, value, says):
 
 @pytest.mark.parametrize("value", [0.3, -7.7, 1234.5, 0.0])
 def test_a_state_that_never_changed_is_minus_one(copied, value):
-    """As LeRobot makes it, whatever float32 rounds: it adds 1e-8 to no difference, and 2e8 * 0.3 has a unit of 4."""
+    """The result is LeRobot's, without float32's rounding.
+
+    LeRobot takes 1e-8 for a range of zero, so the scale is 2e8; near 2e8 * 0.3, float32's numbers are 4 apart.
+    """
     edit(copied / INNER, in_step(lambda s: s["config"]["norm_map"].update(STATE="MIN_MAX")))
     same, stats = torch.tensor([value, 0.5]), load_file(copied / "stats.safetensors")
     ends = {"observation.state.min": same, "observation.state.max": torch.tensor([value, 2.5])}
@@ -635,7 +638,7 @@ def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copi
 
 
 def normalised(policy, mode):
-    """LeRobot's processors for a policy whose inputs and outputs are all normalised by `mode`, and the statistics."""
+    """Return LeRobot's two processors, which normalise all inputs and outputs by `mode`, and their statistics."""
     from lerobot.configs.types import NormalizationMode
     from lerobot.policies.act.processor_act import make_act_pre_post_processors
 
@@ -652,7 +655,7 @@ def normalised(policy, mode):
 
 
 def check_is(checkpoint, policy, inner, outer):
-    """The same actions as LeRobot's own, processors included: 1e-5 of the largest."""
+    """Check that the actions equal LeRobot's, processors included, within 1e-5 of the largest."""
     (sample,) = memory_samples(1)
     frame, state = cv2.cvtColor(sample.picture, cv2.COLOR_BGR2RGB), torch.from_numpy(sample.state)
     raw = {
@@ -689,9 +692,9 @@ def test_statistics_in_the_weights_are_read_as_lerobot_did_before_processors(mod
     checkpoint = load_checkpoint(tmp_path)
     check_is(checkpoint, policy, inner, outer)
     assert checkpoint.report["normalisation_from"]["out"] == "the weights' file, as LeRobot did before 0.4"
-    theirs = extract_normalization_stats(weights)["action"]  # LeRobot's own migration finds the same
+    theirs = extract_normalization_stats(weights)["action"]  # LeRobot's own migration
     assert all(torch.equal(theirs[stat], stats["action"][stat]) for stat in kept)
-    weights[f"unnormalize_outputs.buffer_action.{kept[0]}"] = torch.full((2,), torch.inf)  # LeRobot's for: never set
+    weights[f"unnormalize_outputs.buffer_action.{kept[0]}"] = torch.full((2,), torch.inf)  # LeRobot's mark: never set
     save_file(weights, tmp_path / "model.safetensors")
     assert "not finite" in str(refused_quickly(tmp_path))
 
@@ -703,7 +706,7 @@ def test_what_lerobot_train_leaves_is_found(tmp_path):
     for part in (policy, inner, outer):
         part.save_pretrained(folder)
     with pytest.raises(CheckpointError, match="it does not say which of its checkpoints is the last, found 000020"):
-        load_checkpoint(tmp_path / "out")  # copied by what leaves links out
+        load_checkpoint(tmp_path / "out")  # as copied by a program that leaves links out
     (tmp_path / "out/checkpoints/last").symlink_to("000020")
     assert lerobot_folder(tmp_path) is None
     for place in ("out", "out/checkpoints", "out/checkpoints/last", "out/checkpoints/last/pretrained_model"):

@@ -1,4 +1,4 @@
-"""What is written is read again as it was: here, and by LeRobot itself."""
+"""Checkpoints that we write are read back unchanged, by us and by LeRobot itself."""
 
 import json
 import resource
@@ -36,7 +36,7 @@ def config(tiny):
 
 
 def lerobots_chunk(folder, sample, config):
-    """(C, A) by LeRobot's own classes, its processors included."""
+    """Return the chunk, (C, A), that LeRobot's own classes plan, its processors included."""
     from lerobot.policies.act.modeling_act import ACTPolicy
     from lerobot.policies.factory import make_pre_post_processors
 
@@ -99,7 +99,7 @@ def _saved(path, weights):
 
 
 def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_path):
-    """A student of 15 steps a second would drive twice as fast as one of 30; the trainer's file cannot say it."""
+    """Driven at 30 steps a second, a student of 15 would drive twice as fast; the trainer's file cannot hold a rate."""
     slow = replace(config, rate_hz=15.0)
     write_lerobot(tmp_path, slow, weights, ORIGIN)
     read = load_checkpoint(tmp_path)

@@ -1,4 +1,4 @@
-"""What figures say above themselves: computed of what they draw, and the contrary where that is so."""
+"""The sentence above a figure is computed from what it draws, and says the contrary when the data does."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The comparison against values computed by hand."""
+"""The comparison gives the values that were computed by hand."""
 
 import json
 import math
@@ -30,7 +30,7 @@ LIMITS = {
 
 
 class Fixed:
-    """A policy that plans base, plus `off` once per frame that it has seen before."""
+    """A policy that plans `base`, and adds off[k] in its k-th call."""
 
     chunk = CHUNK
 
@@ -59,7 +59,7 @@ def sample(pads=0, recorded=((0, 0),) * CHUNK):
 
 @pytest.fixture
 def report():
-    """Steering is 0.008 off (1 % of its range) in the first step of frame 2, throttle 0.001 everywhere."""
+    """Static INT8's steering is 0.008 off (1 % of its range) in frame 2's first step, its throttle 0.001 everywhere."""
     base = [[0.1, 0.05], [0.2, 0.05], [0.3, 0.05]]
     off = [np.full((3, 2), [0, 0.001]), np.float64([[0.008, 0.001], [0, 0.001], [0, 0.001]])]
     return compare.fidelity(Fixed(base), {"static": Fixed(base, off)}, [sample(), sample(pads=2)], RANGE)
@@ -80,7 +80,7 @@ def test_padded_steps_count_in_the_plan_but_not_against_the_recording(report):
     found = report.summary("static")
     assert report.is_pad.sum() == 2
     assert found["steering_mae_recorded_steps_pct"] == pytest.approx(0.008 / 4 / 0.8 * 100, rel=1e-4)
-    # FP32 against a recorded (0, 0): steps 0.1, 0.2, 0.3 of frame 1 and 0.1 of frame 2
+    # FP32 against a recorded (0, 0): the steps 0.1, 0.2, 0.3 of frame 1, and 0.1 of frame 2
     assert report.recorded_error(report.reference)["steering_vs_recorded_pct"] == pytest.approx(
         0.7 / 4 / 0.8 * 100, rel=1e-4
     )
@@ -88,7 +88,7 @@ def test_padded_steps_count_in_the_plan_but_not_against_the_recording(report):
 
 def test_worst_frame_comes_first_and_keeps_both_plans(report):
     first, second = report.worst("static", 5)
-    assert (first.index, second.index) == (0, 1)  # equal throttle errors: the order is the recording's
+    assert (first.index, second.index) == (0, 1)  # their throttle errors are equal, so they are in recorded order
     assert first.action == "throttle" and first.error_pct == pytest.approx(1.0, rel=1e-4)
     assert np.abs(first.other - first.reference)[:, 1] == pytest.approx([0.001] * 3, rel=1e-3)
 
@@ -104,7 +104,7 @@ def test_a_policy_does_not_differ_from_itself(values, frames, pads):
 
 @pytest.fixture
 def still(policies):
-    """metrics and report of recordings whose throttle never changed; the plans' differ by 0.001 all the same."""
+    """Return metrics and report: the recordings' throttle never changes, but static INT8's is 0.001 off."""
     base, off = np.full((3, 2), 0.05), [np.full((3, 2), [0.008, 0.001])]
     static = Fixed(base, off)
     report = compare.fidelity(Fixed(base), {"static": static}, [sample()], RANGE | {"throttle": (0.04, 0.04)})
@@ -135,7 +135,7 @@ def test_an_action_that_is_not_judged_is_in_no_gate(still):
 
 @pytest.mark.filterwarnings("error")
 def test_figures_leave_out_what_is_not_judged(still):
-    """And name it; one in which nothing is judged is a sentence."""
+    """The figure names the action that is left out. If nothing is judged, a sentence takes the figure's place."""
     metrics, report = still
     error, worst = plots.action_error(report), plots.worst_frames(report, count=1)
     for figure in (error, worst):
@@ -257,7 +257,7 @@ def test_gates_are_exact_at_the_limit_and_blind_to_what_is_not_judged():
 
 
 def test_microseconds_are_of_the_policys_car():
-    """Whatever car this machine has: a run may be of another one."""
+    """This machine may be set up for another car than the run's."""
     described = Car().description()
     described["steering"] = {"period_us": 20000, "left_us": 1900, "neutral_us": 1500, "right_us": 1100}
     for car, us in ((Car.of(described), 400), (Car(), PwmCalibration().us_per_unit("steering"))):

@@ -1,4 +1,4 @@
-"""`rover inspect` and `rover list`: everything that this project writes."""
+"""`rover inspect` and `rover list` describe everything that this project writes."""
 
 import shutil
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A student is taught on recordings alone, whatever interrupts it."""
+"""A student is taught from recordings alone, and an interrupted training goes on where it stopped."""
 
 import json
 import math
@@ -98,7 +98,7 @@ def test_distill_json_judges_it_on_held_out_episodes(taught):
 
 
 def test_what_was_begun_with_other_settings_is_not_gone_on_with(teacher, episodes, recipe, tmp_path, monkeypatch):
-    """Rounded by ranges of another calibration it would learn what its export does not round."""
+    """With the ranges of another calibration, training would round otherwise than the export does."""
     opened, places = load(teacher, episodes), []
 
     class Elsewhere(distill_module.Resumable):
@@ -123,7 +123,7 @@ def test_what_was_begun_with_other_settings_is_not_gone_on_with(teacher, episode
                 distill_module._taught(work)
     lessons, students = places[::2], places[1::2]
     assert len(set(lessons)) == 1
-    assert students[0] != students[1] and students[2] == students[3]  # of QAT alone it matters
+    assert students[0] != students[1] and students[2] == students[3]  # the settings matter only with QAT
 
 
 @pytest.mark.slow
@@ -138,7 +138,7 @@ def test_killed_in_the_middle_it_goes_on_and_gives_the_same(
         distill(teacher, episodes, "fast", SHAPE, **arguments)
     assert not (tmp_path / "fast").exists()
     folder = distill(teacher, episodes, "fast", SHAPE, **arguments)
-    assert len(steps) == 3 + 8 + 3 + 1  # only the step that was interrupted is made again
+    assert len(steps) == 3 + 8 + 3 + 1  # only the interrupted step is repeated
     expected = weights_of(taught)
     assert all(torch.equal(weight, expected[name]) for name, weight in weights_of(folder).items())
     losses = [json.loads((f / "distill.json").read_text())["metrics"]["losses"] for f in (folder, taught)]
@@ -147,7 +147,7 @@ def test_killed_in_the_middle_it_goes_on_and_gives_the_same(
 
 @pytest.mark.slow
 def test_a_student_of_half_the_channels_keeps_its_zeros(teacher, episodes, recipe, tmp_path, monkeypatch):
-    """Through all phases, a kill among them, to the INT8 artifact; LeRobot's forward gives what ours gives."""
+    """They stay zero in all phases, through an interrupt, up to the INT8 artifact; LeRobot's forward equals ours."""
     shape, arguments = StudentShape(backbone_channels=0.5), {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
         save_each_step(patch, distill_module)
@@ -157,7 +157,7 @@ def test_a_student_of_half_the_channels_keeps_its_zeros(teacher, episodes, recip
         (own,) = (tmp_path / "cache").glob("student-*")
         began, _ = torch.load(own / "start.pt", weights_only=True)
         folder = distill(teacher, episodes, "thin", shape, qat=True, **arguments)
-    assert len(steps) == 8 + 3 + 3 + 1  # no backbone, and only the step that was interrupted again
+    assert len(steps) == 8 + 3 + 3 + 1  # no backbone phase, and only the interrupted step is repeated
     ends = load_checkpoint(folder / "pretrained_model")
     for name in (f"backbone.layer{i}.{j}" for i in (1, 2, 3, 4) for j in (0, 1)):
         gone = (began[f"{name}.conv1.weight"] == 0).flatten(1).all(1)
@@ -173,7 +173,7 @@ def test_a_student_of_half_the_channels_keeps_its_zeros(teacher, episodes, recip
     assert "50% of the backbone's channels" in summary(content)
     artifact = load_policy(folder / "policy_static.pt")
     assert artifact.manifest["gmac"] == pytest.approx(of_student["gmac"])
-    assert (folder / "policy_static.pt").stat().st_size < 8e6  # 12 with all channels
+    assert (folder / "policy_static.pt").stat().st_size < 8e6  # it has 12 MB with all channels
     sample = session.load(folder / "best_model.pth", episodes).parts.held_out[0]
     lerobots = LerobotEager(ends).predict_chunk(sample.frame_bgr(), sample.state)
     ours = ACT(ends.config, ends.weights)(*inputs_of(sample, ends.config))[0].numpy()
@@ -182,7 +182,7 @@ def test_a_student_of_half_the_channels_keeps_its_zeros(teacher, episodes, recip
 
 @pytest.mark.slow
 def test_the_teacher_itself_learns_to_be_int8(teacher, episodes, recipe, tmp_path, monkeypatch):
-    """And nothing else; killed in the middle, too."""
+    """Only the QAT phase runs, also after an interrupt in its middle."""
     arguments = {"qat": True, "runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
         save_each_step(patch, distill_module)
@@ -220,14 +220,14 @@ def test_the_next_student_of_the_same_picture_asks_nothing_again(teacher, episod
         distill_module, "descend", lambda loss, module, *rest: kinds.append(1) or training.descend(loss, module, *rest)
     )
     distill(teacher, episodes, "second", SHAPE, **arguments)
-    assert len(kinds) == 8 + 3  # no backbone
+    assert len(kinds) == 8 + 3  # no backbone phase
     assert (tmp_path / "first" / "best_model.pth").read_bytes() == before
     assert [p.name.split("-")[0] for p in (tmp_path / "cache").iterdir()] == ["lessons"]
 
 
 @pytest.mark.slow
 def test_a_teacher_with_other_statistics_is_asked_again(teacher, episodes, recipe, tmp_path, monkeypatch):
-    """Its weights are the same: what it planned with the wrong statistics lies in the cache."""
+    """The weights did not change, but the cache holds what the teacher planned with the wrong statistics."""
     was = load_checkpoint(teacher)
     plans, rows = [], np.arange(2 * recipe.samples)
     monkeypatch.setattr(distill_module, "_refuse_strangers", lambda room: plans.append(room.lessons.plans[rows]))
@@ -313,7 +313,7 @@ def test_a_damaged_file_of_a_phase_is_one_sentence(tmp_path):
 
 
 def test_phases_that_another_process_has_removed_are_no_error(teacher, episodes, tmp_path, monkeypatch):
-    """Who learns the same under another name goes on in the same folder, and may be done first."""
+    """A process that learns the same under another name uses the same folder, and may finish first."""
     monkeypatch.setattr(distill_module, "_taught", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
     monkeypatch.setattr(distill_module, "_leave", lambda new, *_: (new / "distill.json").touch())
     folder = distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path, device="cpu")
@@ -321,7 +321,7 @@ def test_phases_that_another_process_has_removed_are_no_error(teacher, episodes,
 
 
 def test_a_policy_that_somebody_trained_is_not_replaced_by_a_student(teacher, episodes, tmp_path):
-    """The teacher's own folder, as in `rover distill runs/full/best_model.pth ... --name full`, and another one's."""
+    """The teacher's folder, as in `rover distill runs/full/best_model.pth ... --name full`, or another policy's."""
     own = tmp_path / "full" / "best_model.pth"
     own.parent.mkdir()
     shutil.copy(teacher, own)
@@ -345,7 +345,7 @@ def test_an_artifact_of_another_run_is_not_replaced_by_a_student(teacher, episod
 
 
 def test_what_was_killed_while_it_took_its_place_is_an_earlier_students_again(teacher, episodes, tmp_path, monkeypatch):
-    """Some of it had gone, and the run's report stayed: it looked like the run of another policy."""
+    """The checkpoint had moved and the run's report stayed, so the folder looked like another policy's run."""
     monkeypatch.setattr(distill_module, "_is_student", lambda path: True)
     monkeypatch.setattr(distill_module, "_taught", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
     monkeypatch.setattr(distill_module, "_leave", lambda new, *_: (new / "distill.json").touch())
@@ -358,7 +358,7 @@ def test_what_was_killed_while_it_took_its_place_is_an_earlier_students_again(te
 
 
 def test_an_old_students_checkpoint_goes_where_the_new_one_has_none(tmp_path):
-    """The trainer's format has no place for a policy of another rate: best_model.pth would be of the old one."""
+    """A student of another rate has no best_model.pth, whose format lacks a rate; the old student's must not stay."""
     assert tmp_path / "best_model.pth" in distill_module._of_an_earlier_student(tmp_path)
 
 
@@ -387,7 +387,7 @@ def test_what_cannot_be_taught_is_refused(teacher, episodes, tmp_path, options, 
         ({"rate": 0.0}, "above 0"),
         ({"rate": math.nan}, "finite"),
         ({"to_teacher": 0.0, "to_recorded": 0.0}, "not both 0"),
-        ({"rate": "2e-4"}, "rate must be a number, found '2e-4'"),  # as YAML reads it
+        ({"rate": "2e-4"}, "rate must be a number, found '2e-4'"),  # YAML reads 2e-4 as text
         ({"samples": 10.5}, "samples must be a whole number"),
         ({"lessons": 3}, "there is no 'lessons'"),
     ],
@@ -403,7 +403,7 @@ def test_of_no_steps_there_is_no_recipe():
 
 
 def test_a_phase_may_be_left_out(recipe):
-    """Its optimiser is made all the same."""
+    """With zero steps its optimiser is still made, and must not fail."""
     work = SimpleNamespace(recipe=replace(recipe, transformer_steps=0, together_steps=0), rng=np.random.default_rng)
     room, policy = SimpleNamespace(work=work, lessons=None), torch.nn.Linear(1, 1)
     policy.model = torch.nn.Linear(1, 1)
@@ -437,7 +437,7 @@ def test_steps_are_shared_by_the_phases_that_it_learns_in(shape, qat, phases):
 
 
 def test_int8_is_held_against_what_its_teacher_would_drive(monkeypatch):
-    """Both plan the same beyond what a pulse can express, where the teacher's plans are clipped."""
+    """Both plan the same, beyond what a pulse can express; the teacher's plans are clipped, so INT8's must be too."""
     plans = np.float32([[[1.5, -0.2], [0.5, 0.1]]])
     monkeypatch.setattr(distill_module, "predictions", lambda policy, inputs: torch.from_numpy(plans))
     monkeypatch.setattr(distill_module, "ACT", lambda config, weights: None)

@@ -1,4 +1,4 @@
-"""Recordings with every fault that was seen, and some that were not: counted and skipped, never an action."""
+"""Every fault seen in recordings, and some not seen yet, is counted and skipped, and never becomes an action."""
 
 import json
 import math
@@ -34,7 +34,7 @@ def throttle_at(t_s):
 
 
 def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0):
-    """A faultless drive: controls every 33 ms from 0.1 s before the frames to 0.1 s after them."""
+    """Record a faultless drive, with controls every 33 ms from 0.1 s before the frames to 0.1 s after them."""
     folder = root / name
     with EpisodeWriter(folder, About("hit red balloon"), resolution=(32, 18)) as writer:
         for i in range(round((frames / 30 + 0.2) / 0.033)):
@@ -47,7 +47,7 @@ def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0):
 
 
 def edit(folder, change):
-    """Rewrite a recording's JSON; the CSVs go, so that nothing can be taken from them."""
+    """Rewrite a recording's JSON, and remove the CSVs, so that nothing can be read from them."""
     path = folder / "episode_data.json"
     content = json.loads(path.read_text())
     changed = change(content)
@@ -85,7 +85,7 @@ def test_pairs_of_a_faultless_recording(tmp_path):
         assert sample.state.dtype == sample.chunk.dtype == np.float32
         assert sample.chunk.shape == (CHUNK, 2)
         assert sample.time_s == pytest.approx(k / 30, abs=1e-6)
-        # the chunk is this frame's action and the next ones: within half a control interval of the drive
+        # The chunk is this frame's action and the next ones, each within half a control interval of the drive's.
         for step in range(CHUNK):
             t_s = 0.1 + min(k + step, 39) / 30
             assert sample.chunk[step, 0] == pytest.approx(steering_at(t_s), abs=0.9 * 0.017 + 0.001)
@@ -117,7 +117,7 @@ def test_a_driver_of_whom_nobody_knows_is_left_out(tmp_path):
 
 
 def test_no_chunk_and_no_state_goes_over_to_where_nobody_drove(tmp_path):
-    """There the car was held: what the sticks said is not what it did."""
+    """While nobody drives, the car is held, and does not do what the sticks say."""
 
     def change(content):
         for row in content["control_samples"]:
@@ -261,7 +261,7 @@ def test_a_channel_that_is_flagged_is_missing(tmp_path):
         assert kinds(recordings) == {"throttle_no_pulse": 10, "frame_without_measurement": 8, "frame_without_state": 1}
         assert len(recordings.samples) == 31
         assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009  # the drive's least throttle, no 0
-        (flagged.folder / "episode_data.json").write_text("{}")  # and again from the CSVs
+        (flagged.folder / "episode_data.json").write_text("{}")  # the second turn reads the CSVs
 
 
 def test_null_is_no_pulse_with_and_without_a_flag(tmp_path):
@@ -269,7 +269,7 @@ def test_null_is_no_pulse_with_and_without_a_flag(tmp_path):
         for i, control in enumerate(content["control_samples"][20:24]):
             lost = dict.fromkeys(("throttle_normalized", "throttle_raw_us", "throttle_period_us"))
             control.update([lost, lost | {"throttle_measured": False}, {"throttle_measured": False}, {}][i])
-            if i == 3:  # a program that left the fields out
+            if i == 3:  # as by a program that leaves the fields out
                 for name in lost:
                     del control[name]
 
@@ -302,7 +302,7 @@ def test_serial_burst_is_placed_by_the_arduinos_clock(tmp_path):
     whole = load(tmp_path).samples
 
     def change(content):
-        # the first 0.7 s waited in the buffer: they arrive together, 0.3 ms apart, before the 21st
+        # The controls of the first 0.7 s waited in the buffer, and arrive 0.3 ms apart just before the 21st.
         controls = content["control_samples"]
         for k, control in enumerate(controls[:20]):
             control["system_timestamp"] = controls[20]["system_timestamp"] - 0.0003 * (20 - k)
@@ -356,7 +356,7 @@ def test_real_recording(tmp_path):
     with pytest.raises(EpisodeError, match="frame_missing 176 times"):
         load_recordings(tmp_path)
     pictures = sorted((sample_episode / "frames").glob("*.jpg"))
-    for k in range(1, 177):  # what is not there gets the picture that is
+    for k in range(1, 177):  # each missing picture becomes a copy of the one that exists
         shutil.copyfile(pictures[0], copy / f"frames/frame_{k:06d}.jpg")
     recordings = load_recordings(tmp_path)
     found = kinds(recordings)
@@ -400,7 +400,7 @@ def test_without_json_and_csvs_the_folder_is_skipped(tmp_path, text):
 
 
 def test_files_larger_than_any_drives_are_not_read(tmp_path):
-    """Of a terabyte without a byte on the disk, no memory is left for the other episodes."""
+    """Sparse files of a terabyte take no disk, but reading them would leave no memory for the other episodes."""
     record(tmp_path, "episode_20260101_120000")
     other = record(tmp_path, "episode_20260102_120000")
     for name in ("episode_data.json", "control_data.csv", "frame_data.csv"):
@@ -469,7 +469,7 @@ def test_unsorted_times(tmp_path):
 
 @pytest.mark.parametrize("back_s", [0.2, 0.5, 30])
 def test_what_follows_on_a_clock_that_was_set_back_is_left_out(tmp_path, back_s):
-    """Frames of two moments would have one time, and the actions of either."""
+    """Otherwise frames of two moments would have the same time, and get each other's actions."""
     folder = record(tmp_path)
     whole = {s.frame_name: s.chunk[0].tolist() for s in load(tmp_path).samples}
 
@@ -514,7 +514,7 @@ def test_no_overlap(tmp_path):
 
 def test_sync_window(tmp_path):
     def change(content):
-        del content["control_samples"][20:24]  # a hole of 165 ms: two frames are further than 50 ms from both ends
+        del content["control_samples"][20:24]  # a hole of 165 ms: two frames in it are more than 50 ms from both ends
 
     edit(record(tmp_path), change)
     recordings = load(tmp_path)
@@ -602,7 +602,7 @@ def test_links_instead_of_data(tmp_path):
     (tmp_path / "mine/.episode_20260106_000000.tmp").mkdir()  # a recorder at work
     (tmp_path / "mine/notes.txt").write_text("x")
     recordings = load(tmp_path / "mine")
-    # a linked episode is its owner's choice; what a recording's own files point to is not
+    # A linked episode is its owner's choice; a link among a recording's own files is not, and is refused.
     assert [e.id for e in recordings.episodes] == ["episode_20260101_000000", "episode_20260103_000000"]
     assert len(recordings.episodes[0].samples) == len(recordings.episodes[1].samples)
     assert kinds(recordings) == {"path_leaves_folder": 1, "absent": 2, "nothing_usable": 1, "no_data": 1}
@@ -676,7 +676,7 @@ QUICK = settings(max_examples=150, deadline=None, suppress_health_check=list(Hea
 
 
 def check_sane(root):
-    """Loads or refuses; whatever is loaded can be trained on."""
+    """Check that a folder is either refused in one line, or loaded as samples that can be trained on."""
     try:
         recordings = load(root)
     except EpisodeError as e:
@@ -719,7 +719,7 @@ def test_wild_bytes_as_json(wild_folder, data):
 
 @pytest.fixture(scope="module")
 def csv_folder(tmp_path_factory):
-    """A recording without its JSON, and what its tables hold."""
+    """Return a recording without its JSON, and the content of its CSV tables."""
     folder = record(tmp_path_factory.mktemp("csv"), frames=2)
     (folder / "episode_data.json").unlink()
     return folder, {name: (folder / name).read_bytes() for name in ("control_data.csv", "frame_data.csv")}
@@ -790,7 +790,7 @@ def test_few_episodes_are_parted_along_time_with_a_gap(tmp_path, episodes):
         ]
         assert all(times)
         for before, after in pairwise(times):
-            # a chunk's last action lies (CHUNK - 1) frames after its frame: none is shared
+            # A chunk's last action is (CHUNK - 1) frames after its frame, so no action is shared.
             assert min(after) - max(before) > (CHUNK - 0.5) / 30
     assert len(parts.calibration) > len(parts.choosing) + len(parts.held_out)
 

@@ -1,4 +1,4 @@
-"""Our recordings as a LeRobotDataset: LeRobot reads them back equal, and so do we."""
+"""Our recordings, exported as a LeRobotDataset, are read back equal by LeRobot and by us."""
 
 import json
 import shutil
@@ -19,9 +19,9 @@ from rover_lib.workshop.export_dataset import export_dataset
 from rover_lib.workshop.samples import car_of
 
 CRAWLER = read_car(Path(__file__).parents[2] / "lab/cars/crawler.yml")
-CHUNK = 8  # as test_episodes' load
+CHUNK = 8  # as in test_episodes.load
 
-# AV1 of tiny pictures and LeRobot's import: seconds
+# Importing LeRobot and encoding tiny pictures as AV1 takes seconds.
 pytestmark = pytest.mark.slow
 
 
@@ -82,7 +82,7 @@ def test_as_video(recorded, tmp_path):
     result = CliRunner().invoke(main, ["export-dataset", str(recorded), str(tmp_path / "out"), "--video", "--json"])
     assert result.exit_code == 0, result.output
     assert list((tmp_path / "out").rglob("*.mp4"))
-    check_equal(load(tmp_path / "out").samples, load(recorded).samples, pixels=6)  # of one colour each: AV1 is close
+    check_equal(load(tmp_path / "out").samples, load(recorded).samples, pixels=6)  # plain pictures: AV1 is close
 
 
 def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
@@ -97,7 +97,7 @@ def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
     edit(first, change)
     (first / "frames/frame_000008.jpg").unlink()
     whole = (first / "frames/frame_000015.jpg").read_bytes()
-    (first / "frames/frame_000015.jpg").write_bytes(whole[:200] + bytes(60) + whole[260:])  # seen when decoded
+    (first / "frames/frame_000015.jpg").write_bytes(whole[:200] + bytes(60) + whole[260:])  # seen in decoding
     report = export_dataset(recorded, tmp_path / "out")
     kinds = {f["kind"]: f["count"] for f in report["repaired_or_left_out_while_reading"]}
     assert kinds == {"serial_burst": 10, "throttle_zero_period": 1, "frame_missing": 1}
@@ -108,7 +108,7 @@ def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
     again = load(tmp_path / "out").samples
     for ours, theirs in zip(again, original, strict=True):
         assert np.array_equal(ours.state, theirs.state) and np.array_equal(ours.chunk[0], theirs.chunk[0])
-    check_equal(again[18:], original[18:])  # the last two episodes, and no end of the first one
+    check_equal(again[18:], original[18:])  # the first episode is in parts now, so its chunks end earlier
 
 
 def refused(episodes, out, **options) -> str:
@@ -148,11 +148,11 @@ def wide(folder):
     return folder / "wide.jpg"
 
 
-# ---- who drove, and what it came to
+# ---- who drove, and with what outcome
 
 
 def driven(folder, *spans, outcome=None):
-    """Says who drove: (driver, from which frame on); controls are 0.1 s ahead of the frames, every 33 ms."""
+    """Write into a recording who drove and its outcome. spans: (driver, its first frame), in order."""
 
     def change(content):
         first_s = content["frame_samples"][0]["timestamp"]
@@ -167,7 +167,7 @@ def driven(folder, *spans, outcome=None):
 
 @pytest.fixture
 def mixed(tmp_path):
-    """A demonstration, a policy's drive, and one that a human ended."""
+    """Record a demonstration, a policy's drive, and a policy's drive that a human took over."""
     root = tmp_path / "mixed"
     for second in range(3):
         record(root, f"episode_20260101_12000{second}", frames=40)
@@ -181,7 +181,7 @@ def test_interventions_are_lerobots(mixed, tmp_path):
 
     report = export_dataset(mixed, tmp_path / "out")
     theirs = LeRobotDataset("local/out", tmp_path / "out", video_backend="pyav")
-    # lerobot-rollout's, rollout/context.py
+    # as lerobot-rollout writes it, in rollout/context.py
     assert theirs.meta.features["intervention"] == {"dtype": "bool", "shape": (1,), "names": None}
     ours = [s for s in load(mixed).samples if s.driver != "nobody"]
     assert report["left_out_nobody_drove"] == 6 and len(theirs) == len(ours) == 40 + 40 + 25 + 7
@@ -206,7 +206,7 @@ def test_without_our_report_all_else_is_a_policys(mixed, tmp_path):
 
 
 def backwards(folder, name, car):
-    """An episode of two seconds, half of it backwards if the car can."""
+    """Record an episode of two seconds whose second half goes backwards if the car can."""
     with EpisodeWriter(folder / name, About("there and back", car=car), resolution=(64, 36)) as writer:
         for n in range(60):
             pulses = car.pwm.pulses(0.5, -0.1 if n >= 30 and car.reverses else 0.1)
@@ -215,7 +215,7 @@ def backwards(folder, name, car):
 
 
 def test_a_dataset_of_another_car_is_read_as_its_own(tmp_path):
-    """On a machine that has no car.yml. Without our report a dataset is of this machine's car, which has no reverse."""
+    """Our report says whose car it is. Without it, a dataset counts as this machine's car's, which has no reverse."""
     backwards(tmp_path / "mine", "episode_20260101_120000", CRAWLER)
     export_dataset(tmp_path / "mine", tmp_path / "out")
     again = load(tmp_path / "out")
@@ -307,7 +307,7 @@ def test_a_drive_that_nobody_drove_is_no_dataset(tmp_path):
 
 
 def test_lerobots_training_takes_it(mixed, tmp_path):
-    """What it does with a dataset before the first step: features of a policy, statistics, a batch."""
+    """LeRobot's training derives the policy's features from the dataset and loads batches; both work."""
     import torch
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.datasets.utils import dataset_to_policy_features

@@ -1,4 +1,4 @@
-"""Static INT8 that can be trained rounds as the real one does."""
+"""The trainable form of static INT8 rounds as the real one does."""
 
 import pytest
 import torch
@@ -45,7 +45,7 @@ def test_its_weights_are_the_int8_weights_to_the_last_bit(tiny, calibration, rou
 
 @pytest.mark.slow
 def test_every_layer_gives_what_the_int8_layer_gives(tiny, calibration, rounded, batch):
-    """Asked what each INT8 layer was asked: another step only where XNNPACK breaks a tie the other way."""
+    """Given each INT8 layer's input, it differs by a step only where XNNPACK breaks a tie the other way."""
     quantized = quantize(tiny, Scheme("static"), calibration).module
     seen = {}
     for name, layer in int8_layers(quantized).items():
@@ -67,7 +67,7 @@ def test_every_layer_gives_what_the_int8_layer_gives(tiny, calibration, rounded,
 
 @pytest.mark.slow
 def test_it_loses_as_much_as_the_int8_policy(tiny, calibration, rounded, batch):
-    """Ties flip roundings, and over layers those grow as large as the error itself: only its size can be compared."""
+    """Over the layers, flipped ties grow as large as INT8's error itself, so only the error's size can be compared."""
     frames, states = batch
     inputs = [(state[None], frame) for state, frame in zip(states, frames, strict=True)]
     exact = predictions(ACT(tiny.config, tiny.weights), inputs)
@@ -105,9 +105,9 @@ def test_without_channel_scales(tiny, batch):
 
 @pytest.mark.slow
 def test_its_gradients_lead_to_what_float_plans(tiny, rounded, batch):
-    """Small steps along them take a part of what INT8 loses on one observation.
+    """Small steps along the gradients remove a part of what INT8 loses on one observation.
 
-    Which of them does is a matter of which roundings flip, and so of the processor.
+    Which step does so depends on which roundings flip, and so on the processor.
     """
     frames, states = batch[0][:1], batch[1][:1]
     with torch.no_grad():

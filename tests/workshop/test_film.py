@@ -1,4 +1,4 @@
-"""A drive that was: its pictures beside the flight log, as moments, as a film, and in the view."""
+"""A past drive is shown from its pictures and its flight log, as moments, as a film, and in the view."""
 
 import asyncio
 import csv
@@ -27,7 +27,7 @@ SECONDS, HZ, PICTURES_HZ = 2.0, 30, 10
 
 
 class Pace:
-    """A clock that the log's ticks are of."""
+    """The clock of the log's ticks."""
 
     def __init__(self):
         self.now = 50.0
@@ -37,7 +37,7 @@ class Pace:
 
 
 def drive(folder, *, recorded=True, pictures=True, car=None):
-    """A flight log and the episode that was recorded with it; the log's path."""
+    """Write a flight log and the episode that was recorded with it. Returns the log's path."""
     described = {"car": car.description()} if car else {}
     clock, episode = Pace(), folder / "episodes" / "episode_1"
     with FlightLog(folder / "flight.log", header={"hz": HZ, "artifact": "runs/x/policy_static.pt"} | described,
@@ -69,7 +69,7 @@ def test_each_picture_has_what_the_log_says_of_its_moment(tmp_path):
     ticks = read_log(tmp_path / "flight.log").ticks
     assert [round(m.t_s, 2) for m in found] == [round(k / PICTURES_HZ, 2) for k in range(20)]  # and none from outside
     for k, moment in enumerate(found):
-        row = 3 * k  # of the last tick before the picture
+        row = 3 * k  # the last tick before the picture
         tick = moment.head["tick"]
         for name in ("t_s", "throttle", "steering", "throttle_us", "pins_throttle_us", "plan", "latency_ms"):
             assert tick[name] == pytest.approx(ticks[name][row]), name
@@ -97,7 +97,7 @@ def test_the_ribbon_and_the_bars_are_of_the_moment():
     way = np.argwhere(to_the_left[:360, :, 1].astype(int) > to_the_left[:360, :, 0] + 15)
     assert way[:, 1].mean() < 310
     assert (f.drawn(head | {"plan": plan | {"actions": [[0.6, 0.0]] * 30}}, frame, shape, pwm)[:360] == 90).all()
-    bar = picture[360 + 19, 84:265]  # steering: half of its left half, and the pin in the middle
+    bar = picture[360 + 19, 84:265]  # steering fills half of the bar's left half, and the pin's line is in the middle
     filled = np.flatnonzero((bar == f.FILL).all(axis=1))
     assert (84 + filled.min(), 84 + filled.max()) == pytest.approx((129, 172), abs=3)
     assert np.flatnonzero((bar == f.PIN).all(axis=1)).mean() == pytest.approx(90, abs=1)

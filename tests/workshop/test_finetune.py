@@ -1,4 +1,4 @@
-"""A policy learns on from what humans drove, and from nothing else, whatever interrupts it."""
+"""A policy learns on from what humans drove, and from nothing else; interrupted, it goes on where it stopped."""
 
 import contextlib
 import json
@@ -41,7 +41,7 @@ TAKEN_OVER = [POLICY] * 8 + [HUMAN] * 12 + [NOBODY] * 4
 
 
 def record(root, drives=4, drivers=(HUMAN,) * FRAMES, size=(96, 54), offset=0, car=None, rate_hz=30):
-    """Drives whose steering and throttle change, and whose pictures do; with who drove at each frame."""
+    """Record drives in which steering, throttle and pictures change. drivers: who drives at each frame."""
     rng, pwm = np.random.default_rng(offset), PwmCalibration()
     for drive in range(drives):
         with EpisodeWriter(root / f"episode_{offset + drive}", About("", car=car), resolution=size) as writer:
@@ -106,7 +106,7 @@ def episode_of(drivers, chunk=8, missing=()):
     st.integers(1, 12),
 )
 def test_only_what_a_human_drove_is_learned_from(drivers, missing, chunk):
-    """Against the definition, frame by frame and step by step."""
+    """Compare with the definition, frame by frame and step by step."""
     if set(range(len(drivers))) <= missing:
         return
     episode = episode_of(drivers, chunk, missing)
@@ -122,7 +122,7 @@ def test_only_what_a_human_drove_is_learned_from(drivers, missing, chunk):
 
 
 def test_a_plan_that_began_before_the_takeover_is_not_taught():
-    """And one that ends where the human let go has no step of what came then."""
+    """A plan during a takeover has no step from after the human let go."""
     learned = human_samples(episode_of([POLICY] * 5 + [HUMAN] * 4 + [NOBODY] * 3 + [HUMAN] * 2))
     assert [s.row - 100 for s in learned] == [5, 6, 7, 8, 12, 13]
     assert [int((~s.is_pad).sum()) for s in learned] == [4, 3, 2, 1, 2, 1]
@@ -148,7 +148,7 @@ def test_the_state_of_the_first_correction_is_what_the_policy_did(new):
 def test_what_is_left_is_one_policy_in_two_formats_with_its_parent_and_recipe(taught, checkpoint):
     ours, lerobots = load_checkpoint(taught / "best_model.pth"), load_checkpoint(taught / "pretrained_model")
     parent = load_checkpoint(checkpoint)
-    assert ours.config == parent.config  # the VAE's encoder too, so that the trainer can go on with it
+    assert ours.config == parent.config  # including the VAE's encoder, so that the trainer can go on with it
     assert set(ours.weights) == set(parent.weights)
     assert all(torch.equal(weight, lerobots.weights[name]) for name, weight in ours.weights.items())
     moved = {name for name, weight in ours.weights.items() if not torch.equal(weight, parent.weights[name])}
@@ -167,7 +167,7 @@ def test_finetune_json_says_what_was_learned_from_and_judges_each_episode(taught
         "demonstrations": 20,
         "new_demonstrations": 0,
         "corrections": 24,
-        "not_imitated": 3 * (8 + 3),  # nobody's first frame is no sample: the action before it was the human's
+        "not_imitated": 3 * (8 + 3),  # nobody's first frame makes no sample: the action before it was the human's
     } | {"corrections": 20}
     assert [(row["kind"], row["frames"]) for row in metrics["held_out"]] == [("old", 4)] * 2 + [("new", 4)]
     assert all(row[f"{when}_steering_pct"] > 0 for row in metrics["held_out"] for when in ("before", "after"))
@@ -187,7 +187,7 @@ def test_killed_in_either_phase_it_goes_on_and_gives_the_same(
         finetune(checkpoint, [old, new], "better", **arguments)
     assert not (tmp_path / "better").exists()
     folder = finetune(checkpoint, [old, new], "better", **arguments)
-    assert len(steps) == 6 + 3 + 1  # only the step that was interrupted is made again
+    assert len(steps) == 6 + 3 + 1  # only the interrupted step is repeated
     assert_same(folder, taught)
 
 
@@ -204,7 +204,7 @@ def assert_same(folder, other):
 def test_killed_while_it_looks_at_the_recordings_it_goes_on(
     checkpoint, old, new, recipe, taught, tmp_path, monkeypatch, asked
 ):
-    """In the old ones, and in the new ones."""
+    """It is interrupted once in the old recordings, and once in the new ones."""
     save_each_step(monkeypatch, finetune_module)
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
@@ -238,7 +238,7 @@ def test_it_learns_what_the_human_did_and_keeps_what_it_could(checkpoint, old, n
 
 @pytest.mark.slow
 def test_a_lerobot_folder_learns_on_and_recordings_of_one_folder_do(taught, old, new, recipe, tmp_path):
-    """Episodes in which a policy drove are new, wherever they are; a LeRobot folder is what `rover finetune` leaves."""
+    """Episodes in which a policy drove count as new in any folder. `rover finetune` itself leaves a LeRobot folder."""
     both = tmp_path / "both"
     both.mkdir()
     for path in (*old.iterdir(), *new.iterdir()):
@@ -263,7 +263,7 @@ def test_new_demonstrations_alone_are_learned_from_too(checkpoint, old, recipe, 
 
 @pytest.mark.slow
 def test_a_policy_that_does_without_channels_learns_without_them(checkpoint, old, new, recipe, tmp_path):
-    """What `rover distill --backbone-channels` left out stays zero, so its artifact stays as small."""
+    """Channels that `rover distill --backbone-channels` left out stay zero, so the artifact stays as small."""
     parent, rng = load_checkpoint(checkpoint), np.random.default_rng(0)
     pictures = [torch.from_numpy(np.stack([smooth_frame(rng, 72, 128) for _ in range(4)]))]
     thin, notes = without_channels(parent.weights, parent.config, 0.25, pictures, rng)
@@ -275,7 +275,7 @@ def test_a_policy_that_does_without_channels_learns_without_them(checkpoint, old
     for name in (note["block"] for note in notes):
         for part in ("conv1.weight", "bn1.weight", "bn1.bias", "conv2.weight"):
             before, after = (of[f"{name}.{part}"] for of in (thin, learned.weights))
-            if part == "conv2.weight":  # which reads the channels
+            if part == "conv2.weight":  # its inputs are the channels
                 before, after = before.transpose(0, 1), after.transpose(0, 1)
             alive = before.reshape(len(before), -1).any(1)
             assert torch.equal(after.reshape(len(after), -1).any(1), alive) and alive.sum() * 4 == len(alive)
@@ -283,12 +283,12 @@ def test_a_policy_that_does_without_channels_learns_without_them(checkpoint, old
     recipe = replace(pipeline.Recipe.of(params()), samples=8)
     make_artifact(session.load(folder / "best_model.pth", old), folder / "policy_static.pt", recipe)
     assert load_policy(folder / "policy_static.pt").manifest["gmac"] == pytest.approx(gmac(parent.config, thin))
-    assert (folder / "policy_static.pt").stat().st_size < 6e6  # 12 with all channels
+    assert (folder / "policy_static.pt").stat().st_size < 6e6  # it has 12 MB with all channels
 
 
 @pytest.mark.slow
 def test_a_policy_with_other_statistics_is_asked_again(checkpoint, old, new, recipe, tmp_path, monkeypatch):
-    """Its weights are the same: what it planned with the wrong statistics lies in the cache."""
+    """The weights did not change, but the cache holds what the policy planned with the wrong statistics."""
     was = load_checkpoint(checkpoint)
     plans, rows = [], np.arange(2 * recipe.samples)
     monkeypatch.setattr(finetune_module, "_refuse_strangers", lambda work, each: plans.append(each.plans[rows]))
@@ -342,7 +342,7 @@ def test_a_recipe_that_cannot_be_is_refused(recipe, values, says):
 
 
 def test_phases_that_another_process_has_removed_are_no_error(checkpoint, old, new, tmp_path, monkeypatch):
-    """Who learns the same under another name goes on in the same folder, and may be done first."""
+    """A process that learns the same under another name uses the same folder, and may finish first."""
     monkeypatch.setattr(finetune_module, "_taught", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
     monkeypatch.setattr(finetune_module, "_leave", lambda new, *_: (new / "finetune.json").touch())
     assert finetune(checkpoint, [old, new], "better", runs_dir=tmp_path, device="cpu").is_dir()
@@ -364,7 +364,7 @@ def test_a_run_that_another_process_made_meanwhile_is_not_overwritten(checkpoint
 
 
 def test_ended_while_the_run_takes_its_place_it_goes_on(checkpoint, old, new, tmp_path, monkeypatch):
-    """A folder that has only some of its files would keep the same command from going on."""
+    """A run's folder with only some of its files would keep the same command from going on."""
     taught = SimpleNamespace(folder=tmp_path / "phases")
     monkeypatch.setattr(finetune_module, "_taught", lambda work: taught)
 
@@ -411,7 +411,7 @@ def test_another_car_is_refused(checkpoint, old, tmp_path):
 
 
 def test_a_policy_of_two_wheels_is_not_taught_to_steer(checkpoint, old, new, tmp_path, monkeypatch):
-    """Every sample is shown mirrored too, with its first number negated: of a wheel that is another drive."""
+    """Each sample is also shown mirrored, with its first number negated; for a wheel's speed that is another drive."""
     wheels = ("left", "right")
     real = finetune_module.load_checkpoint
     monkeypatch.setattr(

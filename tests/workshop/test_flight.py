@@ -1,4 +1,4 @@
-"""The figure of a flight log, and the command that draws it."""
+"""A flight log becomes a figure, and a command draws it."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from rover_lib.workshop.flight import flight_figure
 
 
 class Pi(Host):
-    """Warm, and with too thin a cable."""
+    """A Pi that is warm and has too thin a cable."""
 
     def temperature_c(self):
         return 61.5
@@ -25,7 +25,7 @@ class Pi(Host):
 
 
 def fly(path, *, seconds=4.0, events=3, header=None, machine=None, hz=30):
-    """A drive by hand: the host drives, its plans grow old, then the human takes over."""
+    """Write and read the log of a made-up drive: the host drives, its plans grow old, then the human takes over."""
     with FlightLog(path, header={"hz": hz, "fade_s": 0.5, "stop_s": 1.0} if header is None else header,
                    max_bytes=1_000_000, keep=1, host=machine) as log:  # fmt: skip
         for k in range(events):
@@ -83,7 +83,7 @@ def test_what_is_drawn(path, tmp_path):
 
 
 def test_nothing_is_cut_off(path):
-    """All text lies inside the figure, and no panel became narrow for it."""
+    """All text lies inside the figure, and no panel becomes narrow because of it."""
     figure = flight_figure(fly(path, events=40))
     figure.draw_without_rendering()
     width, height = figure.bbox.size
