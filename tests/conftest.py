@@ -1,8 +1,5 @@
 """Fixtures that many tests share: a tiny policy, its calibration, its artifacts, and the demo's run."""
 
-import contextlib
-import ctypes
-import gc
 import os
 import sys
 from collections.abc import Callable
@@ -17,7 +14,6 @@ from hypothesis import settings
 sys.modules["rfc3987_syntax"] = None  # type: ignore[assignment]
 # In a container, root may be the only user.
 os.environ.setdefault("ROVER_AS_ROOT", "1")
-LARGE_BYTES = 2e9  # a test process that holds more than this gives memory back
 # No deadline for hypothesis's examples: one that waits for another program's turn has not failed.
 settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")
@@ -39,17 +35,6 @@ def _one_thread():
     import torch
 
     torch.set_num_threads(1)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _free_memory():
-    """Give memory back after each test file that used large policies; otherwise a worker ends with more than 5 GB."""
-    yield
-    pages = Path("/proc/self/statm")  # only Linux has it; and of the C libraries, only glibc has malloc_trim
-    if pages.is_file() and int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > LARGE_BYTES:
-        gc.collect()  # unused policies are kept alive by reference cycles
-        with contextlib.suppress(AttributeError, OSError):
-            ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 @pytest.fixture(scope="session")
