@@ -6,7 +6,8 @@ LAB := $(VENV)/bin/python -m lab
 READY := $(VENV)/.ready
 # Each process runs whole test files or notebooks. More than four processes would cost more memory than they save time.
 # They go in the order of the folders: ansible and lab have the longest files, which would run alone if they came last.
-PYTEST := $(VENV)/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+PROCESSES ?= auto
+PYTEST := $(VENV)/bin/pytest --numprocesses $(PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 NAME ?= mine
 DEMO := runs/demo/.made
 # A container may have no user but root. Root may load artifacts here, as they were made here; see onboard/confine.py.
