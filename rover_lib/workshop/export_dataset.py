@@ -90,10 +90,10 @@ def export_dataset(
     if recordings.layout.rate_hz is not None:
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = _rate_hz(recordings)
-    car_of(recordings.samples)  # raises for several cars
+    car = car_of(recordings.samples)
     with alone_in(out.with_name(f".{out.name}.new")) as beside:
         new = beside / out.name
-        report = _write(recordings, new, rate_hz, video, size, progress)
+        report = _write(recordings, new, rate_hz, video, size, progress) | {CAR: car.description()}
         (new / REPORT).write_text(json.dumps(report, indent=2) + "\n")
         new.rename(out)
     return report
@@ -207,7 +207,6 @@ def _write(
         "episodes_are": origins,
         DRIVEN_BY: driven_by,
         OUTCOMES: outcomes,
-        CAR: car_of(recordings.samples).description(),
     }
 
 
