@@ -25,7 +25,6 @@ from rover_lib.onboard.car import Car
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.kinds import kinds_of
 from rover_lib.onboard.picture import PictureError, read_jpeg
-from rover_lib.onboard.recording import recorded_car
 from rover_lib.onboard.servo_link import REASONS
 from rover_lib.onboard.telemetry import Flight, LogError, Tick, read_log
 from rover_lib.workshop.episodes import load_recordings
@@ -171,7 +170,7 @@ def _of_flight(flight: Flight, episode: Path) -> list[Moment]:
 
 def _of_recording(folder: Path) -> Replay:
     episode = load_recordings(folder).episodes[0]
-    car, found = recorded_car(episode.path), []
+    car, found = episode.samples[0].car, []
     for number, sample in enumerate(episode.samples, 1):
         steering, throttle = (float(v) for v in sample.chunk[0])
         pulses = car.pwm.pulses(*(float(v) for v in np.clip([steering, throttle], *car.limits)))
