@@ -120,7 +120,7 @@ def faults(
     All faults take about 6 minutes. The rows are written to OUTPUT as JSON, if it is given. The exit code is 1 if
     anything is not as expected. Needs Debian's packages for the Arduino's firmware and simavr, see docs/first_hour.md.
     """
-    from rover_lib.onboard.car import FILE_VARIABLE, read_car
+    from rover_lib.onboard.car.car import FILE_VARIABLE, read_car
 
     if car:
         read_car(car)

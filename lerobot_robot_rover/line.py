@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable
 from weakref import WeakSet, WeakValueDictionary
 
-from rover_lib.onboard.servo_link import LinkError, ServoLink
+from rover_lib.onboard.car.servo_link import LinkError, ServoLink
 
 _lines: WeakValueDictionary[str, Line] = WeakValueDictionary()
 

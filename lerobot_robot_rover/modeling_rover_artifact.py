@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig, not_trained
 from lerobot_robot_rover.line import wait_for_humans
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.drive import another_car
 from rover_lib.onboard.errors import ParamsError, PolicyError
 from rover_lib.onboard.inference import PolicyProcess

@@ -9,13 +9,13 @@ import threading
 import time
 from collections.abc import Callable
 
-from rover_lib.onboard.camera import Camera
+from rover_lib.onboard.car.camera import Camera
+from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
 from rover_lib.onboard.drive import arm_capped
 from rover_lib.onboard.errors import DriveFault
 from rover_lib.onboard.loop import Hooks, Log, Report, Until, drive
 from rover_lib.onboard.pilot import Order, Sight
 from rover_lib.onboard.plan import Settings
-from rover_lib.onboard.servo_link import ServoLink, Telemetry
 from rover_lib.onboard.watch import SWITCH_S, HealthWatch
 
 RATE_HZ = 50.0  # an action waits 20 ms at most; at 100 Hz a busy machine's pauses of 10 ms would count as missed ticks

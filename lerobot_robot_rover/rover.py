@@ -15,17 +15,17 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 from lerobot_robot_rover.line import line_to
 from lerobot_robot_rover.ride import HOLD_S, RATE_HZ, Ride
-from rover_lib.onboard.camera import Camera, CameraError
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car.camera import Camera, CameraError
+from rover_lib.onboard.car.car import this_car
+from rover_lib.onboard.car.host import default_log
+from rover_lib.onboard.car.pwm import NEUTRAL
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive import arm_when_ready, check_no_film
 from rover_lib.onboard.errors import ParamsError, PolicyError
-from rover_lib.onboard.host import default_log
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import HOLE_S, LATE_FRAME_S, Sight
 from rover_lib.onboard.plan import Plan, Settings
 from rover_lib.onboard.preprocess import prepare_frame
-from rover_lib.onboard.pwm import NEUTRAL
-from rover_lib.onboard.servo_link import ServoLink
 from rover_lib.onboard.telemetry import FlightLog, log_limits
 from rover_lib.onboard.watch import unfinished_drive
 

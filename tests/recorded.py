@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from policies import smooth_frame
 
-from rover_lib.onboard.pwm import PwmCalibration
+from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.recording import About, EpisodeWriter
 
 REPO = Path(__file__).resolve().parents[1]

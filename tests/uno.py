@@ -10,7 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from lab.arduino import emulator as arduino
-from rover_lib.onboard import car
+from rover_lib.onboard.car import car
 
 REPOSITORY = arduino.REPOSITORY
 symbol = arduino.symbol

@@ -10,7 +10,7 @@ extern "C" {
 #endif
 
 enum {
-    /* The car that is driven until another is told: actions -1 to 1 and 0 to 1 of rover_lib/onboard/pwm.py. */
+    /* The car that is driven until another is told: actions -1 to 1 and 0 to 1 of rover_lib/onboard/car/pwm.py. */
     STEERING_PERIOD_US = 21316,
     STEERING_MIN_US = 900,
     STEERING_NEUTRAL_US = 1456,
@@ -23,7 +23,7 @@ enum {
     CAP_MAX_US = 118,          /* of throttle, from neutral, either way: action 0.2 of this car. No car's may be more */
     STEERING_SLEW_US_PER_MS = 4,
     THROTTLE_SLEW_US_PER_MS = 2,
-    /* The limits of another car; rover_lib/onboard/car.py has the same. */
+    /* The limits of another car; rover_lib/onboard/car/car.py has the same. */
     PERIOD_MIN_US = 3000,
     PERIOD_MAX_US = 25000,
     STEERING_NEUTRAL_MIN_US = 1300,

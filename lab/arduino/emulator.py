@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lab import debian
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.program import run

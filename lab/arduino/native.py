@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lab.arduino.emulator import CC, FIRMWARE, compile_c
-from rover_lib.onboard.car import Car
-from rover_lib.onboard.servo_link import Hello, Telemetry, frame, parse
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.servo_link import Hello, Telemetry, frame, parse
 from rover_lib.workshop.cache import cached_folder, key_of
 
 SOURCES = (FIRMWARE / "rover" / "protocol.c", FIRMWARE / "rover" / "vehicle.c")

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 from lab.driving.pins import Command
 from lab.driving.priority import boost
-from rover_lib.onboard.servo_link import frame
+from rover_lib.onboard.car.servo_link import frame
 
 Change = Callable[[bytes], bytes]
 

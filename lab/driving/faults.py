@@ -49,7 +49,7 @@ from lab.driving.pins import (
 )
 from lab.driving.row import FaultRow
 from lab.driving.rows import FAULTS, KINDS
-from rover_lib.onboard.pwm import ARDUINO_STEP_US
+from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.stage import write_stage
 from rover_lib.world.standin import REST_US, PinEvent
 

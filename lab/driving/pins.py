@@ -9,9 +9,9 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 from lab.params import lab_params
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car.car import this_car
+from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pwm import ARDUINO_STEP_US
 from rover_lib.world.standin import REST_US, PinEvent
 
 STOPPED, HUMAN, CONTINUES, REFUSED = "stopped", "human", "continues", "refused"

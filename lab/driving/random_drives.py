@@ -17,7 +17,7 @@ from typing import Any
 from lab.driving.invariants import RESTING_US, Run, broken
 from lab.driving.stories import Story, drive_story, random_story, shortest
 from lab.driving.virtual import Event, Seen, library
-from rover_lib.onboard import servo_link
+from rover_lib.onboard.car import servo_link
 from rover_lib.onboard.stage import write_stage
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from lab.driving.virtual import HELD, LIVE, LOST, PRESET, STICKS_US, Killed, Seen, Wire, World
 from lab.driving.virtual_host import Process
-from rover_lib.onboard.servo_link import frame
+from rover_lib.onboard.car.servo_link import frame
 
 WIGGLE_MS, START_MS, ASK_MS, STOP_MS, END_MS = 100, 700, 1300, 4000, 4600
 

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from lab.driving.virtual import FRAME_MS, Killed, World
-from rover_lib.onboard.camera import Camera
+from rover_lib.onboard.car.camera import Camera
+from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
 from rover_lib.onboard.errors import DriveFault, PolicyError, RoverError, TakenOver, sentence_of
 from rover_lib.onboard.inference import Planner
 from rover_lib.onboard.loop import Hooks, Report, Until, drive
@@ -21,7 +22,6 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Order, PolicyPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
 from rover_lib.onboard.service import NotArmed, check_age
-from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink, Telemetry
 
 RATE_HZ = 30.0
 PLAN = (0.2, 0.15)  # steering, throttle

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-from rover_lib.onboard.car import WIDTH_PX, Car, this_car
+from rover_lib.onboard.car.car import WIDTH_PX, Car, this_car
+from rover_lib.onboard.car.pwm import is_finite
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pwm import is_finite
 
 NEAR_M = 0.15  # in front of the camera; the picture does not show what is nearer
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rover_lib.onboard.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.engines import HAILO, ONNXRUNTIME
 from rover_lib.onboard.errors import ArtifactError, CarError
 from rover_lib.onboard.onnx_file import check_model

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from rover_lib.onboard.car.host import Host, throttled_means, usable_cores
 from rover_lib.onboard.errors import ParamsError, PolicyError
 from rover_lib.onboard.floor import floor_ms
-from rover_lib.onboard.host import Host, throttled_means, usable_cores
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
@@ -39,7 +39,7 @@ def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeou
     code = (
         "import sys, numpy as np\n"
         "from rover_lib.onboard import load_policy\n"
-        "from rover_lib.onboard.host import Host\n"
+        "from rover_lib.onboard.car.host import Host\n"
         "policy = load_policy(sys.argv[1], threads=int(sys.argv[2]) or None)\n"
         "cameras = policy.manifest['cameras']\n"
         "frame = {c['name']: np.zeros((c['height'], c['width'], 3), np.uint8) for c in cameras}\n"

@@ -348,7 +348,7 @@ def doctor(
     warnings do not count. With --receiver it asks you to move a stick and to switch the transmitter off: do that once.
     """
     from rover_lib.onboard import doctor as checking
-    from rover_lib.onboard.host import default_log
+    from rover_lib.onboard.car.host import default_log
 
     if receiver:
         found = checking.receiver(port, lambda text: click.prompt(text + " Enter", "", show_default=False, err=True))
@@ -389,9 +389,9 @@ def calibrate(
     Recorder, drive, doctor and the balloon world read it from then on, and the Arduino is told it. Take the wheels off
     the ground and unplug the motor first. Ctrl-C leaves everything as it was.
     """
-    from rover_lib.onboard.calibrate import measure, refuse_existing, write_car
-    from rover_lib.onboard.car import Car, default_place, yaml_of
-    from rover_lib.onboard.servo_link import ServoLink
+    from rover_lib.onboard.car.calibrate import measure, refuse_existing, write_car
+    from rover_lib.onboard.car.car import Car, default_place, yaml_of
+    from rover_lib.onboard.car.servo_link import ServoLink
 
     path = output or default_place()
     refuse_existing(path, force)
@@ -643,7 +643,7 @@ def status(releases: Any, as_json: bool) -> None:
     if as_json:
         import socket
 
-        from rover_lib.onboard.host import Host, default_log
+        from rover_lib.onboard.car.host import Host, default_log
         from rover_lib.onboard.service import ServiceError, state_of
 
         try:
@@ -710,7 +710,7 @@ def open_view(
     """
     import asyncio
 
-    from rover_lib.onboard.host import default_view
+    from rover_lib.onboard.car.host import default_view
     from rover_lib.onboard.view import Address, View, new_token, read_token
 
     token = read_token(token_file) if token_file else new_token()

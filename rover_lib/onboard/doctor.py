@@ -24,15 +24,15 @@ from typing import Any, Literal
 import numpy as np
 
 from rover_lib.onboard.artifact import car_of, read_manifest
-from rover_lib.onboard.camera import Camera, path_of
-from rover_lib.onboard.car import car_file, this_car
+from rover_lib.onboard.car.camera import Camera, path_of
+from rover_lib.onboard.car.car import car_file, this_car
+from rover_lib.onboard.car.host import Host, throttled_means
+from rover_lib.onboard.car.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, ServoLink, Telemetry
 from rover_lib.onboard.errors import ArtifactError, RoverError
-from rover_lib.onboard.host import Host, throttled_means
 from rover_lib.onboard.inference import PolicyProcess
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import blank, frozen
 from rover_lib.onboard.plan import Settings
-from rover_lib.onboard.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, ServoLink, Telemetry
 from rover_lib.onboard.telemetry import log_limits
 
 NAME_WIDTH = 15

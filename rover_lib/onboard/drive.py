@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rover_lib.onboard.artifact import car_of, content_hash
-from rover_lib.onboard.camera import Camera, CameraError, path_of
-from rover_lib.onboard.car import Car, this_car
+from rover_lib.onboard.car.camera import Camera, CameraError, path_of
+from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.car.host import default_log, default_view
+from rover_lib.onboard.car.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver, sentence_of
 from rover_lib.onboard.feed import Feed
-from rover_lib.onboard.host import default_log, default_view
 from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
 from rover_lib.onboard.loop import Arm, Hooks, Report, Until, Warnings, drive
 from rover_lib.onboard.params import params
@@ -32,7 +33,6 @@ from rover_lib.onboard.plan import Commanded, Settings
 from rover_lib.onboard.recorder import Recorder, room_for
 from rover_lib.onboard.recording import About, Controls, read_controls, recorded_car
 from rover_lib.onboard.service import CHECK_S, NotArmed, Service
-from rover_lib.onboard.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.status_line import StatusLine
 from rover_lib.onboard.takeover import TakeoverRecorder

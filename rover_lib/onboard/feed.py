@@ -29,11 +29,11 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.camera import Camera, Frame
+from rover_lib.onboard.car.camera import Camera, Frame
+from rover_lib.onboard.car.servo_link import MISSING, REASONS, ServoLink
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.loop import Report
 from rover_lib.onboard.pilot import PolicyPilot
-from rover_lib.onboard.servo_link import MISSING, REASONS, ServoLink
 from rover_lib.onboard.telemetry import FlightLog, Tick
 
 EVERY_S = 0.1  # between two messages

@@ -14,9 +14,9 @@ import hailo_platform
 import numpy as np
 
 from rover_lib.onboard.archive import HEF, ONNX, open_archive, read_record
+from rover_lib.onboard.car.host import usable_cores
 from rover_lib.onboard.engines import SessionEngine
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.host import usable_cores
 
 TIMEOUT_MS = 1000  # for one inference: about thirty times what it should take
 LARGEST_SIDE = 8192  # of an output's shape

@@ -19,10 +19,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car.car import this_car
+from rover_lib.onboard.car.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
 from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, TakenOver, sentence_of
 from rover_lib.onboard.pilot import Order, Pilot
-from rover_lib.onboard.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
 from rover_lib.onboard.telemetry import ARMED, Tick
 
 RATES_HZ = (10.0, 100.0)

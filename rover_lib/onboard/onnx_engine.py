@@ -8,9 +8,9 @@ import numpy as np
 import onnxruntime
 
 from rover_lib.onboard.archive import ONNX, nothing_unknown, open_archive, read_record
+from rover_lib.onboard.car.host import usable_cores
 from rover_lib.onboard.engines import SessionEngine
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.host import usable_cores
 
 onnxruntime.disable_telemetry_events()  # nobody has agreed to it
 ERRORS_ONLY = 3  # log level; ONNX Runtime warns of what a machine without a graphics card lacks

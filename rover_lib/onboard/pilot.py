@@ -8,11 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
-from rover_lib.onboard.camera import Camera, CameraError, Frame
+from rover_lib.onboard.car.camera import Camera, CameraError, Frame
+from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import DriveFault, PolicyError
 from rover_lib.onboard.inference import Planner
 from rover_lib.onboard.plan import Commanded, Follower, Plan, Settings
-from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import Controls
 
 FIRST_PLAN_S = 10.0

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from rover_lib.onboard.car.pwm import is_finite
 from rover_lib.onboard.errors import ParamsError, PolicyError
-from rover_lib.onboard.pwm import is_finite
 
 STEERING, THROTTLE = 0, 1
 ROUNDING = 1e-6  # error of a time, in steps

@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
 
-from rover_lib.onboard.camera import Camera
+from rover_lib.onboard.car.camera import Camera
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
 from rover_lib.onboard.recording import About, EpisodeExists, EpisodeWriter
-from rover_lib.onboard.servo_link import ServoLink
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.status_line import StatusLine
 from rover_lib.onboard.watch import signals

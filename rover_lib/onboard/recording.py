@@ -29,9 +29,9 @@ from typing import IO, Any
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.stage import plain
 
 CHANNELS = ("steering", "throttle")

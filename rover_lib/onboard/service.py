@@ -45,12 +45,12 @@ from typing import TYPE_CHECKING, Any
 
 from systemd_watchdog import WatchDog
 
+from rover_lib.onboard.car.host import is_listened_at
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.host import is_listened_at
 
 if TYPE_CHECKING:  # asking for the service's state, as every playbook does, must not import numpy or OpenCV
+    from rover_lib.onboard.car.servo_link import Telemetry
     from rover_lib.onboard.loop import Arm, Report
-    from rover_lib.onboard.servo_link import Telemetry
 
 UNIT = "rover-drive.service"
 RUNTIME = Path("/run/rover-drive")  # the unit's RuntimeDirectory=

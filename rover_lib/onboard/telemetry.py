@@ -36,12 +36,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.host import THROTTLED_VALUE, Host, throttled_means
+from rover_lib.onboard.car.pwm import is_finite
+from rover_lib.onboard.car.servo_link import State
 from rover_lib.onboard.errors import ParamsError, RoverError
-from rover_lib.onboard.host import THROTTLED_VALUE, Host, throttled_means
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pwm import is_finite
-from rover_lib.onboard.servo_link import State
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.stage import open_plain, plain
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from rover_lib.onboard.car.servo_link import LinkError, ServoLink, Telemetry
 from rover_lib.onboard.loop import Report
-from rover_lib.onboard.servo_link import LinkError, ServoLink, Telemetry
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.stage import open_plain
 from rover_lib.onboard.telemetry import FlightLog, LogError

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rover_lib.onboard.car import Car, this_car
+from rover_lib.onboard.car.car import Car, this_car
 
 
 def cache_root() -> Path:

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from rover_lib.onboard.artifact import content_hash
-from rover_lib.onboard.car import Car, this_car
+from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.columns import number, ratio
 from rover_lib.onboard.errors import PolicyError, PwmError
 from rover_lib.onboard.policy import Policy, action_limits, load_policy

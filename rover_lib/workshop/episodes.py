@@ -38,9 +38,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.pwm import NEUTRAL, PwmCalibration
 from rover_lib.onboard.errors import CarError, EpisodeError
-from rover_lib.onboard.pwm import NEUTRAL, PwmCalibration
 from rover_lib.onboard.recording import (
     BURST_MIN,
     CONTROL_FIELDS,

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from rover_lib.onboard import artifact
 from rover_lib.onboard.artifact import ONNX_SUFFIX
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.wheel_version import release

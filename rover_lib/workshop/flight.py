@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from rover_lib.onboard.host import THROTTLED_BITS
-from rover_lib.onboard.pwm import Channel
-from rover_lib.onboard.servo_link import State
+from rover_lib.onboard.car.host import THROTTLED_BITS
+from rover_lib.onboard.car.pwm import Channel
+from rover_lib.onboard.car.servo_link import State
 from rover_lib.onboard.telemetry import Event, Flight
 from rover_lib.workshop.plots.style import BLACK, COLOURS, GREY, MIST, NOW_BITS, RED, SLATE, new_figure
 

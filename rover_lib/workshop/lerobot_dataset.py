@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rover_lib.onboard.car import Car, this_car
+from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.policy import action_limits
 from rover_lib.onboard.recording import HIT, HUMAN, MISSED, POLICY

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.picture import PictureError, read_jpeg
+from rover_lib.onboard.car.servo_link import REASONS
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.kinds import kinds_of
-from rover_lib.onboard.picture import PictureError, read_jpeg
-from rover_lib.onboard.servo_link import REASONS
 from rover_lib.onboard.telemetry import Flight, LogError, Tick, read_log
 from rover_lib.workshop.episodes import load_recordings
 

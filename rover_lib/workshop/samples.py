@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.picture import PictureError, read_jpeg
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.picture import PictureError, read_jpeg
 from rover_lib.onboard.recording import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
 

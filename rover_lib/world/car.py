@@ -29,9 +29,9 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car.car import this_car
+from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import WorldError
-from rover_lib.onboard.pwm import NEUTRAL
 from rover_lib.world.child import Child
 from rover_lib.world.record import JPEG_QUALITY
 from rover_lib.world.standin import PinEvent

@@ -13,11 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rover_lib.onboard import pwm as pwm_module
 from rover_lib.onboard import recording
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car import pwm as pwm_module
+from rover_lib.onboard.car.car import this_car
+from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.errors import WorldError
-from rover_lib.onboard.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.recording import About, EpisodeWriter
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.progress import Progress, silent

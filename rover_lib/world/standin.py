@@ -14,8 +14,8 @@ import zlib
 from collections import deque
 from typing import Any, NamedTuple
 
-from rover_lib.onboard.car import DEFAULT_NUMBERS, this_car
-from rover_lib.onboard.servo_link import FIRMWARE_VERSION, PROTOCOL_VERSION
+from rover_lib.onboard.car.car import DEFAULT_NUMBERS, this_car
+from rover_lib.onboard.car.servo_link import FIRMWARE_VERSION, PROTOCOL_VERSION
 
 BOOT_S = 0.2  # how long the boot loader runs; a real board's takes 1 to 2 s
 _NEUTRAL = this_car().pwm.neutral()

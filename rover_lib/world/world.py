@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car import this_car
+from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.errors import WorldError
 
 _CAR = this_car()  # its wheelbase, focal length and limits of the throttle are used here

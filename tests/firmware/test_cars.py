@@ -6,8 +6,8 @@ import needs
 import pytest
 
 from lab.arduino.native import STEERING, THROTTLE, NativeArduino
-from rover_lib.onboard.car import Car, read_car
-from rover_lib.onboard.servo_link import State
+from rover_lib.onboard.car.car import Car, read_car
+from rover_lib.onboard.car.servo_link import State
 
 CARS = Path(__file__).parents[2] / "lab" / "cars"
 pytestmark = needs.gcc

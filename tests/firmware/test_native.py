@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lab.arduino.native import READ_COMMAND, SOURCES, CarNumbers, Command, Reader, Vehicle, library, said
-from rover_lib.onboard import car, servo_link
+from rover_lib.onboard.car import car, servo_link
 from rover_lib.onboard.errors import RoverError
 from rover_lib.world import standin
 

@@ -9,7 +9,7 @@ import needs
 import pytest
 
 from lab.arduino.native import STEERING, THROTTLE, NativeArduino
-from rover_lib.onboard.servo_link import State
+from rover_lib.onboard.car.servo_link import State
 from rover_lib.world.standin import REST_US
 
 pytestmark = needs.gcc

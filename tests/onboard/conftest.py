@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rover_lib.onboard.host import Host
+from rover_lib.onboard.car.host import Host
 
 
 @pytest.fixture

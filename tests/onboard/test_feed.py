@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from rover_lib.onboard import feed as f
-from rover_lib.onboard.camera import CameraError, Frame
+from rover_lib.onboard.car.camera import CameraError, Frame
+from rover_lib.onboard.car.pwm import PwmCalibration
+from rover_lib.onboard.car.servo_link import State, Telemetry
 from rover_lib.onboard.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.pilot import Order
 from rover_lib.onboard.plan import Plan
-from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.onboard.servo_link import State, Telemetry
 from rover_lib.onboard.telemetry import FlightLog, read_log
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.AUTONOMOUS, "a", "-", 1456, 150, 238, None, None, None, None, 0, 0, 0, 0)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rover_lib.onboard import load_policy
-from rover_lib.onboard.camera import CameraError, Frame
+from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.confine import PROCESSORS
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
@@ -243,7 +243,7 @@ def test_it_ends_with_its_parent(artifacts):
 
 def test_the_side_that_drives_does_not_load_torch():
     code = (
-        "import sys, rover_lib.onboard.drive, rover_lib.onboard.camera, rover_lib.onboard.inference; "
+        "import sys, rover_lib.onboard.drive, rover_lib.onboard.car.camera, rover_lib.onboard.inference; "
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -12,15 +12,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rover_lib.onboard.camera import CameraError, Frame
+from rover_lib.onboard.car.camera import CameraError, Frame
+from rover_lib.onboard.car.pwm import PwmCalibration
+from rover_lib.onboard.car.servo_link import Hello, LinkError, State, Telemetry
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
 from rover_lib.onboard.loop import KEEP_S, Hooks, Report, Until, drive
 from rover_lib.onboard.pilot import Order, PolicyPilot, ReplayPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
-from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import Controls
 from rover_lib.onboard.service import NotArmed
-from rover_lib.onboard.servo_link import Hello, LinkError, State, Telemetry
 from rover_lib.onboard.telemetry import FlightLog
 from rover_lib.onboard.watch import (
     OFTEN,

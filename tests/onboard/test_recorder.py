@@ -21,12 +21,12 @@ import pytest
 from needs import until
 
 from rover_lib.onboard import recorder as module
-from rover_lib.onboard.camera import Camera, CameraError, Frame
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.camera import Camera, CameraError, Frame
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.servo_link import LinkError, ServoLink, State, Telemetry, frame
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recorder import Recorder, record
 from rover_lib.onboard.recording import About, EpisodeWriter, read_controls
-from rover_lib.onboard.servo_link import LinkError, ServoLink, State, Telemetry, frame
 from rover_lib.workshop.episodes import load_recordings
 
 PICTURE = np.full((36, 64, 3), (30, 90, 200), np.uint8)

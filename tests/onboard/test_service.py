@@ -24,13 +24,13 @@ from needs import until
 from lab.driving.policy import pictures
 from rover_lib.cli import main
 from rover_lib.onboard import service as s
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.pwm import PwmCalibration
+from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
 from rover_lib.onboard.drive import DriveOptions, arm_capped, arm_when_ready, drive_car
 from rover_lib.onboard.loop import Report
 from rover_lib.onboard.plan import Settings
-from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import read_controls
-from rover_lib.onboard.servo_link import MISSING, LinkError, State, Telemetry
 from rover_lib.onboard.telemetry import read_log
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.MANUAL, "h", "-", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)

@@ -14,11 +14,11 @@ from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.policy import PLAIN, pictures
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig
 from lerobot_robot_rover.ride import HOLD_S, Ride
-from rover_lib.onboard.camera import CameraError
+from rover_lib.onboard.car.camera import CameraError
+from rover_lib.onboard.car.pwm import PwmCalibration
+from rover_lib.onboard.car.servo_link import LinkError, State
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
 from rover_lib.onboard.plan import Settings
-from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.onboard.servo_link import LinkError, State
 from rover_lib.onboard.telemetry import read_log
 from rover_lib.world.standin import REST_US
 

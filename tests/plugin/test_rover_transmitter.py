@@ -9,9 +9,9 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig, line
 from lerobot_robot_rover.line import line_to, wait_for_humans
+from rover_lib.onboard.car.pwm import PwmCalibration
+from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry
 from rover_lib.onboard.errors import ParamsError
-from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.onboard.servo_link import LinkError, State, Telemetry
 
 PORT = "/dev/ttyNONE"
 CALIBRATION = PwmCalibration()

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.stage import plain
 from rover_lib.workshop import compare, plots
 

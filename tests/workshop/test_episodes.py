@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from recorded import real_episode
 
+from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.pwm import PwmCalibration
 from rover_lib.onboard.recording import CONTROL_FIELDS, FRAME_FIELDS, About, EpisodeWriter
 from rover_lib.workshop.episodes import choose_calibration, load_recordings, split
 

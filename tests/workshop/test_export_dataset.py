@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from test_episodes import edit, load, record
 
 from rover_lib.cli import main
-from rover_lib.onboard.car import Car, read_car, yaml_of
+from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.preprocess import prepare_frame
 from rover_lib.onboard.recording import About, EpisodeWriter

@@ -8,7 +8,7 @@ import pytest
 import torch
 from policies import memory_samples
 
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.workshop.compare import LerobotEager, fidelity
 from rover_lib.workshop.looking import FRAMES, look

@@ -17,9 +17,9 @@ import pytest
 from needs import ended, until
 
 from lab.arduino.emulator import BOARD
+from rover_lib.onboard.car.pwm import PwmCalibration
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import WorldError
-from rover_lib.onboard.pwm import PwmCalibration
-from rover_lib.onboard.servo_link import ServoLink
 from rover_lib.world import car as car_module
 from rover_lib.world.car import KEEP_DRIVES, STAND_IN, CameraFeed, VirtualCar, _Car, _Pins
 from rover_lib.world.standin import PinEvent

@@ -9,7 +9,7 @@ import pytest
 import serial
 from uno import body_of, line, status_of
 
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
 from rover_lib.world.standin import StandIn
 
 

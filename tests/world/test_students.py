@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
-from rover_lib.onboard.car import FILE_VARIABLE, Car, yaml_of
+from rover_lib.onboard.car.car import FILE_VARIABLE, Car, yaml_of
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import plots

@@ -9,7 +9,7 @@ from lab.driving.cable import Change, dropping, flipping, lagging, whole_lines
 from lab.driving.pins import CONTINUES, REFUSED, STOPPED
 from lab.driving.policy import OTHER, PLAIN
 from lab.driving.row import FaultKind
-from rover_lib.onboard.servo_link import LATE_S, frame
+from rover_lib.onboard.car.servo_link import LATE_S, frame
 
 FAULTS = FaultKind("link")
 

@@ -1,6 +1,6 @@
 """Faults of what the camera shows: nothing, always the same, too late, or something useless.
 
-There are no rows about time stamps that are old or stand still, as a FIFO has none; tests/onboard/test_camera.py tests
+There are no rows about time stamps that are old or stand still, as a FIFO has none; tests/onboard/car/test_camera.py tests
 those.
 """
 

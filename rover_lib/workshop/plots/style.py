@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.onboard.host import THROTTLED_BITS
+from rover_lib.onboard.car.host import THROTTLED_BITS
 from rover_lib.workshop.judge import worst
 
 WIDTH_IN, DPI, SHARPER = 9.0, 100, 2

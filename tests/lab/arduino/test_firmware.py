@@ -10,8 +10,8 @@ import uno
 from recorded import real_episode
 from uno import CUT, LINE_IN, RESET, Uno, body_of, line, pulses, widths
 
-from rover_lib.onboard import car
-from rover_lib.onboard.pwm import ARDUINO_STEP_US, PwmCalibration
+from rover_lib.onboard.car import car
+from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 
 pytestmark = [
     pytest.mark.emulated,

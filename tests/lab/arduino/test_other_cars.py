@@ -11,8 +11,8 @@ import needs
 import pytest
 from uno import LINE_IN, RESET, Uno, pulses, widths
 
-from rover_lib.onboard.car import Car, read_car
-from rover_lib.onboard.pwm import ARDUINO_STEP_US
+from rover_lib.onboard.car.car import Car, read_car
+from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 
 CARS = Path(__file__).parents[3] / "lab" / "cars"
 pytestmark = [pytest.mark.emulated, needs.simavr]

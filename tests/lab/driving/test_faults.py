@@ -27,9 +27,9 @@ from lab.driving.pins import CONTINUES, HUMAN, PERIOD_US, REFUSED, STOPPED, Comm
 from lab.driving.row import FaultRow
 from lab.driving.rows import FAULTS, KINDS
 from lab.driving.stories import KEPT
+from rover_lib.onboard.car.servo_link import frame
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy import load_policy
-from rover_lib.onboard.servo_link import frame
 from rover_lib.world.standin import PinEvent
 
 GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50, rows=60, stopped_rows=30, bytes_us=4)

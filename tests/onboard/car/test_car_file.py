@@ -8,10 +8,10 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rover_lib.onboard import car as module
-from rover_lib.onboard.car import Car, read_car, this_car, yaml_of
+from rover_lib.onboard.car import car as module
+from rover_lib.onboard.car.car import Car, read_car, this_car, yaml_of
+from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import CarError
-from rover_lib.onboard.pwm import PwmCalibration
 
 CRAWLER = {
     "name": "crawler",

@@ -23,9 +23,9 @@ from typing import Any
 
 import serial
 
-from rover_lib.onboard.car import Car, this_car
+from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.car.pwm import Channel, Pulses
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.pwm import Channel, Pulses
 
 PROTOCOL_VERSION = 3
 FIRMWARE_VERSION = "3.0.0"  # open() accepts no other; firmware/rover/protocol.h has the same

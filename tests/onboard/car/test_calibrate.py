@@ -10,11 +10,12 @@ import yaml
 from click.testing import CliRunner
 
 from lab.arduino.native import NativeArduino
-from rover_lib.onboard import calibrate as module
-from rover_lib.onboard import car as car_module
-from rover_lib.onboard import cli, servo_link
-from rover_lib.onboard.calibrate import measure
-from rover_lib.onboard.car import Car, read_car, yaml_of
+from rover_lib.onboard import cli
+from rover_lib.onboard.car import calibrate as module
+from rover_lib.onboard.car import car as car_module
+from rover_lib.onboard.car import servo_link
+from rover_lib.onboard.car.calibrate import measure
+from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import CarError
 
 pytestmark = needs.gcc

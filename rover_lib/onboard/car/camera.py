@@ -23,8 +23,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from rover_lib.onboard.car.picture import LEAST, MOST_BYTES, PictureError, block_sums, brightness, decode_jpeg
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.picture import LEAST, MOST_BYTES, PictureError, block_sums, brightness, decode_jpeg
 
 FIRST_FRAME_S = 5.0
 CLOSE_S = 1.0

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recorded import real_episode
 
+from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, NEUTRAL, Channel, Pulses, PwmCalibration
 from rover_lib.onboard.errors import PwmError
-from rover_lib.onboard.pwm import ARDUINO_STEP_US, NEUTRAL, Channel, Pulses, PwmCalibration
 
 PWM = PwmCalibration()
 

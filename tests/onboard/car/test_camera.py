@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rover_lib.onboard import camera as c
-from rover_lib.onboard.camera import Camera, CameraError
+from rover_lib.onboard.car import camera as c
+from rover_lib.onboard.car.camera import Camera, CameraError
 
 
 def jpeg(value: int, size=(64, 36)) -> bytes:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hostile import HOSTILE, WHOLE, jpeg, scene
 
-from rover_lib.onboard.picture import PictureError, block_sums, brightness, decode_jpeg, read_jpeg
+from rover_lib.onboard.car.picture import PictureError, block_sums, brightness, decode_jpeg, read_jpeg
 
 MOST_MB, MOST_S = 300, 5
 
@@ -29,7 +29,7 @@ def test_none_of_them_costs_much(tmp_path):
     code = f"""
 import resource, sys, time
 from pathlib import Path
-from rover_lib.onboard.picture import PictureError, read_jpeg
+from rover_lib.onboard.car.picture import PictureError, read_jpeg
 def most_mb(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 before = most_mb()
 taken = int(Path("/proc/self/statm").read_text().split()[0]) * 4096

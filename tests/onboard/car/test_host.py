@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from rover_lib.onboard.host import Host, throttled_means
+from rover_lib.onboard.car.host import Host, throttled_means
 
 
 def test_what_a_host_cannot_tell_is_none(bare_host):

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from uno import body_of, line
 
 from lab.arduino.emulator import EmulatedArduino
-from rover_lib.onboard.car import Car
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
 from rover_lib.onboard.errors import PwmError, RoverError
-from rover_lib.onboard.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
 
 DEFAULT = Car().id
 until = functools.partial(needs.until, seconds=2.0)

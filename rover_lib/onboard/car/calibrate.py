@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from rover_lib.onboard.car import (
+from rover_lib.onboard.car.car import (
     DEFAULT,
     FAST_PULSE_MAX_US,
     PERIOD_MIN_US,
@@ -22,8 +22,8 @@ from rover_lib.onboard.car import (
     Car,
     yaml_of,
 )
+from rover_lib.onboard.car.servo_link import Telemetry
 from rover_lib.onboard.errors import CarError
-from rover_lib.onboard.servo_link import Telemetry
 from rover_lib.onboard.stage import atomic_path
 
 LOOK_S = 0.5  # time for both signals to appear with one kind of car; two or even eight pulses of 25 ms take less

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from rover_lib.onboard.car.pwm import Channel, PwmCalibration, is_finite
 from rover_lib.onboard.errors import CarError, ParamsError, PwmError
-from rover_lib.onboard.pwm import Channel, PwmCalibration, is_finite
 
 FILE_VARIABLE = "ROVER_CAR"  # environment variable that names another file; inherited by started programs
 PLACES = (  # where car.yml may be; the first one that exists is used
