@@ -14,7 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_robot_rover.configuration_rover_artifact import N_ACTION_STEPS, RoverArtifactConfig
 from lerobot_robot_rover.processor_rover_artifact import make_rover_artifact_pre_post_processors
-from rover_lib.onboard.artifact import check_artifact, read_manifest
+from rover_lib.onboard.artifact.manifest import check_artifact, read_manifest
 from rover_lib.onboard.errors import ParamsError, RoverError
 
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from lab.a76.core import FOR_GUEST, GUEST, Core, emulate_script, fetch_wheels
 from lab.a76.symbols import GuestFunctions, by_kernel
-from rover_lib.onboard import engines
-from rover_lib.onboard.artifact import read_manifest
+from rover_lib.onboard.artifact import engines
+from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.wheelhouse import REQUIREMENTS

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.artifact import ONNX_SUFFIX
+from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage

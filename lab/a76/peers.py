@@ -25,7 +25,7 @@ from lab.a76.count import COUNTED, OURS, Counted, Guest, count_artifact, side_by
 from lab.a76.count_run import REFERENCE, chunks_here, errors_pct
 from lab.a76.report import artifact_metrics
 from lab.debian import install_packages, missing_packages
-from rover_lib.onboard.artifact import car_of, read_manifest
+from rover_lib.onboard.artifact.manifest import car_of, read_manifest
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import action_limits
 from rover_lib.onboard.preprocess import prepare_frame

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rover_lib.onboard.artifact import SCHEMA, save_artifact, save_onnx
-from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
+from rover_lib.onboard.artifact.engines import ONNXRUNTIME, TORCH
+from rover_lib.onboard.artifact.manifest import SCHEMA, save_artifact, save_onnx
 
 SIZE = (160, 320)  # height and width of the camera's pictures
 CHUNK, RATE_HZ = 32, 30.0

@@ -56,8 +56,8 @@ from lab.pi.pulses import Pins, moving
 from lab.pi.report import PiReport
 from lab.pi.service_proofs import READY_S, STATE, VENV, environment, hang, sandbox, show, start_limit
 from lab.pi.view_proofs import Row, view_again, view_beside_a_drive, view_gone
-from rover_lib.onboard.artifact import ONNX_SUFFIX
-from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
+from rover_lib.onboard.artifact.engines import ONNXRUNTIME, TORCH
+from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.recording import read_controls
 from rover_lib.onboard.service import UNIT

@@ -27,7 +27,7 @@ from lab.pi.machine import DEBS, Card, Machine, card
 from lab.pi.pulses import READ_S, Pins, compare, moving, stopped
 from lab.pi.report import PiReport
 from lab.pi.usb_camera import UsbCamera
-from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.service import UNIT
 from rover_lib.onboard.telemetry import Flight, read_log

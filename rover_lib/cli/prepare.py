@@ -215,7 +215,7 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
     Errors are in percent of the recorded range and in microseconds of servo pulse. Warns if REFERENCE copies its state
     and ignores its camera.
     """
-    from rover_lib.onboard.artifact import distinct_names
+    from rover_lib.onboard.artifact.manifest import distinct_names
     from rover_lib.onboard.params import params
     from rover_lib.onboard.policy import load_policy
     from rover_lib.workshop import compare as c

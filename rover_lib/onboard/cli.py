@@ -424,7 +424,7 @@ def inspect(file: Path, as_json: bool) -> None:
 
 def describe_artifact(file: Path) -> dict[str, Any]:
     """Return what `rover inspect` says of an intact artifact. Raises ArtifactError for any other file."""
-    from rover_lib.onboard.artifact import check_artifact, content_hash, read_manifest
+    from rover_lib.onboard.artifact.manifest import check_artifact, content_hash, read_manifest
 
     check_artifact(file)
     return {"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}
@@ -454,7 +454,7 @@ def benchmark(
     With --json or --output the first artifact's figures are at the top level. Needs nothing but the artifacts: this is
     what runs on the Pi.
     """
-    from rover_lib.onboard.artifact import content_hash, distinct_names, read_parity
+    from rover_lib.onboard.artifact.manifest import content_hash, distinct_names, read_parity
     from rover_lib.onboard.benchmark import BenchmarkOptions
     from rover_lib.onboard.benchmark import benchmark as measure
     from rover_lib.onboard.gates import check_gates

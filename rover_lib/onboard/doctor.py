@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rover_lib.onboard.artifact import car_of, read_manifest
+from rover_lib.onboard.artifact.manifest import car_of, read_manifest
 from rover_lib.onboard.car.camera import Camera, path_of
 from rover_lib.onboard.car.car import car_file, this_car
 from rover_lib.onboard.car.host import Host, throttled_means

@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from rover_lib.onboard.artifact import car_of, content_hash
+from rover_lib.onboard.artifact.manifest import car_of, content_hash
 from rover_lib.onboard.car.camera import Camera, CameraError, path_of
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import default_log, default_view

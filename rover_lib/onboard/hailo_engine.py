@@ -13,9 +13,9 @@ from typing import Any
 import hailo_platform
 import numpy as np
 
-from rover_lib.onboard.archive import HEF, ONNX, open_archive, read_record
+from rover_lib.onboard.artifact.archive import HEF, ONNX, open_archive, read_record
+from rover_lib.onboard.artifact.engines import SessionEngine
 from rover_lib.onboard.car.host import usable_cores
-from rover_lib.onboard.engines import SessionEngine
 from rover_lib.onboard.errors import ArtifactError
 
 TIMEOUT_MS = 1000  # for one inference: about thirty times what it should take

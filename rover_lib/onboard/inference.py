@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.artifact import read_manifest
+from rover_lib.onboard.artifact.engines import UNCONFINED
+from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.confine import confine, memory_mb, open_no_more
-from rover_lib.onboard.engines import UNCONFINED
 from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
 from rover_lib.onboard.plan import LIMITS, Commanded, Plan
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.archive import HEF, ONNX
+from rover_lib.onboard.artifact.archive import HEF, ONNX
 from rover_lib.onboard.errors import RoverError
 
 CALLED = {

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from rover_lib.onboard.archive import ONNX, nothing_unknown, open_archive, read_record
+from rover_lib.onboard.artifact.archive import ONNX, nothing_unknown, open_archive, read_record
+from rover_lib.onboard.artifact.engines import SessionEngine
 from rover_lib.onboard.car.host import usable_cores
-from rover_lib.onboard.engines import SessionEngine
 from rover_lib.onboard.errors import ArtifactError
 
 onnxruntime.disable_telemetry_events()  # nobody has agreed to it

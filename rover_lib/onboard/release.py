@@ -31,10 +31,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rover_lib.onboard.archive import ARCHIVE_BYTES, ONNX, kind_of, open_archive, read_record
-from rover_lib.onboard.artifact import check_artifact, content_hash, read_manifest, read_parity
+from rover_lib.onboard.artifact.archive import ARCHIVE_BYTES, ONNX, kind_of, open_archive, read_record
+from rover_lib.onboard.artifact.engines import PACKAGES, TORCH
+from rover_lib.onboard.artifact.manifest import check_artifact, content_hash, read_manifest, read_parity
 from rover_lib.onboard.confine import less_memory
-from rover_lib.onboard.engines import PACKAGES, TORCH
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.stage import open_plain, sha256_of, version_of
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from rover_lib.onboard.artifact.torchscript import unknown_operators
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.memory import give_back_packed_weights
-from rover_lib.onboard.torchscript import unknown_operators
 
 
 class TorchEngine:

@@ -4,7 +4,7 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 
-from rover_lib.onboard.engines import PACKAGES
+from rover_lib.onboard.artifact.engines import PACKAGES
 from rover_lib.onboard.wheel_version import UNTAGGED
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.columns import number, ratio
 from rover_lib.onboard.errors import PolicyError, PwmError

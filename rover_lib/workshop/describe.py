@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.artifact import ONNX_SUFFIX
+from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import kinds_of
 from rover_lib.onboard.stage import read_stage

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rover_lib.onboard import artifact
-from rover_lib.onboard.artifact import ONNX_SUFFIX
+from rover_lib.onboard.artifact import manifest as artifact
+from rover_lib.onboard.artifact.engines import ONNXRUNTIME, TORCH
+from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.wheel_version import release
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions

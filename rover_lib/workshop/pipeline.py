@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.artifact import ONNX_SUFFIX, content_hash
+from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, content_hash
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage

@@ -22,7 +22,7 @@ import nbformat
 from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 
-from rover_lib.onboard.artifact import ONNX_SUFFIX
+from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.alone import made_beside

@@ -12,7 +12,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.columns import aligned, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params

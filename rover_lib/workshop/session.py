@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from rover_lib.onboard.artifact import CHUNK, MOST_NAMES, NAME_LENGTH, RATE_HZ, SIDE_PX, is_name
+from rover_lib.onboard.artifact.manifest import CHUNK, MOST_NAMES, NAME_LENGTH, RATE_HZ, SIDE_PX, is_name
 from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.errors import DriveFault, RoverError, WorldError
 from rover_lib.onboard.loop import Until, drive

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError, WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Order

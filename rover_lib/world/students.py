@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from rover_lib.onboard import loop, pilot, plan, preprocess
-from rover_lib.onboard.artifact import content_hash, read_manifest
+from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.floor import PI5_SEEN_GMAC_PER_S
 from rover_lib.onboard.params import params

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.release import Releases, pack
 
 ROOT = Path(__file__).parents[2]

@@ -16,7 +16,8 @@ from archives import manifest_with, rewritten, vectors_with
 from policies import memory_samples
 
 import rover_lib
-from rover_lib.onboard import artifact, load_policy, memory
+from rover_lib.onboard import load_policy, memory
+from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.errors import ArtifactError, FrameError, PolicyError
 from rover_lib.onboard.release import pack
 

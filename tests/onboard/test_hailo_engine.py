@@ -10,8 +10,8 @@ import pytest
 from hailo_kit import normalised
 from policies import memory_samples
 
-from rover_lib.onboard import engines
-from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.artifact import engines
+from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.kinds import kinds_of
 from rover_lib.onboard.policy import load_policy

@@ -10,8 +10,8 @@ from archives import manifest_with, rewritten, vectors_with
 from policies import memory_samples
 
 from rover_lib.onboard import load_policy
-from rover_lib.onboard.archive import ONNX, open_archive, read_record
-from rover_lib.onboard.artifact import content_hash, read_manifest
+from rover_lib.onboard.artifact.archive import ONNX, open_archive, read_record
+from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.inference import PolicyProcess
 from rover_lib.onboard.onnx_engine import session_of

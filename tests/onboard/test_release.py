@@ -20,7 +20,7 @@ from click.testing import CliRunner
 
 from lab.pi.deployment_bench import changed_artifact
 from rover_lib.cli import main
-from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.policy import load_policy
 from rover_lib.onboard.release import Expected, ReleaseError, Releases, inspect_artifact, pack, sign

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from policies import memory_samples
 
-from rover_lib.onboard.artifact import content_hash, read_manifest
+from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.workshop import pipeline

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from policies import TINY, lerobot_policy, memory_samples, trainer_content
 
-from rover_lib.onboard.artifact import LARGEST_TOLERANCE
+from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy import load_policy
 from rover_lib.workshop import act, observe
@@ -449,7 +449,7 @@ def test_an_observer_that_saw_nothing_says_so():
 
 @pytest.mark.slow
 def test_same_inputs_same_content(tiny, calibration, made, tmp_path):
-    from rover_lib.onboard.artifact import content_hash
+    from rover_lib.onboard.artifact.manifest import content_hash
 
     twice = {"a.pt": made(Scheme("static")), "b.pt": quantize(tiny, Scheme(), calibration)}
     hashes = {export(p, tiny, tmp_path / n, memory_samples(2), calibration) for n, p in twice.items()}

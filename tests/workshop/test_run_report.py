@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rover_lib.onboard.artifact import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop import run_report as report

@@ -17,7 +17,7 @@ import numpy as np
 from inferences import frame_of, leave, loaded, predict_all
 
 from rover_lib.onboard import load_policy
-from rover_lib.onboard.engines import PACKAGES
+from rover_lib.onboard.artifact.engines import PACKAGES
 from rover_lib.onboard.errors import RoverError
 
 

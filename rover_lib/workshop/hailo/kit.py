@@ -10,7 +10,7 @@ from typing import Any
 
 import onnx
 
-from rover_lib.onboard.artifact import LARGEST_TOLERANCE, read_manifest, read_parity
+from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE, read_manifest, read_parity
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.act import ACT, Affine

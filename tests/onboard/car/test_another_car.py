@@ -9,9 +9,9 @@ import yaml
 from click.testing import CliRunner
 
 from lab.driving.policy import make_artifact
-from rover_lib.onboard import artifact as artifact_module
 from rover_lib.onboard import doctor
-from rover_lib.onboard.artifact import car_of
+from rover_lib.onboard.artifact import manifest as artifact_module
+from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car import car as car_module
 from rover_lib.onboard.car.car import Car, yaml_of
 from rover_lib.onboard.cli import main

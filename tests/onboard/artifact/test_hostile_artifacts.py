@@ -26,7 +26,8 @@ import numpy as np
 import pytest
 from archives import Edit, manifest_with, rewritten, vectors_with
 
-from rover_lib.onboard import artifact, load_policy
+from rover_lib.onboard import load_policy
+from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.car.host import Host
 from rover_lib.onboard.confine import confine, memory_mb
 from rover_lib.onboard.errors import ArtifactError, RoverError

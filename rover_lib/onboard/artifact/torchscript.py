@@ -7,7 +7,7 @@ The graphs of this project have one form: one class without attributes, one meth
 operators on tensors, constants and numbers. This module accepts that form and nothing else, and it does so before torch
 sees the archive. For torch.jit.load calls __setstate__ of every class that it finds in a pickle, and believes what the
 pickle says about a tensor's size without checking that its bytes are there (torch 2.8;
-tests/onboard/test_hostile_artifacts.py shows both).
+tests/onboard/artifact/test_hostile_artifacts.py shows both).
 """
 
 import ast
@@ -22,7 +22,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.archive import DEBUG_BYTES, Unknown, nothing_unknown, read_record
+from rover_lib.onboard.artifact.archive import DEBUG_BYTES, Unknown, nothing_unknown, read_record
 
 LARGEST_NUMBER = 10_000_000  # for a size or an index in the program
 PARSED = 5  # attempts to parse a program, because Python may fail by a fault of its own

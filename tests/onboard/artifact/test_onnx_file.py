@@ -9,10 +9,10 @@ from archives import rewritten
 from onnx import TensorProto, helper
 
 from rover_lib.onboard import load_policy
-from rover_lib.onboard.archive import ONNX
-from rover_lib.onboard.artifact import check_artifact
+from rover_lib.onboard.artifact.archive import ONNX
+from rover_lib.onboard.artifact.manifest import check_artifact
+from rover_lib.onboard.artifact.onnx_file import FIELDS, NODES, OPERATORS
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.onnx_file import FIELDS, NODES, OPERATORS
 
 Change = Callable[[onnx.ModelProto], object]
 
@@ -102,5 +102,5 @@ def test_policy_for_two_engines_is_refused(artifacts, tmp_path):
 
 def test_every_operator_of_the_list_has_a_use():
     """Of those that the writer knows; erf and division are gelu's."""
-    source = (Path(__file__).parents[2] / "rover_lib/workshop/onnx_graph.py").read_text()
+    source = (Path(__file__).parents[3] / "rover_lib/workshop/onnx_graph.py").read_text()
     assert not [o for o in OPERATORS if f'"{o}"' not in source]

@@ -13,7 +13,7 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from rover_lib.onboard.archive import ONNX, Unknown, nothing_unknown, read_record
+from rover_lib.onboard.artifact.archive import ONNX, Unknown, nothing_unknown, read_record
 
 OPSET, NODES, NAME_BYTES = 17, 5000, 200
 FIELDS, MOST_DIMENSIONS = 100_000, 8  # most fields of a whole model; most dimensions of a tensor

@@ -16,13 +16,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rover_lib.onboard.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record
+from rover_lib.onboard.artifact.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record
+from rover_lib.onboard.artifact.engines import HAILO, ONNXRUNTIME
+from rover_lib.onboard.artifact.onnx_file import check_model
+from rover_lib.onboard.artifact.torchscript import check_program
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.engines import HAILO, ONNXRUNTIME
 from rover_lib.onboard.errors import ArtifactError, CarError
-from rover_lib.onboard.onnx_file import check_model
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.onboard.torchscript import check_program
 
 if TYPE_CHECKING:  # reading a manifest needs neither
     import numpy as np
