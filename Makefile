@@ -10,7 +10,7 @@ PROCESSES ?= auto
 PYTEST := $(VENV)/bin/pytest --numprocesses $(PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 NAME ?= mine
 DEMO := runs/demo/.made
-# A container may have no user but root. Root may load artifacts here, as they were made here; see onboard/confine.py.
+# A container may have no user but root. Root may load artifacts here, as they were made here; see onboard/policy/confine.py.
 export ROVER_AS_ROOT := 1
 # Some container images forbid Python to store its bytecode; then every process compiles torch again, which takes 2 s.
 unexport PYTHONDONTWRITEBYTECODE

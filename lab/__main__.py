@@ -9,8 +9,8 @@ from typing import Any
 import click
 
 from rover_lib.onboard.cli import ARTIFACT, FILE, Rover, drive_options, run_drive, show
-from rover_lib.onboard.confine import AS_ROOT
 from rover_lib.onboard.kinds import Number
+from rover_lib.onboard.policy.confine import AS_ROOT
 from rover_lib.workshop.progress import terminal
 
 

@@ -25,7 +25,7 @@ from rover_lib.onboard.errors import ParamsError, PolicyError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import HOLE_S, LATE_FRAME_S, Sight
 from rover_lib.onboard.plan import Plan, Settings
-from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.telemetry import FlightLog, log_limits
 from rover_lib.onboard.watch import unfinished_drive
 

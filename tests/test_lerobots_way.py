@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
-from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage
 
 TINY = ("--policy.chunk_size=32", "--policy.n_action_steps=32", "--policy.dim_model=64", "--policy.n_heads=4",

@@ -34,8 +34,8 @@ from typing import IO, Any
 import numpy as np
 
 from lab.debian import fetch_packages, install_packages, missing_packages, unpack_packages
-from rover_lib.onboard.confine import AS_ROOT
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.policy.confine import AS_ROOT
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.program import last_words, run
 from rover_lib.workshop.progress import Progress, silent

@@ -21,7 +21,7 @@ from lab.a76.count import COUNTED, OURS, STEADY, Counted, count_artifact, guest_
 from lab.a76.report import LABEL, STATIC, artifact_metrics, gates
 from lab.params import lab_params
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, read_manifest
-from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.checkpoint import Checkpoint

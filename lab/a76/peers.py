@@ -27,8 +27,8 @@ from lab.a76.report import artifact_metrics
 from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.artifact.manifest import car_of, read_manifest
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy import action_limits
-from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.policy.load import action_limits
+from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop import act
 from rover_lib.workshop import quantize as q

@@ -217,7 +217,7 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
     """
     from rover_lib.onboard.artifact.manifest import distinct_names
     from rover_lib.onboard.params import params
-    from rover_lib.onboard.policy import load_policy
+    from rover_lib.onboard.policy.load import load_policy
     from rover_lib.workshop import compare as c
     from rover_lib.workshop.episodes import load_recordings, split
     from rover_lib.workshop.looking import look

@@ -66,7 +66,7 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
 @AS_JSON
 def trial(artifact: Path, worlds: int, seed: int, as_json: bool) -> None:
     """Drive ARTIFACT through worlds that it has never seen, and count the balloons it hits."""
-    from rover_lib.onboard.policy import load_policy
+    from rover_lib.onboard.policy.load import load_policy
     from rover_lib.world.trial import run_trials
 
     report = run_trials(load_policy(artifact), worlds, seed, progress=terminal())

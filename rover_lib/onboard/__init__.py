@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rover_lib.onboard.policy import Policy, load_policy
+    from rover_lib.onboard.policy.load import Policy, load_policy
 
 __all__ = ["Policy", "load_policy"]
 
@@ -11,7 +11,7 @@ __all__ = ["Policy", "load_policy"]
 def __getattr__(name: str) -> Any:
     # On first use, because what drives the car must not load torch: the policy runs in a process of its own.
     if name in __all__:
-        from rover_lib.onboard import policy
+        from rover_lib.onboard.policy import load as policy
 
         return getattr(policy, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

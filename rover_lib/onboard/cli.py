@@ -459,7 +459,7 @@ def benchmark(
     from rover_lib.onboard.benchmark import benchmark as measure
     from rover_lib.onboard.gates import check_gates
     from rover_lib.onboard.params import params
-    from rover_lib.onboard.policy import load_policy
+    from rover_lib.onboard.policy.load import load_policy
     from rover_lib.onboard.stage import write_stage
 
     files = distinct_names(artifacts)
@@ -600,8 +600,8 @@ def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow
 def verify(releases: Any, name: str, confined: bool) -> None:
     """Verify that a release is complete and computes here what it should, by checksums and parity vectors."""
     if confined and (path := releases.path_of(name)).exists():
-        from rover_lib.onboard.confine import confine, memory_mb
-        from rover_lib.onboard.policy import import_engine
+        from rover_lib.onboard.policy.confine import confine, memory_mb
+        from rover_lib.onboard.policy.load import import_engine
 
         import_engine(path)
         if unconfined := confine(memory_mb(path, os.cpu_count() or 1)):

@@ -28,9 +28,9 @@ import numpy as np
 from rover_lib.onboard.artifact.engines import UNCONFINED
 from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.onboard.car.camera import Camera
-from rover_lib.onboard.confine import confine, memory_mb, open_no_more
 from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
 from rover_lib.onboard.plan import LIMITS, Commanded, Plan
+from rover_lib.onboard.policy.confine import confine, memory_mb, open_no_more
 
 LOAD_S = 120.0  # time to load an engine and a full-size policy from a slow card
 POLL_S = 0.05
@@ -301,7 +301,7 @@ def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any],
     with contextlib.suppress(EOFError, OSError):
         try:
             # Here, because the process that drives must load no engine; and before the limits, which an engine exceeds.
-            from rover_lib.onboard.policy import import_engine, load_policy
+            from rover_lib.onboard.policy.load import import_engine, load_policy
 
             unconfined = UNCONFINED.get(import_engine(artifact)) or confine(memory_mb(artifact, threads))
             policy = load_policy(artifact, threads=threads)

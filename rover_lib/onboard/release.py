@@ -34,8 +34,8 @@ from typing import Any, BinaryIO
 from rover_lib.onboard.artifact.archive import ARCHIVE_BYTES, ONNX, kind_of, open_archive, read_record
 from rover_lib.onboard.artifact.engines import PACKAGES, TORCH
 from rover_lib.onboard.artifact.manifest import check_artifact, content_hash, read_manifest, read_parity
-from rover_lib.onboard.confine import less_memory
 from rover_lib.onboard.errors import ArtifactError, RoverError
+from rover_lib.onboard.policy.confine import less_memory
 from rover_lib.onboard.stage import open_plain, sha256_of, version_of
 
 MODELS = Path("/var/lib/rover/models")
@@ -378,7 +378,7 @@ class Releases:
         real = path.parent.resolve().name
         if wrong := self.wrong_with(real):
             raise ReleaseError(f"{path}: {wrong}", remedy="deploy it again")
-        from rover_lib.onboard.policy import load_policy
+        from rover_lib.onboard.policy.load import load_policy
 
         load_policy(path)
 

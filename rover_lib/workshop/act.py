@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
+from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
 from rover_lib.workshop.episodes import Sample
 
 if TYPE_CHECKING:

@@ -26,8 +26,8 @@ from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.columns import number, ratio
 from rover_lib.onboard.errors import PolicyError, PwmError
-from rover_lib.onboard.policy import Policy, action_limits, load_policy
-from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.policy.load import Policy, action_limits, load_policy
+from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop import judge
 from rover_lib.workshop.act import Affine, lerobot_act
 from rover_lib.workshop.checkpoint import Checkpoint

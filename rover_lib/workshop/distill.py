@@ -25,9 +25,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rover_lib.onboard import preprocess
 from rover_lib.onboard.errors import CheckpointError, DistillError, TrainingError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.stage import atomic_path, write_stage
 from rover_lib.workshop import act, channels, refit, training
 from rover_lib.workshop import lessons as lessons_module

@@ -73,7 +73,7 @@ class Onnx:
         import onnx
         import onnxruntime
 
-        from rover_lib.onboard.onnx_engine import session_of
+        from rover_lib.onboard.policy.onnx_engine import session_of
         from rover_lib.workshop.onnx_graph import graph_of, onnx_model
 
         self.versions = {"onnx": onnx.__version__, "onnxruntime": onnxruntime.__version__}

@@ -20,8 +20,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_lib.onboard.policy import action_limits
-from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.policy.load import action_limits
+from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine, lerobot_act
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.progress import Progress, silent

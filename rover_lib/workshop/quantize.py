@@ -29,7 +29,7 @@ from torch.ao.quantization.quantize_fx import convert_fx
 from torch.fx import GraphModule
 
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.onboard.memory import give_back_freed
+from rover_lib.onboard.policy.memory import give_back_freed
 from rover_lib.workshop.act import ACT, EMBEDDINGS, ActConfig, Columns, block_of, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.episodes import Sample

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import TrainingError
-from rover_lib.onboard.preprocess import normalise, prepare_frame
+from rover_lib.onboard.policy.preprocess import normalise, prepare_frame
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.episodes import Sample

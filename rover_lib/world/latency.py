@@ -26,7 +26,7 @@ from rover_lib.onboard.loop import Until, drive
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Order, PolicyPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
-from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import plain, read_stage, write_stage
 from rover_lib.workshop.cells import Table
 from rover_lib.workshop.compare import GATED, gate

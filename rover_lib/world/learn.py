@@ -26,7 +26,7 @@ from rover_lib.onboard.errors import RoverError, WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Order
 from rover_lib.onboard.plan import Settings
-from rover_lib.onboard.policy import Policy
+from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.recording import HUMAN, POLICY
 from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, write_stage
 from rover_lib.workshop import pipeline

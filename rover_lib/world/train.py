@@ -22,10 +22,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rover_lib.onboard import preprocess
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.preprocess import normalise
+from rover_lib.onboard.policy import preprocess
+from rover_lib.onboard.policy.preprocess import normalise
 from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop import act as act_module
 from rover_lib.workshop import episodes as episodes_module

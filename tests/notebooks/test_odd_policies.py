@@ -10,8 +10,8 @@ from policies import TINY, lerobot_policy, smooth_frame
 
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.inference import PolicyProcess
-from rover_lib.onboard.policy import load_policy
-from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD
+from rover_lib.onboard.policy.load import load_policy
+from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run import NAMES, NOTEBOOKS, parameters_of
 from rover_lib.workshop.samples import ACTION_NAMES, Source

@@ -13,10 +13,10 @@ import pytest
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.car.camera import CameraError, Frame
-from rover_lib.onboard.confine import PROCESSORS
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
 from rover_lib.onboard.plan import Commanded
+from rover_lib.onboard.policy.confine import PROCESSORS
 
 pytestmark = pytest.mark.slow  # each starts processes that import torch
 

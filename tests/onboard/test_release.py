@@ -22,7 +22,7 @@ from lab.pi.deployment_bench import changed_artifact
 from rover_lib.cli import main
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import ArtifactError, RoverError
-from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.release import Expected, ReleaseError, Releases, inspect_artifact, pack, sign
 from rover_lib.onboard.stage import sha256_of
 

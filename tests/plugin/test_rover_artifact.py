@@ -15,7 +15,7 @@ from lab.driving.policy import make_artifact
 from lerobot_robot_rover import RoverArtifactConfig
 from lerobot_robot_rover.pack import pack
 from rover_lib.onboard.errors import ArtifactError, ParamsError, PolicyError
-from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.policy.load import load_policy
 
 NUMBERS = {"dtype": "float32", "shape": (2,), "names": ["steering", "throttle"]}
 

@@ -8,7 +8,7 @@ import torch
 from policies import FULL, TINY, lerobot_policy, smooth_frame
 from torch.utils.flop_counter import FlopCounterMode
 
-from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise
+from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise
 from rover_lib.workshop.act import (
     ACT,
     ActConfig,

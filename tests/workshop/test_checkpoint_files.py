@@ -10,7 +10,7 @@ import torch
 from policies import TINY, lerobot_policy, memory_samples
 
 from rover_lib.onboard.errors import CheckpointError, RoverError
-from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint import load_checkpoint

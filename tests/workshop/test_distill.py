@@ -15,7 +15,7 @@ from recorded import record_drives
 
 from rover_lib.onboard.errors import DistillError, RoverError, TrainingError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop import distill as distill_module
 from rover_lib.workshop import session, training
 from rover_lib.workshop.act import ACT, Affine, inputs_of

@@ -13,7 +13,7 @@ from test_episodes import edit, load, record
 from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.recording import About, EpisodeWriter
 from rover_lib.workshop.export_dataset import export_dataset
 from rover_lib.workshop.samples import car_of

@@ -12,7 +12,7 @@ from policies import TINY, MemorySample, lerobot_policy, memory_samples, smooth_
 from torch import nn
 
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.onboard.onnx_engine import session_of
+from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
 from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint import load_checkpoint

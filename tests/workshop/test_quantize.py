@@ -16,7 +16,7 @@ from policies import TINY, lerobot_policy, memory_samples, trainer_content
 
 from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop import act, observe
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions

@@ -17,9 +17,9 @@ import numpy as np
 TORCH, ONNXRUNTIME, HAILO = "qnnpack", "onnxruntime", "hailo"
 PACKAGES = {TORCH: "torch", ONNXRUNTIME: "onnxruntime", HAILO: "hailo_platform"}  # the package each engine needs
 MODULES = {
-    TORCH: "rover_lib.onboard.torch_engine",
-    ONNXRUNTIME: "rover_lib.onboard.onnx_engine",
-    HAILO: "rover_lib.onboard.hailo_engine",
+    TORCH: "rover_lib.onboard.policy.torch_engine",
+    ONNXRUNTIME: "rover_lib.onboard.policy.onnx_engine",
+    HAILO: "rover_lib.onboard.policy.hailo_engine",
 }
 # Engines whose process cannot be confined (see confine.py), and why
 UNCONFINED = {HAILO: "HailoRT talks to the chip through its driver"}

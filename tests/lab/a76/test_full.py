@@ -6,7 +6,7 @@ import pytest
 
 from lab.a76.full import LEARNED_NOTE, NOTE, SIZES, STEPS, full_run
 from rover_lib.onboard.errors import WorldError
-from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.observe import Calibration

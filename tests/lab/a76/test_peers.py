@@ -24,8 +24,8 @@ from lab.a76.report import LABEL, artifact_metrics
 from lab.a76.symbols import GuestFunctions, by_kernel
 from lab.debian import DebianError
 from rover_lib.onboard.artifact.manifest import read_manifest
-from rover_lib.onboard.policy import load_policy
-from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.policy.load import load_policy
+from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT

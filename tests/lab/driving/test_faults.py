@@ -29,7 +29,7 @@ from lab.driving.rows import FAULTS, KINDS
 from lab.driving.stories import KEPT
 from rover_lib.onboard.car.servo_link import frame
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.onboard.policy import load_policy
+from rover_lib.onboard.policy.load import load_policy
 from rover_lib.world.standin import PinEvent
 
 GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50, rows=60, stopped_rows=30, bytes_us=4)

@@ -29,10 +29,12 @@ from archives import Edit, manifest_with, rewritten, vectors_with
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.car.host import Host
-from rover_lib.onboard.confine import confine, memory_mb
 from rover_lib.onboard.errors import ArtifactError, RoverError
+from rover_lib.onboard.policy.confine import confine, memory_mb
+from rover_lib.onboard.policy.torch_engine import (
+    load as _load,  # noqa: F401, torch is imported before limits, as by verify
+)
 from rover_lib.onboard.release import Expected, ReleaseError, Releases, check_signature, pack, sign
-from rover_lib.onboard.torch_engine import load as _load  # noqa: F401, torch is imported before limits, as by verify
 
 pytestmark = pytest.mark.slow  # there are 140, each with a process of its own
 

@@ -24,7 +24,7 @@ import rover_lib
 package = types.ModuleType("rover_lib.onboard")
 package.__path__ = [str(Path(rover_lib.__file__).parent / "onboard")]
 sys.modules[package.__name__] = package
-from rover_lib.onboard.preprocess import prepare_frame  # noqa: E402
+from rover_lib.onboard.policy.preprocess import prepare_frame  # noqa: E402
 
 Run = Callable[[np.ndarray, np.ndarray], np.ndarray]  # state (1, S), planes -> (chunk, A), all float32
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rover_lib.onboard import confine
+from rover_lib.onboard.policy import confine
 
 ALLOWED, REFUSED, UNKNOWN = confine.ALLOW, confine.REFUSE | confine.EPERM, confine.REFUSE | confine.ENOSYS
 HEADERS = {
@@ -23,7 +23,7 @@ here = pytest.mark.skipif(platform.machine() not in confine.PROCESSORS, reason="
 
 PROGRAM = r"""
 import ctypes, json, os, resource, signal, socket, subprocess, sys, threading, time
-from rover_lib.onboard.confine import confine, open_no_more
+from rover_lib.onboard.policy.confine import confine, open_no_more
 
 port, folder, other = sys.argv[1], sys.argv[2], int(sys.argv[3])
 libc = ctypes.CDLL(None, use_errno=True)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from policies import smooth_frame
 
 from rover_lib.onboard.errors import FrameError
-from rover_lib.onboard.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise, prepare_frame
+from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise, prepare_frame
 
 
 def lerobots(frame_bgr, height, width):

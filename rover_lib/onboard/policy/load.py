@@ -9,10 +9,10 @@ import numpy as np
 from rover_lib.onboard.artifact.engines import PACKAGES, Engine, module_of
 from rover_lib.onboard.artifact.manifest import car_of, check_artifact, read_manifest, read_parity
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.confine import refuse_root
 from rover_lib.onboard.errors import ArtifactError, PolicyError
-from rover_lib.onboard.memory import give_back_freed
-from rover_lib.onboard.preprocess import prepare_frame
+from rover_lib.onboard.policy.confine import refuse_root
+from rover_lib.onboard.policy.memory import give_back_freed
+from rover_lib.onboard.policy.preprocess import prepare_frame
 
 
 def action_limits(names: Sequence[str], car: Car) -> np.ndarray:

@@ -16,9 +16,10 @@ from archives import manifest_with, rewritten, vectors_with
 from policies import memory_samples
 
 import rover_lib
-from rover_lib.onboard import load_policy, memory
+from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.errors import ArtifactError, FrameError, PolicyError
+from rover_lib.onboard.policy import memory
 from rover_lib.onboard.release import pack
 
 FRAME = memory_samples(1)[0].picture
@@ -118,7 +119,7 @@ def test_a_prediction_that_is_not_finite_never_comes_out(artifacts, monkeypatch)
 def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(artifacts, monkeypatch):
     asked, (state, frame) = [], (np.full(2, 0.1, np.float32), 255 - FRAME)
     monkeypatch.setattr(
-        "rover_lib.onboard.torch_engine.give_back_packed_weights", lambda module: asked.append(module) or 0
+        "rover_lib.onboard.policy.torch_engine.give_back_packed_weights", lambda module: asked.append(module) or 0
     )
     policy = load_policy(artifacts["static"])
     before = policy.predict_chunk(frame, state)
@@ -144,7 +145,7 @@ def test_refuses_a_policy_that_changes_when_memory_is_given_back(artifacts, monk
         bias.zero_()
         return bias.nbytes
 
-    monkeypatch.setattr("rover_lib.onboard.torch_engine.give_back_packed_weights", take_what_is_used)
+    monkeypatch.setattr("rover_lib.onboard.policy.torch_engine.give_back_packed_weights", take_what_is_used)
     assert "once the memory of its original weights was given back; do not drive" in refused(artifacts["static"])
 
 

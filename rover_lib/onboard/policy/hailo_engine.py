@@ -76,7 +76,9 @@ class HailoEngine(SessionEngine):
         if self._rest_model is None:
             self._rest = None
             return
-        from rover_lib.onboard.onnx_engine import session_of  # here: a whole network on the chip does not need it
+        from rover_lib.onboard.policy.onnx_engine import (
+            session_of,  # here: a whole network on the chip does not need it
+        )
 
         self._rest = session_of(self._rest_model, threads, self._path)
 

@@ -9,7 +9,7 @@ import torch
 
 from rover_lib.onboard.artifact.torchscript import unknown_operators
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.memory import give_back_packed_weights
+from rover_lib.onboard.policy.memory import give_back_packed_weights
 
 
 class TorchEngine:

@@ -14,7 +14,7 @@ from rover_lib.onboard.artifact.archive import ONNX, open_archive, read_record
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.inference import PolicyProcess
-from rover_lib.onboard.onnx_engine import session_of
+from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.onboard.release import Expected, ReleaseError, Releases, pack
 
 FRAME, STATE = np.full((360, 640, 3), 99, np.uint8), np.array([0.1, 0.2], np.float32)
@@ -98,7 +98,7 @@ def test_refuses_what_is_not_proven(onnx_static, tmp_path):
 
 def test_says_what_to_install(onnx_static, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    monkeypatch.delitem(sys.modules, "rover_lib.onboard.onnx_engine", raising=False)
+    monkeypatch.delitem(sys.modules, "rover_lib.onboard.policy.onnx_engine", raising=False)
     assert "install onnxruntime, or use an artifact of another engine" in refused(onnx_static)
     monkeypatch.setattr("rover_lib.onboard.release.version_of", lambda package: None)
     with pytest.raises(ReleaseError, match="it needs onnxruntime, which is not installed here"):
