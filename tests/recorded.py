@@ -8,7 +8,7 @@ import pytest
 from policies import smooth_frame
 
 from rover_lib.onboard.car.pwm import PwmCalibration
-from rover_lib.onboard.recording import About, EpisodeWriter
+from rover_lib.onboard.recording.episode import About, EpisodeWriter
 
 REPO = Path(__file__).resolve().parents[1]
 

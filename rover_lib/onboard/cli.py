@@ -305,7 +305,7 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -
     Ctrl-C, SIGTERM, SIGHUP and SIGQUIT end an episode, and it is kept. Exit code 1 if a fault ended it; what was
     recorded until then is kept too.
     """
-    from rover_lib.onboard.recorder import record_episodes
+    from rover_lib.onboard.recording.recorder import record_episodes
 
     fault = None
     for report in record_episodes(
@@ -325,7 +325,7 @@ def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
     The note is metadata.outcome in its episode_data.json, where nothing else changes. A drive that failed is kept:
     `rover inspect` counts outcomes, and `rover export-dataset` writes them.
     """
-    from rover_lib.onboard.outcome import label
+    from rover_lib.onboard.recording.outcome import label
 
     label(episodes, outcome)
     click.echo(f"{len(episodes)} labelled: {outcome}")

@@ -30,8 +30,8 @@ from rover_lib.onboard.loop import Arm, Hooks, Report, Until, Warnings, drive
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Pilot, PolicyPilot, ReplayPilot
 from rover_lib.onboard.plan import Commanded, Settings
-from rover_lib.onboard.recorder import Recorder, room_for
-from rover_lib.onboard.recording import About, Controls, read_controls, recorded_car
+from rover_lib.onboard.recording.episode import About, Controls, read_controls, recorded_car
+from rover_lib.onboard.recording.recorder import Recorder, room_for
 from rover_lib.onboard.service import CHECK_S, NotArmed, Service
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.status_line import StatusLine

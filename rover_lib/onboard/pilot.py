@@ -13,7 +13,7 @@ from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import DriveFault, PolicyError
 from rover_lib.onboard.inference import Planner
 from rover_lib.onboard.plan import Commanded, Follower, Plan, Settings
-from rover_lib.onboard.recording import Controls
+from rover_lib.onboard.recording.episode import Controls
 
 FIRST_PLAN_S = 10.0
 MOVING = 0.004  # throttle above which a car moves, so that it matters what it sees

@@ -23,8 +23,8 @@ from typing import Any
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.car.servo_link import ServoLink, State, Telemetry
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.recorder import SILENT_S, Recorder
-from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY
+from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
+from rover_lib.onboard.recording.recorder import SILENT_S, Recorder
 
 LET_GO_S = 2.0  # after both sticks have been at rest for this time, the human has let go
 MOST_S = 300.0  # or a transmitter that was put down with a stick off its rest would fill the disk

@@ -6,7 +6,7 @@
 
 How a recording becomes samples:
 - A control measures a channel only if the firmware saw a pulse there (`pwm.Channel.measured`). If it saw none, the file
-  has a flag and no value, or the old recorder's 0 (onboard/recording.py); here such a value is missing, never 0. A
+  has a flag and no value, or the old recorder's 0 (onboard/recording/episode.py); here such a value is missing, never 0. A
   frame takes its throttle and its steering each from the nearest *measured* control within `sync_s`. So one lost
   reading between two good ones costs nothing (controls come every 33 ms), and a longer hole leaves its frames without
   an action.
@@ -41,7 +41,7 @@ import numpy as np
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import NEUTRAL, PwmCalibration
 from rover_lib.onboard.errors import CarError, EpisodeError
-from rover_lib.onboard.recording import (
+from rover_lib.onboard.recording.episode import (
     BURST_MIN,
     CONTROL_FIELDS,
     DATA_BYTES,

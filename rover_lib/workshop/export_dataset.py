@@ -29,7 +29,7 @@ import numpy as np
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.recording import HIT, HUMAN, NOBODY, POLICY
+from rover_lib.onboard.recording.episode import HIT, HUMAN, NOBODY, POLICY
 from rover_lib.workshop.alone import alone_in
 from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.lerobot_dataset import (

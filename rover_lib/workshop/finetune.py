@@ -32,7 +32,7 @@ from torch import Tensor
 from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
-from rover_lib.onboard.recording import HUMAN
+from rover_lib.onboard.recording.episode import HUMAN
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import act, training
 from rover_lib.workshop import lessons as lessons_module

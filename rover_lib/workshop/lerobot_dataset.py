@@ -19,7 +19,7 @@ import numpy as np
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.recording import HIT, HUMAN, MISSED, POLICY
+from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
 from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.samples import (

@@ -16,7 +16,7 @@ import numpy as np
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import PictureError, read_jpeg
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording import CHANNELS, HUMAN, POLICY
+from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
 
 OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has another rate
@@ -104,7 +104,7 @@ class Sample:
 
     time_s: seconds since the episode's first frame. state: (S,) float32, in our recordings the previous frame's
     [steering, throttle]. chunk: (chunk, A) float32, this frame's action and the following ones. is_pad: (chunk,)
-    bool, True past the end. driver: who drove at this frame, one of onboard.recording.DRIVERS. car: the car that was
+    bool, True past the end. driver: who drove at this frame, one of onboard.recording.episode.DRIVERS. car: the car that was
     driven.
     """
 
@@ -180,7 +180,7 @@ class Episode:
     """One drive.
 
     duration_s: from the first to the last frame. frames, controls: how many the recording lists. outcome: one of
-    onboard.recording.OUTCOMES, None if none was noted.
+    onboard.recording.episode.OUTCOMES, None if none was noted.
     """
 
     id: str
@@ -222,7 +222,7 @@ class Recordings:
         }
 
     def driven_by_pct(self) -> dict[str, float]:
-        """The percentage of samples at which each of onboard.recording.DRIVERS drove, without those who never did."""
+        """The percentage of samples at which each of onboard.recording.episode.DRIVERS drove, without those who never did."""
         count = len(self.samples)
         return {who: round(100 * n / count, 1) for who, n in self._counted(s.driver for s in self.samples).items()}
 

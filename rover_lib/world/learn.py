@@ -27,7 +27,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Order
 from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.policy.load import Policy
-from rover_lib.onboard.recording import HUMAN, POLICY
+from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, write_stage
 from rover_lib.workshop import pipeline
 from rover_lib.workshop.cache import car_in_key

@@ -13,12 +13,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rover_lib.onboard import recording
 from rover_lib.onboard.car import pwm as pwm_module
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.errors import WorldError
-from rover_lib.onboard.recording import About, EpisodeWriter
+from rover_lib.onboard.recording import episode as recording
+from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.world import world as world_module

@@ -18,7 +18,7 @@ from lab.driving.policy import make_artifact, pictures
 from rover_lib.cli import main
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.pilot import SLACK_S
-from rover_lib.onboard.recording import read_controls
+from rover_lib.onboard.recording.episode import read_controls
 from rover_lib.onboard.telemetry import read_log
 from rover_lib.workshop.episodes import load_recordings
 from rover_lib.world.car import VirtualCar

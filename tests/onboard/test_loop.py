@@ -19,7 +19,7 @@ from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, Taken
 from rover_lib.onboard.loop import KEEP_S, Hooks, Report, Until, drive
 from rover_lib.onboard.pilot import Order, PolicyPilot, ReplayPilot
 from rover_lib.onboard.plan import Commanded, Plan, Settings
-from rover_lib.onboard.recording import Controls
+from rover_lib.onboard.recording.episode import Controls
 from rover_lib.onboard.service import NotArmed
 from rover_lib.onboard.telemetry import FlightLog
 from rover_lib.onboard.watch import (

@@ -30,7 +30,7 @@ from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetr
 from rover_lib.onboard.drive import DriveOptions, arm_capped, arm_when_ready, drive_car
 from rover_lib.onboard.loop import Report
 from rover_lib.onboard.plan import Settings
-from rover_lib.onboard.recording import read_controls
+from rover_lib.onboard.recording.episode import read_controls
 from rover_lib.onboard.telemetry import read_log
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.MANUAL, "h", "-", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)

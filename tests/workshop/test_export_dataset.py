@@ -14,7 +14,7 @@ from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.recording import About, EpisodeWriter
+from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.workshop.export_dataset import export_dataset
 from rover_lib.workshop.samples import car_of
 
@@ -279,7 +279,7 @@ def test_demonstrations_alone_have_no_more_columns_than_before(recorded, tmp_pat
 def test_outcomes_are_lerobots_where_all_are_known(mixed, tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from rover_lib.onboard.outcome import label
+    from rover_lib.onboard.recording.outcome import label
 
     folders = sorted(mixed.iterdir())
     label(folders[:2], "hit")
@@ -312,7 +312,7 @@ def test_lerobots_training_takes_it(mixed, tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.datasets.utils import dataset_to_policy_features
 
-    from rover_lib.onboard.outcome import label
+    from rover_lib.onboard.recording.outcome import label
 
     label(sorted(mixed.iterdir()), "hit")
     export_dataset(mixed, tmp_path / "out")

@@ -22,7 +22,7 @@ from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
-from rover_lib.onboard.recording import HUMAN, NOBODY, POLICY, About, EpisodeWriter
+from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY, About, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import finetune as finetune_module
 from rover_lib.workshop import pipeline, session

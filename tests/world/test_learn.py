@@ -10,7 +10,7 @@ from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.pilot import Order
 from rover_lib.onboard.plan import Settings
-from rover_lib.onboard.recording import HUMAN, POLICY
+from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import pipeline, plots
 from rover_lib.workshop.episodes import load_recordings

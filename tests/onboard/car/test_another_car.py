@@ -20,7 +20,7 @@ from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.pilot import ReplayPilot
 from rover_lib.onboard.plan import Follower, Plan, Settings
 from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.recording import About, Controls, EpisodeWriter, read_controls, recorded_car
+from rover_lib.onboard.recording.episode import About, Controls, EpisodeWriter, read_controls, recorded_car
 from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.lessons import as_driven
 from rover_lib.workshop.plots.recordings import episode_overview

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rover_lib.cli import main
-from rover_lib.onboard import outcome as module
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.outcome import label, labelled
-from rover_lib.onboard.recording import About, EpisodeWriter
+from rover_lib.onboard.recording import outcome as module
+from rover_lib.onboard.recording.episode import About, EpisodeWriter
+from rover_lib.onboard.recording.outcome import label, labelled
 from rover_lib.workshop.episodes import load_recordings
 
 FRAME = np.full((18, 32, 3), (30, 90, 200), np.uint8)

@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
-from rover_lib.onboard.recording import About, EpisodeExists, EpisodeWriter
+from rover_lib.onboard.recording.episode import About, EpisodeExists, EpisodeWriter
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.status_line import StatusLine
 from rover_lib.onboard.watch import signals

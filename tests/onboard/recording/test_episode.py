@@ -20,7 +20,14 @@ from recorded import real_episode
 
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording import CONTROL_FIELDS, FLAG_FIELDS, FRAME_FIELDS, About, EpisodeWriter, read_controls
+from rover_lib.onboard.recording.episode import (
+    CONTROL_FIELDS,
+    FLAG_FIELDS,
+    FRAME_FIELDS,
+    About,
+    EpisodeWriter,
+    read_controls,
+)
 from rover_lib.workshop.episodes import load_recordings
 
 NAME = "episode_20260101_120000"
@@ -562,7 +569,7 @@ def test_wild_bytes(tmp_path_factory, data):
 
 def test_needs_no_workshop():
     code = (
-        "import sys, rover_lib.onboard.recording, rover_lib.onboard.car.pwm\n"
+        "import sys, rover_lib.onboard.recording.episode, rover_lib.onboard.car.pwm\n"
         "bad = {'lerobot', 'torchvision', 'yaml', 'jsonschema', 'rover_lib.workshop'} & set(sys.modules)\n"
         "sys.exit(str(bad) if bad else 0)"
     )

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording import HIT, MISSED
+from rover_lib.onboard.recording.episode import HIT, MISSED
 from rover_lib.onboard.stage import atomic_path
 
 NONE = "none"

@@ -20,13 +20,13 @@ import numpy as np
 import pytest
 from needs import until
 
-from rover_lib.onboard import recorder as module
 from rover_lib.onboard.car.camera import Camera, CameraError, Frame
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import LinkError, ServoLink, State, Telemetry, frame
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recorder import Recorder, record
-from rover_lib.onboard.recording import About, EpisodeWriter, read_controls
+from rover_lib.onboard.recording import recorder as module
+from rover_lib.onboard.recording.episode import About, EpisodeWriter, read_controls
+from rover_lib.onboard.recording.recorder import Recorder, record
 from rover_lib.workshop.episodes import load_recordings
 
 PICTURE = np.full((36, 64, 3), (30, 90, 200), np.uint8)
@@ -568,5 +568,5 @@ def test_nothing_to_record_from_is_a_sentence(tmp_path, arduino):
 
 
 def test_loads_no_torch():
-    code = "import sys, rover_lib.onboard.recorder; sys.exit('torch' in sys.modules)"
+    code = "import sys, rover_lib.onboard.recording.recorder; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
