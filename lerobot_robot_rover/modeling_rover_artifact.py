@@ -16,11 +16,11 @@ from torch import Tensor
 from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig, not_trained
 from lerobot_robot_rover.line import wait_for_humans
 from rover_lib.onboard.car.car import this_car
-from rover_lib.onboard.drive import another_car
+from rover_lib.onboard.drive.drive import another_car
+from rover_lib.onboard.drive.inference import PolicyProcess
+from rover_lib.onboard.drive.plan import Plan, Settings
 from rover_lib.onboard.errors import ParamsError, PolicyError
-from rover_lib.onboard.inference import PolicyProcess
 from rover_lib.onboard.params import params
-from rover_lib.onboard.plan import Plan, Settings
 
 ACTIONS = ["steering", "throttle"]
 

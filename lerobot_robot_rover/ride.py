@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
-from rover_lib.onboard.drive import arm_capped
+from rover_lib.onboard.drive.drive import arm_capped
+from rover_lib.onboard.drive.loop import Hooks, Log, Report, Until, drive
+from rover_lib.onboard.drive.pilot import Order, Sight
+from rover_lib.onboard.drive.plan import Settings
+from rover_lib.onboard.drive.watch import SWITCH_S, HealthWatch
 from rover_lib.onboard.errors import DriveFault
-from rover_lib.onboard.loop import Hooks, Log, Report, Until, drive
-from rover_lib.onboard.pilot import Order, Sight
-from rover_lib.onboard.plan import Settings
-from rover_lib.onboard.watch import SWITCH_S, HealthWatch
 
 RATE_HZ = 50.0  # an action waits 20 ms at most; at 100 Hz a busy machine's pauses of 10 ms would count as missed ticks
 # How long an action is repeated: LeRobot's loop, at 30 Hz, may miss two turns. The Arduino allows a silent host 150 ms,

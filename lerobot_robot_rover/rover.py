@@ -20,14 +20,14 @@ from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import default_log
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.car.servo_link import ServoLink
-from rover_lib.onboard.drive import arm_when_ready, check_no_film
+from rover_lib.onboard.drive.drive import arm_when_ready, check_no_film
+from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
+from rover_lib.onboard.drive.pilot import HOLE_S, LATE_FRAME_S, Sight
+from rover_lib.onboard.drive.plan import Plan, Settings
+from rover_lib.onboard.drive.watch import unfinished_drive
 from rover_lib.onboard.errors import ParamsError, PolicyError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pilot import HOLE_S, LATE_FRAME_S, Sight
-from rover_lib.onboard.plan import Plan, Settings
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.telemetry import FlightLog, log_limits
-from rover_lib.onboard.watch import unfinished_drive
 
 ACTIONS = ("steering", "throttle")
 NO_PROMISE = (

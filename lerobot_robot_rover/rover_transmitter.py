@@ -11,8 +11,8 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 from lerobot_robot_rover.line import line_to
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, ServoLink, Telemetry
+from rover_lib.onboard.drive.service import CHECK_S
 from rover_lib.onboard.errors import ParamsError
-from rover_lib.onboard.service import CHECK_S
 
 WITHHELD_S = 0.5  # far longer than until a status shows a moved stick
 

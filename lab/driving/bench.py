@@ -23,8 +23,8 @@ from lab.driving.cable import Cable
 from lab.driving.pins import BEFORE_S, STOPPED_THROTTLE_US
 from lab.driving.policy import PLAIN, RATE_HZ, make_artifact, pictures
 from lab.driving.priority import boost, boosted_priority
+from rover_lib.onboard.drive.flight_log import LogError, read_log
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.telemetry import LogError, read_log
 from rover_lib.world.car import CameraFeed
 from rover_lib.world.child import Child
 from rover_lib.world.standin import REST_US, PinEvent
@@ -53,7 +53,7 @@ def _raise() -> None:
 
 
 def _break_logger() -> None:
-    from rover_lib.onboard import telemetry
+    from rover_lib.onboard.drive import flight_log as telemetry
 
     def broken(*_: Any) -> bytes:
         raise RuntimeError("raised in the logger")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lab.driving.virtual import HELD, LIVE, Hand, Seen
-from rover_lib.onboard.service import REQUEST_S
+from rover_lib.onboard.drive.service import REQUEST_S
 
 # What firmware/README.md and params.yml promise, with numbers that are written here anew.
 RESTING_US = 124  # a throttle pulse up to this moves no car

@@ -83,7 +83,7 @@ def obey_pictures() -> None:
 
     An artifact cannot do that, as its operators are a closed list. Otherwise the policy process is the real one.
     """
-    from rover_lib.onboard.inference import PolicyProcess
+    from rover_lib.onboard.drive.inference import PolicyProcess
 
     PolicyProcess.program = __name__
 
@@ -131,6 +131,6 @@ def pictures(instruction: int, size: tuple[int, int] = SIZE, level: int = 100, c
 
 
 if __name__ == "__main__":
-    from rover_lib.onboard.inference import main
+    from rover_lib.onboard.drive.inference import main
 
     main(sys.argv[1:], loaded=obey)

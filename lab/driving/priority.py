@@ -3,7 +3,7 @@
 import contextlib
 import os
 
-from rover_lib.onboard.watch import real_time
+from rover_lib.onboard.drive.watch import real_time
 
 PRIORITY = 3  # of real-time scheduling, above that of rover drive
 

@@ -25,10 +25,10 @@ from lab.driving.bench import Drive, DrivingBench, FaultError
 from lab.driving.page import Page, ViewServer
 from lab.driving.pins import STOPPED, Gates, Observation, judge
 from lab.params import lab_params
+from rover_lib.onboard.drive.flight_log import read_log
+from rover_lib.onboard.drive.service import Request, arm_car
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.service import Request, arm_car
 from rover_lib.onboard.stage import write_stage
-from rover_lib.onboard.telemetry import read_log
 from rover_lib.world.child import Child
 
 SPEED_S = 0.5  # how long the car drives at speed before a click

@@ -15,13 +15,13 @@ import numpy as np
 from lab.driving.virtual import FRAME_MS, Killed, World
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
+from rover_lib.onboard.drive.inference import Planner
+from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
+from rover_lib.onboard.drive.pilot import Order, PolicyPilot
+from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
+from rover_lib.onboard.drive.service import NotArmed, check_age
 from rover_lib.onboard.errors import DriveFault, PolicyError, RoverError, TakenOver, sentence_of
-from rover_lib.onboard.inference import Planner
-from rover_lib.onboard.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pilot import Order, PolicyPilot
-from rover_lib.onboard.plan import Commanded, Plan, Settings
-from rover_lib.onboard.service import NotArmed, check_age
 
 RATE_HZ = 30.0
 PLAN = (0.2, 0.15)  # steering, throttle

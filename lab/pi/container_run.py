@@ -58,11 +58,11 @@ from lab.pi.service_proofs import READY_S, STATE, VENV, environment, hang, sandb
 from lab.pi.view_proofs import Row, view_again, view_beside_a_drive, view_gone
 from rover_lib.onboard.artifact.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
+from rover_lib.onboard.drive.flight_log import read_log
+from rover_lib.onboard.drive.service import UNIT
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.recording.episode import read_controls
-from rover_lib.onboard.service import UNIT
 from rover_lib.onboard.stage import sha256_of
-from rover_lib.onboard.telemetry import read_log
 from rover_lib.world.car import CameraFeed
 from rover_lib.world.standin import REST_US
 

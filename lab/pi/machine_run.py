@@ -28,9 +28,9 @@ from lab.pi.pulses import READ_S, Pins, compare, moving, stopped
 from lab.pi.report import PiReport
 from lab.pi.usb_camera import UsbCamera
 from rover_lib.onboard.artifact.manifest import content_hash
+from rover_lib.onboard.drive.flight_log import Flight, read_log
+from rover_lib.onboard.drive.service import UNIT
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.service import UNIT
-from rover_lib.onboard.telemetry import Flight, read_log
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
 from rover_lib.world.standin import REST_US
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from lab.arduino.emulator import EmulatedArduino
 from lab.driving.pins import NEUTRAL_US, PERIOD_US, STEP_US, STOPPED_THROTTLE_US
+from rover_lib.onboard.drive.flight_log import Flight
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.telemetry import Flight
 from rover_lib.world.standin import PinEvent
 
 # A command holds from the next pulse that begins after it has come, which may need a second sending (loop.RESEND_S),

@@ -20,7 +20,7 @@ from typing import Any
 from lab.pi.container import Container
 from lab.pi.emulation import EmulationError, wait_for
 from lab.pi.pulses import Pins, moving, stopped
-from rover_lib.onboard.service import UNIT
+from rover_lib.onboard.drive.service import UNIT
 from rover_lib.workshop.wheelhouse import REQUIREMENTS, VIEW
 
 VENV, STATE = "/opt/rover/venv", "/var/lib/rover-drive"

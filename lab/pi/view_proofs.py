@@ -23,8 +23,8 @@ from lab.pi.container import Container
 from lab.pi.emulation import EmulationError, wait_for
 from lab.pi.pulses import READ_S, Pins, moving, stopped
 from lab.pi.service_proofs import READY_S, STATE, VENV, show
-from rover_lib.onboard.feed import DRIVING, WAITING
-from rover_lib.onboard.service import UNIT
+from rover_lib.onboard.drive.feed import DRIVING, WAITING
+from rover_lib.onboard.drive.service import UNIT
 from rover_lib.world.standin import PinEvent
 
 VIEW_UNIT, VIEW_USER = "rover-view.service", "rover-view"

@@ -252,10 +252,10 @@ def drive(ctx: click.Context, **options: Any) -> None:
 
 def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
     """Drive by DriveOptions, print or write the summary, and return the exit code. car: see drive_car()."""
-    from rover_lib.onboard.drive import DriveOptions, drive_car
+    from rover_lib.onboard.drive.drive import DriveOptions, drive_car
+    from rover_lib.onboard.drive.loop import Report
+    from rover_lib.onboard.drive.service import NotArmed
     from rover_lib.onboard.errors import DriveFault, TakenOver
-    from rover_lib.onboard.loop import Report
-    from rover_lib.onboard.service import NotArmed
 
     o = DriveOptions(**options)
     if bool(o.artifact) == bool(o.replay):
@@ -512,8 +512,8 @@ def arm_car(yes: bool, model: str, max_seconds: float | None, heartbeat_s: float
     Says what the Arduino still wants, and waits for it: the transmitter switched on, its throttle stick at rest, its
     steering stick just wiggled. Moving a stick takes the car back; `sudo systemctl restart rover-drive` disarms it.
     """
-    from rover_lib.onboard.service import Request
-    from rover_lib.onboard.service import arm_car as arm
+    from rover_lib.onboard.drive.service import Request
+    from rover_lib.onboard.drive.service import arm_car as arm
 
     def confirm(state: dict[str, Any]) -> None:
         click.echo(f"model {state['model'][:12]}, {state['text']}")
@@ -527,7 +527,7 @@ def arm_car(yes: bool, model: str, max_seconds: float | None, heartbeat_s: float
 @main.command(short_help="Tell the drive that its operator is there.")
 def heartbeat() -> None:
     """Tell the drive that its operator is there, and say what the car does. See `rover arm-car --heartbeat-s`."""
-    from rover_lib.onboard.service import ask_service
+    from rover_lib.onboard.drive.service import ask_service
 
     click.echo(ask_service(ask="heartbeat")["text"])
 
@@ -644,7 +644,7 @@ def status(releases: Any, as_json: bool) -> None:
         import socket
 
         from rover_lib.onboard.car.host import Host, default_log
-        from rover_lib.onboard.service import ServiceError, state_of
+        from rover_lib.onboard.drive.service import ServiceError, state_of
 
         try:
             report["service"] = state_of()
@@ -748,7 +748,7 @@ def log(file: Path, drive: int, as_json: bool) -> None:
 
 def sum_up(file: Path, drive: int, as_json: bool) -> Any:
     """Print what a flight log says of one of its drives, and return that drive, a telemetry.Flight."""
-    from rover_lib.onboard.telemetry import read_log
+    from rover_lib.onboard.drive.flight_log import read_log
 
     flight = read_log(file, drive)
     summary = flight.summary()

@@ -28,12 +28,12 @@ from rover_lib.onboard.car.camera import Camera, path_of
 from rover_lib.onboard.car.car import car_file, this_car
 from rover_lib.onboard.car.host import Host, throttled_means
 from rover_lib.onboard.car.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, ServoLink, Telemetry
+from rover_lib.onboard.drive.flight_log import log_limits
+from rover_lib.onboard.drive.inference import PolicyProcess
+from rover_lib.onboard.drive.pilot import blank, frozen
+from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import ArtifactError, RoverError
-from rover_lib.onboard.inference import PolicyProcess
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pilot import blank, frozen
-from rover_lib.onboard.plan import Settings
-from rover_lib.onboard.telemetry import log_limits
 
 NAME_WIDTH = 15
 RATE_SHARE = 0.9  # of the requested frame rate must be reached

@@ -29,7 +29,7 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
     if kind == "run":
         return {"run": _run(path)}
     if kind == "flight log":
-        from rover_lib.onboard.telemetry import read_log
+        from rover_lib.onboard.drive.flight_log import read_log
 
         return {"flight log": {k: v for k, v in read_log(path).summary().items() if k != "events"}}
     if kind == "calibration":

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from rover_lib.onboard.car.host import THROTTLED_BITS
 from rover_lib.onboard.car.pwm import Channel
 from rover_lib.onboard.car.servo_link import State
-from rover_lib.onboard.telemetry import Event, Flight
+from rover_lib.onboard.drive.flight_log import Event, Flight
 from rover_lib.workshop.plots.style import BLACK, COLOURS, GREY, MIST, NOW_BITS, RED, SLATE, new_figure
 
 STATES = {

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rover_lib.onboard.car.picture import PictureError, read_jpeg
+from rover_lib.onboard.drive.flight_log import Flight, Tick
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import CONTROL_FIELDS, DRIVERS, json_controls, number_of
 from rover_lib.onboard.stage import atomic_path, plain
-from rover_lib.onboard.telemetry import Flight, Tick
 from rover_lib.workshop.replay import began_s, pictures_of, recorded_with
 
 TICK, EVENT, MACHINE, CONTROL, PICTURE = TOPICS = ("/tick", "/event", "/machine", "/control", "/camera")

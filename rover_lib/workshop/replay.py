@@ -24,9 +24,9 @@ import numpy as np
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import PictureError, read_jpeg
 from rover_lib.onboard.car.servo_link import REASONS
+from rover_lib.onboard.drive.flight_log import Flight, LogError, Tick, read_log
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.kinds import kinds_of
-from rover_lib.onboard.telemetry import Flight, LogError, Tick, read_log
 from rover_lib.workshop.episodes import load_recordings
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
     reports = run_latencies([policy], [Condition(0.0, settings), Condition(0.15, settings)], worlds=40)
 
-The car's own loop drives: `onboard.loop.drive` with its PolicyPilot, on a virtual clock. Only the camera and the
+The car's own loop drives: `onboard.drive.loop.drive` with its PolicyPilot, on a virtual clock. Only the camera and the
 planner's thread are replaced. Nothing waits, and no result depends on how fast this machine is.
 """
 
@@ -21,11 +21,11 @@ import numpy as np
 
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.car.camera import Frame
+from rover_lib.onboard.drive.loop import Until, drive
+from rover_lib.onboard.drive.pilot import Order, PolicyPilot
+from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
 from rover_lib.onboard.errors import DriveFault, RoverError, WorldError
-from rover_lib.onboard.loop import Until, drive
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pilot import Order, PolicyPilot
-from rover_lib.onboard.plan import Commanded, Plan, Settings
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import plain, read_stage, write_stage
 from rover_lib.workshop.cells import Table

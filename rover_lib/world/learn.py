@@ -22,10 +22,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rover_lib.onboard.artifact.manifest import content_hash
+from rover_lib.onboard.drive.pilot import Order
+from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import RoverError, WorldError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pilot import Order
-from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, write_stage

@@ -16,7 +16,7 @@ import jinja2
 import pytest
 import yaml
 
-from rover_lib.onboard.watch import PRIORITY
+from rover_lib.onboard.drive.watch import PRIORITY
 
 pytestmark = pytest.mark.slow  # Ansible takes a second to start
 

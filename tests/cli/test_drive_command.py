@@ -17,9 +17,9 @@ from needs import real_time, until
 from lab.driving.policy import make_artifact, pictures
 from rover_lib.cli import main
 from rover_lib.onboard.car.servo_link import ServoLink
-from rover_lib.onboard.pilot import SLACK_S
+from rover_lib.onboard.drive.flight_log import read_log
+from rover_lib.onboard.drive.pilot import SLACK_S
 from rover_lib.onboard.recording.episode import read_controls
-from rover_lib.onboard.telemetry import read_log
 from rover_lib.workshop.episodes import load_recordings
 from rover_lib.world.car import VirtualCar
 

@@ -14,8 +14,8 @@ import pytest
 
 from rover_lib import cli as workstation
 from rover_lib.onboard import cli as onboard
+from rover_lib.onboard.drive.flight_log import FlightLog, Tick
 from rover_lib.onboard.stage import read_stage
-from rover_lib.onboard.telemetry import FlightLog, Tick
 from rover_lib.workshop.wheelhouse import REQUIREMENTS, make
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ pytest.importorskip("aiohttp", reason="needs the extra view")
 
 from browser import Browser, chromium  # it needs aiohttp
 
-from rover_lib.onboard.telemetry import read_log
+from rover_lib.onboard.drive.flight_log import read_log
 
 pytestmark = [pytest.mark.release, chromium]
 PAGES = 10

@@ -8,8 +8,8 @@ import pytest
 import torch
 from policies import TINY, lerobot_policy, smooth_frame
 
+from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.onboard.inference import PolicyProcess
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
 from rover_lib.onboard.stage import read_stage

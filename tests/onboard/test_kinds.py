@@ -6,9 +6,9 @@ import zipfile
 
 import pytest
 
+from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.kinds import INSTEAD, WANTED, KindError, check_kind, check_output, kinds_of
 from rover_lib.onboard.stage import write_stage
-from rover_lib.onboard.telemetry import FlightLog
 
 
 def archive(path, **entries):

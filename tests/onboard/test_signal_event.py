@@ -6,8 +6,8 @@ import time
 
 import pytest
 
+from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.signal_event import SignalEvent
-from rover_lib.onboard.telemetry import FlightLog
 
 
 def interrupted(work, handler):

@@ -120,7 +120,7 @@ def test_a_program_ends_though_its_terminal_is_stuck(tmp_path):
     code = (
         "import logging, sys, time\n"
         "from rover_lib.onboard.status_line import StatusLine\n"
-        "from rover_lib.onboard.telemetry import FlightLog\n"
+        "from rover_lib.onboard.drive.flight_log import FlightLog\n"
         "with StatusLine(lambda: 'x' * 3000, plain_every_s=0.001) as status:\n"
         "    logging.getLogger('rover').addHandler(status.handler)\n"
         "    with FlightLog(sys.argv[1], header={}, max_bytes=1_000_000, keep=2) as log:\n"

@@ -20,7 +20,7 @@ from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import CONTINUES, HUMAN, STOPPED, Command, Gates, Observation, judge
 from lab.driving.policy import PLAIN, make_artifact, pictures
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
-from rover_lib.onboard.telemetry import read_log
+from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.world.car import CameraFeed, VirtualCar
 from rover_lib.world.standin import REST_US
 

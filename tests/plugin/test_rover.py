@@ -17,9 +17,9 @@ from lerobot_robot_rover.ride import HOLD_S, Ride
 from rover_lib.onboard.car.camera import CameraError
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import LinkError, State
+from rover_lib.onboard.drive.flight_log import read_log
+from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
-from rover_lib.onboard.plan import Settings
-from rover_lib.onboard.telemetry import read_log
 from rover_lib.world.standin import REST_US
 
 GO = {"steering": 0.2, "throttle": 0.15}

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.telemetry import FlightLog
 from rover_lib.workshop import run_report as report
 from rover_lib.workshop.describe import describe, runs
 from rover_lib.workshop.samples import Source

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from rover_lib.cli import main
 from rover_lib.onboard.car.host import Host
 from rover_lib.onboard.car.pwm import PwmCalibration
-from rover_lib.onboard.telemetry import FlightLog, Tick, read_log
+from rover_lib.onboard.drive.flight_log import FlightLog, Tick, read_log
 from rover_lib.workshop.flight import flight_figure
 
 

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 from test_film import HZ, PICTURES_HZ, SECONDS, drive
 
 from rover_lib.cli import main
+from rover_lib.onboard.drive.flight_log import LogError, Tick, read_log
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.telemetry import LogError, Tick, read_log
 
 pytest.importorskip("mcap", reason="needs the package mcap, of the extra workshop")
 

@@ -46,7 +46,7 @@ def test_another_content_is_another_version(own, monkeypatch, tmp_path):
     monkeypatch.setattr(v, "ONBOARD", tmp_path / "onboard")
     monkeypatch.setattr(v, "PACKAGE", tmp_path / "__init__.py")
     assert v.wheel_version() == own.version and re.fullmatch(r"\d+\.\d+\.\d+\+[0-9a-f]{12}", own.version)
-    for name in ("__init__.py", "onboard/drive.py", "onboard/params.yml", "onboard/pyproject.toml"):
+    for name in ("__init__.py", "onboard/drive/drive.py", "onboard/params.yml", "onboard/pyproject.toml"):
         before = v.wheel_version()
         with (tmp_path / name).open("a") as f:
             f.write("# another\n")

@@ -13,9 +13,9 @@ import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
+from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import PolicyError, WorldError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import run as runs
 from rover_lib.world import latency

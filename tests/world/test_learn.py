@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from policies import of_a_cars_size
 
+from rover_lib.onboard.drive.pilot import Order
+from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.pilot import Order
-from rover_lib.onboard.plan import Settings
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import pipeline, plots

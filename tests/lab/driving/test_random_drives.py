@@ -12,7 +12,7 @@ from lab.driving import virtual
 from lab.driving.invariants import broken
 from lab.driving.random_drives import random_drives
 from lab.driving.stories import HAPPENINGS, KEPT, Happening, Story, drive_story, random_story, shortest
-from rover_lib.onboard import loop, pilot
+from rover_lib.onboard.drive import loop, pilot
 
 pytestmark = needs.gcc
 

@@ -14,9 +14,9 @@ from lab.driving.pins import HUMAN as BY_HUMAN
 from lab.driving.pins import STEP_US, Gates, Observation, judge
 from lab.driving.virtual import FRAME_MS, LOST, STICKS_US, World
 from lab.driving.virtual_host import RATE_HZ, Process
+from rover_lib.onboard.drive.takeover import LET_GO_S, TakeoverRecorder
 from rover_lib.onboard.errors import TakenOver
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
-from rover_lib.onboard.takeover import LET_GO_S, TakeoverRecorder
 from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.export_dataset import export_dataset
 from rover_lib.world.standin import REST_US

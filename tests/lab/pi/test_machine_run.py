@@ -18,9 +18,9 @@ from lab.pi import usb_camera as camera
 from lab.pi.machine import MachineError, Qmp
 from lab.pi.pulses import compare, stopped
 from lab.pi.usb_camera import UsbCamera
+from rover_lib.onboard.drive.flight_log import Flight
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
-from rover_lib.onboard.telemetry import Flight
 from rover_lib.world.standin import PinEvent
 
 SLOW = 10.0

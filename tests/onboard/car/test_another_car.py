@@ -15,10 +15,10 @@ from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car import car as car_module
 from rover_lib.onboard.car.car import Car, yaml_of
 from rover_lib.onboard.cli import main
-from rover_lib.onboard.drive import another_car, arm_capped
+from rover_lib.onboard.drive.drive import another_car, arm_capped
+from rover_lib.onboard.drive.pilot import ReplayPilot
+from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
-from rover_lib.onboard.pilot import ReplayPilot
-from rover_lib.onboard.plan import Follower, Plan, Settings
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import About, Controls, EpisodeWriter, read_controls, recorded_car
 from rover_lib.workshop.episodes import load_recordings

@@ -12,8 +12,8 @@ from policies import memory_samples
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact.archive import ONNX, open_archive, read_record
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
+from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.inference import PolicyProcess
 from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.onboard.release import Expected, ReleaseError, Releases, pack
 
@@ -60,7 +60,7 @@ def test_needs_no_torch(onnx_static):
 import sys
 sys.modules |= dict.fromkeys(["torch", "onnx", "lerobot"])
 import numpy as np
-import rover_lib.onboard.cli, rover_lib.onboard.drive, rover_lib.onboard.benchmark, rover_lib.onboard.doctor
+import rover_lib.onboard.cli, rover_lib.onboard.drive.drive, rover_lib.onboard.benchmark, rover_lib.onboard.doctor
 from rover_lib.onboard import load_policy
 chunk = load_policy({str(onnx_static)!r}, threads=1).predict_chunk(np.full((360, 640, 3), 99, np.uint8), np.zeros(2))
 assert chunk.shape == (32, 2) and np.isfinite(chunk).all()

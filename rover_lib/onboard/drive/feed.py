@@ -31,10 +31,10 @@ import numpy as np
 
 from rover_lib.onboard.car.camera import Camera, Frame
 from rover_lib.onboard.car.servo_link import MISSING, REASONS, ServoLink
+from rover_lib.onboard.drive.flight_log import FlightLog, Tick
+from rover_lib.onboard.drive.loop import Report
+from rover_lib.onboard.drive.pilot import PolicyPilot
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.loop import Report
-from rover_lib.onboard.pilot import PolicyPilot
-from rover_lib.onboard.telemetry import FlightLog, Tick
 
 EVERY_S = 0.1  # between two messages
 AGAIN_S = 1.0  # between two checks whether a view listens

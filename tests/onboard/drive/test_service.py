@@ -23,15 +23,15 @@ from needs import until
 
 from lab.driving.policy import pictures
 from rover_lib.cli import main
-from rover_lib.onboard import service as s
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
-from rover_lib.onboard.drive import DriveOptions, arm_capped, arm_when_ready, drive_car
-from rover_lib.onboard.loop import Report
-from rover_lib.onboard.plan import Settings
+from rover_lib.onboard.drive import service as s
+from rover_lib.onboard.drive.drive import DriveOptions, arm_capped, arm_when_ready, drive_car
+from rover_lib.onboard.drive.flight_log import read_log
+from rover_lib.onboard.drive.loop import Report
+from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.recording.episode import read_controls
-from rover_lib.onboard.telemetry import read_log
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.MANUAL, "h", "-", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)
 
@@ -573,7 +573,7 @@ def write_film(path):
 def test_after_a_takeover_the_same_process_waits_for_another_request(systemd, tmp_path, monkeypatch):
     """The port stays open: opened again, it might reset the Arduino, and the human would lose the car."""
     for name, fake in {"ServoLink": Link, "PolicyProcess": Policy, "content_hash": lambda path: "ab12"}.items():
-        monkeypatch.setattr(f"rover_lib.onboard.drive.{name}", fake)
+        monkeypatch.setattr(f"rover_lib.onboard.drive.drive.{name}", fake)
     write_film(tmp_path / "film.mjpeg")
     answers = []
     monkeypatch.setattr(Link, "missing", "w")
@@ -638,8 +638,8 @@ class DrivenLink(Link):
 @pytest.mark.parametrize("ends", ["let go", "SIGTERM"])
 def test_a_takeover_is_recorded_and_then_the_service_waits_disarmed(systemd, tmp_path, monkeypatch, ends):
     for name, fake in {"ServoLink": DrivenLink, "PolicyProcess": Policy, "content_hash": lambda path: "ab12"}.items():
-        monkeypatch.setattr(f"rover_lib.onboard.drive.{name}", fake)
-    monkeypatch.setattr("rover_lib.onboard.takeover.LET_GO_S", 0.5)
+        monkeypatch.setattr(f"rover_lib.onboard.drive.drive.{name}", fake)
+    monkeypatch.setattr("rover_lib.onboard.drive.takeover.LET_GO_S", 0.5)
     monkeypatch.setattr(s, "FINISH_S", 0.0)  # the watchdog hears of what happens, and of nothing else
     for name in ("taken_s", "opened"):
         monkeypatch.setattr(DrivenLink, name, 0)

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rover_lib.onboard.drive.plan import Commanded, Follower, Plan, Settings
 from rover_lib.onboard.errors import ParamsError, PolicyError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.plan import Commanded, Follower, Plan, Settings
 
 RATE = 30.0
 STEP = 1 / RATE

@@ -17,10 +17,10 @@ from types import FrameType
 from typing import Any
 
 from rover_lib.onboard.car.servo_link import LinkError, ServoLink, Telemetry
-from rover_lib.onboard.loop import Report
+from rover_lib.onboard.drive.flight_log import FlightLog, LogError
+from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.stage import open_plain
-from rover_lib.onboard.telemetry import FlightLog, LogError
 
 SWITCH_S = 0.0005  # after this, other threads give the interpreter back to the loop; Python's default is 5 ms
 PRIORITY = 2  # real-time; above that of the balloon world's stand-in for a car

@@ -21,9 +21,9 @@ import numpy as np
 
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
+from rover_lib.onboard.drive.flight_log import ARMED, Tick
+from rover_lib.onboard.drive.pilot import Order, Pilot
 from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, TakenOver, sentence_of
-from rover_lib.onboard.pilot import Order, Pilot
-from rover_lib.onboard.telemetry import ARMED, Tick
 
 RATES_HZ = (10.0, 100.0)
 KEEP_S = 0.034  # longest time between commands, even if ticks are rarer: to the Arduino, 100 ms without one is a pause

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry
+from rover_lib.onboard.drive.takeover import LET_GO_S, MOST_S, TakeoverRecorder, driver_by
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
-from rover_lib.onboard.takeover import LET_GO_S, MOST_S, TakeoverRecorder, driver_by
 
 ARMED = Telemetry(99.0, 7, 0, 0, "k", State.AUTONOMOUS, "a", "-", 1456, 120, 238, 1460, 21316, 120, 1016, 0, 0, 0, 0)
 STEP_S = 0.02  # between two statuses

@@ -23,21 +23,15 @@ from rover_lib.onboard.car.camera import Camera, CameraError, path_of
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import default_log, default_view
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink, Telemetry
-from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver, sentence_of
-from rover_lib.onboard.feed import Feed
-from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
-from rover_lib.onboard.loop import Arm, Hooks, Report, Until, Warnings, drive
-from rover_lib.onboard.params import params
-from rover_lib.onboard.pilot import Pilot, PolicyPilot, ReplayPilot
-from rover_lib.onboard.plan import Commanded, Settings
-from rover_lib.onboard.recording.episode import About, Controls, read_controls, recorded_car
-from rover_lib.onboard.recording.recorder import Recorder, room_for
-from rover_lib.onboard.service import CHECK_S, NotArmed, Service
-from rover_lib.onboard.signal_event import SignalEvent
-from rover_lib.onboard.status_line import StatusLine
-from rover_lib.onboard.takeover import TakeoverRecorder
-from rover_lib.onboard.telemetry import FlightLog, log_limits
-from rover_lib.onboard.watch import (
+from rover_lib.onboard.drive.feed import Feed
+from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
+from rover_lib.onboard.drive.inference import Planner, PolicyProcess, delayed
+from rover_lib.onboard.drive.loop import Arm, Hooks, Report, Until, Warnings, drive
+from rover_lib.onboard.drive.pilot import Pilot, PolicyPilot, ReplayPilot
+from rover_lib.onboard.drive.plan import Commanded, Settings
+from rover_lib.onboard.drive.service import CHECK_S, NotArmed, Service
+from rover_lib.onboard.drive.takeover import TakeoverRecorder
+from rover_lib.onboard.drive.watch import (
     HealthWatch,
     MemoryWatch,
     artifact_changes,
@@ -46,6 +40,12 @@ from rover_lib.onboard.watch import (
     stopped_by_signals,
     unfinished_drive,
 )
+from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver, sentence_of
+from rover_lib.onboard.params import params
+from rover_lib.onboard.recording.episode import About, Controls, read_controls, recorded_car
+from rover_lib.onboard.recording.recorder import Recorder, room_for
+from rover_lib.onboard.signal_event import SignalEvent
+from rover_lib.onboard.status_line import StatusLine
 
 REST_S = 1.0  # between plans while the car is not driving
 TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"

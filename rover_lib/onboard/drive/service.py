@@ -50,7 +50,7 @@ from rover_lib.onboard.errors import RoverError
 
 if TYPE_CHECKING:  # asking for the service's state, as every playbook does, must not import numpy or OpenCV
     from rover_lib.onboard.car.servo_link import Telemetry
-    from rover_lib.onboard.loop import Arm, Report
+    from rover_lib.onboard.drive.loop import Arm, Report
 
 UNIT = "rover-drive.service"
 RUNTIME = Path("/run/rover-drive")  # the unit's RuntimeDirectory=

@@ -13,9 +13,9 @@ import pytest
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.car.camera import CameraError, Frame
+from rover_lib.onboard.drive.inference import Planner, PolicyProcess, delayed
+from rover_lib.onboard.drive.plan import Commanded
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.onboard.inference import Planner, PolicyProcess, delayed
-from rover_lib.onboard.plan import Commanded
 from rover_lib.onboard.policy.confine import PROCESSORS
 
 pytestmark = pytest.mark.slow  # each starts processes that import torch
@@ -109,7 +109,7 @@ def test_it_rests_unless_somebody_is_in_a_hurry():
 
 
 def test_closing_ends_its_rest(monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.inference.END_S", 5.0)  # of waiting for it
+    monkeypatch.setattr("rover_lib.onboard.drive.inference.END_S", 5.0)  # of waiting for it
     with Planner(Frames(), lambda frame, state: CHUNK, Commanded(), 30.0, rest_s=20.0) as planner:
         planner.wait(2.0)
     assert not planner._thread.is_alive()
@@ -127,7 +127,7 @@ def test_a_plan_to_begin_by_is_fresh():
 
 
 def test_a_policy_that_has_no_fresh_plan(monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.inference.FRESH_S", 0.1)
+    monkeypatch.setattr("rover_lib.onboard.drive.inference.FRESH_S", 0.1)
     answers = iter([CHUNK])
 
     def predict(frame, state):
@@ -226,7 +226,7 @@ def test_a_process_that_hangs_is_ended(artifacts):
 
 def test_it_ends_with_its_parent(artifacts):
     code = (
-        "import os, sys; from rover_lib.onboard.inference import PolicyProcess; "
+        "import os, sys; from rover_lib.onboard.drive.inference import PolicyProcess; "
         f"p = PolicyProcess({str(artifacts['static'])!r}).__enter__(); print(*p.pids, flush=True); "
         "os.kill(os.getpid(), 9)"
     )
@@ -243,7 +243,7 @@ def test_it_ends_with_its_parent(artifacts):
 
 def test_the_side_that_drives_does_not_load_torch():
     code = (
-        "import sys, rover_lib.onboard.drive, rover_lib.onboard.car.camera, rover_lib.onboard.inference; "
+        "import sys, rover_lib.onboard.drive.drive, rover_lib.onboard.car.camera, rover_lib.onboard.drive.inference; "
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -28,8 +28,8 @@ import numpy as np
 from rover_lib.onboard.artifact.engines import UNCONFINED
 from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.onboard.car.camera import Camera
+from rover_lib.onboard.drive.plan import LIMITS, Commanded, Plan
 from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
-from rover_lib.onboard.plan import LIMITS, Commanded, Plan
 from rover_lib.onboard.policy.confine import confine, memory_mb, open_no_more
 
 LOAD_S = 120.0  # time to load an engine and a full-size policy from a slow card

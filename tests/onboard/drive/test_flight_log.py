@@ -19,9 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from needs import until
 
-from rover_lib.onboard import telemetry
+from rover_lib.onboard.drive import flight_log as telemetry
+from rover_lib.onboard.drive.flight_log import FlightLog, LogError, Tick, read_log
 from rover_lib.onboard.errors import ParamsError
-from rover_lib.onboard.telemetry import FlightLog, LogError, Tick, read_log
 
 LIMITS = {"max_bytes": 1_000_000, "keep": 2}
 HEADER = {"hz": 30, "fade_s": 0.5, "stop_s": 1.0}
@@ -119,7 +119,7 @@ def test_without_a_file_events_are_still_said(caplog):
 def test_a_power_cut_costs_less_than_a_second(path):
     code = (
         "import sys, time, os, signal\n"
-        "from rover_lib.onboard.telemetry import FlightLog, Tick\n"
+        "from rover_lib.onboard.drive.flight_log import FlightLog, Tick\n"
         f"log = FlightLog(sys.argv[1], header={{}}, **{LIMITS}).__enter__()\n"
         "while (t := time.monotonic() - log.start_s) < 1.5:\n"
         f"    log.tick(Tick(*(t, *{tuple(tick(0))[1:]})))\n"

@@ -15,14 +15,12 @@ import pytest
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import Hello, LinkError, State, Telemetry
-from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
-from rover_lib.onboard.loop import KEEP_S, Hooks, Report, Until, drive
-from rover_lib.onboard.pilot import Order, PolicyPilot, ReplayPilot
-from rover_lib.onboard.plan import Commanded, Plan, Settings
-from rover_lib.onboard.recording.episode import Controls
-from rover_lib.onboard.service import NotArmed
-from rover_lib.onboard.telemetry import FlightLog
-from rover_lib.onboard.watch import (
+from rover_lib.onboard.drive.flight_log import FlightLog
+from rover_lib.onboard.drive.loop import KEEP_S, Hooks, Report, Until, drive
+from rover_lib.onboard.drive.pilot import Order, PolicyPilot, ReplayPilot
+from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
+from rover_lib.onboard.drive.service import NotArmed
+from rover_lib.onboard.drive.watch import (
     OFTEN,
     HealthWatch,
     MemoryWatch,
@@ -32,6 +30,8 @@ from rover_lib.onboard.watch import (
     stopped_by_signals,
     unfinished_drive,
 )
+from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
+from rover_lib.onboard.recording.episode import Controls
 
 PERIOD = 1 / 30
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.AUTONOMOUS, "a", "w", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)
@@ -540,7 +540,7 @@ def test_faults_come_through(pilot):
 
 
 def test_no_plan_in_time(pilot, monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.pilot.FIRST_PLAN_S", 0.0)
+    monkeypatch.setattr("rover_lib.onboard.drive.pilot.FIRST_PLAN_S", 0.0)
     with pytest.raises(PolicyError, match="no plan within"):
         pilot.ready(threading.Event())
 
@@ -618,8 +618,8 @@ def test_what_is_ridden_through_is_said(link, monkeypatch):
     report, spent, system_s = Report(), [100, 1000, 7], [0.0]
     link.garbled = 3
     link.status = replace(STATUS, bad_lines=4)
-    monkeypatch.setattr("rover_lib.onboard.watch._processors", lambda: tuple(spent))
-    monkeypatch.setattr("rover_lib.onboard.watch.time", Time(system_s))
+    monkeypatch.setattr("rover_lib.onboard.drive.watch._processors", lambda: tuple(spent))
+    monkeypatch.setattr("rover_lib.onboard.drive.watch.time", Time(system_s))
     look = HealthWatch(report, link)
     assert list(look()) == []  # what was before it is not its own
 
@@ -766,7 +766,7 @@ def test_memory():
 
 def test_memory_is_watched_for_growth_after_the_first_minute(clock, monkeypatch):
     megabytes = iter([500.0, 520.0, 521.5])
-    monkeypatch.setattr("rover_lib.onboard.watch.memory_mb", lambda pids: next(megabytes))
+    monkeypatch.setattr("rover_lib.onboard.drive.watch.memory_mb", lambda pids: next(megabytes))
     report = Report()
     watch = MemoryWatch(report, [1], clock)
     seen = []

@@ -9,14 +9,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from rover_lib.onboard import feed as f
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import State, Telemetry
-from rover_lib.onboard.loop import Hooks, Report, Until, drive
-from rover_lib.onboard.pilot import Order
-from rover_lib.onboard.plan import Plan
-from rover_lib.onboard.telemetry import FlightLog, read_log
+from rover_lib.onboard.drive import feed as f
+from rover_lib.onboard.drive.flight_log import FlightLog, read_log
+from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
+from rover_lib.onboard.drive.pilot import Order
+from rover_lib.onboard.drive.plan import Plan
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.AUTONOMOUS, "a", "-", 1456, 150, 238, None, None, None, None, 0, 0, 0, 0)
 JPEG = b"\xff\xd8 a picture\n with a line's end \xff\xd9"
