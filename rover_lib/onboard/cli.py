@@ -711,7 +711,7 @@ def open_view(
     import asyncio
 
     from rover_lib.onboard.car.host import default_view
-    from rover_lib.onboard.view import Address, View, new_token, read_token
+    from rover_lib.onboard.view.server import Address, View, new_token, read_token
 
     token = read_token(token_file) if token_file else new_token()
     place = None if replay else feed or default_view()

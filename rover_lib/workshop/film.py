@@ -14,10 +14,10 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from rover_lib.onboard.ahead import CarShape, from_now
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
+from rover_lib.onboard.view.path_overlay import CarShape, from_now
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.replay import AHEAD, Replay
 

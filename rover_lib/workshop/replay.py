@@ -30,7 +30,7 @@ from rover_lib.onboard.kinds import kinds_of
 from rover_lib.workshop.episodes import load_recordings
 
 if TYPE_CHECKING:
-    from rover_lib.onboard.view import View
+    from rover_lib.onboard.view.server import View
 
 RECORDED = "recorded: "  # the event that names the episode
 AHEAD = "ahead: where the commands of the next second led"

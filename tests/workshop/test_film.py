@@ -13,12 +13,12 @@ from click.testing import CliRunner
 from PIL import Image
 
 from rover_lib.cli import main
-from rover_lib.onboard.ahead import CarShape
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.drive.flight_log import FlightLog, LogError, Tick, read_log
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
+from rover_lib.onboard.view.path_overlay import CarShape
 from rover_lib.workshop import film as f
 from rover_lib.workshop import replay as r
 from rover_lib.workshop.progress import silent

@@ -24,7 +24,7 @@ from lab.pi.view_proofs import (
     view_again,
     view_gone,
 )
-from rover_lib.onboard.view import Address, View
+from rover_lib.onboard.view.server import Address, View
 from rover_lib.world.standin import PinEvent
 
 ROOT = Path(__file__).parents[3]

@@ -34,11 +34,11 @@ from typing import Any
 
 from aiohttp import WSMsgType, web
 
-from rover_lib.onboard.ahead import CarShape, from_now
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import is_listened_at, throttled_means
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.view.path_overlay import CarShape, from_now
 
 PORT = 8470
 MESSAGE_BYTES = 1 << 20  # no message of a drive is larger (MOST_BYTES in feed.py)

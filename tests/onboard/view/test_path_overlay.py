@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from rover_lib.onboard.ahead import CarShape, from_now
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import ParamsError
+from rover_lib.onboard.view.path_overlay import CarShape, from_now
 from rover_lib.world import world as w
 
 SHAPE = CarShape.of()

@@ -16,8 +16,8 @@ import pytest
 
 aiohttp = pytest.importorskip("aiohttp", reason="needs the extra view: pip install 'rover-policy[view]'")
 
-from rover_lib.onboard import view as v  # noqa: E402  # after it is known that it can be
 from rover_lib.onboard.car.car import read_car  # noqa: E402
+from rover_lib.onboard.view import server as v
 
 TOKEN = "a-token-of-the-tests"
 JPEG = b"\xff\xd8 a picture \n \xff\xd9"
