@@ -5,8 +5,8 @@ from typing import Any
 
 from lab.a76.core import A76
 from lab.a76.count import Counted
+from rover_lib.onboard.care.lower_bound import PI5_SEEN_GMAC_PER_S
 from rover_lib.onboard.columns import aligned
-from rover_lib.onboard.floor import PI5_SEEN_GMAC_PER_S
 from rover_lib.workshop.compare import gate
 from rover_lib.workshop.judge import worst
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from lab.arduino.emulator import EmulatedArduino
-from rover_lib.onboard.doctor import Check, examine, receiver
+from rover_lib.onboard.care.doctor import Check, examine, receiver
 from rover_lib.world.car import VirtualCar
 from rover_lib.world.standin import REST_US
 

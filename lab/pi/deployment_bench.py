@@ -27,7 +27,7 @@ from lab.pi.container import Container
 from lab.pi.emulation import EmulationError, wait_for
 from lab.pi.network import Network
 from lab.pi.playbooks import Play
-from rover_lib.onboard.release import POLICY, Releases, pack
+from rover_lib.onboard.care.release import POLICY, Releases, pack
 from rover_lib.workshop.cache import cached_folder, key_of
 
 STATE = "var/lib/rover"  # on the rover; it has models/, which has incoming/

@@ -11,7 +11,7 @@ deploy.yml, run again, leaves the rover with the new model.
 
 A power cut ends every program of the rover at one moment and leaves its disk as it was. A real one also loses writes
 that were not synced. A container cannot show that, because its disk is a layer over a folder of this machine. So
-tests/onboard/test_release.py cuts the same commands after every system call that changes something, and loses what was
+tests/onboard/care/test_release.py cuts the same commands after every system call that changes something, and loses what was
 not synced.
 """
 
@@ -39,8 +39,8 @@ from lab.pi.deployment_bench import (
     rovers,
 )
 from lab.pi.emulation import EmulationError
+from rover_lib.onboard.care.release import ORIGIN, SPARE_BYTES
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.release import ORIGIN, SPARE_BYTES
 from rover_lib.workshop.program import run
 
 ROOM = 4 << 20  # bytes free on a full disk

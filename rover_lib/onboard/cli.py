@@ -347,8 +347,8 @@ def doctor(
     Nothing is armed, and only the transmitter can move a servo. Exit code 1 if anything that driving needs fails;
     warnings do not count. With --receiver it asks you to move a stick and to switch the transmitter off: do that once.
     """
-    from rover_lib.onboard import doctor as checking
     from rover_lib.onboard.car.host import default_log
+    from rover_lib.onboard.care import doctor as checking
 
     if receiver:
         found = checking.receiver(port, lambda text: click.prompt(text + " Enter", "", show_default=False, err=True))
@@ -455,9 +455,9 @@ def benchmark(
     what runs on the Pi.
     """
     from rover_lib.onboard.artifact.manifest import content_hash, distinct_names, read_parity
-    from rover_lib.onboard.benchmark import BenchmarkOptions
-    from rover_lib.onboard.benchmark import benchmark as measure
-    from rover_lib.onboard.gates import check_gates
+    from rover_lib.onboard.care.benchmark import BenchmarkOptions
+    from rover_lib.onboard.care.benchmark import benchmark as measure
+    from rover_lib.onboard.care.limits import check_gates
     from rover_lib.onboard.params import params
     from rover_lib.onboard.policy.load import load_policy
     from rover_lib.onboard.stage import write_stage
@@ -553,7 +553,7 @@ def release(
 
     `ansible-playbook ansible/deploy.yml` does all of it over a network.
     """
-    from rover_lib.onboard import release as r
+    from rover_lib.onboard.care import release as r
 
     expected = r.Expected(chunk=chunk, camera=camera, aspect=aspect)
     ctx.obj = r.Releases(models, check=r.sandboxed if sandboxed else None, expected=expected, signers=signers)
@@ -575,7 +575,7 @@ ALLOW = click.option(
 @click.pass_obj
 def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, allow: tuple[str, ...]) -> None:
     """Split ARTIFACT into parts for the transfer, in FOLDER. Refuses what the rover would refuse."""
-    from rover_lib.onboard.release import pack as pack_parts
+    from rover_lib.onboard.care.release import pack as pack_parts
 
     show(pack_parts(artifact, folder, releases.expected, allow, sign_key), True)
 

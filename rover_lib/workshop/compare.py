@@ -377,7 +377,7 @@ def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GA
     """The gates of params.yml that a comparison can judge. compared: `metrics`; limits: params.yml's `gates`.
 
     The error gates are for every action that the policy has and params.yml names, as `<action>_mae_pct`. Those of
-    speed are `onboard.gates.check_gates`.
+    speed are `onboard.care.limits.check_gates`.
     """
     fp32, judged = compared["fp32"], compared["modes"][mode]
     rows = [

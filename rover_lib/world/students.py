@@ -21,10 +21,10 @@ import numpy as np
 import torch
 
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
+from rover_lib.onboard.care.lower_bound import PI5_SEEN_GMAC_PER_S
 from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import DistillError
-from rover_lib.onboard.floor import PI5_SEEN_GMAC_PER_S
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.policy.load import Policy, load_policy

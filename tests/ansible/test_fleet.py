@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from rover_lib.onboard.artifact.manifest import content_hash
-from rover_lib.onboard.release import Releases, pack
+from rover_lib.onboard.care.release import Releases, pack
 
 ROOT = Path(__file__).parents[2]
 NAMES = ("canary", "second", "third")

@@ -191,7 +191,9 @@ def test_benchmark_writes_its_stage(artifacts, tmp_path):
 
 
 def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.benchmark.peak_memory_alone_mb", lambda path, threads: None)  # for speed
+    monkeypatch.setattr(
+        "rover_lib.onboard.care.benchmark.peak_memory_alone_mb", lambda path, threads: None
+    )  # for speed
     files = []
     for run, mode in (("a", "static"), ("b", "mixed")):
         (tmp_path / run).mkdir()

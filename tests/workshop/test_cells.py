@@ -8,7 +8,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from rover_lib.onboard.gates import check_gates
+from rover_lib.onboard.care.limits import check_gates
 from rover_lib.onboard.params import params
 from rover_lib.workshop import browse, plots
 from rover_lib.workshop.cells import Table

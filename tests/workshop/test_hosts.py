@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rover_lib.onboard.benchmark import BenchmarkOptions, Clocks, benchmark
+from rover_lib.onboard.care.benchmark import BenchmarkOptions, Clocks, benchmark
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import hosts, plots
 

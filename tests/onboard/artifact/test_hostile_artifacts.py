@@ -29,12 +29,12 @@ from archives import Edit, manifest_with, rewritten, vectors_with
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.car.host import Host
+from rover_lib.onboard.care.release import Expected, ReleaseError, Releases, check_signature, pack, sign
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.policy.confine import confine, memory_mb
 from rover_lib.onboard.policy.torch_engine import (
     load as _load,  # noqa: F401, torch is imported before limits, as by verify
 )
-from rover_lib.onboard.release import Expected, ReleaseError, Releases, check_signature, pack, sign
 
 pytestmark = pytest.mark.slow  # there are 140, each with a process of its own
 
@@ -564,7 +564,7 @@ PACKED = {
 
 @pytest.mark.parametrize("what", PACKED)
 def test_no_parts_of_another_form_are_joined(artifacts, tmp_path, monkeypatch, what):
-    monkeypatch.setattr("rover_lib.onboard.release.PART_BYTES", 20 << 20)
+    monkeypatch.setattr("rover_lib.onboard.care.release.PART_BYTES", 20 << 20)
     name, change, message = PACKED[what]
     pack(artifacts["fp32"], tmp_path / "packed", EITHER)
     change(tmp_path / "packed" / name)

@@ -9,11 +9,11 @@ import yaml
 from click.testing import CliRunner
 
 from lab.driving.policy import make_artifact
-from rover_lib.onboard import doctor
 from rover_lib.onboard.artifact import manifest as artifact_module
 from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car import car as car_module
 from rover_lib.onboard.car.car import Car, yaml_of
+from rover_lib.onboard.care import doctor
 from rover_lib.onboard.cli import main
 from rover_lib.onboard.drive.drive import another_car, arm_capped
 from rover_lib.onboard.drive.pilot import ReplayPilot

@@ -18,9 +18,9 @@ from policies import memory_samples
 import rover_lib
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact import manifest as artifact
+from rover_lib.onboard.care.release import pack
 from rover_lib.onboard.errors import ArtifactError, FrameError, PolicyError
 from rover_lib.onboard.policy import memory
-from rover_lib.onboard.release import pack
 
 FRAME = memory_samples(1)[0].picture
 STATE = np.zeros(2, np.float32)

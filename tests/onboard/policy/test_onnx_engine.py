@@ -12,10 +12,10 @@ from policies import memory_samples
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact.archive import ONNX, open_archive, read_record
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
+from rover_lib.onboard.care.release import Expected, ReleaseError, Releases, pack
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.onnx_engine import session_of
-from rover_lib.onboard.release import Expected, ReleaseError, Releases, pack
 
 FRAME, STATE = np.full((360, 640, 3), 99, np.uint8), np.array([0.1, 0.2], np.float32)
 HERE = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
@@ -60,7 +60,7 @@ def test_needs_no_torch(onnx_static):
 import sys
 sys.modules |= dict.fromkeys(["torch", "onnx", "lerobot"])
 import numpy as np
-import rover_lib.onboard.cli, rover_lib.onboard.drive.drive, rover_lib.onboard.benchmark, rover_lib.onboard.doctor
+import rover_lib.onboard.cli, rover_lib.onboard.drive.drive, rover_lib.onboard.care.benchmark, rover_lib.onboard.care.doctor
 from rover_lib.onboard import load_policy
 chunk = load_policy({str(onnx_static)!r}, threads=1).predict_chunk(np.full((360, 640, 3), 99, np.uint8), np.zeros(2))
 assert chunk.shape == (32, 2) and np.isfinite(chunk).all()
@@ -100,7 +100,7 @@ def test_says_what_to_install(onnx_static, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     monkeypatch.delitem(sys.modules, "rover_lib.onboard.policy.onnx_engine", raising=False)
     assert "install onnxruntime, or use an artifact of another engine" in refused(onnx_static)
-    monkeypatch.setattr("rover_lib.onboard.release.version_of", lambda package: None)
+    monkeypatch.setattr("rover_lib.onboard.care.release.version_of", lambda package: None)
     with pytest.raises(ReleaseError, match="it needs onnxruntime, which is not installed here"):
         pack(onnx_static, tmp_path / "packed")
 

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.car.host import Host, throttled_means, usable_cores
+from rover_lib.onboard.care.lower_bound import floor_ms
 from rover_lib.onboard.errors import ParamsError, PolicyError
-from rover_lib.onboard.floor import floor_ms
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}

@@ -11,10 +11,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rover_lib.onboard.benchmark import BenchmarkOptions, Clocks, benchmark, latency_metrics, peak_memory_alone_mb
+from rover_lib.onboard.care.benchmark import BenchmarkOptions, Clocks, benchmark, latency_metrics, peak_memory_alone_mb
+from rover_lib.onboard.care.limits import check_gates
+from rover_lib.onboard.care.lower_bound import floor_ms
 from rover_lib.onboard.errors import ParamsError, PolicyError
-from rover_lib.onboard.floor import floor_ms
-from rover_lib.onboard.gates import check_gates
 
 FRAMES = [np.full((4, 4, 3), k, np.uint8) for k in range(3)]
 STATE = np.zeros(2, np.float32)

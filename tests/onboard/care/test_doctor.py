@@ -19,10 +19,10 @@ from click.testing import CliRunner
 from test_servo_link import board_of
 
 from rover_lib.cli import main
-from rover_lib.onboard import doctor
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.car.host import Host
-from rover_lib.onboard.doctor import Check, examine
+from rover_lib.onboard.care import doctor
+from rover_lib.onboard.care.doctor import Check, examine
 
 USB = (b"uvcvideo", b"HD Camera", 0x85200001, 0x04200001)
 METADATA = (b"uvcvideo", b"HD Camera", 0x85200001, 0x04A00000)

@@ -21,15 +21,15 @@ from click.testing import CliRunner
 from lab.pi.deployment_bench import changed_artifact
 from rover_lib.cli import main
 from rover_lib.onboard.artifact.manifest import content_hash
+from rover_lib.onboard.care.release import Expected, ReleaseError, Releases, inspect_artifact, pack, sign
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.policy.load import load_policy
-from rover_lib.onboard.release import Expected, ReleaseError, Releases, inspect_artifact, pack, sign
 from rover_lib.onboard.stage import sha256_of
 
 
 @pytest.fixture(autouse=True)
 def _our_laptop(keys, monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.release.SIGNERS", keys / "signers")
+    monkeypatch.setattr("rover_lib.onboard.care.release.SIGNERS", keys / "signers")
 
 
 @pytest.fixture(scope="session")
@@ -271,7 +271,7 @@ def all_packed(two, keys, tmp_path_factory) -> Path:
     """The second of the two, in parts."""
     folder = tmp_path_factory.mktemp("laptop") / "packed"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rover_lib.onboard.release.PART_BYTES", PART_BYTES)
+        patch.setattr("rover_lib.onboard.care.release.PART_BYTES", PART_BYTES)
         assert pack(two[1], folder, key=keys / "ours")["parts"] == len(list(folder.glob("part-*"))) > 3
     return folder
 
@@ -279,7 +279,7 @@ def all_packed(two, keys, tmp_path_factory) -> Path:
 @pytest.fixture
 def packed(all_packed, tmp_path, monkeypatch) -> Path:
     """The second of the two, in parts, to do anything with."""
-    monkeypatch.setattr("rover_lib.onboard.release.PART_BYTES", PART_BYTES)
+    monkeypatch.setattr("rover_lib.onboard.care.release.PART_BYTES", PART_BYTES)
     return Path(shutil.copytree(all_packed, tmp_path / "packed"))
 
 
@@ -359,7 +359,7 @@ def test_a_file_in_place_of_the_folder_is_refused(two, tmp_path):
 
 
 def test_packing_a_smaller_artifact_leaves_no_part_of_the_larger_one(packed, two, monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.release.PART_BYTES", 1 << 30)
+    monkeypatch.setattr("rover_lib.onboard.care.release.PART_BYTES", 1 << 30)
     pack(two[0], packed)
     assert set(contents(packed)) == {"part-0000", "release.json"}
 
@@ -817,7 +817,7 @@ def test_bad_input_ends_in_a_sentence(two, signed, tmp_path):
 def test_staging_takes_no_more_memory_than_it_may(two, tmp_path, monkeypatch):
     """Whoever asks for it: a deployment does so as root, in no unit of systemd's."""
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    monkeypatch.setattr("rover_lib.onboard.release.inspect_artifact", lambda *_: bytearray(10**9))
+    monkeypatch.setattr("rover_lib.onboard.care.release.inspect_artifact", lambda *_: bytearray(10**9))
     result = rover("--models", tmp_path / "models", "stage", "--unsigned", two[0])
     assert "staging it would take more than 400 MB of memory" in result.output
     assert resource.getrlimit(resource.RLIMIT_DATA) == before

@@ -1,0 +1,1 @@
+"""Look after a rover: its releases, its health, its speed."""
