@@ -7,8 +7,8 @@ from policies import memory_samples
 
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint import Checkpoint
-from rover_lib.workshop.episodes import Split
 from rover_lib.workshop.hailo.kit import write_kit
+from rover_lib.workshop.recordings.episodes import Split
 from rover_lib.workshop.session import Opened
 
 FRAMES = 6

@@ -35,11 +35,11 @@ from rover_lib.workshop import quantize as q
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
-from rover_lib.workshop.episodes import Sample, choose_calibration
 from rover_lib.workshop.export import export
 from rover_lib.workshop.pipeline import Recipe
 from rover_lib.workshop.program import run
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.session import Opened, opened
 
 FOLDER = GUEST / "peers"

@@ -16,7 +16,7 @@ from rover_lib.onboard.kinds import Number, Output, PathTo
 from rover_lib.workshop.progress import terminal
 
 if TYPE_CHECKING:
-    from rover_lib.workshop.samples import Source
+    from rover_lib.workshop.recordings.samples import Source
 
 
 def _size(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -44,7 +44,7 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
     @CAMERA
     @functools.wraps(command)
     def called(*args: Any, episodes: Path, action_names: str, camera: str, **options: Any) -> None:
-        from rover_lib.workshop.samples import Source
+        from rover_lib.workshop.recordings.samples import Source
 
         return command(*args, episodes=Source.of(episodes, action_names, camera), **options)
 
@@ -219,8 +219,8 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
     from rover_lib.onboard.params import params
     from rover_lib.onboard.policy.load import load_policy
     from rover_lib.workshop import compare as c
-    from rover_lib.workshop.episodes import load_recordings, split
     from rover_lib.workshop.looking import look
+    from rover_lib.workshop.recordings.episodes import load_recordings, split
 
     p = params()["calibration"]
     fp32 = load_policy(reference)
@@ -386,8 +386,8 @@ def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> 
     fifth as long. What is repaired in the recordings or left out is printed, and kept in OUT/rover_export.json. In a
     drive of a policy, each frame says whether a human had taken over: LeRobot's `intervention`.
     """
-    from rover_lib.workshop.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
-    from rover_lib.workshop.export_dataset import export_dataset as write
+    from rover_lib.workshop.recordings.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
+    from rover_lib.workshop.recordings.export_dataset import export_dataset as write
 
     report = write(episodes, out, progress=terminal(), **options)
     for name in ("episodes_are", CAR, DRIVEN_BY, OUTCOMES):  # too long to print; the file has them

@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
-from rover_lib.workshop.episodes import Sample
+from rover_lib.workshop.recordings.episodes import Sample
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy

@@ -19,7 +19,7 @@ from rover_lib.workshop import hub
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.checkpoint_contents import CORRECT_IT, TWO_ACTIONS, Contents, expected_shapes, tensor_bytes
 from rover_lib.workshop.lerobot_checkpoint import lerobot_folder, read_lerobot
-from rover_lib.workshop.samples import Layout
+from rover_lib.workshop.recordings.samples import Layout
 from rover_lib.workshop.trainer_checkpoint import read_trainer
 from rover_lib.workshop.untrusted import listed, shown
 

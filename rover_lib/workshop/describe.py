@@ -9,7 +9,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import kinds_of
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.samples import Source
+from rover_lib.workshop.recordings.samples import Source
 
 BULK = 200  # characters; of a longer value in a report only the number of its items is shown
 STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "distill", "finetune", "learn")
@@ -37,7 +37,7 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
     if kind == "stage":
         return {"report": _report(path)}
     if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
-        from rover_lib.workshop.episodes import load_recordings
+        from rover_lib.workshop.recordings.episodes import load_recordings
 
         return {"recordings": load_recordings(source, progress=progress).summary()}
     from rover_lib.workshop.checkpoint import load_checkpoint

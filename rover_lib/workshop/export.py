@@ -25,7 +25,7 @@ from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, mu
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.observe import Calibration
 from rover_lib.workshop.quantize import QuantizedPolicy, int8_layers
-from rover_lib.workshop.samples import ACTION_NAMES, Sample, car_of
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, car_of
 
 
 class Form(Protocol):

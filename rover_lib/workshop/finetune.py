@@ -41,7 +41,6 @@ from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_both
 from rover_lib.workshop.compare import thinned
-from rover_lib.workshop.episodes import load_recordings, split
 from rover_lib.workshop.improved import Judged, verdict
 from rover_lib.workshop.judge import not_judged, pct_of_range
 from rover_lib.workshop.lessons import (
@@ -54,8 +53,9 @@ from rover_lib.workshop.lessons import (
     plans_of,
 )
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.episodes import load_recordings, split
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, frame_rate_hz, is_another_rate
 from rover_lib.workshop.run_folder import run_folder
-from rover_lib.workshop.samples import Episode, Recordings, Sample, Source, frame_rate_hz, is_another_rate
 from rover_lib.workshop.session import SMALL_GMAC, check_sizes, training_device
 from rover_lib.workshop.student import gmac, not_a_cars
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads

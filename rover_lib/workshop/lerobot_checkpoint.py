@@ -25,7 +25,7 @@ from rover_lib.workshop.checkpoint_contents import (
     one_observation,
     positive,
 )
-from rover_lib.workshop.samples import camera_names
+from rover_lib.workshop.recordings.samples import camera_names
 from rover_lib.workshop.untrusted import listed, shown
 
 RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings

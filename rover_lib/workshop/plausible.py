@@ -19,7 +19,7 @@ from rover_lib.workshop.cells import Table
 from rover_lib.workshop.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.judge import Range, constant_actions
-from rover_lib.workshop.samples import Sample, frame_rate_hz, is_another_rate
+from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, is_another_rate
 
 FRAMES = 12  # planned in FP32, which takes ten seconds for a policy of full size
 BEYOND = 0.5  # a prediction lies beyond if it passes either end by this share of the range; a good policy does not

@@ -32,8 +32,8 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.memory import give_back_freed
 from rover_lib.workshop.act import ACT, EMBEDDINGS, ActConfig, Columns, block_of, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint import Checkpoint
-from rover_lib.workshop.episodes import Sample
 from rover_lib.workshop.observe import Calibration, observed_graph, qconfig_mapping, scaled_model
+from rover_lib.workshop.recordings.episodes import Sample
 from rover_lib.workshop.scales import projections
 from rover_lib.workshop.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 

@@ -27,7 +27,7 @@ from rover_lib.onboard.car.servo_link import REASONS
 from rover_lib.onboard.drive.flight_log import Flight, LogError, Tick, read_log
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.kinds import kinds_of
-from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.recordings.episodes import load_recordings
 
 if TYPE_CHECKING:
     from rover_lib.onboard.view.server import View

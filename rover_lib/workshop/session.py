@@ -13,9 +13,9 @@ from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.samples import Source
+from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
+from rover_lib.workshop.recordings.samples import Source
 from rover_lib.workshop.untrusted import shown
 
 SMALL_GMAC = 1.0  # a policy below this gains less from a second thread than the thread costs on a busy machine

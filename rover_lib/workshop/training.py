@@ -28,8 +28,8 @@ from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.policy.preprocess import normalise, prepare_frame
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act import ActConfig
-from rover_lib.workshop.episodes import Sample
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.episodes import Sample
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy

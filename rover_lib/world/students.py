@@ -32,11 +32,11 @@ from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_st
 from rover_lib.workshop.cache import cache_root, car_in_key, key_of
 from rover_lib.workshop.compare import GATED, thinned
 from rover_lib.workshop.distill import errors_of
-from rover_lib.workshop.episodes import load_recordings, split
 from rover_lib.workshop.judge import not_judged
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.episodes import load_recordings, split
+from rover_lib.workshop.recordings.samples import Recordings, Sample, Source
 from rover_lib.workshop.run_folder import says_how_it_was_taught
-from rover_lib.workshop.samples import Recordings, Sample, Source
 from rover_lib.world import latency, trial, world
 from rover_lib.world.frontier import DRIVES, NOBODY_DROVE, recommendation
 from rover_lib.world.latency import SEED, Condition, drive_late

@@ -28,13 +28,13 @@ from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.policy.preprocess import normalise
 from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop import act as act_module
-from rover_lib.workshop import episodes as episodes_module
 from rover_lib.workshop import training as training_module
 from rover_lib.workshop.act import ActConfig, lerobot_act
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
 from rover_lib.workshop.compare import thinned
-from rover_lib.workshop.episodes import load_recordings, split
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings import episodes as episodes_module
+from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.training import (
     ACTION,
     IMAGE,

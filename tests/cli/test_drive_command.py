@@ -20,7 +20,7 @@ from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.pilot import SLACK_S
 from rover_lib.onboard.recording.episode import read_controls
-from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.world.car import VirtualCar
 
 pytestmark = pytest.mark.slow

@@ -13,8 +13,8 @@ from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
 from rover_lib.onboard.stage import read_stage
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Source
 from rover_lib.workshop.run import NAMES, NOTEBOOKS, parameters_of
-from rover_lib.workshop.samples import ACTION_NAMES, Source
 from rover_lib.workshop.session import load
 
 pytestmark = pytest.mark.slow

@@ -200,7 +200,7 @@ class TestHuman:
     def test_lerobots_loader_reads_it_and_ours(self, drives, monkeypatch):
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        from rover_lib.workshop.episodes import load_recordings
+        from rover_lib.workshop.recordings.episodes import load_recordings
 
         monkeypatch.setenv("HF_HUB_OFFLINE", "1")
         data = LeRobotDataset("local/drives", root=drives, video_backend="pyav")

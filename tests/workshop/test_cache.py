@@ -3,8 +3,8 @@
 import json
 from pathlib import Path
 
-from rover_lib.workshop import episodes
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
+from rover_lib.workshop.recordings import episodes
 
 
 def test_the_cache_is_where_the_user_says(monkeypatch, tmp_path):

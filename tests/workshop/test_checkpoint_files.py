@@ -16,7 +16,7 @@ from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
 from rover_lib.workshop.observe import calibrate
-from rover_lib.workshop.samples import Layout
+from rover_lib.workshop.recordings.samples import Layout
 
 SETTINGS = {
     "learning_rate": 1e-4, "batch_size": 4, "data_dir": "episodes", "output_dir": "fast", "device": "cpu", "seed": 0

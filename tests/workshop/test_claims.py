@@ -6,7 +6,7 @@ import pytest
 
 from rover_lib.workshop import plots
 from rover_lib.workshop.plots import claims
-from rover_lib.workshop.samples import Fault, Recordings, Source
+from rover_lib.workshop.recordings.samples import Fault, Recordings, Source
 
 
 def compared(fp32, static):

@@ -9,7 +9,7 @@ from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop import run_report as report
 from rover_lib.workshop.describe import describe, runs
-from rover_lib.workshop.samples import Source
+from rover_lib.workshop.recordings.samples import Source
 
 DEMO = Path(__file__).parents[2] / "results" / "demo"
 

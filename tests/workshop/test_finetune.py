@@ -30,10 +30,10 @@ from rover_lib.workshop.act import Affine
 from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
-from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.finetune import FinetuneRecipe, finetune, human_samples
 from rover_lib.workshop.pipeline import make_artifact
-from rover_lib.workshop.samples import Episode, Sample
+from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.samples import Episode, Sample
 from rover_lib.workshop.student import gmac
 
 FRAMES = 24

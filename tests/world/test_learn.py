@@ -13,9 +13,9 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import pipeline, plots
-from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.finetune import human_samples
 from rover_lib.workshop.pipeline import make_artifact
+from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.session import load
 from rover_lib.world import learn
 from rover_lib.world.latency import Condition, drive_in

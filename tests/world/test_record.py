@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rover_lib.onboard.errors import WorldError
-from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.world import record
 from rover_lib.world.record import record_episodes
 

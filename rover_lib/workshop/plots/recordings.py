@@ -9,7 +9,6 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.episodes import Episode, Recordings, Sample
 from rover_lib.workshop.observe import Calibration, RangeObserver
 from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
@@ -35,7 +34,8 @@ from rover_lib.workshop.plots.style import (
     part_colours,
     shown_picture,
 )
-from rover_lib.workshop.samples import ACTION_NAMES
+from rover_lib.workshop.recordings.episodes import Episode, Recordings, Sample
+from rover_lib.workshop.recordings.samples import ACTION_NAMES
 from rover_lib.workshop.scheme import OBSERVERS
 
 

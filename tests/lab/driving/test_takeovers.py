@@ -17,8 +17,8 @@ from lab.driving.virtual_host import RATE_HZ, Process
 from rover_lib.onboard.drive.takeover import LET_GO_S, TakeoverRecorder
 from rover_lib.onboard.errors import TakenOver
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
-from rover_lib.workshop.episodes import load_recordings
-from rover_lib.workshop.export_dataset import export_dataset
+from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.export_dataset import export_dataset
 from rover_lib.world.standin import REST_US
 
 # ---- in virtual time: the real firmware's state machine, link, loop and plans

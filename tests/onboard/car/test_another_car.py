@@ -21,10 +21,10 @@ from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import About, Controls, EpisodeWriter, read_controls, recorded_car
-from rover_lib.workshop.episodes import load_recordings
 from rover_lib.workshop.lessons import as_driven
 from rover_lib.workshop.plots.recordings import episode_overview
-from rover_lib.workshop.samples import car_of as car_of_samples
+from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.samples import car_of as car_of_samples
 
 CRAWLER = Car.of(
     {

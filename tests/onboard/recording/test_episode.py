@@ -28,7 +28,7 @@ from rover_lib.onboard.recording.episode import (
     EpisodeWriter,
     read_controls,
 )
-from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.recordings.episodes import load_recordings
 
 NAME = "episode_20260101_120000"
 FRAME = np.full((36, 64, 3), (30, 90, 200), np.uint8)

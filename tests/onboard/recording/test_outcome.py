@@ -15,7 +15,7 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording import outcome as module
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.onboard.recording.outcome import label, labelled
-from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.recordings.episodes import load_recordings
 
 FRAME = np.full((18, 32, 3), (30, 90, 200), np.uint8)
 

@@ -27,7 +27,7 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording import recorder as module
 from rover_lib.onboard.recording.episode import About, EpisodeWriter, read_controls
 from rover_lib.onboard.recording.recorder import Recorder, record
-from rover_lib.workshop.episodes import load_recordings
+from rover_lib.workshop.recordings.episodes import load_recordings
 
 PICTURE = np.full((36, 64, 3), (30, 90, 200), np.uint8)
 

@@ -20,8 +20,8 @@ from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint_files import write_lerobot
-from rover_lib.workshop.episodes import load_recordings, split
-from rover_lib.workshop.samples import CAMERA, Layout, Source, camera_names
+from rover_lib.workshop.recordings.episodes import load_recordings, split
+from rover_lib.workshop.recordings.samples import CAMERA, Layout, Source, camera_names
 from rover_lib.workshop.session import load
 
 CHUNK, FPS, SIZE = 8, 20, (72, 128)

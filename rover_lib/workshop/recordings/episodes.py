@@ -56,9 +56,10 @@ from rover_lib.onboard.recording.episode import (
     number_of,
     recorded_car,
 )
-from rover_lib.workshop import hub, lerobot_dataset
+from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source, relative
+from rover_lib.workshop.recordings import lerobot_dataset
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source, relative
 from rover_lib.workshop.untrusted import listed, shown
 
 DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")

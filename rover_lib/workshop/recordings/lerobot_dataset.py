@@ -22,7 +22,7 @@ from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
 from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.samples import (
+from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     Episode,
     Fault,

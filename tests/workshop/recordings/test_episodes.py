@@ -18,7 +18,7 @@ from recorded import real_episode
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import CONTROL_FIELDS, FRAME_FIELDS, About, EpisodeWriter
-from rover_lib.workshop.episodes import choose_calibration, load_recordings, split
+from rover_lib.workshop.recordings.episodes import choose_calibration, load_recordings, split
 
 CHUNK = 8
 PWM = PwmCalibration()

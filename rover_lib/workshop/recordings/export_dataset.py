@@ -31,8 +31,9 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.recording.episode import HIT, HUMAN, NOBODY, POLICY
 from rover_lib.workshop.alone import alone_in
-from rover_lib.workshop.episodes import load_recordings
-from rover_lib.workshop.lerobot_dataset import (
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.lerobot_dataset import (
     ACTION,
     BACKEND,
     CAR,
@@ -43,8 +44,7 @@ from rover_lib.workshop.lerobot_dataset import (
     STATE,
     SUCCESS,
 )
-from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.samples import (
+from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     CAMERA,
     Episode,
