@@ -84,7 +84,7 @@ def tiny_file(made_once, request) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny(tiny_file):
-    from rover_lib.workshop.checkpoint import load_checkpoint
+    from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
     return load_checkpoint(tiny_file)
 

@@ -33,7 +33,7 @@ from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_st
 from rover_lib.workshop import act
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.cache import cached_folder, key_of
-from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.export import export
 from rover_lib.workshop.pipeline import Recipe

@@ -19,7 +19,7 @@ from torch.fx import GraphModule, Interpreter, Node
 
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, block_of, blocks, inputs_of, multiply_accumulates, predictions
-from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge import Range, constant_actions, not_judged, pct_of_range, worst
 from rover_lib.workshop.observe import Calibration, observed_graph
 from rover_lib.workshop.progress import Progress, silent

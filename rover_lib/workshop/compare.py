@@ -30,7 +30,7 @@ from rover_lib.onboard.policy.load import Policy, action_limits, load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop import judge
 from rover_lib.workshop.act import Affine, lerobot_act
-from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.progress import Progress, silent
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32

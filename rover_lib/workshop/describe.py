@@ -40,7 +40,7 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         from rover_lib.workshop.recordings.episodes import load_recordings
 
         return {"recordings": load_recordings(source, progress=progress).summary()}
-    from rover_lib.workshop.checkpoint import load_checkpoint
+    from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
     checkpoint = load_checkpoint(path)
     return {"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}

@@ -37,14 +37,14 @@ from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.channels import without_channels
-from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint_files import write_both, written_in
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint.files import write_both, written_in
+from rover_lib.workshop.checkpoint.lerobot import read_origin
 from rover_lib.workshop.choose import Chooser
 from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.export import export
 from rover_lib.workshop.fake_quant import RoundedPolicy
 from rover_lib.workshop.judge import Range, not_judged, pct_of_range, shown_pct, worst
-from rover_lib.workshop.lerobot_checkpoint import read_origin
 from rover_lib.workshop.lessons import BatchedPolicy, Lessons, as_driven, in_another_light, judged_ranges, plans_of
 from rover_lib.workshop.observe import Calibration, calibrate
 from rover_lib.workshop.progress import Progress, silent

@@ -22,7 +22,7 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.wheel_version import release
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
-from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.observe import Calibration
 from rover_lib.workshop.quantize import QuantizedPolicy, int8_layers
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, car_of

@@ -30,7 +30,7 @@ from rover_lib.workshop.act import (
     folded_block,
     of_columns,
 )
-from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.observe import Calibration, RangeObserver, observed_graph, scaled_model
 from rover_lib.workshop.scheme import KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 

@@ -38,8 +38,8 @@ from rover_lib.workshop import act, training
 from rover_lib.workshop import lessons as lessons_module
 from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.cache import cache_root, key_of
-from rover_lib.workshop.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint_files import write_both
+from rover_lib.workshop.checkpoint.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint.files import write_both
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.improved import Judged, verdict
 from rover_lib.workshop.judge import not_judged, pct_of_range

@@ -31,7 +31,7 @@ from torch.fx import GraphModule, Node
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act import ACT, ActConfig, Columns, block_of, blocks, example_inputs, inputs_of
-from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 from rover_lib.workshop.scales import Maxima, apply_channel_scales, channel_maxima

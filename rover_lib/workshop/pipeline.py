@@ -21,7 +21,7 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block
-from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.export import Exporter, Parity, export
 from rover_lib.workshop.observe import Calibration, calibrate

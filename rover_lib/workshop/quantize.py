@@ -31,7 +31,7 @@ from torch.fx import GraphModule
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.memory import give_back_freed
 from rover_lib.workshop.act import ACT, EMBEDDINGS, ActConfig, Columns, block_of, example_inputs, inputs_of
-from rover_lib.workshop.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.observe import Calibration, observed_graph, qconfig_mapping, scaled_model
 from rover_lib.workshop.recordings.episodes import Sample
 from rover_lib.workshop.scales import projections

@@ -12,7 +12,7 @@ from rover_lib.onboard.artifact.manifest import CHUNK, MOST_NAMES, NAME_LENGTH, 
 from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.recordings.samples import Source

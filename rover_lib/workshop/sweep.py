@@ -221,7 +221,7 @@ class Notebooks:
 
     def _taught(self, job: Job, folder: Path) -> Path:
         """Teach the student in the run's own folder, or continue; return its checkpoint."""
-        from rover_lib.workshop.checkpoint_files import written_in
+        from rover_lib.workshop.checkpoint.files import written_in
         from rover_lib.workshop.distill import DistillRecipe, distill, phases_of
         from rover_lib.workshop.student import StudentShape
 

@@ -23,7 +23,7 @@ from rover_lib.workshop.act import (
     imagenet,
     multiply_accumulates,
 )
-from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
 SHAPES = {
     "the user's": FULL,

@@ -19,8 +19,8 @@ from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop import distill as distill_module
 from rover_lib.workshop import session, training
 from rover_lib.workshop.act import ACT, Affine, inputs_of
-from rover_lib.workshop.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint_files import write_lerobot
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.files import write_lerobot
 from rover_lib.workshop.compare import LerobotEager
 from rover_lib.workshop.distill import DistillRecipe, distill, summary
 from rover_lib.workshop.progress import silent

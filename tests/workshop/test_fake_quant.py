@@ -6,7 +6,7 @@ from policies import TINY, lerobot_policy, memory_samples, trainer_content
 from torch.func import functional_call
 
 from rover_lib.workshop.act import ACT, inputs_of, predictions
-from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.fake_quant import RoundedPolicy, parameters
 from rover_lib.workshop.observe import calibrate, scaled_model
 from rover_lib.workshop.quantize import int8_layers, quantize

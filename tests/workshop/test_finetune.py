@@ -28,8 +28,8 @@ from rover_lib.workshop import finetune as finetune_module
 from rover_lib.workshop import pipeline, session
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.channels import without_channels
-from rover_lib.workshop.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.files import write_lerobot, write_trainer
 from rover_lib.workshop.finetune import FinetuneRecipe, finetune, human_samples
 from rover_lib.workshop.pipeline import make_artifact
 from rover_lib.workshop.recordings.episodes import load_recordings

@@ -8,7 +8,7 @@ from policies import TINY, lerobot_policy
 
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
 from rover_lib.workshop import hub
-from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.recordings.episodes import load_recordings
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"

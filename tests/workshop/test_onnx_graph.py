@@ -15,7 +15,7 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
 from rover_lib.workshop.channels import without_channels
-from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.observe import calibrate
 from rover_lib.workshop.onnx_graph import graph_of, onnx_model, stacked
 from rover_lib.workshop.quantize import int8_layers, quantize

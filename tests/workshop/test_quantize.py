@@ -20,7 +20,7 @@ from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop import act, observe
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
-from rover_lib.workshop.checkpoint import Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.choose import Chooser, float_costs_pct
 from rover_lib.workshop.export import export
 from rover_lib.workshop.observe import Calibration, RangeObserver, calibrate, observed_graph, qconfig_mapping

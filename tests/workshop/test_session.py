@@ -9,7 +9,7 @@ from recorded import record_drives
 from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.workshop import session
 from rover_lib.workshop.act import Affine
-from rover_lib.workshop.checkpoint_files import write_lerobot
+from rover_lib.workshop.checkpoint.files import write_lerobot
 from rover_lib.workshop.pipeline import write_load
 from rover_lib.workshop.session import load, opened
 

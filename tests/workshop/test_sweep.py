@@ -15,7 +15,7 @@ from rover_lib.cli import main
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.workshop import sweep as sweeping
-from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.sweep import Job, Sheet, SweepError
 
 

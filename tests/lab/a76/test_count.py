@@ -24,7 +24,7 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT
-from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.export import export
 from rover_lib.workshop.observe import calibrate
 from rover_lib.workshop.wheelhouse import REQUIREMENTS

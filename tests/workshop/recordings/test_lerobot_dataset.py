@@ -18,8 +18,8 @@ from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.act import ACT, inputs_of, predictions
-from rover_lib.workshop.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint_files import write_lerobot
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.files import write_lerobot
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import CAMERA, Layout, Source, camera_names
 from rover_lib.workshop.session import load

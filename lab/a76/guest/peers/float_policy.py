@@ -8,7 +8,7 @@ from planes import planes
 from torch import Tensor, nn
 
 from rover_lib.workshop.act import ACT
-from rover_lib.workshop.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
 
 def float_policy(checkpoint: str) -> tuple[ACT, tuple[Tensor, Tensor]]:

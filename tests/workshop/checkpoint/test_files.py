@@ -13,8 +13,8 @@ from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
-from rover_lib.workshop.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint_files import write_lerobot, write_trainer
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.files import write_lerobot, write_trainer
 from rover_lib.workshop.observe import calibrate
 from rover_lib.workshop.recordings.samples import Layout
 

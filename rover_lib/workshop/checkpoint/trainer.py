@@ -16,7 +16,7 @@ import torch
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import imagenet
-from rover_lib.workshop.checkpoint_contents import (
+from rover_lib.workshop.checkpoint.contents import (
     COPY_AGAIN,
     LARGEST_SIDE_PX,
     Contents,

@@ -17,10 +17,10 @@ from torch import Tensor
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop import hub
 from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.checkpoint_contents import CORRECT_IT, TWO_ACTIONS, Contents, expected_shapes, tensor_bytes
-from rover_lib.workshop.lerobot_checkpoint import lerobot_folder, read_lerobot
+from rover_lib.workshop.checkpoint.contents import CORRECT_IT, TWO_ACTIONS, Contents, expected_shapes, tensor_bytes
+from rover_lib.workshop.checkpoint.lerobot import lerobot_folder, read_lerobot
+from rover_lib.workshop.checkpoint.trainer import read_trainer
 from rover_lib.workshop.recordings.samples import Layout
-from rover_lib.workshop.trainer_checkpoint import read_trainer
 from rover_lib.workshop.untrusted import listed, shown
 
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side

@@ -22,11 +22,11 @@ from safetensors.torch import load_file, save_file
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.act import ACT, inputs_of
-from rover_lib.workshop.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint_contents import expected_shapes
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.contents import expected_shapes
+from rover_lib.workshop.checkpoint.lerobot import Normaliser, lerobot_folder
+from rover_lib.workshop.checkpoint.trainer import PICKLE_BYTES
 from rover_lib.workshop.compare import LerobotEager
-from rover_lib.workshop.lerobot_checkpoint import Normaliser, lerobot_folder
-from rover_lib.workshop.trainer_checkpoint import PICKLE_BYTES
 
 
 def write(content, path):

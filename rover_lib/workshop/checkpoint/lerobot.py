@@ -13,7 +13,7 @@ from torch import Tensor
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import Affine
-from rover_lib.workshop.checkpoint_contents import (
+from rover_lib.workshop.checkpoint.contents import (
     COPY_AGAIN,
     FLOATS,
     LARGEST_SIDE_PX,

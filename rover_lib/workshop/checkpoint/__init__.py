@@ -1,0 +1,1 @@
+"""Checkpoints, the user's trainer's and LeRobot's: read, check and write them."""
