@@ -93,7 +93,7 @@ def tiny(tiny_file):
 def calibration(tiny):
     from policies import memory_samples
 
-    from rover_lib.workshop.observe import calibrate
+    from rover_lib.workshop.int8.observe import calibrate
 
     return calibrate(tiny, memory_samples(12))
 
@@ -106,9 +106,9 @@ def artifacts(made_once, request) -> dict[str, Path]:
         from policies import memory_samples
 
         from rover_lib.workshop.act import ACT
-        from rover_lib.workshop.export import export
-        from rover_lib.workshop.quantize import quantize
-        from rover_lib.workshop.scheme import Scheme
+        from rover_lib.workshop.int8.export import export
+        from rover_lib.workshop.int8.quantize import quantize
+        from rover_lib.workshop.int8.scheme import Scheme
 
         tiny, calibration = request.getfixturevalue("tiny"), request.getfixturevalue("calibration")
         samples = memory_samples(4, seed=1)
@@ -138,9 +138,9 @@ def onnx_static(tiny, calibration, tmp_path_factory) -> Path:
     """The same policy as `artifacts["static"]`, exported for ONNX Runtime."""
     from policies import memory_samples
 
-    from rover_lib.workshop.export import export
-    from rover_lib.workshop.quantize import quantize
-    from rover_lib.workshop.scheme import Scheme
+    from rover_lib.workshop.int8.export import export
+    from rover_lib.workshop.int8.quantize import quantize
+    from rover_lib.workshop.int8.scheme import Scheme
 
     path = tmp_path_factory.mktemp("onnx") / "policy_static.onnx.zip"
     export(quantize(tiny, Scheme("static"), calibration), tiny, path, memory_samples(4, seed=1), calibration)

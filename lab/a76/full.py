@@ -14,7 +14,8 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.compare import thinned
-from rover_lib.workshop.observe import calibrate
+from rover_lib.workshop.int8.observe import calibrate
+from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.pipeline import (
     Recipe,
     export_onnx,
@@ -24,7 +25,6 @@ from rover_lib.workshop.pipeline import (
     write_quantize,
 )
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.quantize import quantize
 from rover_lib.workshop.session import Opened, load
 from rover_lib.world.record import record_episodes
 from rover_lib.world.train import train

@@ -71,7 +71,7 @@ def make_artifact(
         "chunk": np.full((1, CHUNK, 2), PLAN, np.float32),
     }
     if engine == ONNXRUNTIME:
-        from rover_lib.workshop.onnx_graph import graph_of, onnx_model
+        from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model
 
         save_onnx(path, onnx_model(graph_of(module), inputs, ("chunk",)).SerializeToString(), manifest, parity)
     else:

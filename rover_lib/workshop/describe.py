@@ -55,7 +55,7 @@ def _run(folder: Path) -> dict[str, Any]:
 
 
 def _calibration(path: Path) -> dict[str, Any]:
-    from rover_lib.workshop.observe import Calibration
+    from rover_lib.workshop.int8.observe import Calibration
 
     found = Calibration.load(path)
     return {

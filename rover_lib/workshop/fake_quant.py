@@ -31,8 +31,8 @@ from rover_lib.workshop.act import (
     of_columns,
 )
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.observe import Calibration, RangeObserver, observed_graph, scaled_model
-from rover_lib.workshop.scheme import KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
+from rover_lib.workshop.int8.observe import Calibration, RangeObserver, observed_graph, scaled_model
+from rover_lib.workshop.int8.scheme import KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 
 
 class Rounded(nn.Module):

@@ -12,11 +12,11 @@ from policies import memory_samples
 from rover_lib.workshop.act import ACT, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.channels import _chosen, _leave_out, kept_of, without_channels
 from rover_lib.workshop.fake_quant import parameters
+from rover_lib.workshop.int8.observe import calibrate
+from rover_lib.workshop.int8.quantize import int8_layers, quantize
+from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.lessons import BatchedPolicy
-from rover_lib.workshop.observe import calibrate
-from rover_lib.workshop.quantize import int8_layers, quantize
 from rover_lib.workshop.refit import Gram
-from rover_lib.workshop.scheme import Scheme
 
 BLOCKS = [f"backbone.layer{stage}.{block}" for stage in (1, 2, 3, 4) for block in (0, 1)]
 PARTS = ("conv1.weight", "bn1.weight", "bn1.bias")

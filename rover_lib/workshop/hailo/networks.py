@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block, transform
 from rover_lib.workshop.hailo.operators import OPERATORS
-from rover_lib.workshop.onnx_graph import graph_of, onnx_model
+from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model
 
 
 class Front(nn.Module):

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.observe import Calibration
+from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
     BLACK,

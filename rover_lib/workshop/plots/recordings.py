@@ -9,7 +9,8 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.observe import Calibration, RangeObserver
+from rover_lib.workshop.int8.observe import Calibration, RangeObserver
+from rover_lib.workshop.int8.scheme import OBSERVERS
 from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
     BLUE,
@@ -36,7 +37,6 @@ from rover_lib.workshop.plots.style import (
 )
 from rover_lib.workshop.recordings.episodes import Episode, Recordings, Sample
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
-from rover_lib.workshop.scheme import OBSERVERS
 
 
 def checkpoint_size(report: Mapping[str, Any]) -> Figure:

@@ -22,11 +22,11 @@ from lab.a76.count_run import count_run
 from lab.a76.symbols import Functions, GuestFunctions, by_kernel
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
-from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.export import export
-from rover_lib.workshop.observe import calibrate
+from rover_lib.workshop.int8 import quantize as q
+from rover_lib.workshop.int8.export import export
+from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
 pytestmark = [pytest.mark.emulated, needs.qemu]

@@ -27,10 +27,10 @@ from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
-from rover_lib.workshop import quantize as q
 from rover_lib.workshop.act import ACT
-from rover_lib.workshop.export import export
-from rover_lib.workshop.observe import calibrate
+from rover_lib.workshop.int8 import quantize as q
+from rover_lib.workshop.int8.export import export
+from rover_lib.workshop.int8.observe import calibrate
 
 pytestmark = pytest.mark.emulated
 RANGES = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.1)}

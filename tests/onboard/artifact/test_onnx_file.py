@@ -102,5 +102,5 @@ def test_policy_for_two_engines_is_refused(artifacts, tmp_path):
 
 def test_every_operator_of_the_list_has_a_use():
     """Of those that the writer knows; erf and division are gelu's."""
-    source = (Path(__file__).parents[3] / "rover_lib/workshop/onnx_graph.py").read_text()
+    source = (Path(__file__).parents[3] / "rover_lib/workshop/int8/onnx_graph.py").read_text()
     assert not [o for o in OPERATORS if f'"{o}"' not in source]

@@ -78,7 +78,7 @@ def test_equals_the_policy_it_was_made_of(tiny, artifacts):
 def test_a_policy_of_gelu_drives_and_is_packed(tiny, tmp_path):
     """If an operator has changed since it was new, as gelu has, torch names a record of its archive differently."""
     from rover_lib.workshop.act import ACT, inputs_of
-    from rover_lib.workshop.export import export
+    from rover_lib.workshop.int8.export import export
 
     other, path = replace(tiny, config=replace(tiny.config, activation="gelu")), tmp_path / "policy_fp32.pt"
     model, sample = ACT(other.config, other.weights), memory_samples(1, seed=9)[0]

@@ -15,7 +15,7 @@ from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_lerobot, write_trainer
-from rover_lib.workshop.observe import calibrate
+from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.recordings.samples import Layout
 
 SETTINGS = {

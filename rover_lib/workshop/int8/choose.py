@@ -20,12 +20,12 @@ from torch.fx import GraphModule, Interpreter, Node
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, block_of, blocks, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.int8.observe import Calibration, observed_graph
+from rover_lib.workshop.int8.quantize import convert, forget_graphs, quantize
+from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge import Range, constant_actions, not_judged, pct_of_range, worst
-from rover_lib.workshop.observe import Calibration, observed_graph
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.quantize import convert, forget_graphs, quantize
 from rover_lib.workshop.recordings.episodes import Sample
-from rover_lib.workshop.scheme import OBSERVERS, Scheme
 
 Errors = dict[str, float | None]  # <action>_mae_pct, None where it is not judged
 # A multiply-accumulate in float against one in INT8, in instructions: 6.08 to 1.44 G of the full policy, counted on an

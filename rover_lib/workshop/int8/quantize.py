@@ -32,10 +32,10 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.memory import give_back_freed
 from rover_lib.workshop.act import ACT, EMBEDDINGS, ActConfig, Columns, block_of, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.observe import Calibration, observed_graph, qconfig_mapping, scaled_model
+from rover_lib.workshop.int8.observe import Calibration, observed_graph, qconfig_mapping, scaled_model
+from rover_lib.workshop.int8.scales import projections
+from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 from rover_lib.workshop.recordings.episodes import Sample
-from rover_lib.workshop.scales import projections
-from rover_lib.workshop.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 
 Int8Layer = int8.Conv2d | int8.Linear | fused_int8.ConvReLU2d | dynamic_int8.Linear
 INT8_MODULES = (int8.Conv2d, int8.Linear, fused_int8.ConvReLU2d, dynamic_int8.Linear)

@@ -16,10 +16,10 @@ from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
 from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.observe import calibrate
-from rover_lib.workshop.onnx_graph import graph_of, onnx_model, stacked
-from rover_lib.workshop.quantize import int8_layers, quantize
-from rover_lib.workshop.scheme import Scheme
+from rover_lib.workshop.int8.observe import calibrate
+from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model, stacked
+from rover_lib.workshop.int8.quantize import int8_layers, quantize
+from rover_lib.workshop.int8.scheme import Scheme
 
 SHAPES = {
     "tiny": TINY,

@@ -23,8 +23,8 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.wheel_version import release
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.observe import Calibration
-from rover_lib.workshop.quantize import QuantizedPolicy, int8_layers
+from rover_lib.workshop.int8.observe import Calibration
+from rover_lib.workshop.int8.quantize import QuantizedPolicy, int8_layers
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, car_of
 
 
@@ -74,7 +74,7 @@ class Onnx:
         import onnxruntime
 
         from rover_lib.onboard.policy.onnx_engine import session_of
-        from rover_lib.workshop.onnx_graph import graph_of, onnx_model
+        from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model
 
         self.versions = {"onnx": onnx.__version__, "onnxruntime": onnxruntime.__version__}
         self.names = ["state", *(f"frame_{name}" for name in config.cameras)]

@@ -17,16 +17,17 @@ from policies import TINY, lerobot_policy, memory_samples, trainer_content
 from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.load import load_policy
-from rover_lib.workshop import act, observe
-from rover_lib.workshop import quantize as q
+from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.choose import Chooser, float_costs_pct
-from rover_lib.workshop.export import export
-from rover_lib.workshop.observe import Calibration, RangeObserver, calibrate, observed_graph, qconfig_mapping
-from rover_lib.workshop.quantize import quantize
-from rover_lib.workshop.scales import apply_channel_scales, channel_maxima, projections
-from rover_lib.workshop.scheme import ENGINE, KINDS, OBSERVERS, SMALLEST_SCALE, Scheme
+from rover_lib.workshop.int8 import observe
+from rover_lib.workshop.int8 import quantize as q
+from rover_lib.workshop.int8.choose import Chooser, float_costs_pct
+from rover_lib.workshop.int8.export import export
+from rover_lib.workshop.int8.observe import Calibration, RangeObserver, calibrate, observed_graph, qconfig_mapping
+from rover_lib.workshop.int8.quantize import quantize
+from rover_lib.workshop.int8.scales import apply_channel_scales, channel_maxima, projections
+from rover_lib.workshop.int8.scheme import ENGINE, KINDS, OBSERVERS, SMALLEST_SCALE, Scheme
 
 RANGE = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.5)}
 
@@ -357,7 +358,7 @@ def test_an_observer_that_clips_must_win_clearly(tiny, calibration, monkeypatch,
     rows = iter(errors.values())
     monkeypatch.setattr(Chooser, "__init__", lambda self: None)
     monkeypatch.setattr(Chooser, "error", lambda *_: dict(zip(("steering", "throttle"), next(rows), strict=True)))
-    monkeypatch.setattr("rover_lib.workshop.choose.quantize", lambda *_: SimpleNamespace(module=None))
+    monkeypatch.setattr("rover_lib.workshop.int8.choose.quantize", lambda *_: SimpleNamespace(module=None))
     chooser = Chooser()
     chooser.checkpoint, chooser.calibration = tiny, calibration
     scheme, table = chooser.observer(Scheme(), list(errors))
@@ -474,7 +475,7 @@ def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, t
     def badly_written(module, config):
         return SimpleNamespace(predict=lambda inputs: predictions(module, inputs) + torch.tensor([0.0, 0.5]))
 
-    monkeypatch.setattr("rover_lib.workshop.export.TorchScript", badly_written)
+    monkeypatch.setattr("rover_lib.workshop.int8.export.TorchScript", badly_written)
     policy = q.QuantizedPolicy(Scheme(), tiny.config, off, {})
     with pytest.raises(QuantizeError, match="throttle of the written graph differs"):
         export(policy, tiny, tmp_path / "a.pt", memory_samples(2), calibration)

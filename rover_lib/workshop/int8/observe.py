@@ -32,10 +32,10 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act import ACT, ActConfig, Columns, block_of, blocks, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.int8.scales import Maxima, apply_channel_scales, channel_maxima
+from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
-from rover_lib.workshop.scales import Maxima, apply_channel_scales, channel_maxima
-from rover_lib.workshop.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 
 BROKEN_INPUT = "check the checkpoint and the recordings"
 
