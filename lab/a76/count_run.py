@@ -24,9 +24,9 @@ from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, read_manifest
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.int8 import quantize as q
-from rover_lib.workshop.judge import pct_of_range
+from rover_lib.workshop.judge.compare import thinned
+from rover_lib.workshop.judge.recorded_range import pct_of_range
 from rover_lib.workshop.pipeline import requantized
 from rover_lib.workshop.program import run
 from rover_lib.workshop.progress import Progress, silent

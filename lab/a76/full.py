@@ -13,9 +13,9 @@ from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.act import ACT
-from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import quantize
+from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.pipeline import (
     Recipe,
     export_onnx,

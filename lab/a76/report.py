@@ -7,8 +7,8 @@ from lab.a76.core import A76
 from lab.a76.count import Counted
 from rover_lib.onboard.care.lower_bound import PI5_SEEN_GMAC_PER_S
 from rover_lib.onboard.columns import aligned
-from rover_lib.workshop.compare import gate
-from rover_lib.workshop.judge import worst
+from rover_lib.workshop.judge.compare import gate
+from rover_lib.workshop.judge.recorded_range import worst
 
 LABEL = "counted on an emulated Cortex-A76"
 STATIC, STATIC_ONNX = "policy_static", "policy_static.onnx"

@@ -218,8 +218,8 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
     from rover_lib.onboard.artifact.manifest import distinct_names
     from rover_lib.onboard.params import params
     from rover_lib.onboard.policy.load import load_policy
-    from rover_lib.workshop import compare as c
-    from rover_lib.workshop.looking import look
+    from rover_lib.workshop.judge import compare as c
+    from rover_lib.workshop.judge.camera_use import look
     from rover_lib.workshop.recordings.episodes import load_recordings, split
 
     p = params()["calibration"]

@@ -40,14 +40,14 @@ from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_both, written_in
 from rover_lib.workshop.checkpoint.lerobot import read_origin
-from rover_lib.workshop.compare import gate, thinned
 from rover_lib.workshop.fake_quant import RoundedPolicy
 from rover_lib.workshop.int8.choose import Chooser
 from rover_lib.workshop.int8.export import export
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, quantize
 from rover_lib.workshop.int8.scheme import Scheme
-from rover_lib.workshop.judge import Range, not_judged, pct_of_range, shown_pct, worst
+from rover_lib.workshop.judge.compare import gate, thinned
+from rover_lib.workshop.judge.recorded_range import Range, not_judged, pct_of_range, shown_pct, worst
 from rover_lib.workshop.lessons import BatchedPolicy, Lessons, as_driven, in_another_light, judged_ranges, plans_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample

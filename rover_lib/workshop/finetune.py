@@ -40,9 +40,9 @@ from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_both
-from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.improved import Judged, verdict
-from rover_lib.workshop.judge import not_judged, pct_of_range
+from rover_lib.workshop.judge.compare import thinned
+from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range
 from rover_lib.workshop.lessons import (
     MIRROR,
     MIRRORED,

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.workshop.judge import shown_pct
+from rover_lib.workshop.judge.recorded_range import shown_pct
 
 CHANCE = 0.05
 LEAST_EPISODES = 6  # with 5, all changed the same way, the chance is 2 in 32

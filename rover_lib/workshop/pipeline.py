@@ -22,11 +22,11 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.int8.export import Exporter, Parity, export
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, quantize
 from rover_lib.workshop.int8.scheme import Scheme
+from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.session import Opened, opened

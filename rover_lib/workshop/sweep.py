@@ -27,9 +27,9 @@ from rover_lib.onboard.columns import aligned, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import FOR_THIS_RUN, params, read_params
 from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
-from rover_lib.workshop import judge
-from rover_lib.workshop.hosts import benchmark_of
 from rover_lib.workshop.hub import absolute
+from rover_lib.workshop.judge import recorded_range as judge
+from rover_lib.workshop.judge.hosts import benchmark_of
 from rover_lib.workshop.progress import Progress, silent
 
 if TYPE_CHECKING:

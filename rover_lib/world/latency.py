@@ -29,7 +29,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import plain, read_stage, write_stage
 from rover_lib.workshop.cells import Table
-from rover_lib.workshop.compare import GATED, gate
+from rover_lib.workshop.judge.compare import GATED, gate
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.world.trial import Trajectory, wilson_interval
 from rover_lib.world.world import RATE_HZ, CarState, World

@@ -32,8 +32,8 @@ from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, w
 from rover_lib.workshop import pipeline
 from rover_lib.workshop.cache import car_in_key
 from rover_lib.workshop.cells import Table
-from rover_lib.workshop.compare import gate
 from rover_lib.workshop.finetune import FinetuneRecipe, finetune
+from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.pipeline import make_artifact
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.session import load

@@ -30,9 +30,9 @@ from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.cache import cache_root, car_in_key, key_of
-from rover_lib.workshop.compare import GATED, thinned
 from rover_lib.workshop.distill import errors_of
-from rover_lib.workshop.judge import not_judged
+from rover_lib.workshop.judge.compare import GATED, thinned
+from rover_lib.workshop.judge.recorded_range import not_judged
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Recordings, Sample, Source

@@ -31,7 +31,7 @@ from rover_lib.workshop import act as act_module
 from rover_lib.workshop import training as training_module
 from rover_lib.workshop.act import ActConfig, lerobot_act
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
-from rover_lib.workshop.compare import thinned
+from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings.episodes import load_recordings, split

@@ -21,8 +21,8 @@ from rover_lib.workshop import session, training
 from rover_lib.workshop.act import ACT, Affine, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_lerobot
-from rover_lib.workshop.compare import LerobotEager
 from rover_lib.workshop.distill import DistillRecipe, distill, summary
+from rover_lib.workshop.judge.compare import LerobotEager
 from rover_lib.workshop.progress import silent
 from rover_lib.workshop.session import load
 from rover_lib.workshop.student import StudentShape, student_config

@@ -8,7 +8,7 @@ from rover_lib.onboard.errors import RoverError, TrainingError, WorldError
 from rover_lib.workshop import training as training_module
 from rover_lib.workshop.act import lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.compare import LerobotEager
+from rover_lib.workshop.judge.compare import LerobotEager
 from rover_lib.workshop.training import descend
 from rover_lib.world import train as train_module
 from rover_lib.world.train import FULL, RECIPES, SIZES, train

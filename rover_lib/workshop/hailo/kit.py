@@ -14,7 +14,6 @@ from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE, read_manifest
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.act import ACT, Affine
-from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.hailo.calibration import save_arrays, write_calibration, write_expected
 from rover_lib.workshop.hailo.chips import CHIPS, estimate
 from rover_lib.workshop.hailo.description import description
@@ -22,6 +21,7 @@ from rover_lib.workshop.hailo.networks import Network, Splits
 from rover_lib.workshop.hailo.scripts import compile_script, model_script, script_names
 from rover_lib.workshop.hailo.stand_in import Error, stand_in_errors
 from rover_lib.workshop.int8.export import Exporter
+from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.pipeline import CHOOSING_FRAMES, Recipe
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.session import Opened

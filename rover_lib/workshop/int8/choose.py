@@ -23,7 +23,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.observe import Calibration, observed_graph
 from rover_lib.workshop.int8.quantize import convert, forget_graphs, quantize
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
-from rover_lib.workshop.judge import Range, constant_actions, not_judged, pct_of_range, worst
+from rover_lib.workshop.judge.recorded_range import Range, constant_actions, not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 

@@ -6,9 +6,9 @@ A function returns an empty text if what it would compare is not there.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rover_lib.workshop.compare import GATED, Fidelity, WorstFrame
-from rover_lib.workshop.judge import worst
-from rover_lib.workshop.verdict import CALLED
+from rover_lib.workshop.judge.compare import GATED, Fidelity, WorstFrame
+from rover_lib.workshop.judge.recorded_range import worst
+from rover_lib.workshop.judge.verdict import CALLED
 
 
 def _upper(text: str) -> str:

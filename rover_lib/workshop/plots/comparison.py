@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from rover_lib.workshop.compare import Fidelity
+from rover_lib.workshop.judge.compare import Fidelity
 from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
     BLACK,

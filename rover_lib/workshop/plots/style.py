@@ -21,7 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rover_lib.onboard.car.host import THROTTLED_BITS
-from rover_lib.workshop.judge import worst
+from rover_lib.workshop.judge.recorded_range import worst
 
 WIDTH_IN, DPI, SHARPER = 9.0, 100, 2
 BLACK = "#333333"

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rover_lib.workshop.cells import Table
+from rover_lib.workshop.judge.verdict import gate_in_words
 from rover_lib.workshop.plots.style import NAMES
-from rover_lib.workshop.verdict import gate_in_words
 
 KEPT = {True: "kept", False: "MISSED", None: "not measured"}
 SHADES = {True: "#009E7333", False: "#D55E0044", None: "#88888833"}  # translucent: readable on a dark page too

@@ -8,10 +8,10 @@ from lab.a76.full import LEARNED_NOTE, NOTE, SIZES, STEPS, full_run
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
-from rover_lib.workshop.compare import thinned
 from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import Scheme
+from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.session import opened
 from rover_lib.world import train as train_module
 

@@ -26,7 +26,7 @@ from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.contents import expected_shapes
 from rover_lib.workshop.checkpoint.lerobot import Normaliser, lerobot_folder
 from rover_lib.workshop.checkpoint.trainer import PICKLE_BYTES
-from rover_lib.workshop.compare import LerobotEager
+from rover_lib.workshop.judge.compare import LerobotEager
 
 
 def write(content, path):

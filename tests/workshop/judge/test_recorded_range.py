@@ -1,6 +1,6 @@
 """Errors as shares of the recorded range, and actions that were never moved."""
 
-from rover_lib.workshop.judge import constant_actions, not_judged, pct_of_range, shown_pct, worst
+from rover_lib.workshop.judge.recorded_range import constant_actions, not_judged, pct_of_range, shown_pct, worst
 
 RANGES = {"steering": (-0.5, 0.5), "throttle": (0.06, 0.06)}
 

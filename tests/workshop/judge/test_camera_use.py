@@ -10,8 +10,8 @@ from policies import memory_samples
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.workshop.compare import LerobotEager, fidelity
-from rover_lib.workshop.looking import FRAMES, look
+from rover_lib.workshop.judge.camera_use import FRAMES, look
+from rover_lib.workshop.judge.compare import LerobotEager, fidelity
 
 RANGE = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.2)}
 CHUNK = 4

@@ -10,7 +10,8 @@ import pytest
 
 from rover_lib.onboard.care.benchmark import BenchmarkOptions, Clocks, benchmark
 from rover_lib.onboard.stage import write_stage
-from rover_lib.workshop import hosts, plots
+from rover_lib.workshop import plots
+from rover_lib.workshop.judge import hosts
 
 OURS = {"policy_static.pt": "5a", "policy_fp32.pt": "f3"}
 

@@ -15,7 +15,8 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.stage import plain
-from rover_lib.workshop import compare, plots
+from rover_lib.workshop import plots
+from rover_lib.workshop.judge import compare
 
 CHUNK = 3
 RANGE = {"steering": (-0.2, 0.6), "throttle": (0.0, 0.1)}

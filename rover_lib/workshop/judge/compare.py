@@ -28,9 +28,9 @@ from rover_lib.onboard.columns import number, ratio
 from rover_lib.onboard.errors import PolicyError, PwmError
 from rover_lib.onboard.policy.load import Policy, action_limits, load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.workshop import judge
 from rover_lib.workshop.act import Affine, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.progress import Progress, silent
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32

@@ -7,7 +7,7 @@ import pytest
 from policies import MemorySample, memory_samples
 
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
-from rover_lib.workshop.plausible import fits
+from rover_lib.workshop.judge.plausible import fits
 
 NAMES = ("steering", "throttle")
 

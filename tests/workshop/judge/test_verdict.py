@@ -10,10 +10,10 @@ from recorded import real_episode
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop import verdict as v
+from rover_lib.workshop.judge import verdict as v
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 
-RESULTS = Path(__file__).parents[2] / "results"
+RESULTS = Path(__file__).parents[3] / "results"
 NAMES = v.Names("runs/mine", "best model.pth", "episodes")
 PARAMS = params()
 

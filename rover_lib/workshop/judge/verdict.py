@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rover_lib.onboard.columns import ratio
-from rover_lib.workshop import judge
-from rover_lib.workshop.compare import GATED, MODES, gate, gates
+from rover_lib.workshop.judge import recorded_range as judge
+from rover_lib.workshop.judge.compare import GATED, MODES, gate, gates
 
 CALLED = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed INT8"}
 OF_BENCHMARKS = {  # the original's acceptance table
