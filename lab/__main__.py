@@ -73,7 +73,7 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as
     from lab.a76.count_run import count_other_core, count_run
     from lab.a76.report import other_core_table, table
     from rover_lib.onboard.stage import read_stage
-    from rover_lib.workshop.run import execute
+    from rover_lib.workshop.run.run import execute
 
     if pi4:
         content = count_other_core(run_dir, A72, progress=terminal())

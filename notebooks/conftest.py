@@ -9,7 +9,7 @@ import os
 from typing import Any
 
 # The notebooks' kernels inherit these, as in `rover run`.
-from rover_lib.workshop.run import KERNEL_ENVIRONMENT
+from rover_lib.workshop.run.run import KERNEL_ENVIRONMENT
 
 FEW: dict[str, Any] = {
     "run_dir": "../runs/nbval",

@@ -9,7 +9,7 @@ from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.hailo.kit import write_kit
 from rover_lib.workshop.recordings.episodes import Split
-from rover_lib.workshop.session import Opened
+from rover_lib.workshop.run.session import Opened
 
 FRAMES = 6
 

@@ -16,7 +16,8 @@ from rover_lib.workshop.act import ACT
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.judge.compare import thinned
-from rover_lib.workshop.pipeline import (
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.run.pipeline import (
     Recipe,
     export_onnx,
     export_policies,
@@ -24,8 +25,7 @@ from rover_lib.workshop.pipeline import (
     write_load,
     write_quantize,
 )
-from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.session import Opened, load
+from rover_lib.workshop.run.session import Opened, load
 from rover_lib.world.record import record_episodes
 from rover_lib.world.train import train
 

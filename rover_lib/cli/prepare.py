@@ -70,7 +70,7 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     with a verdict, printed and written as report.html and run.json: which artifact to deploy, what failed, and what to
     do about it.
     """
-    from rover_lib.workshop.run import run as run_notebooks
+    from rover_lib.workshop.run.run import run as run_notebooks
 
     chosen = {k: v for k, v in options.items() if v is not None}
     folder = run_notebooks(checkpoint, episodes, progress=terminal(), **chosen)
@@ -89,7 +89,7 @@ def report(run_dir: Path, as_json: bool) -> None:
 
 
 def _judge(run_dir: Path, as_json: bool = False) -> None:
-    from rover_lib.workshop.run_report import PAGE, text, write
+    from rover_lib.workshop.run.run_report import PAGE, text, write
 
     content = write(run_dir)
     if as_json:
@@ -107,7 +107,7 @@ def inspect(episodes: "Source", as_json: bool) -> None:
     A run, an artifact, a checkpoint (a trainer's or LeRobot's), an episode or a folder of them, a LeRobotDataset, a
     flight log, a calibration, a stage's report.
     """
-    from rover_lib.workshop.describe import describe
+    from rover_lib.workshop.run.describe import describe
 
     show(describe(episodes, terminal()), as_json)
 
@@ -117,7 +117,7 @@ def inspect(episodes: "Source", as_json: bool) -> None:
 @AS_JSON
 def list_runs(runs_dir: Path, as_json: bool) -> None:
     """List the runs in RUNS_DIR, one line each, with the verdict that each ended with."""
-    from rover_lib.workshop.describe import runs
+    from rover_lib.workshop.run.describe import runs
 
     found = runs(runs_dir)
     if as_json:
@@ -189,8 +189,8 @@ def quantize(checkpoint: Path, episodes: "Source", output: Path, mode: str, samp
     `rover run` does this for all modes, chooses the observer and the blocks by measurement, and compares.
     """
     from rover_lib.onboard.params import params
-    from rover_lib.workshop.pipeline import Recipe, make_artifact
-    from rover_lib.workshop.session import load
+    from rover_lib.workshop.run.pipeline import Recipe, make_artifact
+    from rover_lib.workshop.run.session import load
 
     recipe = Recipe.of(params(), samples)
     if mode != "fp32":
@@ -356,7 +356,7 @@ def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
     if not onnx and kit is None:
         raise click.UsageError("for which engine? --onnx, or --hailo OUT")
     if onnx:
-        from rover_lib.workshop.pipeline import export_onnx
+        from rover_lib.workshop.run.pipeline import export_onnx
 
         for name, digest in export_onnx(run_dir, terminal()).items():
             path = run_dir / name
@@ -364,7 +364,7 @@ def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
     if kit is None:
         return
     from rover_lib.workshop.hailo.kit import write_kit
-    from rover_lib.workshop.session import opened
+    from rover_lib.workshop.run.session import opened
 
     report = write_kit(opened(run_dir, terminal()), kit, samples=samples, progress=terminal())
     for name, network in report["networks"].items():

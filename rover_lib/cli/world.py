@@ -85,7 +85,7 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
     Leaves drive.json and the executed notebook 07 in RUN_DIR, and says whether the gate of params.yml holds.
     """
     from rover_lib.onboard.stage import read_stage
-    from rover_lib.workshop.run import execute
+    from rover_lib.workshop.run.run import execute
     from rover_lib.world.latency import table
 
     with _anew(run_dir / "drive.json"):  # the present one may be of another version
@@ -128,7 +128,7 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
     distill.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its teacher's place. If
     it is ended at any moment, the same command continues where it was.
     """
-    from rover_lib.workshop.run import execute
+    from rover_lib.workshop.run.run import execute
     from rover_lib.world.frontier import sentences, table
     from rover_lib.world.students import measured
 
@@ -163,7 +163,7 @@ def learn(run_dir: Path, out: Path | None, worlds: int, as_json: bool, **options
     RUN_DIR. If it is ended at any moment, the same command continues where it was; with more --worlds, it drives only
     in those that are missing.
     """
-    from rover_lib.workshop.run import execute
+    from rover_lib.workshop.run.run import execute
     from rover_lib.world.learn import Experiment, measured, table
 
     run_dir = run_dir.resolve()

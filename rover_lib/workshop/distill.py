@@ -31,7 +31,6 @@ from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.stage import atomic_path, write_stage
 from rover_lib.workshop import act, channels, refit, training
 from rover_lib.workshop import lessons as lessons_module
-from rover_lib.workshop import pipeline as quantization
 from rover_lib.workshop import student as student_module
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.alone import made_beside
@@ -52,9 +51,10 @@ from rover_lib.workshop.lessons import BatchedPolicy, Lessons, as_driven, in_ano
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 from rover_lib.workshop.recordings.samples import Source
-from rover_lib.workshop.run import files_of_a_run
-from rover_lib.workshop.run_folder import run_folder
-from rover_lib.workshop.session import SMALL_GMAC, Opened, load, training_device
+from rover_lib.workshop.run import pipeline as quantization
+from rover_lib.workshop.run.run import files_of_a_run
+from rover_lib.workshop.run.run_folder import run_folder
+from rover_lib.workshop.run.session import SMALL_GMAC, Opened, load, training_device
 from rover_lib.workshop.student import StudentShape, gmac, initial_weights, student_config
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 from rover_lib.workshop.untrusted import numbers

@@ -55,8 +55,8 @@ from rover_lib.workshop.lessons import (
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, frame_rate_hz, is_another_rate
-from rover_lib.workshop.run_folder import run_folder
-from rover_lib.workshop.session import SMALL_GMAC, check_sizes, training_device
+from rover_lib.workshop.run.run_folder import run_folder
+from rover_lib.workshop.run.session import SMALL_GMAC, check_sizes, training_device
 from rover_lib.workshop.student import gmac, not_a_cars
 from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 from rover_lib.workshop.untrusted import numbers

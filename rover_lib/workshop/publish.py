@@ -20,8 +20,8 @@ import nbformat
 from PIL import Image
 
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.run import NAMES, NOTEBOOKS, NotebookError
-from rover_lib.workshop.run_folder import says_how_it_was_taught
+from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, NotebookError
+from rover_lib.workshop.run.run_folder import says_how_it_was_taught
 
 RESULTS_OF = {  # stages that a notebook leaves
     "01_load": "load",

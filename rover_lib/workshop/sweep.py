@@ -97,7 +97,7 @@ class Sheet:
     @classmethod
     def read(cls, path: Path | str) -> "Sheet":
         """Read a sheet. Paths in it are relative to the working folder. Raises SweepError, ParamsError."""
-        from rover_lib.workshop.run import NAMES, NOTEBOOKS, parameters_of
+        from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, parameters_of
 
         if not Path(path).exists():
             raise SweepError(f"{path}: not found", remedy=A_SHEET)
@@ -203,7 +203,7 @@ class Notebooks:
 
     def prepare(self, job: Job, folder: Path) -> None:
         """Teach the student, if the job has one, and make the run without its benchmark."""
-        from rover_lib.workshop.run import run
+        from rover_lib.workshop.run.run import run
 
         with _settings_of(job, folder):
             checkpoint = self._taught(job, folder) if job.student else job.checkpoint
@@ -211,8 +211,8 @@ class Notebooks:
 
     def benchmark(self, job: Job, folder: Path) -> None:
         """Make the run's benchmark and its verdict."""
-        from rover_lib.workshop.run import NAMES, NOTEBOOKS, execute, parameters_of
-        from rover_lib.workshop.run_report import write
+        from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, execute, parameters_of
+        from rover_lib.workshop.run.run_report import write
 
         own = parameters_of(NOTEBOOKS / f"{NAMES[-1]}.ipynb")
         with _settings_of(job, folder):
@@ -241,7 +241,7 @@ class Notebooks:
 @contextmanager
 def _settings_of(job: Job, folder: Path) -> Iterator[None]:
     """Apply the job's own values of params.yml inside the block, for this process and the kernels that it starts."""
-    from rover_lib.workshop.run import environment
+    from rover_lib.workshop.run.run import environment
 
     values: dict[str, Any] = {}
     for place, value in job.params.items():

@@ -14,7 +14,7 @@ from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path, read_stage
-from rover_lib.workshop.run import parameters_in
+from rover_lib.workshop.run.run import parameters_in
 
 ROOT = Path(__file__).parents[2]
 MODES = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed"}

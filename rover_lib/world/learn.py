@@ -29,14 +29,14 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, write_stage
-from rover_lib.workshop import pipeline
 from rover_lib.workshop.cache import car_in_key
 from rover_lib.workshop.cells import Table
 from rover_lib.workshop.finetune import FinetuneRecipe, finetune
 from rover_lib.workshop.judge.compare import gate
-from rover_lib.workshop.pipeline import make_artifact
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.session import load
+from rover_lib.workshop.run import pipeline
+from rover_lib.workshop.run.pipeline import make_artifact
+from rover_lib.workshop.run.session import load
 from rover_lib.world.frontier import sign_test
 from rover_lib.world.latency import SEED, Condition, Plans, drive_in, drive_late
 from rover_lib.world.record import WorldEpisode, episode_name

@@ -36,7 +36,7 @@ from rover_lib.workshop.judge.recorded_range import not_judged
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Recordings, Sample, Source
-from rover_lib.workshop.run_folder import says_how_it_was_taught
+from rover_lib.workshop.run.run_folder import says_how_it_was_taught
 from rover_lib.world import latency, trial, world
 from rover_lib.world.frontier import DRIVES, NOBODY_DROVE, recommendation
 from rover_lib.world.latency import SEED, Condition, drive_late

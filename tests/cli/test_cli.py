@@ -132,7 +132,7 @@ def test_bad_input_is_one_sentence(args, tmp_path, monkeypatch):
 def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):
     folder = tmp_path / "runs" / "mine"
     shutil.copytree(Path(__file__).parents[2] / "results" / "demo", folder)
-    monkeypatch.setattr("rover_lib.workshop.run.run", lambda *args, **options: folder)
+    monkeypatch.setattr("rover_lib.workshop.run.run.run", lambda *args, **options: folder)
     result = rover("run", "best_model.pth", "recordings")
     assert result.exit_code == 0 and "Verdict: deploy policy_static.pt" in result.output
     assert "Next:" in result.output and (folder / "report.html").is_file()
@@ -151,7 +151,7 @@ def test_a_drive_that_does_not_end_costs_nothing_of_the_last_one(tmp_path, monke
         assert not file.exists()  # so that it is measured again
         raise error
 
-    monkeypatch.setattr("rover_lib.workshop.run.execute", execute)
+    monkeypatch.setattr("rover_lib.workshop.run.run.execute", execute)
     assert rover("world", "latency", tmp_path).exit_code == 1
     assert read_stage(file, "drive")["metrics"] == {"of": "before"}
     assert list(tmp_path.iterdir()) == [file]

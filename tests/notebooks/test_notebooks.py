@@ -11,10 +11,11 @@ import nbformat
 import pytest
 
 from rover_lib.onboard.stage import read_stage, write_stage
-from rover_lib.workshop import progress, publish, session
-from rover_lib.workshop import run as runs
+from rover_lib.workshop import progress, publish
 from rover_lib.workshop.publish import NOTEBOOK_LIMIT, RESULTS_OF
-from rover_lib.workshop.run import AFTERWARDS, NAMES, NOTEBOOKS, parameters_of
+from rover_lib.workshop.run import run as runs
+from rover_lib.workshop.run import session
+from rover_lib.workshop.run.run import AFTERWARDS, NAMES, NOTEBOOKS, parameters_of
 
 PATHS = [NOTEBOOKS / f"{name}.ipynb" for name in NAMES + AFTERWARDS]
 MOST_LINES = 12

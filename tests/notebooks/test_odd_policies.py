@@ -14,8 +14,8 @@ from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Source
-from rover_lib.workshop.run import NAMES, NOTEBOOKS, parameters_of
-from rover_lib.workshop.session import load
+from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, parameters_of
+from rover_lib.workshop.run.session import load
 
 pytestmark = pytest.mark.slow
 IMAGENET = {"mean": IMAGENET_MEAN, "std": IMAGENET_STD}

@@ -10,7 +10,7 @@ import pytest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop import alone
 from rover_lib.workshop.alone import alone_in, made_beside
-from rover_lib.workshop.run_folder import run_folder
+from rover_lib.workshop.run.run_folder import run_folder
 
 
 def test_while_one_is_in_it_another_is_refused(tmp_path):

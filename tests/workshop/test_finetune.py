@@ -25,15 +25,15 @@ from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY, About, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import finetune as finetune_module
-from rover_lib.workshop import pipeline, session
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_lerobot, write_trainer
 from rover_lib.workshop.finetune import FinetuneRecipe, finetune, human_samples
-from rover_lib.workshop.pipeline import make_artifact
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Episode, Sample
+from rover_lib.workshop.run import pipeline, session
+from rover_lib.workshop.run.pipeline import make_artifact
 from rover_lib.workshop.student import gmac
 
 FRAMES = 24

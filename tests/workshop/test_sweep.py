@@ -200,7 +200,7 @@ def test_twelve_runs_on_two_workers_of_which_one_dies(tmp_path, sheet):
 def test_a_student_is_taught_into_its_runs_folder(tmp_path, monkeypatch):
     """The notebooks themselves are left out: what they are given is what this is about."""
     asked = []
-    monkeypatch.setattr("rover_lib.workshop.run.run", lambda *words, **options: asked.append((words, options)))
+    monkeypatch.setattr("rover_lib.workshop.run.run.run", lambda *words, **options: asked.append((words, options)))
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
     of_a_cars_size(tmp_path / "teacher.pth")
     episodes = record_drives(tmp_path / "episodes")
@@ -217,7 +217,7 @@ def test_a_student_is_taught_into_its_runs_folder(tmp_path, monkeypatch):
 
 def test_a_student_that_only_lerobots_folder_can_hold_is_run_from_there(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr("rover_lib.workshop.run.run", lambda checkpoint, *_, **__: asked.append(checkpoint))
+    monkeypatch.setattr("rover_lib.workshop.run.run.run", lambda checkpoint, *_, **__: asked.append(checkpoint))
 
     def leave(*_, **__):
         (tmp_path / "taught" / "pretrained_model").mkdir(parents=True)

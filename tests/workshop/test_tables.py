@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from rover_lib.workshop import tables
-from rover_lib.workshop.run import AFTERWARDS, NAMES, NOTEBOOKS, parameters_of
+from rover_lib.workshop.run.run import AFTERWARDS, NAMES, NOTEBOOKS, parameters_of
 
 
 @pytest.fixture

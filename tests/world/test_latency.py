@@ -17,7 +17,7 @@ from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import PolicyError, WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop import run as runs
+from rover_lib.workshop.run import run as runs
 from rover_lib.world import latency
 from rover_lib.world.latency import Condition, beside_path, drive_late, from_above, gates, run_latencies, table
 from rover_lib.world.world import World, expert

@@ -12,11 +12,12 @@ from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop import pipeline, plots
+from rover_lib.workshop import plots
 from rover_lib.workshop.finetune import human_samples
-from rover_lib.workshop.pipeline import make_artifact
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.session import load
+from rover_lib.workshop.run import pipeline
+from rover_lib.workshop.run.pipeline import make_artifact
+from rover_lib.workshop.run.session import load
 from rover_lib.world import learn
 from rover_lib.world.latency import Condition, drive_in
 from rover_lib.world.learn import Experiment, Human, demonstrate, drive_corrected, gates, measured, sentences, table

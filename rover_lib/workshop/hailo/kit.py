@@ -22,9 +22,9 @@ from rover_lib.workshop.hailo.scripts import compile_script, model_script, scrip
 from rover_lib.workshop.hailo.stand_in import Error, stand_in_errors
 from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.judge.compare import thinned
-from rover_lib.workshop.pipeline import CHOOSING_FRAMES, Recipe
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.session import Opened
+from rover_lib.workshop.run.pipeline import CHOOSING_FRAMES, Recipe
+from rover_lib.workshop.run.session import Opened
 
 LEAST_SAMPLES = 1024  # as many as the zoo's scripts use to calibrate transformers (vit_small.alls, deit_base.alls)
 # The chip's answers may be this many times as far from FP32 as those of ONNX Runtime's INT8. The chip rounds in other

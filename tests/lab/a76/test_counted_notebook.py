@@ -6,7 +6,7 @@ from executed import printed
 from lab.a76 import report
 from lab.params import lab_params
 from rover_lib.onboard.stage import write_stage
-from rover_lib.workshop import run as runs
+from rover_lib.workshop.run import run as runs
 
 pytestmark = pytest.mark.slow  # each executes a notebook
 

@@ -12,7 +12,7 @@ from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.judge.compare import thinned
-from rover_lib.workshop.session import opened
+from rover_lib.workshop.run.session import opened
 from rover_lib.world import train as train_module
 
 pytestmark = pytest.mark.slow  # each makes a policy of a size that is no toy's

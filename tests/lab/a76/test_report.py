@@ -12,7 +12,7 @@ from lab.a76 import count_run as counting
 from lab.a76 import report
 from lab.params import lab_params
 from rover_lib.onboard.stage import read_stage, write_stage
-from rover_lib.workshop import run as runs
+from rover_lib.workshop.run import run as runs
 
 # As counted: {kernel: (instructions, SDOT among them, group)}, 10**9
 KERNELS = {

@@ -22,7 +22,7 @@ from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_lerobot
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import CAMERA, Layout, Source, camera_names
-from rover_lib.workshop.session import load
+from rover_lib.workshop.run.session import load
 
 CHUNK, FPS, SIZE = 8, 20, (72, 128)
 CAR, SWAPPED = ("steering", "throttle"), ("throttle", "steering")

@@ -12,9 +12,9 @@ import pytest
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of
-from rover_lib.workshop import run_report as report
+from rover_lib.workshop.run import run_report as report
 
-DEMO = Path(__file__).parents[2] / "results" / "demo"
+DEMO = Path(__file__).parents[3] / "results" / "demo"
 PNG = b"\x89PNG a picture"
 
 

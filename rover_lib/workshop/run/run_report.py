@@ -19,7 +19,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.judge.hosts import benchmark_of, is_of
 from rover_lib.workshop.judge.verdict import CALLED, Names, against, count, error_pct, verdict
-from rover_lib.workshop.run_folder import says_how_it_was_taught
+from rover_lib.workshop.run.run_folder import says_how_it_was_taught
 
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
 LATER = ("arm", "distill")  # that `make arm` and `rover world students` add to a run

@@ -7,11 +7,11 @@ import pytest
 from recorded import record_drives
 
 from rover_lib.onboard.errors import CheckpointError, RoverError
-from rover_lib.workshop import session
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.files import write_lerobot
-from rover_lib.workshop.pipeline import write_load
-from rover_lib.workshop.session import load, opened
+from rover_lib.workshop.run import session
+from rover_lib.workshop.run.pipeline import write_load
+from rover_lib.workshop.run.session import load, opened
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
-from rover_lib.workshop.session import Opened, opened
+from rover_lib.workshop.run.session import Opened, opened
 
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
 

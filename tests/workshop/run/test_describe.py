@@ -7,11 +7,11 @@ import pytest
 
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop import run_report as report
-from rover_lib.workshop.describe import describe, runs
 from rover_lib.workshop.recordings.samples import Source
+from rover_lib.workshop.run import run_report as report
+from rover_lib.workshop.run.describe import describe, runs
 
-DEMO = Path(__file__).parents[2] / "results" / "demo"
+DEMO = Path(__file__).parents[3] / "results" / "demo"
 
 
 @pytest.fixture

@@ -9,11 +9,11 @@ from policies import memory_samples
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
-from rover_lib.workshop import pipeline
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import quantize
-from rover_lib.workshop.pipeline import Recipe, export_onnx, export_policies, make_artifact, write_quantize
-from rover_lib.workshop.session import Opened
+from rover_lib.workshop.run import pipeline
+from rover_lib.workshop.run.pipeline import Recipe, export_onnx, export_policies, make_artifact, write_quantize
+from rover_lib.workshop.run.session import Opened
 
 
 @pytest.fixture
