@@ -92,23 +92,23 @@ def log(
     """
     flight = sum_up(file, drive, as_json)
     if video:
-        from rover_lib.workshop.film import write_film
+        from rover_lib.workshop.drive_log.film import write_film
+        from rover_lib.workshop.drive_log.replay import load_replay
         from rover_lib.workshop.progress import terminal
-        from rover_lib.workshop.replay import load_replay
 
         shown = load_replay(file, drive, pictures)
         width = video_width // 2 * 2
         count = write_film(video, shown, rate_hz=video_hz, width=width, progress=terminal())
         click.echo(f"drawn: {video}, {count} pictures, {video.stat().st_size / 1e6:.2f} MB", err=as_json)
     if mcap:
-        from rover_lib.workshop.mcap_log import write_mcap
+        from rover_lib.workshop.drive_log.mcap_log import write_mcap
 
         counts = write_mcap(mcap, flight, pictures)
         said = ", ".join(f"{count} of {topic}" for topic, count in counts.items())
         click.echo(f"written: {mcap}, {said}, {mcap.stat().st_size / 1e6:.2f} MB", err=as_json)
     if output or not (as_json or video or mcap):
         from rover_lib.onboard.stage import atomic_path
-        from rover_lib.workshop.flight import flight_figure
+        from rover_lib.workshop.drive_log.flight import flight_figure
 
         output = output or file.with_name(f"{file.name}.png")
         figure = flight_figure(flight)

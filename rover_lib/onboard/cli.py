@@ -706,7 +706,7 @@ def open_view(
 ) -> None:
     """Serve the view until SIGINT or SIGTERM.
 
-    opened: called with its URL. replay: a workshop.replay.Replay that is shown instead of the drives that connect.
+    opened: called with its URL. replay: a workshop.drive_log.replay.Replay that is shown instead of the drives that connect.
     """
     import asyncio
 

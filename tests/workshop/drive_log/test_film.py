@@ -19,8 +19,8 @@ from rover_lib.onboard.drive.flight_log import FlightLog, LogError, Tick, read_l
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.onboard.view.path_overlay import CarShape
-from rover_lib.workshop import film as f
-from rover_lib.workshop import replay as r
+from rover_lib.workshop.drive_log import film as f
+from rover_lib.workshop.drive_log import replay as r
 from rover_lib.workshop.progress import silent
 
 SECONDS, HZ, PICTURES_HZ = 2.0, 30, 10

@@ -11,7 +11,7 @@ from rover_lib.cli import main
 from rover_lib.onboard.car.host import Host
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick, read_log
-from rover_lib.workshop.flight import flight_figure
+from rover_lib.workshop.drive_log.flight import flight_figure
 
 
 class Pi(Host):
@@ -150,7 +150,12 @@ def test_the_summary_needs_no_workstation(path, monkeypatch):
 
     fly(path)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    for name in ("rover_lib.workshop.flight", "rover_lib.workshop.plots", "matplotlib.pyplot", "matplotlib.axes"):
+    for name in (
+        "rover_lib.workshop.drive_log.flight",
+        "rover_lib.workshop.plots",
+        "matplotlib.pyplot",
+        "matplotlib.axes",
+    ):
         monkeypatch.delitem(sys.modules, name, raising=False)
     result = rover("log", path)
     assert result.exit_code == 1
