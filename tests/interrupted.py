@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from rover_lib.workshop import training
+from rover_learn import training
 
 
 def interrupt(patch: pytest.MonkeyPatch, owner: Any, name: str, at: int = 1) -> list[int]:

@@ -6,7 +6,7 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from rover_lib.workshop.sweep import Job
+from rover_learn.sweep import Job
 
 ENV = {"host": "here", "machine": "x", "torch": "2.8", "commit": ""}
 

@@ -141,7 +141,7 @@ def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | N
     folder inside the sweep's. Finished runs are not made again: after Ctrl-C, a power cut or a new line in SHEET, the
     same command continues. Runs that fail are named at the end and do not harm the others.
     """
-    from rover_lib.workshop import sweep as sweeping
+    from rover_learn import sweep as sweeping
 
     if workers and scheduler:
         raise click.UsageError("--workers are this machine's; a cluster has its own")
@@ -278,11 +278,11 @@ def distill(
     Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot, policy_static.pt to drive with, and
     distill.json in the run's folder. If it is ended at any moment, the same command continues where it was.
     """
+    from rover_learn.distill import DistillRecipe, phases_of, summary
+    from rover_learn.distill import distill as teach
+    from rover_learn.student import StudentShape
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import read_stage
-    from rover_lib.workshop.distill import DistillRecipe, phases_of, summary
-    from rover_lib.workshop.distill import distill as teach
-    from rover_lib.workshop.student import StudentShape
 
     height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
@@ -325,11 +325,11 @@ def finetune(
     folder, and says on which held-out episodes it came closer to the human. If it is ended at any moment, the same
     command continues where it was.
     """
+    from rover_learn.acceptance import summary
+    from rover_learn.finetune import FinetuneRecipe
+    from rover_learn.finetune import finetune as learn_on
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import read_stage
-    from rover_lib.workshop.finetune import FinetuneRecipe
-    from rover_lib.workshop.finetune import finetune as learn_on
-    from rover_lib.workshop.improved import summary
 
     recipe = FinetuneRecipe.of(params(), correction_weight=weight, samples=samples, seed=seed)
     recipe = recipe.of_steps(steps) if steps else recipe

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from rover_learn.finetune import FinetuneRecipe, finetune
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.pilot import Order
 from rover_lib.onboard.drive.plan import Settings
@@ -31,7 +32,6 @@ from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, write_stage
 from rover_lib.workshop.cache import car_in_key
 from rover_lib.workshop.cells import Table
-from rover_lib.workshop.finetune import FinetuneRecipe, finetune
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run import pipeline

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from rover_learn.distill import errors_of
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.care.lower_bound import PI5_SEEN_GMAC_PER_S
 from rover_lib.onboard.drive import loop, pilot, plan
@@ -30,7 +31,6 @@ from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.cache import cache_root, car_in_key, key_of
-from rover_lib.workshop.distill import errors_of
 from rover_lib.workshop.judge.compare import GATED, thinned
 from rover_lib.workshop.judge.recorded_range import not_judged
 from rover_lib.workshop.progress import Progress, silent

@@ -22,20 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rover_lib.onboard.errors import WorldError
-from rover_lib.onboard.params import params
-from rover_lib.onboard.policy import preprocess
-from rover_lib.onboard.policy.preprocess import normalise
-from rover_lib.onboard.stage import atomic_path, sha256_of
-from rover_lib.workshop import act as act_module
-from rover_lib.workshop import training as training_module
-from rover_lib.workshop.act import ActConfig, lerobot_act
-from rover_lib.workshop.cache import cache_root, cached_folder, key_of
-from rover_lib.workshop.judge.compare import thinned
-from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings import episodes as episodes_module
-from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.training import (
+from rover_learn import training as training_module
+from rover_learn.training import (
     ACTION,
     IMAGE,
     IS_PAD,
@@ -59,6 +47,18 @@ from rover_lib.workshop.training import (
     to_cpu,
     trainer_config,
 )
+from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.policy import preprocess
+from rover_lib.onboard.policy.preprocess import normalise
+from rover_lib.onboard.stage import atomic_path, sha256_of
+from rover_lib.workshop import act as act_module
+from rover_lib.workshop.act import ActConfig, lerobot_act
+from rover_lib.workshop.cache import cache_root, cached_folder, key_of
+from rover_lib.workshop.judge.compare import thinned
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings import episodes as episodes_module
+from rover_lib.workshop.recordings.episodes import load_recordings, split
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from policies import of_a_cars_size
 
+from rover_learn.finetune import human_samples
 from rover_lib.onboard.drive.pilot import Order
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import WorldError
@@ -13,7 +14,6 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop import plots
-from rover_lib.workshop.finetune import human_samples
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.pipeline import make_artifact

@@ -13,11 +13,11 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
+from rover_learn.training import trainer_config
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
 from rover_lib.workshop.checkpoint.lerobot import ORIGIN, RATE_HZ
-from rover_lib.workshop.training import trainer_config
 
 EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
 

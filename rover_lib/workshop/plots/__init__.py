@@ -7,6 +7,7 @@ Each subject has a module; `style` has what all figures share.
 """
 # ruff: noqa: F401, these are the names that notebooks use
 
+from rover_learn.plots.students import frontier, losses
 from rover_lib.workshop.cells import Table
 from rover_lib.workshop.plots.benchmarks import latency, soak
 from rover_lib.workshop.plots.comparison import action_error, drives_from_above, hits, sizes, worst_frames
@@ -29,6 +30,5 @@ from rover_lib.workshop.plots.recordings import (
     observer_ranges,
     work_per_block,
 )
-from rover_lib.workshop.plots.students import frontier, losses
 from rover_lib.workshop.plots.style import save
 from rover_lib.workshop.plots.tables import computed_times, gates

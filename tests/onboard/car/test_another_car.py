@@ -9,6 +9,7 @@ import yaml
 from click.testing import CliRunner
 
 from lab.driving.policy import make_artifact
+from rover_learn.lessons import as_driven
 from rover_lib.onboard.artifact import manifest as artifact_module
 from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car import car as car_module
@@ -21,7 +22,6 @@ from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import About, Controls, EpisodeWriter, read_controls, recorded_car
-from rover_lib.workshop.lessons import as_driven
 from rover_lib.workshop.plots.recordings import episode_overview
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import car_of as car_of_samples

@@ -11,10 +11,10 @@ import torch
 from policies import TINY, MemorySample, lerobot_policy, memory_samples, smooth_frame
 from torch import nn
 
+from rover_learn.channels import without_channels
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
-from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model, stacked

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rover_lib.workshop.improved import DRAWN, Judged, chance_of, summary, verdict
+from rover_learn.acceptance import DRAWN, Judged, chance_of, summary, verdict
 
 
 def judged(kind, *changes):

@@ -25,21 +25,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rover_learn import channels, refit, training
+from rover_learn import lessons as lessons_module
+from rover_learn import student as student_module
+from rover_learn.channels import without_channels
+from rover_learn.fake_quant import RoundedPolicy
+from rover_learn.lessons import BatchedPolicy, Lessons, as_driven, in_another_light, judged_ranges, plans_of
+from rover_learn.student import StudentShape, gmac, initial_weights, student_config
+from rover_learn.training import Resumable, descend, optimiser, threads
 from rover_lib.onboard.errors import CheckpointError, DistillError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.stage import atomic_path, write_stage
-from rover_lib.workshop import act, channels, refit, training
-from rover_lib.workshop import lessons as lessons_module
-from rover_lib.workshop import student as student_module
+from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.cache import cache_root, key_of
-from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_both, written_in
 from rover_lib.workshop.checkpoint.lerobot import read_origin
-from rover_lib.workshop.fake_quant import RoundedPolicy
 from rover_lib.workshop.int8.choose import Chooser
 from rover_lib.workshop.int8.export import export
 from rover_lib.workshop.int8.observe import Calibration, calibrate
@@ -47,7 +51,6 @@ from rover_lib.workshop.int8.quantize import QuantizedPolicy, quantize
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.judge.compare import gate, thinned
 from rover_lib.workshop.judge.recorded_range import Range, not_judged, pct_of_range, shown_pct, worst
-from rover_lib.workshop.lessons import BatchedPolicy, Lessons, as_driven, in_another_light, judged_ranges, plans_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 from rover_lib.workshop.recordings.samples import Source
@@ -55,8 +58,6 @@ from rover_lib.workshop.run import pipeline as quantization
 from rover_lib.workshop.run.run import files_of_a_run
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC, Opened, load, training_device
-from rover_lib.workshop.student import StudentShape, gmac, initial_weights, student_config
-from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 from rover_lib.workshop.untrusted import numbers
 
 PHASES = ("backbone", "transformer", "together", "qat")

@@ -16,6 +16,10 @@ from hypothesis import strategies as st
 from interrupted import interrupt, save_each_step
 from policies import TINY, lerobot_policy, of_a_cars_size, smooth_frame, trainer_content
 
+from rover_learn import finetune as finetune_module
+from rover_learn.channels import without_channels
+from rover_learn.finetune import FinetuneRecipe, finetune, human_samples
+from rover_learn.student import gmac
 from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
@@ -24,17 +28,13 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY, About, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop import finetune as finetune_module
 from rover_lib.workshop.act import Affine
-from rover_lib.workshop.channels import without_channels
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_lerobot, write_trainer
-from rover_lib.workshop.finetune import FinetuneRecipe, finetune, human_samples
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Episode, Sample
 from rover_lib.workshop.run import pipeline, session
 from rover_lib.workshop.run.pipeline import make_artifact
-from rover_lib.workshop.student import gmac
 
 FRAMES = 24
 TAKEN_OVER = [POLICY] * 8 + [HUMAN] * 12 + [NOBODY] * 4

@@ -9,14 +9,14 @@ import torch
 import torch.nn.functional as F
 from policies import memory_samples
 
+from rover_learn.channels import _chosen, _leave_out, kept_of, without_channels
+from rover_learn.fake_quant import parameters
+from rover_learn.lessons import BatchedPolicy
+from rover_learn.refit import Gram
 from rover_lib.workshop.act import ACT, inputs_of, multiply_accumulates, predictions
-from rover_lib.workshop.channels import _chosen, _leave_out, kept_of, without_channels
-from rover_lib.workshop.fake_quant import parameters
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme
-from rover_lib.workshop.lessons import BatchedPolicy
-from rover_lib.workshop.refit import Gram
 
 BLOCKS = [f"backbone.layer{stage}.{block}" for stage in (1, 2, 3, 4) for block in (0, 1)]
 PARTS = ("conv1.weight", "bn1.weight", "bn1.bias")

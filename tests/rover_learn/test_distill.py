@@ -13,20 +13,20 @@ from interrupted import interrupt, save_each_step
 from policies import TINY, lerobot_policy, of_a_cars_size, trainer_content
 from recorded import record_drives
 
+from rover_learn import distill as distill_module
+from rover_learn import training
+from rover_learn.distill import DistillRecipe, distill, summary
+from rover_learn.student import StudentShape, student_config
 from rover_lib.onboard.errors import DistillError, RoverError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
-from rover_lib.workshop import distill as distill_module
-from rover_lib.workshop import training
 from rover_lib.workshop.act import ACT, Affine, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_lerobot
-from rover_lib.workshop.distill import DistillRecipe, distill, summary
 from rover_lib.workshop.judge.compare import LerobotEager
 from rover_lib.workshop.progress import silent
 from rover_lib.workshop.run import session
 from rover_lib.workshop.run.session import load
-from rover_lib.workshop.student import StudentShape, student_config
 
 SHAPE = StudentShape(54, 96, decoder_layers=1, feedforward=64)
 

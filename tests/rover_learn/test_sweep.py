@@ -11,12 +11,12 @@ from policies import of_a_cars_size
 from recorded import record_drives
 from sweep_work import Stub
 
+from rover_learn import sweep as sweeping
+from rover_learn.sweep import Job, Sheet, SweepError
 from rover_lib.cli import main
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
-from rover_lib.workshop import sweep as sweeping
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.sweep import Job, Sheet, SweepError
 
 
 @pytest.fixture
@@ -223,7 +223,7 @@ def test_a_student_that_only_lerobots_folder_can_hold_is_run_from_there(tmp_path
         (tmp_path / "taught" / "pretrained_model").mkdir(parents=True)
         return tmp_path / "taught"
 
-    monkeypatch.setattr("rover_lib.workshop.distill.distill", leave)
+    monkeypatch.setattr("rover_learn.distill.distill", leave)
     sweeping.Notebooks().prepare(Job("pretrained_model", "episodes", {"decoder_layers": 1}, {}, {}), tmp_path)
     assert asked == [tmp_path / "taught" / "pretrained_model"]
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 from policies import memory_samples
 
+from rover_learn.student import StudentShape, initial_weights, student_config
 from rover_lib.onboard.errors import CheckpointError, DistillError
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.contents import expected_shapes
-from rover_lib.workshop.student import StudentShape, initial_weights, student_config
 
 
 @pytest.fixture(scope="module")

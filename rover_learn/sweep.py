@@ -221,9 +221,9 @@ class Notebooks:
 
     def _taught(self, job: Job, folder: Path) -> Path:
         """Teach the student in the run's own folder, or continue; return its checkpoint."""
+        from rover_learn.distill import DistillRecipe, distill, phases_of
+        from rover_learn.student import StudentShape
         from rover_lib.workshop.checkpoint.files import written_in
-        from rover_lib.workshop.distill import DistillRecipe, distill, phases_of
-        from rover_lib.workshop.student import StudentShape
 
         _check_student(job.student)
         options = dict(job.student)
@@ -481,7 +481,7 @@ def _beats(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 def write_report(jobs: Sequence[Job], folder: Path | str, failed: Mapping[str, str]) -> dict[str, Any]:
     """Write sweep.json and sweep.png into the sweep's folder, and return the JSON's content."""
-    from rover_lib.workshop.plots.sweep import pareto
+    from rover_learn.plots.sweep import pareto
 
     folder, marks = Path(folder), fingerprints(jobs)
     found = rows(jobs, folder, marks)

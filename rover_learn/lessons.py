@@ -20,13 +20,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from rover_learn.training import Frames, Given, Resumable, RowFile, frames_of, swapped_states
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Sample, car_of
-from rover_lib.workshop.training import Frames, Given, Resumable, RowFile, frames_of, swapped_states
 
 BLOCK = 8  # a policy plans on this many samples at once
 VIEWS = PLAIN, MIRRORED = 0, 1

@@ -5,9 +5,9 @@ import torch
 from policies import TINY, lerobot_policy, memory_samples, trainer_content
 from torch.func import functional_call
 
+from rover_learn.fake_quant import RoundedPolicy, parameters
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.fake_quant import RoundedPolicy, parameters
 from rover_lib.workshop.int8.observe import calibrate, scaled_model
 from rover_lib.workshop.int8.quantize import int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme

@@ -29,21 +29,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rover_lib.onboard.errors import FinetuneError
-from rover_lib.onboard.params import params
-from rover_lib.onboard.policy import preprocess
-from rover_lib.onboard.recording.episode import HUMAN
-from rover_lib.onboard.stage import write_stage
-from rover_lib.workshop import act, training
-from rover_lib.workshop import lessons as lessons_module
-from rover_lib.workshop.alone import made_beside
-from rover_lib.workshop.cache import cache_root, key_of
-from rover_lib.workshop.checkpoint.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint.files import write_both
-from rover_lib.workshop.improved import Judged, verdict
-from rover_lib.workshop.judge.compare import thinned
-from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range
-from rover_lib.workshop.lessons import (
+from rover_learn import lessons as lessons_module
+from rover_learn import training
+from rover_learn.acceptance import Judged, verdict
+from rover_learn.lessons import (
     MIRROR,
     MIRRORED,
     BatchedPolicy,
@@ -52,13 +41,25 @@ from rover_lib.workshop.lessons import (
     judged_ranges,
     plans_of,
 )
+from rover_learn.student import gmac, not_a_cars
+from rover_learn.training import Resumable, descend, optimiser, threads
+from rover_lib.onboard.errors import FinetuneError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.policy import preprocess
+from rover_lib.onboard.recording.episode import HUMAN
+from rover_lib.onboard.stage import write_stage
+from rover_lib.workshop import act
+from rover_lib.workshop.alone import made_beside
+from rover_lib.workshop.cache import cache_root, key_of
+from rover_lib.workshop.checkpoint.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint.files import write_both
+from rover_lib.workshop.judge.compare import thinned
+from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, frame_rate_hz, is_another_rate
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC, check_sizes, training_device
-from rover_lib.workshop.student import gmac, not_a_cars
-from rover_lib.workshop.training import Resumable, descend, optimiser, threads
 from rover_lib.workshop.untrusted import numbers
 
 OLD, NEW = "old", "new"

@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import nn
 
+from rover_learn.training import Resumable, RowFile, descend, frames_of, in_memory, optimiser, seeded
 from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.workshop.recordings.episodes import Sample
-from rover_lib.workshop.training import Resumable, RowFile, descend, frames_of, in_memory, optimiser, seeded
 
 STEPS = 6
 

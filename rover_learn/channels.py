@@ -17,9 +17,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from rover_learn.lessons import BatchedPolicy
+from rover_learn.refit import Gram, refitted
 from rover_lib.workshop.act import ActConfig, Weights, backbone_blocks, norm_gain
-from rover_lib.workshop.lessons import BatchedPolicy
-from rover_lib.workshop.refit import Gram, refitted
 
 TILE = 16  # XNNPACK's INT8 kernels compute 16 channels at a time: 17 cost as much as 32
 PATCHES = 8  # taken of a picture's feature map in each block, at random

@@ -1,0 +1,1 @@
+"""Figures of teaching: students beside their teacher, and a sweep."""
