@@ -29,8 +29,8 @@ def main(debug: bool) -> None:
 @click.pass_context
 def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> None:
     """Do what `rover drive --world` does, with the real firmware on an emulated Arduino."""
+    from balloon_world.car import VirtualCar
     from lab.arduino.emulator import BOARD, build
-    from rover_lib.world.car import VirtualCar
 
     build()  # in this process, where its errors are seen
     ctx.exit(run_drive(car=partial(VirtualCar, seed=seed, board=BOARD), latency_ms=latency_ms, **options))

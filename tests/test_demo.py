@@ -4,11 +4,11 @@ import nbformat
 import pytest
 from executed import shown, text_of
 
+from balloon_world import frontier, latency
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
-from rover_lib.world import frontier, latency
 
 STAGES = ("load", "calibrate", "quantize", "compare", "drive", "distill")
 

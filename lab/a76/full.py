@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from balloon_world.record import record_episodes
+from balloon_world.train import train
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
@@ -26,8 +28,6 @@ from rover_lib.workshop.run.pipeline import (
     write_quantize,
 )
 from rover_lib.workshop.run.session import Opened, load
-from rover_lib.world.record import record_episodes
-from rover_lib.world.train import train
 
 LAST = f"policy_static{ONNX_SUFFIX}"  # the last file that is made, which the Makefile looks for
 NOTE = "trained for a few steps only, so that activations have real ranges: this policy does not drive"

@@ -3,10 +3,10 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from balloon_world.car import VirtualCar
+from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import EmulatedArduino
 from rover_lib.onboard.care.doctor import Check, examine, receiver
-from rover_lib.world.car import VirtualCar
-from rover_lib.world.standin import REST_US
 
 
 def rehearse(artifact: Path | None, say: Callable[[str], object]) -> Iterator[Check]:

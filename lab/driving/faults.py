@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from balloon_world.simulated_arduino import REST_US, PinEvent
 from lab.arduino.emulator import CC, REPOSITORY, build, compile_c
 from lab.driving.bench import END_S, START_S, Drive, DrivingBench, FaultError, RoverCommand
 from lab.driving.pins import (
@@ -51,7 +52,6 @@ from lab.driving.row import FaultRow
 from lab.driving.rows import FAULTS, KINDS
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.stage import write_stage
-from rover_lib.world.standin import REST_US, PinEvent
 
 SLEWED_MS = 2  # for rounding to the milliseconds in which the Arduino slews, and for pulses that it measured a step off
 TICK_S = 0.04  # a tick of a drive, and by how much it may be late

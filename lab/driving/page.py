@@ -13,7 +13,7 @@ from typing import Any
 import aiohttp
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.world.child import Child
+from rover_lib.workshop.child_process import Child
 
 START_S = 60.0
 

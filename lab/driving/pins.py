@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+from balloon_world.simulated_arduino import REST_US, PinEvent
 from lab.params import lab_params
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.params import params
-from rover_lib.world.standin import REST_US, PinEvent
 
 STOPPED, HUMAN, CONTINUES, REFUSED = "stopped", "human", "continues", "refused"
 CAR = this_car()  # python -m lab faults --car names another

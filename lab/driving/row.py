@@ -4,9 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from balloon_world.simulated_arduino import REST_US
 from lab.driving.bench import DrivingBench
 from lab.driving.pins import CONTINUES, HUMAN, REFUSED, STOPPED
-from rover_lib.world.standin import REST_US
 
 Inject = Callable[[DrivingBench], float | None]
 

@@ -41,6 +41,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from balloon_world.car import CameraFeed
+from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE as ARDUINO_NICE
 from lab.arduino.emulator import EmulatedArduino
 from lab.driving.policy import PLAIN, make_artifact, pictures
@@ -63,8 +65,6 @@ from rover_lib.onboard.drive.service import UNIT
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.recording.episode import read_controls
 from rover_lib.onboard.stage import sha256_of
-from rover_lib.world.car import CameraFeed
-from rover_lib.world.standin import REST_US
 
 STAGE = "pi-fast"
 ROVER = "rover1"

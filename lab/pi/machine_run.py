@@ -20,6 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import EmulatedArduino
 from lab.pi import machine, playbooks
 from lab.pi.emulation import interruptible, require_arduino, wait_for
@@ -32,7 +33,6 @@ from rover_lib.onboard.drive.flight_log import Flight, read_log
 from rover_lib.onboard.drive.service import UNIT
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
-from rover_lib.world.standin import REST_US
 
 STAGE = "pi"
 REPOSITORY = Path(__file__).parents[2]

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from balloon_world.simulated_arduino import PinEvent
 from lab.arduino.emulator import EmulatedArduino
 from lab.driving.pins import NEUTRAL_US, PERIOD_US, STEP_US, STOPPED_THROTTLE_US
 from rover_lib.onboard.drive.flight_log import Flight
 from rover_lib.onboard.errors import RoverError
-from rover_lib.world.standin import PinEvent
 
 # A command holds from the next pulse that begins after it has come, which may need a second sending (loop.RESEND_S),
 # until the first pulse of the next command. So a pulse belongs to one of the commands of the last 33 + 18 + 21 ms, and

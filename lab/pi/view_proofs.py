@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from balloon_world.simulated_arduino import PinEvent
 from lab.driving.page import Page
 from lab.driving.pins import STOPPED_THROTTLE_US
 from lab.pi.container import Container
@@ -25,7 +26,6 @@ from lab.pi.pulses import READ_S, Pins, moving, stopped
 from lab.pi.service_proofs import READY_S, STATE, VENV, show
 from rover_lib.onboard.drive.feed import DRIVING, WAITING
 from rover_lib.onboard.drive.service import UNIT
-from rover_lib.world.standin import PinEvent
 
 VIEW_UNIT, VIEW_USER = "rover-view.service", "rover-view"
 TOKEN = "/etc/rover/view.token"

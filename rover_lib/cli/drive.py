@@ -30,7 +30,7 @@ def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **op
     not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with
     --service, which waits disarmed after each drive, another request does.
     """
-    from rover_lib.world.car import VirtualCar
+    from balloon_world.car import VirtualCar
 
     if latency_ms and not in_world:
         raise click.UsageError("--latency-ms belongs to --world")

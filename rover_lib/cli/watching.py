@@ -14,8 +14,8 @@ from rover_lib.onboard.car.host import default_view
 from rover_lib.onboard.cli import open_view
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import check_kind, kinds_of
+from rover_lib.workshop.child_process import Child
 from rover_lib.workshop.drive_log.replay import load_replay
-from rover_lib.world.child import Child
 
 
 def open_browser(url: str) -> None:

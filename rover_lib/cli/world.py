@@ -24,7 +24,7 @@ def world() -> None:
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 def record(out_dir: Path, count: int, seed: int) -> None:
     """Record COUNT drives of the expert to OUT_DIR, in the format of the real car's recorder."""
-    from rover_lib.world.record import record_episodes
+    from balloon_world.record import record_episodes
 
     click.echo(f"recorded: {record_episodes(out_dir, count, seed, terminal())}")
 
@@ -50,7 +50,7 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
     command continues where it was. For that it keeps 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover, until it is
     done. A few --steps do not make a policy drive.
     """
-    from rover_lib.world.train import train as train_policy
+    from balloon_world.train import train as train_policy
 
     try:
         click.echo(f"trained: {train_policy(episodes, output, progress=terminal(), **options)}")
@@ -66,8 +66,8 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
 @AS_JSON
 def trial(artifact: Path, worlds: int, seed: int, as_json: bool) -> None:
     """Drive ARTIFACT through worlds that it has never seen, and count the balloons it hits."""
+    from balloon_world.trial import run_trials
     from rover_lib.onboard.policy.load import load_policy
-    from rover_lib.world.trial import run_trials
 
     report = run_trials(load_policy(artifact), worlds, seed, progress=terminal())
     low, high = report.wilson
@@ -84,9 +84,9 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
 
     Leaves drive.json and the executed notebook 07 in RUN_DIR, and says whether the gate of params.yml holds.
     """
+    from balloon_world.latency import table
     from rover_lib.onboard.stage import read_stage
     from rover_lib.workshop.run.run import execute
-    from rover_lib.world.latency import table
 
     with _anew(run_dir / "drive.json"):  # the present one may be of another version
         execute("07_drive", run_dir, worlds=worlds)
@@ -128,9 +128,9 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
     distill.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its teacher's place. If
     it is ended at any moment, the same command continues where it was.
     """
+    from balloon_world.frontier import sentences, table
+    from balloon_world.students import measured
     from rover_lib.workshop.run.run import execute
-    from rover_lib.world.frontier import sentences, table
-    from rover_lib.world.students import measured
 
     content = measured(teacher_run, student_runs, progress=terminal(), **options)
     given = {"students": [str(run.resolve()) for run in student_runs], "worlds": options["worlds"]}
@@ -163,8 +163,8 @@ def learn(run_dir: Path, out: Path | None, worlds: int, as_json: bool, **options
     RUN_DIR. If it is ended at any moment, the same command continues where it was; with more --worlds, it drives only
     in those that are missing.
     """
+    from balloon_world.learn import Experiment, measured, table
     from rover_lib.workshop.run.run import execute
-    from rover_lib.world.learn import Experiment, measured, table
 
     run_dir = run_dir.resolve()
     experiment = Experiment(worlds=worlds, other_worlds=max(1, worlds // 2), **options)

@@ -14,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 from needs import real_time, until
 
+from balloon_world.car import VirtualCar
 from lab.driving.policy import make_artifact, pictures
 from rover_lib.cli import main
 from rover_lib.onboard.car.servo_link import ServoLink
@@ -21,7 +22,6 @@ from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.pilot import SLACK_S
 from rover_lib.onboard.recording.episode import read_controls
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.world.car import VirtualCar
 
 pytestmark = pytest.mark.slow
 ROVER = [str(Path(sys.executable).parent / "rover"), "drive"]

@@ -11,10 +11,10 @@ import uno
 from hypothesis import given
 from hypothesis import strategies as st
 
+from balloon_world import simulated_arduino as standin
 from lab.arduino.native import READ_COMMAND, SOURCES, CarNumbers, Command, Reader, Vehicle, library, said
 from rover_lib.onboard.car import car, servo_link
 from rover_lib.onboard.errors import RoverError
-from rover_lib.world import standin
 
 pytestmark = needs.gcc
 FOLDER = SOURCES[0].parent

@@ -8,9 +8,9 @@ import itertools
 import needs
 import pytest
 
+from balloon_world.simulated_arduino import REST_US
 from lab.arduino.native import STEERING, THROTTLE, NativeArduino
 from rover_lib.onboard.car.servo_link import State
-from rover_lib.world.standin import REST_US
 
 pytestmark = needs.gcc
 NEUTRAL = (1456, 120)

@@ -4,9 +4,9 @@ import contextlib
 
 import pytest
 
+from balloon_world.car import CameraFeed
+from balloon_world.simulated_arduino import StandIn
 from lab.driving.policy import PLAIN, pictures
-from rover_lib.world.car import CameraFeed
-from rover_lib.world.standin import StandIn
 
 
 @pytest.fixture(scope="session")

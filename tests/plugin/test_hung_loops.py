@@ -6,9 +6,9 @@ import time
 import needs
 import pytest
 
+from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import STOPPED, Gates, Observation, judge
-from rover_lib.world.standin import REST_US
 
 GATES = Gates.of_params()
 HUNG_S = 1.0

@@ -16,13 +16,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from balloon_world.car import CameraFeed, VirtualCar
+from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import CONTINUES, HUMAN, STOPPED, Command, Gates, Observation, judge
 from lab.driving.policy import PLAIN, make_artifact, pictures
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.drive.flight_log import read_log
-from rover_lib.world.car import CameraFeed, VirtualCar
-from rover_lib.world.standin import REST_US
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent

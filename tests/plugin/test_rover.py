@@ -10,6 +10,7 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from needs import real_time, simavr, until
 
+from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.policy import PLAIN, pictures
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig
@@ -20,7 +21,6 @@ from rover_lib.onboard.car.servo_link import LinkError, State
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
-from rover_lib.world.standin import REST_US
 
 GO = {"steering": 0.2, "throttle": 0.15}
 SENT = PwmCalibration().pulses(0.2, 0.15)

@@ -13,6 +13,6 @@ def cache(tmp_path_factory):
 @pytest.fixture(scope="session")
 def recorded(cache, tmp_path_factory):
     """Five drives of the expert."""
-    from rover_lib.world.record import record_episodes
+    from balloon_world.record import record_episodes
 
     return record_episodes(tmp_path_factory.mktemp("data") / "episodes", count=5, seed=3)

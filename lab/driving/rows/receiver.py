@@ -1,9 +1,9 @@
 """Faults of transmitter and receiver, and what the human who holds the transmitter does."""
 
+from balloon_world.simulated_arduino import REST_US
 from lab.driving.bench import DrivingBench
 from lab.driving.pins import HUMAN, NEUTRAL_US, PERIOD_US, REFUSED, STOPPED
 from lab.driving.row import FaultKind
-from rover_lib.world.standin import REST_US
 
 FAULTS = FaultKind("receiver")
 PRESET_US = 280  # by how much a preset throttle is above rest

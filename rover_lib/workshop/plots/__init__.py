@@ -7,6 +7,8 @@ Each subject has a module; `style` has what all figures share.
 """
 # ruff: noqa: F401, these are the names that notebooks use
 
+from balloon_world.plots.late_plans import beside_the_path, hits_by_latency, plans_from_above, throttle_over_age
+from balloon_world.plots.learning import hits_by_round
 from rover_learn.plots.students import frontier, losses
 from rover_lib.workshop.cells import Table
 from rover_lib.workshop.plots.benchmarks import latency, soak
@@ -18,8 +20,6 @@ from rover_lib.workshop.plots.counting import (
     instruction_counts,
     whole_size,
 )
-from rover_lib.workshop.plots.late_plans import beside_the_path, hits_by_latency, plans_from_above, throttle_over_age
-from rover_lib.workshop.plots.learning import hits_by_round
 from rover_lib.workshop.plots.quantization import errors_by_choice, layers, outlier_channels, sensitivity
 from rover_lib.workshop.plots.recordings import (
     calibration_coverage,

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from balloon_world import train as train_module
 from lab.a76.full import LEARNED_NOTE, NOTE, SIZES, STEPS, full_run
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.policy.load import load_policy
@@ -13,7 +14,6 @@ from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.run.session import opened
-from rover_lib.world import train as train_module
 
 pytestmark = pytest.mark.slow  # each makes a policy of a size that is no toy's
 

@@ -16,11 +16,11 @@ import pytest
 import serial
 from needs import ended, until
 
+from balloon_world.simulated_arduino import REST_US, StandIn
 from lab.arduino import emulator as arduino
 from lab.arduino.emulator import NICE, ArduinoError, EmulatedArduino, board
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.car.servo_link import ServoLink, State
-from rover_lib.world.standin import REST_US, StandIn
 
 with_firmware = [pytest.mark.emulated, needs.simavr]
 BOARDS = [

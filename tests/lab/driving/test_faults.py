@@ -18,6 +18,7 @@ import pytest
 import serial
 from click.testing import CliRunner
 
+from balloon_world.simulated_arduino import PinEvent
 from lab.__main__ import main
 from lab.arduino.emulator import REPOSITORY
 from lab.driving import faults, policy
@@ -30,7 +31,6 @@ from lab.driving.stories import KEPT
 from rover_lib.onboard.car.servo_link import frame
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy.load import load_policy
-from rover_lib.world.standin import PinEvent
 
 GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50, rows=60, stopped_rows=30, bytes_us=4)
 AT, START, END = 100.0, 99.5, 102.0

@@ -8,6 +8,7 @@ import needs
 import numpy as np
 import pytest
 
+from balloon_world.simulated_arduino import REST_US
 from lab.driving.bench import AT_SPEED_S, END_S, START_S, Drive, DrivingBench, FaultError
 from lab.driving.faults import ATTEMPTS
 from lab.driving.pins import HUMAN as BY_HUMAN
@@ -19,7 +20,6 @@ from rover_lib.onboard.errors import TakenOver
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.export_dataset import export_dataset
-from rover_lib.world.standin import REST_US
 
 # ---- in virtual time: the real firmware's state machine, link, loop and plans
 

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from balloon_world.simulated_arduino import PinEvent
 from lab import debian
 from lab.params import lab_params
 from lab.pi import container, container_run, emulation, playbooks
@@ -14,7 +15,6 @@ from lab.pi.pulses import moving, stopped
 from lab.pi.report import PiReport
 from lab.pi.service_proofs import environment, hashed, unit_for
 from rover_lib.onboard.stage import read_stage
-from rover_lib.world.standin import PinEvent
 
 OUTPUT = """
 TASK [Do] ****

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from balloon_world.simulated_arduino import PinEvent
 from lab import debian
 from lab.pi import emulation, machine, machine_run
 from lab.pi import usb_camera as camera
@@ -21,7 +22,6 @@ from lab.pi.usb_camera import UsbCamera
 from rover_lib.onboard.drive.flight_log import Flight
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
-from rover_lib.world.standin import PinEvent
 
 SLOW = 10.0
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 from aiohttp import web
 
+from balloon_world.simulated_arduino import PinEvent
 from lab.pi import container, view_proofs
 from lab.pi.emulation import EmulationError
 from lab.pi.view_proofs import (
@@ -25,7 +26,6 @@ from lab.pi.view_proofs import (
     view_gone,
 )
 from rover_lib.onboard.view.server import Address, View
-from rover_lib.world.standin import PinEvent
 
 ROOT = Path(__file__).parents[3]
 SECRET = "a" * 24

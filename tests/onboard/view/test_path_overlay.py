@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
+from balloon_world import world as w
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.view.path_overlay import CarShape, from_now
-from rover_lib.world import world as w
 
 SHAPE = CarShape.of()
 STEP_S = 1 / w.RATE_HZ

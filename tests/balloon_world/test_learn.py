@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 from policies import of_a_cars_size
 
+from balloon_world import learn
+from balloon_world.latency import Condition, drive_in
+from balloon_world.learn import Experiment, Human, demonstrate, drive_corrected, gates, measured, sentences, table
+from balloon_world.world import World, expert
 from rover_learn.finetune import human_samples
 from rover_lib.onboard.drive.pilot import Order
 from rover_lib.onboard.drive.plan import Settings
@@ -18,10 +22,6 @@ from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.pipeline import make_artifact
 from rover_lib.workshop.run.session import load
-from rover_lib.world import learn
-from rover_lib.world.latency import Condition, drive_in
-from rover_lib.world.learn import Experiment, Human, demonstrate, drive_corrected, gates, measured, sentences, table
-from rover_lib.world.world import World, expert
 
 CURVE = 10_003  # the balloon is 23 degrees aside
 LATE = Condition(0.3, Settings.of(params()["drive"]))

@@ -9,8 +9,8 @@ import pytest
 import serial
 from uno import body_of, line, status_of
 
+from balloon_world.simulated_arduino import StandIn
 from rover_lib.onboard.car.car import Car
-from rover_lib.world.standin import StandIn
 
 
 class Raw:

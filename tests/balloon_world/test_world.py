@@ -4,8 +4,8 @@ import time
 import numpy as np
 import pytest
 
+from balloon_world.world import DECOY_ASIDE_RAD, STEERING_MOST, THROTTLE_MOST, TIMEOUT_S, World, expert
 from rover_lib.onboard.errors import WorldError
-from rover_lib.world.world import DECOY_ASIDE_RAD, STEERING_MOST, THROTTLE_MOST, TIMEOUT_S, World, expert
 
 
 def drive(world):

@@ -4,8 +4,7 @@ from itertools import product
 
 import pytest
 
-from rover_lib.onboard.params import params
-from rover_lib.world.frontier import (
+from balloon_world.frontier import (
     NOBODY_DROVE,
     gates_of,
     paired,
@@ -15,6 +14,7 @@ from rover_lib.world.frontier import (
     sign_test,
     table,
 )
+from rover_lib.onboard.params import params
 
 LIMITS = params()["students"]
 SEEDS = list(range(10_000, 10_200))

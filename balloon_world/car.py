@@ -29,14 +29,14 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from balloon_world.record import JPEG_QUALITY
+from balloon_world.simulated_arduino import PinEvent
+from balloon_world.trial import Trajectory, wilson_interval
+from balloon_world.world import FRAME_HEIGHT, FRAME_WIDTH, World
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import WorldError
-from rover_lib.world.child import Child
-from rover_lib.world.record import JPEG_QUALITY
-from rover_lib.world.standin import PinEvent
-from rover_lib.world.trial import Trajectory, wilson_interval
-from rover_lib.world.world import FRAME_HEIGHT, FRAME_WIDTH, World
+from rover_lib.workshop.child_process import Child
 
 HOLD_S = 1.0
 STEPS_PER_S = 100  # steps of the physics a second, at least
@@ -50,7 +50,7 @@ NICE = 5  # the code that drives the car goes first; the camera may be late
 PRIORITY = 1  # of real-time scheduling, below that of the loop that drives the car
 START_S = 60.0  # a busy machine needs long to import everything
 ANSWER_S = 5.0
-STAND_IN = "rover_lib.world.standin:StandIn"
+STAND_IN = "balloon_world.simulated_arduino:StandIn"
 
 
 class FramePipe:
@@ -283,7 +283,7 @@ class VirtualCar:
         }
         self._process = Child(
             "the virtual car",
-            *(sys.executable, "-m", "rover_lib.world.car", json.dumps(options)),
+            *(sys.executable, "-m", "balloon_world.car", json.dumps(options)),
             error=WorldError,
             talks=True,
             env={"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},  # where the board's module is

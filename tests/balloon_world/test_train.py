@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 import torch
 
+from balloon_world import train as train_module
+from balloon_world.train import FULL, RECIPES, SIZES, train
+from balloon_world.trial import run_trials
+from balloon_world.world import World
 from rover_learn import training as training_module
 from rover_learn.training import descend
 from rover_lib.onboard.errors import RoverError, TrainingError, WorldError
 from rover_lib.workshop.act import lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.judge.compare import LerobotEager
-from rover_lib.world import train as train_module
-from rover_lib.world.train import FULL, RECIPES, SIZES, train
-from rover_lib.world.trial import run_trials
-from rover_lib.world.world import World
 
 pytestmark = pytest.mark.slow
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from balloon_world import latency
+from balloon_world.latency import Condition, beside_path, drive_late, from_above, gates, run_latencies, table
+from balloon_world.world import World, expert
 from rover_lib.cli import main
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import PolicyError, WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run import run as runs
-from rover_lib.world import latency
-from rover_lib.world.latency import Condition, beside_path, drive_late, from_above, gates, run_latencies, table
-from rover_lib.world.world import World, expert
 
 SETTINGS = Settings.of(params()["drive"])
 CURVE = 10_003  # the balloon is 23 degrees aside

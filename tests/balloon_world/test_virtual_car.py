@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 from needs import ended, until
 
+from balloon_world import car as car_module
+from balloon_world.car import KEEP_DRIVES, STAND_IN, CameraFeed, VirtualCar, _Car, _Pins
+from balloon_world.simulated_arduino import PinEvent
+from balloon_world.trial import wilson_interval
+from balloon_world.world import World
 from lab.arduino.emulator import BOARD
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import WorldError
-from rover_lib.world import car as car_module
-from rover_lib.world.car import KEEP_DRIVES, STAND_IN, CameraFeed, VirtualCar, _Car, _Pins
-from rover_lib.world.standin import PinEvent
-from rover_lib.world.trial import wilson_interval
-from rover_lib.world.world import World
 
 BOARDS = [
     pytest.param(STAND_IN, id="stand-in"),
@@ -144,7 +144,7 @@ def test_a_slow_reader_misses_frames_and_holds_nothing_up():
 
 
 def test_it_needs_no_torch():
-    program = "import sys, rover_lib.world.car; print([m for m in ('torch', 'lerobot') if m in sys.modules])"
+    program = "import sys, balloon_world.car; print([m for m in ('torch', 'lerobot') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -173,7 +173,7 @@ def test_what_killed_it_is_told(monkeypatch):
 def test_it_ends_with_its_parent():
     """Also where a sister that was forked keeps the pipe open."""
     program = (
-        "import os, time; from rover_lib.world.car import VirtualCar; car = VirtualCar()\n"
+        "import os, time; from balloon_world.car import VirtualCar; car = VirtualCar()\n"
         "if os.fork() == 0: time.sleep(5); os._exit(0)\n"
         "print(car.pid, car.camera, flush=True); time.sleep(30)"
     )

@@ -20,6 +20,10 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from balloon_world import latency, trial, world
+from balloon_world.frontier import DRIVES, NOBODY_DROVE, recommendation
+from balloon_world.latency import SEED, Condition, drive_late
+from balloon_world.trial import run_trials, wilson_interval
 from rover_learn.distill import errors_of
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.care.lower_bound import PI5_SEEN_GMAC_PER_S
@@ -37,10 +41,6 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Recordings, Sample, Source
 from rover_lib.workshop.run.run_folder import says_how_it_was_taught
-from rover_lib.world import latency, trial, world
-from rover_lib.world.frontier import DRIVES, NOBODY_DROVE, recommendation
-from rover_lib.world.latency import SEED, Condition, drive_late
-from rover_lib.world.trial import run_trials, wilson_interval
 
 K = TypeVar("K")
 V = TypeVar("V")

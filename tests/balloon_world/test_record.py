@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from balloon_world import record
+from balloon_world.record import record_episodes
 from rover_lib.onboard.errors import WorldError
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.world import record
-from rover_lib.world.record import record_episodes
 
 pytestmark = pytest.mark.slow
 

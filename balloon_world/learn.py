@@ -21,6 +21,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from balloon_world.frontier import sign_test
+from balloon_world.latency import SEED, Condition, Plans, drive_in, drive_late
+from balloon_world.record import WorldEpisode, episode_name
+from balloon_world.students import everywhere
+from balloon_world.trial import wilson_interval
+from balloon_world.world import RATE_HZ, World, expert
 from rover_learn.finetune import FinetuneRecipe, finetune
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.pilot import Order
@@ -37,12 +43,6 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.pipeline import make_artifact
 from rover_lib.workshop.run.session import load
-from rover_lib.world.frontier import sign_test
-from rover_lib.world.latency import SEED, Condition, Plans, drive_in, drive_late
-from rover_lib.world.record import WorldEpisode, episode_name
-from rover_lib.world.students import everywhere
-from rover_lib.world.trial import wilson_interval
-from rover_lib.world.world import RATE_HZ, World, expert
 
 K = TypeVar("K")
 V = TypeVar("V")

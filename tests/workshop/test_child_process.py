@@ -7,7 +7,7 @@ import pytest
 from needs import ended
 
 from rover_lib.onboard.errors import WorldError
-from rover_lib.world.child import Child
+from rover_lib.workshop.child_process import Child
 
 ECHO = "import sys\nfor line in sys.stdin: print(line.upper(), end='', flush=True)"
 

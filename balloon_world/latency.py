@@ -19,6 +19,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from balloon_world.trial import Trajectory, wilson_interval
+from balloon_world.world import RATE_HZ, CarState, World
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.drive.loop import Until, drive
@@ -31,8 +33,6 @@ from rover_lib.onboard.stage import plain, read_stage, write_stage
 from rover_lib.workshop.cells import Table
 from rover_lib.workshop.judge.compare import GATED, gate
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.world.trial import Trajectory, wilson_interval
-from rover_lib.world.world import RATE_HZ, CarState, World
 
 LATENCY_MOST_S = 5.0
 ROUNDING = 1e-6  # how far times may be rounded, in ticks

@@ -13,6 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from balloon_world import world as world_module
+from balloon_world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World, expert
 from rover_lib.onboard.car import pwm as pwm_module
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
@@ -21,8 +23,6 @@ from rover_lib.onboard.recording import episode as recording
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.world import world as world_module
-from rover_lib.world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World, expert
 
 LABEL = "hit red balloon"
 JPEG_QUALITY = 85

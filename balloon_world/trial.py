@@ -9,9 +9,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.errors import WorldError
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.world.world import RATE_HZ, World
 
 
 class Drives(Protocol):

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from balloon_world.trial import run_trials, run_trials_of, wilson_interval
+from balloon_world.world import World
 from rover_lib.onboard.errors import WorldError
-from rover_lib.world.trial import run_trials, run_trials_of, wilson_interval
-from rover_lib.world.world import World
 
 
 class Constant:

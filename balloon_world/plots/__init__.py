@@ -1,0 +1,1 @@
+"""Figures of drives through the balloon world."""
