@@ -134,11 +134,11 @@ lab: $(READY)
 	$(VENV)/bin/jupyter lab $(if $(wildcard runs/$(NAME)/01_load.ipynb),'runs/$(NAME)',notebooks)
 
 notebooks: demo
-	$(VENV)/bin/python -m rover_lib.workshop.publish
+	$(VENV)/bin/python -m lab.repository.publish
 	$(MAKE) tables
 
 tables: $(READY)
-	$(VENV)/bin/python -m rover_lib.workshop.tables
+	$(VENV)/bin/python -m lab.repository.page_tables
 
 # The pages, and all that they link to. A link to anything else fails the build.
 PAGES = *.md params.yml lab/params.yml docs/* ansible/README.md firmware/README.md lab/README.md notebooks/*.ipynb pictures/* results/*/*.json

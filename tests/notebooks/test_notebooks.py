@@ -10,9 +10,10 @@ from types import SimpleNamespace
 import nbformat
 import pytest
 
+from lab.repository import publish
+from lab.repository.publish import NOTEBOOK_LIMIT, RESULTS_OF
 from rover_lib.onboard.stage import read_stage, write_stage
-from rover_lib.workshop import progress, publish
-from rover_lib.workshop.publish import NOTEBOOK_LIMIT, RESULTS_OF
+from rover_lib.workshop import progress
 from rover_lib.workshop.run import run as runs
 from rover_lib.workshop.run import session
 from rover_lib.workshop.run.run import AFTERWARDS, NAMES, NOTEBOOKS, parameters_of

@@ -1,6 +1,6 @@
 """Put what runs showed into the repository: outputs into its notebooks, and the JSON behind them into results/.
 
-    python -m rover_lib.workshop.publish       # what `make notebooks` does
+    python -m lab.repository.publish       # what `make notebooks` does
 
 results/<run>/<stage>.json is what the run left, less paths of this machine and the hashes of every recorded frame. What
 quotes a number reads it there.

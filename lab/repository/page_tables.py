@@ -1,6 +1,6 @@
 """Writes the tables in the pages: results from the JSON in results/, parameters from the notebooks.
 
-    python -m rover_lib.workshop.tables        # what `make tables` does
+    python -m lab.repository.page_tables        # what `make tables` does
 
 A table stands in README.md or in a page of docs/ between `<!-- table NAME, by make tables -->` and `<!-- end -->`, each
 once. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is left out.

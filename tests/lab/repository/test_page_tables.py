@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from rover_lib.workshop import tables
+from lab.repository import page_tables as tables
 from rover_lib.workshop.run.run import AFTERWARDS, NAMES, NOTEBOOKS, parameters_of
 
 

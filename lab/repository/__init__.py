@@ -1,0 +1,1 @@
+"""What maintains this repository: stored outputs, and the pages' tables."""
