@@ -7,9 +7,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rover_lib.workshop.cells import Table
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.recorded_range import shown_pct, worst
+from rover_lib.workshop.notebook_table import Table
 
 NOBODY_DROVE = "Nobody drove: judged by errors on recordings alone."
 DRIVES = {"": "left alone", "pushed_": "pushed"}  # how a row's keys begin, and the words for that kind of drive

@@ -30,8 +30,8 @@ from rover_lib.onboard.errors import DriveFault, RoverError, WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import plain, read_stage, write_stage
-from rover_lib.workshop.cells import Table
 from rover_lib.workshop.judge.compare import GATED, gate
+from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 
 LATENCY_MOST_S = 5.0

@@ -37,8 +37,8 @@ from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, write_stage
 from rover_lib.workshop.cache import car_in_key
-from rover_lib.workshop.cells import Table
 from rover_lib.workshop.judge.compare import gate
+from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.pipeline import make_artifact

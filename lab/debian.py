@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.program import run
+from rover_lib.workshop.run_program import run
 
 NO_DEBIAN = "use a Debian 12 or 13 with the network, in a container if need be"
 

@@ -39,7 +39,6 @@ from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.stage import atomic_path, write_stage
 from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
-from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_both, written_in
@@ -58,6 +57,7 @@ from rover_lib.workshop.run import pipeline as quantization
 from rover_lib.workshop.run.run import files_of_a_run
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC, Opened, load, training_device
+from rover_lib.workshop.swap_folder import made_beside
 from rover_lib.workshop.untrusted import numbers
 
 PHASES = ("backbone", "transformer", "together", "qat")

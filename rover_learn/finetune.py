@@ -49,7 +49,6 @@ from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.recording.episode import HUMAN
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import act
-from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_both
@@ -60,6 +59,7 @@ from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, frame_rate_hz, is_another_rate
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC, check_sizes, training_device
+from rover_lib.workshop.swap_folder import made_beside
 from rover_lib.workshop.untrusted import numbers
 
 OLD, NEW = "old", "new"

@@ -37,8 +37,8 @@ from lab.debian import fetch_packages, install_packages, missing_packages, unpac
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.confine import AS_ROOT
 from rover_lib.workshop.cache import cached_folder, key_of
-from rover_lib.workshop.program import last_words, run
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.run_program import last_words, run
 
 REPOSITORY = Path(__file__).parents[2]
 GUEST = Path(__file__).parent / "guest"

@@ -27,10 +27,10 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.judge.recorded_range import pct_of_range
-from rover_lib.workshop.program import run
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run.pipeline import requantized
 from rover_lib.workshop.run.session import Opened, opened
+from rover_lib.workshop.run_program import run
 
 REFERENCE = "policy_fp32"
 FRAMES = 50

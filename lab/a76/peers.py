@@ -36,11 +36,11 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.export import export
 from rover_lib.workshop.judge.compare import thinned
-from rover_lib.workshop.program import run
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.run.pipeline import Recipe
 from rover_lib.workshop.run.session import Opened, opened
+from rover_lib.workshop.run_program import run
 
 FOLDER = GUEST / "peers"
 COMMON = (FOLDER / "float_policy.py", FOLDER / "planes.py")

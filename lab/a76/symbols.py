@@ -11,7 +11,7 @@ from elftools.common.exceptions import ELFError
 from elftools.elf.elffile import ELFFile
 
 from lab.a76.core import CountError
-from rover_lib.workshop.program import run
+from rover_lib.workshop.run_program import run
 
 KERNELS = 30  # how many are named in the report; the rest are summed up
 NAME_LENGTH = 140

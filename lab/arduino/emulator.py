@@ -20,7 +20,7 @@ from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.child_process import Child
-from rover_lib.workshop.program import run
+from rover_lib.workshop.run_program import run
 
 REPOSITORY = Path(__file__).parents[2]
 FIRMWARE = REPOSITORY / "firmware"

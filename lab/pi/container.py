@@ -38,7 +38,7 @@ from lab.a76.core import CORES
 from lab.pi.debian_image import debian_image
 from lab.pi.emulation import EmulationError, emulation, free_port, in_cgroup
 from rover_lib.workshop.cache import cache_root
-from rover_lib.workshop.program import last_words, run
+from rover_lib.workshop.run_program import last_words, run
 
 BOOT_S = 180.0  # until sshd answers, which takes 10 s on two quiet cores
 OFF_S = 60.0

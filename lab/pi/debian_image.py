@@ -21,7 +21,7 @@ from typing import NamedTuple
 from lab.debian import fetch_packages
 from lab.pi.emulation import EmulationError, in_cgroup
 from rover_lib.workshop.cache import cached_folder, key_of
-from rover_lib.workshop.program import run
+from rover_lib.workshop.run_program import run
 
 USER, HOST_NAME = "pi", "raspberrypi"
 PACKAGES = (

@@ -41,7 +41,7 @@ from lab.pi.deployment_bench import (
 from lab.pi.emulation import EmulationError
 from rover_lib.onboard.care.release import ORIGIN, SPARE_BYTES
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.program import run
+from rover_lib.workshop.run_program import run
 
 ROOM = 4 << 20  # bytes free on a full disk
 TRIES = 2  # how often a row is tried if its moment was missed

@@ -15,7 +15,7 @@ from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.drive.watch import signals
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cache_root
-from rover_lib.workshop.program import run
+from rover_lib.workshop.run_program import run
 
 NEEDS = {  # commands, each with its Debian package
     "systemd-nspawn": "systemd-container",

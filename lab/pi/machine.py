@@ -38,7 +38,7 @@ from lab.pi.debian_image import USER, DebianImage, debian_image
 from lab.pi.emulation import emulation, free_port, make_sure
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cached_folder, key_of
-from rover_lib.workshop.program import last_words, run
+from rover_lib.workshop.run_program import last_words, run
 
 PACKAGES = {  # commands, each with the Debian package that it comes from
     "qemu-system-aarch64": "qemu-system-arm",

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import IO
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.program import last_words
+from rover_lib.workshop.run_program import last_words
 
 STOP_S = 5.0
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.wheel_version import ONBOARD, wheel_version
-from rover_lib.workshop.program import run
+from rover_lib.workshop.run_program import run
 
 REPOSITORY = Path(__file__).parents[2]
 REQUIREMENTS = {  # by engine

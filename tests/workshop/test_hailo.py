@@ -15,7 +15,7 @@ from policies import TINY, lerobot_policy, memory_samples, smooth_frame
 
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, ActConfig, Affine, imagenet, inputs_of
-from rover_lib.workshop.hailo import stand_in
+from rover_lib.workshop.hailo import int8_estimate as stand_in
 from rover_lib.workshop.hailo.chips import CHIPS, estimate
 from rover_lib.workshop.hailo.description import files
 from rover_lib.workshop.hailo.kit import write_kit

@@ -17,9 +17,9 @@ from rover_lib.workshop.act import ACT, Affine
 from rover_lib.workshop.hailo.calibration import save_arrays, write_calibration, write_expected
 from rover_lib.workshop.hailo.chips import CHIPS, estimate
 from rover_lib.workshop.hailo.description import description
+from rover_lib.workshop.hailo.int8_estimate import Error, stand_in_errors
 from rover_lib.workshop.hailo.networks import Network, Splits
 from rover_lib.workshop.hailo.scripts import compile_script, model_script, script_names
-from rover_lib.workshop.hailo.stand_in import Error, stand_in_errors
 from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.progress import Progress, silent

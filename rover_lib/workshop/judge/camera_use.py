@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.workshop.cells import Table
 from rover_lib.workshop.judge.compare import Fidelity, thinned
 from rover_lib.workshop.judge.recorded_range import follows, shown_pct
+from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 
 FRAMES = 24  # each is planned twice more, in FP32 only: half a minute for a policy of full size

@@ -13,7 +13,7 @@ from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop.cells import Table
+from rover_lib.workshop.notebook_table import Table
 
 THIS = "this machine"  # instead of the host's name, which a committed figure need not show
 NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from rover_lib.workshop.act import ACT, inputs_of, predictions
-from rover_lib.workshop.cells import Table
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.judge.recorded_range import Range, constant_actions
+from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, is_another_rate
 
 FRAMES = 12  # planned in FP32, which takes ten seconds for a policy of full size

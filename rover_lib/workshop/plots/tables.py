@@ -4,8 +4,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rover_lib.workshop.cells import Table
 from rover_lib.workshop.judge.verdict import gate_in_words
+from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.plots.style import NAMES
 
 KEPT = {True: "kept", False: "MISSED", None: "not measured"}

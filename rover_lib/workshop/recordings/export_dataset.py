@@ -30,7 +30,6 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.recording.episode import HIT, HUMAN, NOBODY, POLICY
-from rover_lib.workshop.alone import alone_in
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.lerobot_dataset import (
@@ -54,6 +53,7 @@ from rover_lib.workshop.recordings.samples import (
     frame_rate_hz,
     is_another_rate,
 )
+from rover_lib.workshop.swap_folder import alone_in
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
 REWARD, DONE = "next.reward", "next.done"

@@ -25,10 +25,10 @@ from jupyter_client.manager import AsyncKernelManager
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.alone import made_beside
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
 from rover_lib.workshop.run.run_folder import run_folder, says_how_it_was_taught
+from rover_lib.workshop.swap_folder import made_beside
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")

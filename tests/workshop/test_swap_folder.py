@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop import alone
-from rover_lib.workshop.alone import alone_in, made_beside
+from rover_lib.workshop import swap_folder as alone
 from rover_lib.workshop.run.run_folder import run_folder
+from rover_lib.workshop.swap_folder import alone_in, made_beside
 
 
 def test_while_one_is_in_it_another_is_refused(tmp_path):
@@ -27,7 +27,7 @@ def test_while_one_is_in_it_another_is_refused(tmp_path):
 def test_what_a_killed_process_left_goes_first(tmp_path):
     lines = (
         "import os, sys, pathlib",
-        "from rover_lib.workshop.alone import alone_in",
+        "from rover_lib.workshop.swap_folder import alone_in",
         "with alone_in(pathlib.Path(sys.argv[1])) as folder:",
         "    (folder / 'sub').mkdir()",
         "    (folder / 'link').symlink_to('/nowhere')",

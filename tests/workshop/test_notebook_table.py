@@ -11,9 +11,9 @@ from PIL import Image
 from rover_lib.onboard.care.limits import check_gates
 from rover_lib.onboard.params import params
 from rover_lib.workshop import browse, plots
-from rover_lib.workshop.cells import Table
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.verdict import gate_in_words
+from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.plots.style import Drawn, Note, new_figure
 from rover_lib.workshop.progress import TTY_VARIABLE
 
