@@ -35,11 +35,11 @@ from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.cache import cache_root, car_in_key, key_of
-from rover_lib.workshop.judge.compare import GATED, thinned
+from rover_lib.workshop.judge.compare import GATED
 from rover_lib.workshop.judge.recorded_range import not_judged
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import Recordings, Sample, Source
+from rover_lib.workshop.recordings.samples import Recordings, Sample, Source, pick_evenly
 from rover_lib.workshop.run.run_folder import says_how_it_was_taught
 
 K = TypeVar("K")
@@ -104,7 +104,7 @@ def measured(
     source = _source_of(folder, episodes)
     recordings = load_recordings(source, runs[0].manifest["chunk"], p["calibration"]["sync_s"], progress)
     parts = split(recordings, p["calibration"]["held_out_share"], p["calibration"]["seed"])
-    samples = thinned(parts.held_out, held_out_frames)
+    samples = pick_evenly(parts.held_out, held_out_frames)
     counted = runs[0].counts is not None
     rows = []
     for run, errors in zip(runs, _errors(folder, runs, samples, recordings, progress), strict=True):

@@ -45,7 +45,6 @@ from rover_learn.training import (
     swapped_states,
     threads,
     to_cpu,
-    trainer_config,
 )
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
@@ -55,10 +54,11 @@ from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop import act as act_module
 from rover_lib.workshop.act import ActConfig, lerobot_act
 from rover_lib.workshop.cache import cache_root, cached_folder, key_of
-from rover_lib.workshop.judge.compare import thinned
+from rover_lib.workshop.checkpoint.files import trainer_config
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings.episodes import load_recordings, split
+from rover_lib.workshop.recordings.samples import pick_evenly
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
@@ -264,11 +264,11 @@ def _train(
     parts = split(recordings, p["held_out_share"], p["seed"])
     rng = np.random.default_rng([seed, 77])
     first = replace(size, image_sizes=(recipe.at,)) if recipe.at else size
-    samples = thinned(parts.calibration, recipe.samples)
+    samples = pick_evenly(parts.calibration, recipe.samples)
     data = frames_of(samples, *first.image_sizes[0])
     if not recipe.at:  # a small policy's step is so short that reading its frames from the disk would take longer
         data = in_memory(data, "reading frames", saved.progress)
-    judges = frames_of(thinned(parts.choosing, recipe.judged), *size.image_sizes[0])
+    judges = frames_of(pick_evenly(parts.choosing, recipe.judged), *size.image_sizes[0])
     spread = recorded_spread(data)
     loss_weights = torch.from_numpy(1 / spread).to(device)
     plan = _plan(size, first, recipe, len(data), len(judges))
@@ -380,7 +380,7 @@ def _train_backbone(training: _Training) -> None:
 def _train_transformer(training: _Training) -> None:
     """Phase two: train all but the backbone on features that are computed once, of each frame as it is and mirrored."""
     policy, backbone = training.policy, training.policy.model.backbone.eval()
-    chosen = np.asarray(thinned(range(len(training.data)), training.recipe.feature_samples))
+    chosen = np.asarray(pick_evenly(range(len(training.data)), training.recipe.feature_samples))
     views = {view: _features(training, view, chosen, backbone) for view in ("plain", "mirrored")}
     policy.model.backbone = Given()
     policy.train()

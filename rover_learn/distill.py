@@ -48,11 +48,11 @@ from rover_lib.workshop.int8.export import export
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, quantize
 from rover_lib.workshop.int8.scheme import Scheme
-from rover_lib.workshop.judge.compare import gate, thinned
+from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.recorded_range import Range, not_judged, pct_of_range, shown_pct, worst
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
-from rover_lib.workshop.recordings.samples import Source
+from rover_lib.workshop.recordings.samples import Source, pick_evenly
 from rover_lib.workshop.run import pipeline as quantization
 from rover_lib.workshop.run.run import files_of_a_run
 from rover_lib.workshop.run.run_folder import run_folder
@@ -254,7 +254,7 @@ class _Taught:
 def _taught(work: _Work) -> _Taught:
     """All phases. What depends on teacher, picture and samples alone stays in the cache, for its next student."""
     progress = work.progress
-    samples = thinned(work.opened.parts.calibration, work.recipe.samples)
+    samples = pick_evenly(work.opened.parts.calibration, work.recipe.samples)
     sees = _sees(work, samples)
     sources = [sys.modules[__name__], lessons_module, student_module, channels, refit, training, preprocess, act]
     folder = cache_root() / f"lessons-{key_of(sees, *sources)}"
@@ -386,7 +386,7 @@ def _start(room: _Room, backbone: dict[str, Tensor], folder: Path) -> tuple[dict
     path = folder / "start.pt"
     if not path.exists():
         lessons, work = room.lessons, room.work
-        rows = thinned(range(len(lessons)), work.recipe.unit_frames)
+        rows = pick_evenly(range(len(lessons)), work.recipe.unit_frames)
         states = torch.from_numpy(lessons.data.states)
         inputs = ((states[i][None], torch.from_numpy(lessons.frames[np.array([i])][0])) for i in rows)
         seeing = replace(work.teacher, weights=work.teacher.weights | backbone)
@@ -471,7 +471,7 @@ def _calibrated(work: _Work, student: Checkpoint) -> tuple[Calibration, Scheme]:
     how = quantization.Recipe.of(p)
     samples, _ = how.choose(parts.calibration)
     calibration = calibrate(student, samples, smooth=how.scheme.smooth, progress=work.progress)
-    choosing = thinned(parts.choosing, quantization.CHOOSING_FRAMES)
+    choosing = pick_evenly(parts.choosing, quantization.CHOOSING_FRAMES)
     chooser = Chooser(student, calibration, choosing, work.opened.recordings.action_range())
     return calibration, chooser.observer(how.scheme, p["quantization"]["observers"], work.progress)[0]
 
@@ -576,8 +576,8 @@ def summary(content: dict[str, Any]) -> str:
 def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
     """Judge the student, and write its files and distill.json into a folder that will be the run's of that name."""
     teacher, parts, action_range = work.teacher, work.opened.parts, work.opened.recordings.action_range()
-    held_out = thinned(parts.held_out, work.recipe.judged_frames)
-    choosing = thinned(parts.choosing, work.recipe.judged_frames)
+    held_out = pick_evenly(parts.held_out, work.recipe.judged_frames)
+    choosing = pick_evenly(parts.choosing, work.recipe.judged_frames)
     planned = _plans(work, teacher.config, teacher.weights, held_out)
     own = _plans(work, work.config, taught.weights, held_out)
     students = [
@@ -607,7 +607,7 @@ def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
     }
     hashes = write_both(new, work.config, taught.weights, loss, origin, **settings)
     student = load_checkpoint(written_in(new))
-    samples, parity = thinned(parts.choosing, quantization.CHOOSING_FRAMES), quantization.Recipe.of(params()).parity
+    samples, parity = pick_evenly(parts.choosing, quantization.CHOOSING_FRAMES), quantization.Recipe.of(params()).parity
     export(rounded, student, new / "policy_static.pt", samples, calibration, parity)
     write_stage(
         new / "distill.json",

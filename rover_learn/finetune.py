@@ -52,11 +52,18 @@ from rover_lib.workshop import act
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_both
-from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, frame_rate_hz, is_another_rate
+from rover_lib.workshop.recordings.samples import (
+    Episode,
+    Recordings,
+    Sample,
+    Source,
+    frame_rate_hz,
+    is_another_rate,
+    pick_evenly,
+)
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC, check_sizes, training_device
 from rover_lib.workshop.swap_folder import made_beside
@@ -287,7 +294,7 @@ def _parted(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Material:
     left_out = sum(s.driver != HUMAN for e in every for s in e.samples)
     return _Material(
         tuple(read),
-        tuple((kind, thinned(samples, recipe.samples)) for kind, samples in taught if samples),
+        tuple((kind, pick_evenly(samples, recipe.samples)) for kind, samples in taught if samples),
         tuple(each for each in held_out if each.samples),
         left_out,
     )
@@ -562,7 +569,7 @@ def _judged(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
     policies = [BatchedPolicy(work.parent.config, each).to(work.device) for each in (work.parent.weights, weights)]
     judged = []
     for episode in work.progress(work.material.held_out, desc="judging", total=len(work.material.held_out)):
-        samples = thinned(episode.samples, work.recipe.judged_frames)
+        samples = pick_evenly(episode.samples, work.recipe.judged_frames)
         driven, recorded = ~np.stack([s.is_pad for s in samples]), np.stack([s.chunk for s in samples])
         errors = [
             np.abs(plans_of(policy, samples).astype(np.float64) - recorded)[driven].mean(0) for policy in policies

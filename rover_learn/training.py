@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.policy.preprocess import normalise, prepare_frame
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.act import ActConfig
+from rover_lib.workshop.checkpoint.files import BETAS, GRAD_CLIP, KL_WEIGHT, WEIGHT_DECAY
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 
@@ -35,11 +35,6 @@ if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
 IMAGE, STATE, ACTION, IS_PAD = "observation.images.cam_front", "observation.state", "action", "action_is_pad"
-DROPOUT = 0.1  # LeRobot's default
-KL_WEIGHT = 10.0
-WEIGHT_DECAY = 1e-4
-BETAS = (0.9, 0.999)
-GRAD_CLIP = 1.0
 SWAPPED_STATES = 0.5  # the share of samples that get another's state, so that the state does not give the action away
 STANDING_THROTTLE = 0.01  # below it the car stands, which no frame shows, so such a state is never swapped
 SAVE_EVERY_S = 60.0
@@ -378,45 +373,6 @@ def driving_error(policy: "ACTPolicy", data: Frames, rows: np.ndarray) -> float:
         }
     )
     return float(np.abs(chunks.cpu().numpy() - data.chunks[rows])[~data.is_pad[rows]].mean())
-
-
-def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
-    """Return the config of the user's trainer as a plain dict, key for key.
-
-    known: learning_rate, batch_size, data_dir, output_dir, device and seed. Give folders by their name only, because a
-    checkpoint is shown to others.
-    """
-    ((height, width),) = size.image_sizes
-    return {
-        "image_width": width,
-        "image_height": height,
-        "n_obs_steps": 1,
-        "chunk_size": size.chunk,
-        "n_action_steps": size.chunk,
-        "hidden_size": size.dim,
-        "n_encoder_layers": size.encoder_layers,
-        "n_decoder_layers": size.decoder_layers,
-        "n_heads": size.heads,
-        "feedforward_dim": size.feedforward,
-        "dropout": DROPOUT,
-        "kl_weight": KL_WEIGHT,
-        "vision_encoder": size.backbone,
-        "pretrained_backbone": True,  # as the trainer writes it, whatever the weights came from
-        "learning_rate": known["learning_rate"],
-        "weight_decay": WEIGHT_DECAY,
-        "betas": BETAS,
-        "grad_clip": GRAD_CLIP,
-        "num_epochs": 1,
-        "batch_size": known["batch_size"],
-        "train_split": 0.75,
-        "data_dir": known["data_dir"],
-        "output_dir": known["output_dir"],
-        "device": known["device"],
-        "seed": known["seed"],
-        "log_freq": 1,
-        "save_freq": 1,
-        "num_workers": 0,
-    }
 
 
 def to_cpu(value: Any) -> Any:

@@ -8,9 +8,16 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FLOORS = ("rover_lib.onboard", "rover_lib.workshop", "rover_lib.world", "rover_lib.cli", "lab")  # the lowest first
+# The lowest first:
+FLOORS = ("rover_lib.onboard", "rover_lib.workshop", "rover_lib.cli", "rover_learn", "balloon_world", "lab")
 PLUGIN = "lerobot_robot_rover"  # for LeRobot's commands
-ROOMS = ("lab.debian", "lab.arduino", "lab.driving", "lab.a76", "lab.pi", "lab.__main__")  # the laboratory's
+TOPS = ("rover_lib", "rover_learn", "balloon_world", PLUGIN, "lab")
+ROOMS = {
+    "lab": ("debian", "arduino", "driving", "a76", "pi", "repository", "__main__"),
+    "rover_lib.onboard": ("car", "artifact", "policy", "recording", "drive", "view", "care", "cli"),
+    "rover_lib.workshop": ("recordings", "checkpoint", "judge", "int8", "plots", "run", "drive_log", "hailo"),
+}
+MOST_FILES = 20  # directly in a folder: what has more is no room
 ONBOARD_NEEDS = {
     "torch",
     "onnxruntime",
@@ -22,14 +29,14 @@ ONBOARD_NEEDS = {
     "yaml",
     "systemd_watchdog",
     "click",
-    "aiohttp",  # of the extra `view`; only view.py imports it
+    "aiohttp",  # of the extra `view`; only view/server.py imports it
     "rover_lib",
 }
 
 
 @functools.cache
 def modules() -> dict[str, Path]:
-    files = [p for top in ("rover_lib", PLUGIN, "lab") for p in (ROOT / top).rglob("*.py") if "guest" not in p.parts]
+    files = [p for top in TOPS for p in (ROOT / top).rglob("*.py") if "guest" not in p.parts]
     return {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in files}
 
 
@@ -52,15 +59,14 @@ def ours(path: Path) -> set[str]:
     """Return the modules of this repository that a file imports."""
     known = modules()
     names = imported(path)
-    return {n if n in known else n.rpartition(".")[0] for n in names if n.split(".")[0] in ("rover_lib", PLUGIN, "lab")}
+    return {n if n in known else n.rpartition(".")[0] for n in names if n.split(".")[0] in TOPS}
 
 
 def place(name: str, places: tuple[str, ...]) -> int | None:
     return next((i for i, p in enumerate(places) if name == p or name.startswith(f"{p}.")), None)
 
 
-@pytest.mark.parametrize("places", [FLOORS, ROOMS], ids=["floors", "rooms of the laboratory"])
-def test_imports_go_one_way(places):
+def check_one_way(places: tuple[str, ...]) -> None:
     checked = 0
     for name, path in modules().items():
         if (mine := place(name, places)) is None:
@@ -70,6 +76,25 @@ def test_imports_go_one_way(places):
             assert theirs is None or theirs <= mine, f"{name} imports {other}"
             checked += 1
     assert checked > 20
+
+
+def test_imports_go_one_way():
+    check_one_way(FLOORS)
+
+
+@pytest.mark.parametrize("house", ROOMS)
+def test_rooms_import_one_way(house):
+    """So no two rooms import each other. What stands on the ground, beside the rooms, belongs to none."""
+    check_one_way(tuple(f"{house}.{room}" for room in ROOMS[house]))
+    there = {p.parent.name for p in (ROOT / house.replace(".", "/")).glob("*/__init__.py")}
+    assert there <= set(ROOMS[house]), "a room that nobody has placed"
+
+
+def test_every_room_says_its_subject_and_is_no_hall():
+    folders = {p.parent for top in ("rover_lib", "rover_learn", "balloon_world") for p in (ROOT / top).rglob("*.py")}
+    for folder in folders:
+        assert len([p for p in folder.iterdir() if p.is_file()]) <= MOST_FILES, folder
+        assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), folder
 
 
 def test_no_module_imports_itself_in_a_circle():
@@ -82,10 +107,10 @@ def test_no_module_imports_itself_in_a_circle():
 
 
 def test_onboard_needs_only_what_a_rover_has():
-    for path in (ROOT / "rover_lib" / "onboard").glob("*.py"):
+    for path in (ROOT / "rover_lib" / "onboard").rglob("*.py"):
         for name in imported(path):
             top = name.split(".")[0]
-            assert top != "aiohttp" or path.name == "view.py", f"{path}: imports {name}"
+            assert top != "aiohttp" or path.name == "server.py", f"{path}: imports {name}"
             assert top in ONBOARD_NEEDS or top in sys.stdlib_module_names, f"{path}: imports {name}"
 
 

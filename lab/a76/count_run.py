@@ -25,9 +25,9 @@ from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8 import quantize as q
-from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.judge.recorded_range import pct_of_range
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.pipeline import requantized
 from rover_lib.workshop.run.session import Opened, opened
 from rover_lib.workshop.run_program import run
@@ -74,7 +74,7 @@ def count_run(
         )
     manifests = {stem: read_manifest(path) for stem, path in artifacts.items()}
     again = opened(run_dir)
-    samples = thinned(again.parts.held_out, frames)
+    samples = pick_evenly(again.parts.held_out, frames)
     if not samples:
         raise CountError(
             f"{run_dir}: its recordings have no held-out frames to judge with", remedy="record more episodes"
@@ -89,7 +89,7 @@ def count_run(
     if (run_dir / "load.json").exists() and (note := read_stage(run_dir / "load.json", "load")["metrics"].get("note")):
         metrics["note"] = note
     if STATIC in artifacts:
-        metrics["backbone_bits"] = backbone_bits(run_dir, core, again.checkpoint, thinned(samples, BIT_FRAMES))
+        metrics["backbone_bits"] = backbone_bits(run_dir, core, again.checkpoint, pick_evenly(samples, BIT_FRAMES))
     metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
     given = {"frames": len(samples), "steady": STEADY, "cpu": A76, "threads": 1}
     given["qemu"] = run("qemu-aarch64", "--version", error=CountError).splitlines()[0]
@@ -107,7 +107,7 @@ def count_other_core(run_dir: Path | str, cpu: str, progress: Progress = silent)
     artifacts = {stem: run_dir / f"{stem}.pt" for stem in (REFERENCE, STATIC)}
     if missing := [path.name for path in artifacts.values() if not path.exists()]:
         raise CountError(f"{run_dir}: no {missing[0]} in it", remedy="'rover run' makes a run")
-    samples = thinned(opened(run_dir).parts.held_out, STEADY)
+    samples = pick_evenly(opened(run_dir).parts.held_out, STEADY)
     cores = {core: prepare(progress, core) for core in (A76, cpu)}
     counts = {
         (stem, name): partial(count_artifact, core, path, samples, counted=STEADY)
@@ -141,7 +141,7 @@ def plans_of(manifests: Mapping[str, Mapping[str, Any]], frames: int) -> dict[st
         elif manifest["mode"] in ("fp32", "dynamic"):
             # Both are slow, and fewer frames are enough: FP32 is only compared with this machine's, and nobody would
             # drive a Pi with a dynamic artifact.
-            plans[stem] = Plan(reference, thinned(every, COUNTED))
+            plans[stem] = Plan(reference, pick_evenly(every, COUNTED))
         else:
             plans[stem] = Plan(reference, tuple(every))
     references = {plan.reference for plan in plans.values()}

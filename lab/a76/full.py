@@ -17,8 +17,8 @@ from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import quantize
-from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.pipeline import (
     Recipe,
     export_onnx,
@@ -117,5 +117,5 @@ def _quantized(
         calibration.save(run_dir / f"calibration{suffix}.pt")
     if not suffix:
         write_calibrate(run_dir, checkpoint, calibration, chosen, recipe, note)
-    samples = thinned(loaded.parts.choosing, CHECKED_FRAMES)
+    samples = pick_evenly(loaded.parts.choosing, CHECKED_FRAMES)
     return export_policies(run_dir, checkpoint, policies, calibration, samples, recipe.parity)

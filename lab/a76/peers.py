@@ -35,9 +35,9 @@ from rover_lib.workshop.cache import cached_folder, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.export import export
-from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
+from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.pipeline import Recipe
 from rover_lib.workshop.run.session import Opened, opened
 from rover_lib.workshop.run_program import run
@@ -201,7 +201,7 @@ def affine(run_dir: Path, again: Opened) -> Made:
     calibration = q.Calibration.load(run_dir / "calibration.pt")
     path = run_dir / "peers" / f"{AFFINE}.pt"
     policy = q.quantize(again.checkpoint, q.Scheme("static", kind="affine", smooth=calibration.smooth), calibration)
-    samples = thinned(again.parts.choosing, 8)
+    samples = pick_evenly(again.parts.choosing, 8)
     export(policy, again.checkpoint, path, samples, calibration, Recipe.of(params()).parity)
     return Made(path, {})
 
@@ -232,7 +232,7 @@ def count_peers(
     content, reference = counted_run(run_dir)
     artifacts = content["metrics"]["artifacts"]
     again = opened(run_dir)
-    samples = thinned(again.parts.held_out, frames)
+    samples = pick_evenly(again.parts.held_out, frames)
     core = prepare(progress)
     # Get the packages of all engines first: if some cannot be had, it fails before hours are spent on the others.
     guests = {}

@@ -11,8 +11,8 @@ deploy.yml, run again, leaves the rover with the new model.
 
 A power cut ends every program of the rover at one moment and leaves its disk as it was. A real one also loses writes
 that were not synced. A container cannot show that, because its disk is a layer over a folder of this machine. So
-tests/onboard/care/test_release.py cuts the same commands after every system call that changes something, and loses what was
-not synced.
+tests/onboard/care/test_release.py cuts the same commands after every system call that changes something, and loses
+what was not synced.
 """
 
 import contextlib

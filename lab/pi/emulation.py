@@ -12,8 +12,8 @@ from pathlib import Path
 
 from lab.arduino import emulator as arduino
 from lab.debian import install_packages, missing_packages
-from rover_lib.onboard.drive.watch import signals
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.signal_event import signals
 from rover_lib.workshop.cache import cache_root
 from rover_lib.workshop.run_program import run
 

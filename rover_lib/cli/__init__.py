@@ -1,40 +1,39 @@
-"""The workstation's command line: the rover's commands, and all that prepares a policy for it."""
+"""The workstation's command line: the rover's commands, and all that prepares a policy for it.
+
+Other packages of the same install add commands by the entry points `rover.<section>` of pyproject.toml.
+"""
+
+from importlib.metadata import entry_points
 
 import click
 
-from rover_lib.cli import drive, prepare, world
+from rover_lib.cli import drive, prepare
 from rover_lib.onboard import cli as onboard
 from rover_lib.onboard.cli import VERSION, Rover
 
 ROVERS = onboard.main.commands
-# Grouped by what a user does, as `rover --help` lists them. inspect, drive, view and log can do more here than there.
-SECTIONS = {
-    "Prepare a policy": (
-        prepare.run,
-        prepare.list_runs,
-        prepare.inspect,
-        prepare.report,
-        prepare.sweep,
+# What most people need, by what they do; below it all others. inspect, drive, view and log can do more here than there.
+SECTIONS: dict[str, tuple[click.Command, ...]] = {
+    "Prepare a policy": (prepare.run, prepare.inspect, prepare.report),
+    "Drive": (ROVERS["doctor"], ROVERS["calibrate"], ROVERS["record"], drive.drive),
+    "Look": (drive.view, drive.log),
+    "Step by step": (
         prepare.quantize,
         prepare.compare,
         ROVERS["benchmark"],
-        prepare.distill,
-        prepare.finetune,
         prepare.export,
-        prepare.export_dataset,
+        prepare.list_runs,
     ),
-    "Drive": (
-        ROVERS["doctor"],
-        ROVERS["calibrate"],
-        ROVERS["record"],
-        drive.drive,
-        drive.view,
-        drive.log,
-        ROVERS["label"],
+    "Teach": (),
+    "Recordings": (ROVERS["label"], prepare.export_dataset),
+    "A rover's models, and arming it": (
+        prepare.wheelhouse,
+        ROVERS["release"],
+        ROVERS["arm-car"],
+        ROVERS["heartbeat"],
     ),
-    "Set up a rover, and arm it": (prepare.wheelhouse, ROVERS["release"], ROVERS["arm-car"], ROVERS["heartbeat"]),
-    "Try it without a car": (world.world,),
 }
+MORE = {"rover.teach": "Teach", "rover.look": "Look"}  # sections, by the group of entry points that adds to them
 
 
 class Workstation(Rover):
@@ -42,9 +41,15 @@ class Workstation(Rover):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         width = formatter.width - 6 - max(map(len, self.commands))
-        for title, commands in SECTIONS.items():
+        for title, commands in sections().items():
             with formatter.section(title):
                 formatter.write_dl([(str(c.name), c.get_short_help_str(width)) for c in commands])
+
+
+def sections() -> dict[str, tuple[click.Command, ...]]:
+    """Return the commands of SECTIONS with those that entry points add."""
+    added = {MORE[group]: tuple(e.load() for e in entry_points(group=group)) for group in MORE}
+    return {title: (*commands, *added.get(title, ())) for title, commands in SECTIONS.items()}
 
 
 @click.group(
@@ -60,6 +65,6 @@ def main(debug: bool) -> None:
     """
 
 
-for commands in SECTIONS.values():
+for commands in sections().values():
     for command in commands:
         main.add_command(command)

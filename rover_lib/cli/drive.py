@@ -1,6 +1,7 @@
 """Commands for driving on a workstation, also in the balloon world, and for showing and drawing drives."""
 
 from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,13 @@ def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **op
     not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with
     --service, which waits disarmed after each drive, another request does.
     """
-    from balloon_world.car import VirtualCar
-
     if latency_ms and not in_world:
         raise click.UsageError("--latency-ms belongs to --world")
-    ctx.exit(run_drive(car=partial(VirtualCar, seed=seed) if in_world else None, latency_ms=latency_ms, **options))
+    car = None
+    if in_world:
+        (simulated,) = entry_points(group="rover.cars", name="world")
+        car = partial(simulated.load(), seed=seed)
+    ctx.exit(run_drive(car=car, latency_ms=latency_ms, **options))
 
 
 @click.command(short_help="Show a drive in the browser, with a stop button.")

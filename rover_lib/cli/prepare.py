@@ -12,14 +12,14 @@ import click
 
 from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
 from rover_lib.onboard.columns import aligned
-from rover_lib.onboard.kinds import Number, Output, PathTo
+from rover_lib.onboard.kinds import Output, PathTo
 from rover_lib.workshop.progress import terminal
 
 if TYPE_CHECKING:
     from rover_lib.workshop.recordings.samples import Source
 
 
-def _size(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int, int] | None:
+def size_option(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int, int] | None:
     """Parse WIDTHxHEIGHT; return (height, width)."""
     if value is None:
         return None
@@ -128,38 +128,6 @@ def list_runs(runs_dir: Path, as_json: bool) -> None:
         click.echo(f"no run in {runs_dir}: make demo, or rover run, makes the first")
 
 
-@click.command(short_help="Make many runs from one sheet, and compare them.")
-@click.argument("sheet", type=FILE)
-@click.option("--out", type=FILE, help="The sweep's folder [default: runs/<the sheet's name>].")
-@click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine [default: one for two cores].")
-@click.option("--scheduler", metavar="tcp://HOST:8786", help="A Dask cluster instead of this machine.")
-@AS_JSON
-def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | None, as_json: bool) -> None:
-    """Make all runs that the file SHEET asks for, and say which are the best.
-
-    SHEET names checkpoints, recordings, students to teach and settings to vary. Every combination is a run with its own
-    folder inside the sweep's. Finished runs are not made again: after Ctrl-C, a power cut or a new line in SHEET, the
-    same command continues. Runs that fail are named at the end and do not harm the others.
-    """
-    from rover_learn import sweep as sweeping
-
-    if workers and scheduler:
-        raise click.UsageError("--workers are this machine's; a cluster has its own")
-    jobs, folder = sweeping.Sheet.read(sheet).jobs(), out or Path("runs") / sheet.stem
-    cluster = sweeping.on_cluster(scheduler) if scheduler else sweeping.on_this_machine(workers)
-    with cluster as client:
-        failed = sweeping.sweep(jobs, folder, client, together=bool(scheduler), progress=terminal())
-    content = sweeping.write_report(jobs, folder, failed)
-    if as_json:
-        click.echo(json.dumps(content, indent=2))
-    else:
-        click.echo("\n".join([*sweeping.table(content["metrics"]["runs"]), "", f"done: {folder / sweeping.REPORT}"]))
-    for name, sentence in failed.items():
-        click.echo(f"rover: {name} failed: {sentence}", err=True)
-    if failed:
-        raise click.exceptions.Exit(1)
-
-
 @click.command(short_help="Make one artifact from a checkpoint.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES)
@@ -240,104 +208,6 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
     click.echo(f"errors on {len(held_out)} held-out frames, of the recorded range, and microseconds of pulse")
 
 
-@click.command(short_help="Teach a smaller policy, or train one for INT8.")
-@click.argument("checkpoint", type=CHECKPOINT)
-@click.argument("episodes", type=EPISODES)
-@click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="The student's picture [default: its teacher's].")
-@click.option("--decoder-layers", type=int, metavar="N", help="Keep only the first N decoder layers [default: all].")
-@click.option(
-    "--feedforward", type=int, metavar="N", help="Keep the N most important units of each feed-forward [default: all]."
-)
-@click.option(
-    "--backbone-channels",
-    type=float,
-    metavar="SHARE",
-    help="Keep this share, such as 0.5, of the channels inside the backbone's blocks [default: all].",
-)
-@click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
-@click.option("--runs-dir", type=FILE, default="runs", show_default=True)
-@click.option("--samples", type=click.IntRange(min=1), help="Frames to learn from [default: params.yml].")
-@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of all phases [default: params.yml].")
-@click.option("--qat", is_flag=True, help="Train it for INT8 at the end; without a new shape, CHECKPOINT itself.")
-@click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]")
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
-@AS_JSON
-@with_source
-def distill(
-    checkpoint: Path,
-    episodes: "Source",
-    size: tuple[int, int] | None,
-    samples: int | None,
-    steps: int | None,
-    seed: int | None,
-    as_json: bool,
-    **options: Any,
-) -> None:
-    """Teach a smaller policy what CHECKPOINT plans on the recordings in EPISODES.
-
-    Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot, policy_static.pt to drive with, and
-    distill.json in the run's folder. If it is ended at any moment, the same command continues where it was.
-    """
-    from rover_learn.distill import DistillRecipe, phases_of, summary
-    from rover_learn.distill import distill as teach
-    from rover_learn.student import StudentShape
-    from rover_lib.onboard.params import params
-    from rover_lib.onboard.stage import read_stage
-
-    height, width = size or (None, None)
-    parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
-    shape = StudentShape(height, width, **parts)
-    recipe = DistillRecipe.of(params(), steps, samples, seed, phases_of(shape, options["qat"]))
-    folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal(), **options)
-    content = read_stage(folder / "distill.json", "distill")
-    click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
-
-
-@click.command(short_help="Train a policy further, from takeovers.")
-@click.argument("checkpoint", type=CHECKPOINT)
-@click.argument("episodes", type=EPISODES, nargs=-1, required=True)
-@click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
-@click.option("--runs-dir", type=FILE, default="runs", show_default=True)
-@click.option(
-    "--weight", type=Number(min=0, min_open=True), help="Weight of a frame of a correction [default: params.yml]."
-)
-@click.option(
-    "--samples", type=click.IntRange(min=1), help="Maximum number of frames of each kind [default: params.yml]."
-)
-@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of both phases [default: params.yml].")
-@click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]")
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
-@AS_JSON
-def finetune(
-    checkpoint: Path,
-    episodes: tuple[Path, ...],
-    weight: float | None,
-    samples: int | None,
-    steps: int | None,
-    seed: int | None,
-    as_json: bool,
-    **options: Any,
-) -> None:
-    """Train CHECKPOINT further on what humans drove in EPISODES: first the old recordings, then the new ones.
-
-    A human's frames in a drive of the policy are corrections, and count more; the policy's own frames are not
-    imitated. Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and finetune.json in the run's
-    folder, and says on which held-out episodes it came closer to the human. If it is ended at any moment, the same
-    command continues where it was.
-    """
-    from rover_learn.acceptance import summary
-    from rover_learn.finetune import FinetuneRecipe
-    from rover_learn.finetune import finetune as learn_on
-    from rover_lib.onboard.params import params
-    from rover_lib.onboard.stage import read_stage
-
-    recipe = FinetuneRecipe.of(params(), correction_weight=weight, samples=samples, seed=seed)
-    recipe = recipe.of_steps(steps) if steps else recipe
-    folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal(), **options)
-    content = read_stage(folder / "finetune.json", "finetune")
-    click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
-
-
 @click.command(short_help="Write a run's policies for other engines: ONNX Runtime, Hailo.")
 @click.argument("run_dir", type=PathTo("run"))
 @click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")
@@ -377,7 +247,9 @@ def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
 @click.argument("episodes", type=EPISODES)
 @click.argument("out", type=FILE)
 @click.option("--video", is_flag=True, help="Write AV1 video: far smaller than images, but lossy [default: images].")
-@click.option("--size", callback=_size, metavar="WIDTHxHEIGHT", help="Size of the pictures [default: as recorded].")
+@click.option(
+    "--size", callback=size_option, metavar="WIDTHxHEIGHT", help="Size of the pictures [default: as recorded]."
+)
 @AS_JSON
 def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> None:
     """Write our recordings in EPISODES as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.

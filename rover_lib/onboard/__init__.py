@@ -1,4 +1,4 @@
-"""All that runs on the rover: torch, numpy, cv2, pyserial, PyYAML and the standard library, nothing else of ours."""
+"""All that runs on the rover, on torch, numpy, cv2, pyserial, PyYAML and the standard library alone."""
 
 from typing import TYPE_CHECKING, Any
 

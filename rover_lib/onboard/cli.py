@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import platform
+import re
 import sys
 import traceback
 from collections.abc import Callable
@@ -36,23 +37,6 @@ LOG_DRIVE = click.option(
 
 
 SECONDS = Number(min=0, min_open=True)
-
-WORKSTATION_COMMANDS = frozenset(
-    {
-        "run",
-        "report",
-        "sweep",
-        "list",
-        "quantize",
-        "compare",
-        "distill",
-        "finetune",
-        "export",
-        "export-dataset",
-        "wheelhouse",
-        "world",
-    }
-)  # rover_lib.cli's
 
 
 class Unread:
@@ -115,13 +99,15 @@ class Rover(click.Group):
 
 
 class OnlyOnboard(Rover):
-    """The rover's commands alone. A command of the workstation ends in a sentence that says so, and exit code 2."""
+    """The rover's commands alone. Any other ends in a sentence that says where there are more, and exit code 2."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args[0] in WORKSTATION_COMMANDS:
-            sentence = f"`rover {args[0]}` is a workstation's command: type it there, in a checkout of the project"
+        if re.fullmatch("[a-z][a-z-]*", args[0]) and args[0] not in self.commands:
+            sentence = (
+                f"a rover has no `rover {args[0]}`: see `rover --help`, or type it on a workstation, which has more"
+            )
             click.echo(f"rover: {sentence}", err=True)
             ctx.exit(2)
         return super().resolve_command(ctx, args)
@@ -706,7 +692,7 @@ def open_view(
 ) -> None:
     """Serve the view until SIGINT or SIGTERM.
 
-    opened: called with its URL. replay: a workshop.drive_log.replay.Replay that is shown instead of the drives that connect.
+    opened: called with its URL. replay: a Replay of drive_log, shown instead of the drives that connect.
     """
     import asyncio
 

@@ -1,8 +1,16 @@
-"""An event that the handler of a signal may set."""
+"""Signals that end a program: who handles them, and an event that a handler may set."""
 
+import contextlib
 import queue
+import signal
 import threading
 import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
+
+# All that ask a program to end. A script's & starts a drive with SIGINT and SIGQUIT ignored; they must still end it.
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 
 
 class SignalEvent(threading.Event):
@@ -45,3 +53,14 @@ class SignalEvent(threading.Event):
         except queue.Empty:
             return False
         return True
+
+
+@contextlib.contextmanager
+def signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[dict[int, Any]]:
+    """Send SIGNALS to `handler` inside the context, and to their former handlers afterwards. Yields the former ones."""
+    before: dict[int, Any] = {number: signal.signal(number, handler) for number in SIGNALS}
+    try:
+        yield before
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)

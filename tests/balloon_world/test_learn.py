@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from policies import of_a_cars_size
 
-from balloon_world import learn
+from balloon_world import learn, plots
 from balloon_world.latency import Condition, drive_in
 from balloon_world.learn import Experiment, Human, demonstrate, drive_corrected, gates, measured, sentences, table
 from balloon_world.world import World, expert
@@ -17,7 +17,6 @@ from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop import plots
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.pipeline import make_artifact

@@ -11,11 +11,11 @@ from click.testing import CliRunner
 from balloon_world import students
 from balloon_world.latency import SEED
 from balloon_world.students import measured
+from rover_learn import plots
 from rover_lib.cli import main
 from rover_lib.onboard.car.car import FILE_VARIABLE, Car, yaml_of
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
-from rover_lib.workshop import plots
 from rover_lib.workshop.run import run as runs
 
 

@@ -1,7 +1,7 @@
 """Faults of what the camera shows: nothing, always the same, too late, or something useless.
 
-There are no rows about time stamps that are old or stand still, as a FIFO has none; tests/onboard/car/test_camera.py tests
-those.
+There are no rows about time stamps that are old or stand still, as a FIFO has none: tests/onboard/car/test_camera.py
+tests those.
 """
 
 import numpy as np

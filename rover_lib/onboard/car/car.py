@@ -24,7 +24,7 @@ from rover_lib.onboard.errors import CarError, ParamsError, PwmError
 
 FILE_VARIABLE = "ROVER_CAR"  # environment variable that names another file; inherited by started programs
 PLACES = (  # where car.yml may be; the first one that exists is used
-    Path(__file__).parents[2] / "car.yml",  # a checkout's
+    Path(__file__).parents[3] / "car.yml",  # a checkout's
     Path("/etc/rover/car.yml"),  # an installed rover's
 )
 

@@ -14,12 +14,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 from rover_lib.onboard.car.servo_link import LinkError, ServoLink, Telemetry
 from rover_lib.onboard.drive.flight_log import FlightLog, LogError
 from rover_lib.onboard.drive.loop import Report
-from rover_lib.onboard.signal_event import SignalEvent
+from rover_lib.onboard.signal_event import SignalEvent, signals
 from rover_lib.onboard.stage import open_plain
 
 SWITCH_S = 0.0005  # after this, other threads give the interpreter back to the loop; Python's default is 5 ms
@@ -33,8 +32,6 @@ REPEAT_AFTER = 3  # seconds after which the warning of a busy machine is repeate
 CLOCK_SET_S = 1.0  # a smaller step of the system's clock is ignored
 SETTLED_S = 60.0  # from then on, the growth of memory is measured
 TAIL_BYTES = 1 << 16  # of a flight log, read for the end of its last drive
-# All that ask a program to end. A script's & starts a drive with SIGINT and SIGQUIT ignored; they must still end it.
-SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 
 
 @contextlib.contextmanager
@@ -99,17 +96,6 @@ def stopped_by_signals(stop: SignalEvent, log: FlightLog) -> Iterator[None]:
 
     with signals(on_signal) as before:
         yield
-
-
-@contextlib.contextmanager
-def signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[dict[int, Any]]:
-    """Send SIGNALS to `handler` inside the context, and to their former handlers afterwards. Yields the former ones."""
-    before: dict[int, Any] = {number: signal.signal(number, handler) for number in SIGNALS}
-    try:
-        yield before
-    finally:
-        for number, earlier in before.items():
-            signal.signal(number, earlier)
 
 
 @contextlib.contextmanager

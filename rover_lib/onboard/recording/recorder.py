@@ -20,10 +20,9 @@ from typing import Any, TextIO
 
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink
-from rover_lib.onboard.drive.watch import signals
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
 from rover_lib.onboard.recording.episode import About, EpisodeExists, EpisodeWriter
-from rover_lib.onboard.signal_event import SignalEvent
+from rover_lib.onboard.signal_event import SignalEvent, signals
 from rover_lib.onboard.status_line import StatusLine
 
 SPARE_BYTES = 16_000_000  # always left free on the disk: to finish an episode, and for the rest of the Pi

@@ -13,12 +13,17 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
-from rover_learn.training import trainer_config
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
 from rover_lib.workshop.checkpoint.lerobot import ORIGIN, RATE_HZ
 
+# Settings of the user's trainer, which its checkpoints name:
+DROPOUT = 0.1  # LeRobot's default
+KL_WEIGHT = 10.0
+WEIGHT_DECAY = 1e-4
+BETAS = (0.9, 0.999)
+GRAD_CLIP = 1.0
 EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
 
 
@@ -39,7 +44,7 @@ def write_trainer(
     **settings: Any,
 ) -> None:
     """One file in the format of the user's trainer. weights: LeRobot's names without the leading `model.`. settings: of
-    its training, as `training.trainer_config` wants them.
+    its training, as `trainer_config` wants them.
 
     No optimizer state: it was of another loss. Raises CheckpointError for a policy whose rate or normalisation that
     format cannot hold: it knows ImageNet's for the picture, and none for states and actions; and as `atomic_path`.
@@ -123,3 +128,42 @@ def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
     """Mean and standard deviation whose normalisation, LeRobot's eps included, is x * scale + shift."""
     scale, shift = torch.tensor(norm.scale, dtype=torch.float64), torch.tensor(norm.shift, dtype=torch.float64)
     return {"mean": (-shift / scale).float().reshape(shape), "std": (1 / scale - EPS).float().reshape(shape)}
+
+
+def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
+    """Return the config of the user's trainer as a plain dict, key for key.
+
+    known: learning_rate, batch_size, data_dir, output_dir, device and seed. Give folders by their name only, because a
+    checkpoint is shown to others.
+    """
+    ((height, width),) = size.image_sizes
+    return {
+        "image_width": width,
+        "image_height": height,
+        "n_obs_steps": 1,
+        "chunk_size": size.chunk,
+        "n_action_steps": size.chunk,
+        "hidden_size": size.dim,
+        "n_encoder_layers": size.encoder_layers,
+        "n_decoder_layers": size.decoder_layers,
+        "n_heads": size.heads,
+        "feedforward_dim": size.feedforward,
+        "dropout": DROPOUT,
+        "kl_weight": KL_WEIGHT,
+        "vision_encoder": size.backbone,
+        "pretrained_backbone": True,  # as the trainer writes it, whatever the weights came from
+        "learning_rate": known["learning_rate"],
+        "weight_decay": WEIGHT_DECAY,
+        "betas": BETAS,
+        "grad_clip": GRAD_CLIP,
+        "num_epochs": 1,
+        "batch_size": known["batch_size"],
+        "train_split": 0.75,
+        "data_dir": known["data_dir"],
+        "output_dir": known["output_dir"],
+        "device": known["device"],
+        "seed": known["seed"],
+        "log_freq": 1,
+        "save_freq": 1,
+        "num_workers": 0,
+    }

@@ -21,8 +21,8 @@ from rover_lib.workshop.hailo.int8_estimate import Error, stand_in_errors
 from rover_lib.workshop.hailo.networks import Network, Splits
 from rover_lib.workshop.hailo.scripts import compile_script, model_script, script_names
 from rover_lib.workshop.int8.export import Exporter
-from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.pipeline import CHOOSING_FRAMES, Recipe
 from rover_lib.workshop.run.session import Opened
 
@@ -51,7 +51,7 @@ def write_kit(
             remedy="record more; or say --samples, and expect more of an error",
         )
     splits = Splits(ACT(loaded.checkpoint.config, loaded.checkpoint.weights))
-    judged = Exporter(loaded.checkpoint, thinned(loaded.parts.choosing or chosen, CHOOSING_FRAMES), recipe.parity)
+    judged = Exporter(loaded.checkpoint, pick_evenly(loaded.parts.choosing or chosen, CHOOSING_FRAMES), recipe.parity)
     out.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
         folder = Path(temporary) / out.name

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.workshop.judge.compare import Fidelity, thinned
+from rover_lib.workshop.judge.compare import Fidelity
 from rover_lib.workshop.judge.recorded_range import follows, shown_pct
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.samples import pick_evenly
 
 FRAMES = 24  # each is planned twice more, in FP32 only: half a minute for a policy of full size
 
@@ -81,7 +82,7 @@ def look(policy: Any, report: Fidelity, frames: int = FRAMES, progress: Progress
     Each frame is swapped with the one half of all frames away, which is from another drive if there are several. Raises
     PolicyError for fewer than two frames.
     """
-    rows = thinned(range(len(report.samples)), frames)
+    rows = pick_evenly(range(len(report.samples)), frames)
     if len(rows) < 2:
         raise PolicyError("there are no two frames to swap", remedy="record more, or hold out a larger share")
     others = np.roll(rows, len(rows) // 2).tolist()

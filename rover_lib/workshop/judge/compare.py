@@ -32,6 +32,7 @@ from rover_lib.workshop.act import Affine, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.samples import pick_evenly
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
 ARTIFACTS = ("fp32", *MODES, "static_affine")
@@ -216,17 +217,10 @@ def hashes(run_dir: Path | str) -> dict[str, str]:
     return {path.name: content_hash(path) for path in artifacts(run_dir).values()}
 
 
-def thinned(samples: Sequence[Any], at_most: int) -> tuple[Any, ...]:
-    """At most `at_most` of the samples, evenly spaced, first and last among them."""
-    if len(samples) <= at_most:
-        return tuple(samples)
-    return tuple(samples[i] for i in np.linspace(0, len(samples) - 1, at_most).round().astype(int))
-
-
 def driven(trials: Mapping[str, Any], at_most: int = 200) -> tuple[Observation, ...]:
     """Observations from the (frame_bgr, state) that trial reports kept: places no recording went to."""
     frames = [frame for trial in trials.values() for frame in trial.frames]
-    return tuple(Observation(frame, np.asarray(state, np.float32)) for frame, state in thinned(frames, at_most))
+    return tuple(Observation(frame, np.asarray(state, np.float32)) for frame, state in pick_evenly(frames, at_most))
 
 
 def fidelity(

@@ -16,10 +16,9 @@ import numpy as np
 
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.judge.recorded_range import Range, constant_actions
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, is_another_rate
+from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, is_another_rate, pick_evenly
 
 FRAMES = 12  # planned in FP32, which takes ten seconds for a policy of full size
 BEYOND = 0.5  # a prediction lies beyond if it passes either end by this share of the range; a good policy does not
@@ -100,7 +99,7 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
     samples: of whole episodes, one after the other; each episode's rate is compared with the policy's. An action that
     never changes in the recordings is left out, because its possible range is not known.
     """
-    config, few = checkpoint.config, thinned(samples, FRAMES)
+    config, few = checkpoint.config, pick_evenly(samples, FRAMES)
     plans = predictions(ACT(config, checkpoint.weights), [inputs_of(s, config) for s in few]).numpy()
     known = ~np.stack([s.is_pad for s in few])
     recorded = np.stack([s.chunk for s in few])

@@ -7,9 +7,6 @@ Each subject has a module; `style` has what all figures share.
 """
 # ruff: noqa: F401, these are the names that notebooks use
 
-from balloon_world.plots.late_plans import beside_the_path, hits_by_latency, plans_from_above, throttle_over_age
-from balloon_world.plots.learning import hits_by_round
-from rover_learn.plots.students import frontier, losses
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.plots.benchmarks import latency, soak
 from rover_lib.workshop.plots.comparison import action_error, drives_from_above, hits, sizes, worst_frames

@@ -6,8 +6,8 @@
 
 How a recording becomes samples:
 - A control measures a channel only if the firmware saw a pulse there (`pwm.Channel.measured`). If it saw none, the file
-  has a flag and no value, or the old recorder's 0 (onboard/recording/episode.py); here such a value is missing, never 0. A
-  frame takes its throttle and its steering each from the nearest *measured* control within `sync_s`. So one lost
+  has a flag and no value, or the old recorder's 0 (onboard/recording/episode.py): here that is missing, never 0.
+  A frame takes its throttle and its steering each from the nearest *measured* control within `sync_s`. So one lost
   reading between two good ones costs nothing (controls come every 33 ms), and a longer hole leaves its frames without
   an action.
 - Controls that waited in the serial buffer arrive in one burst, so their system times say nothing. They get the times

@@ -104,8 +104,8 @@ class Sample:
 
     time_s: seconds since the episode's first frame. state: (S,) float32, in our recordings the previous frame's
     [steering, throttle]. chunk: (chunk, A) float32, this frame's action and the following ones. is_pad: (chunk,)
-    bool, True past the end. driver: who drove at this frame, one of onboard.recording.episode.DRIVERS. car: the car that was
-    driven.
+    bool, True past the end. driver: who drove at this frame, one of `episode.DRIVERS` of the rover.
+    car: the car that was driven.
     """
 
     episode: str
@@ -222,7 +222,7 @@ class Recordings:
         }
 
     def driven_by_pct(self) -> dict[str, float]:
-        """The percentage of samples at which each of onboard.recording.episode.DRIVERS drove, without those who never did."""
+        """The percentage of samples at which each of `episode.DRIVERS` drove, without those who never did."""
         count = len(self.samples)
         return {who: round(100 * n / count, 1) for who, n in self._counted(s.driver for s in self.samples).items()}
 
@@ -279,3 +279,10 @@ def relative(path: Path, root: Path) -> str:
         return path.relative_to(root).as_posix()
     except ValueError:
         return path.name
+
+
+def pick_evenly(samples: Sequence[Any], at_most: int) -> tuple[Any, ...]:
+    """Return at most `at_most` of the samples, evenly spaced, first and last among them."""
+    if len(samples) <= at_most:
+        return tuple(samples)
+    return tuple(samples[i] for i in np.linspace(0, len(samples) - 1, at_most).round().astype(int))

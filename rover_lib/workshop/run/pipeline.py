@@ -26,9 +26,9 @@ from rover_lib.workshop.int8.export import Exporter, Parity, export
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, quantize
 from rover_lib.workshop.int8.scheme import Scheme
-from rover_lib.workshop.judge.compare import thinned
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
+from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.session import Opened, opened
 
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
@@ -74,7 +74,7 @@ def make_artifact(
     and `export`.
     """
     checkpoint, parts = loaded.checkpoint, loaded.parts
-    samples = thinned(parts.choosing or parts.calibration, CHOOSING_FRAMES)
+    samples = pick_evenly(parts.choosing or parts.calibration, CHOOSING_FRAMES)
     if fp32:
         return export(ACT(checkpoint.config, checkpoint.weights), checkpoint, path, samples, parity=recipe.parity), []
     chosen, note = recipe.choose(parts.calibration)
@@ -132,7 +132,7 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     run_dir = Path(run_dir)
     again = opened(run_dir, progress)
     checkpoint, parts = again.checkpoint, again.parts
-    samples = thinned(parts.choosing or parts.calibration, CHOOSING_FRAMES)
+    samples = pick_evenly(parts.choosing or parts.calibration, CHOOSING_FRAMES)
     exporter = Exporter(checkpoint, samples, Recipe.of(params()).parity)
     static = requantized(run_dir, checkpoint)  # before anything is written: it refuses a run whose files do not fit
     made = {

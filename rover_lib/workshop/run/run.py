@@ -30,7 +30,7 @@ from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
 from rover_lib.workshop.run.run_folder import run_folder, says_how_it_was_taught
 from rover_lib.workshop.swap_folder import made_beside
 
-NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
+NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
 # Notebooks for a finished run, which `make arm` and `rover world latency`, `students` and `learn` execute.
 AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")

@@ -12,7 +12,7 @@ from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import Scheme
-from rover_lib.workshop.judge.compare import thinned
+from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.session import opened
 
 pytestmark = pytest.mark.slow  # each makes a policy of a size that is no toy's
@@ -46,7 +46,7 @@ def test_leaves_what_counting_needs(run_dir):
     }
     assert len({p.manifest["checkpoint"]["sha256"] for p in artifacts.values()}) == 1
     again = opened(run_dir)
-    assert len(thinned(again.parts.held_out, 50)) == 50
+    assert len(pick_evenly(again.parts.held_out, 50)) == 50
     assert read_stage(run_dir / "load.json", "load")["metrics"]["note"] == NOTE and "does not drive" in NOTE
     assert read_stage(run_dir / "calibrate.json", "calibrate")["metrics"]["samples"] == 6
     assert STEPS < 100 and (180, 320) in SIZES

@@ -229,7 +229,7 @@ def without_engines(tiny_run, monkeypatch):
     """count_peers with the engines' part left out: their chunks are our FP32's, steering off by a hundredth."""
     samples = tiny_run.opened.parts.held_out
     monkeypatch.setattr(peers, "opened", lambda run_dir: tiny_run.opened)
-    monkeypatch.setattr(peers, "thinned", lambda given, n: tuple(given[:n]))
+    monkeypatch.setattr(peers, "pick_evenly", lambda given, n: tuple(given[:n]))
     monkeypatch.setattr(peers, "prepare", lambda progress: None)
     monkeypatch.setattr(peers, "packages_here", lambda engine: None)
     monkeypatch.setattr(peers, "packages_there", lambda engine: None)

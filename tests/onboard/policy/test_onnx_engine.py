@@ -60,7 +60,8 @@ def test_needs_no_torch(onnx_static):
 import sys
 sys.modules |= dict.fromkeys(["torch", "onnx", "lerobot"])
 import numpy as np
-import rover_lib.onboard.cli, rover_lib.onboard.drive.drive, rover_lib.onboard.care.benchmark, rover_lib.onboard.care.doctor
+import rover_lib.onboard.cli, rover_lib.onboard.drive.drive
+import rover_lib.onboard.care.benchmark, rover_lib.onboard.care.doctor
 from rover_lib.onboard import load_policy
 chunk = load_policy({str(onnx_static)!r}, threads=1).predict_chunk(np.full((360, 640, 3), 99, np.uint8), np.zeros(2))
 assert chunk.shape == (32, 2) and np.isfinite(chunk).all()

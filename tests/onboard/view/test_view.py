@@ -17,7 +17,7 @@ import pytest
 aiohttp = pytest.importorskip("aiohttp", reason="needs the extra view: pip install 'rover-policy[view]'")
 
 from rover_lib.onboard.car.car import read_car  # noqa: E402
-from rover_lib.onboard.view import server as v
+from rover_lib.onboard.view import server as v  # noqa: E402
 
 TOKEN = "a-token-of-the-tests"
 JPEG = b"\xff\xd8 a picture \n \xff\xd9"

@@ -17,6 +17,7 @@ from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.stage import plain
 from rover_lib.workshop import plots
 from rover_lib.workshop.judge import compare
+from rover_lib.workshop.recordings.samples import pick_evenly
 
 CHUNK = 3
 RANGE = {"steering": (-0.2, 0.6), "throttle": (0.0, 0.1)}
@@ -182,9 +183,9 @@ def test_refusals_are_sentences(samples, other, ranges, words):
         compare.fidelity(Fixed(np.zeros((3, 2))), {"static": other}, samples, ranges)
 
 
-def test_thinned_keeps_first_and_last():
-    assert compare.thinned(range(100), 4) == (0, 33, 66, 99)
-    assert compare.thinned(range(3), 4) == (0, 1, 2)
+def test_picking_evenly_keeps_first_and_last():
+    assert pick_evenly(range(100), 4) == (0, 33, 66, 99)
+    assert pick_evenly(range(3), 4) == (0, 1, 2)
 
 
 def test_frames_of_drives_become_observations():
