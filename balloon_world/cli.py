@@ -10,7 +10,7 @@ import click
 
 from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
 from rover_lib.onboard.kinds import Output, PathTo
-from rover_lib.workshop.progress import terminal
+from rover_lib.workshop.progress import terminal_bar
 
 
 @click.group(short_help="The balloon world: record, train, drive.")
@@ -26,7 +26,7 @@ def record(out_dir: Path, count: int, seed: int) -> None:
     """Record COUNT drives of the expert to OUT_DIR, in the format of the real car's recorder."""
     from balloon_world.record import record_episodes
 
-    click.echo(f"recorded: {record_episodes(out_dir, count, seed, terminal())}")
+    click.echo(f"recorded: {record_episodes(out_dir, count, seed, terminal_bar())}")
 
 
 @world.command(short_help="Train LeRobot's ACT on recordings.")
@@ -53,7 +53,7 @@ def train(episodes: Path, output: Path, **options: Any) -> None:
     from balloon_world.train import train as train_policy
 
     try:
-        click.echo(f"trained: {train_policy(episodes, output, progress=terminal(), **options)}")
+        click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), **options)}")
     except KeyboardInterrupt:
         click.echo("\nrover: stopped; the same command goes on where it was", err=True)
         raise click.exceptions.Exit(130) from None
@@ -69,7 +69,7 @@ def trial(artifact: Path, worlds: int, seed: int, as_json: bool) -> None:
     from balloon_world.trial import run_trials
     from rover_lib.onboard.policy.load import load_policy
 
-    report = run_trials(load_policy(artifact), worlds, seed, progress=terminal())
+    report = run_trials(load_policy(artifact), worlds, seed, progress=terminal_bar())
     low, high = report.wilson
     result = {"hits": report.hits, "trials": report.trials, "wilson_low": low, "wilson_high": high}
     show(result, as_json)
@@ -129,10 +129,10 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
     it is ended at any moment, the same command continues where it was.
     """
     from balloon_world.frontier import sentences, table
-    from balloon_world.students import measured
+    from balloon_world.students import judge_students
     from rover_lib.workshop.run.run import execute
 
-    content = measured(teacher_run, student_runs, progress=terminal(), **options)
+    content = judge_students(teacher_run, student_runs, progress=terminal_bar(), **options)
     given = {"students": [str(run.resolve()) for run in student_runs], "worlds": options["worlds"]}
     episodes = str(options["episodes"].resolve()) if options["episodes"] else ""
     execute("08_distill", teacher_run, **given, episodes=episodes)
@@ -163,12 +163,12 @@ def learn(run_dir: Path, out: Path | None, worlds: int, as_json: bool, **options
     RUN_DIR. If it is ended at any moment, the same command continues where it was; with more --worlds, it drives only
     in those that are missing.
     """
-    from balloon_world.learn import Experiment, measured, table
+    from balloon_world.learn import Experiment, run_experiment, table
     from rover_lib.workshop.run.run import execute
 
     run_dir = run_dir.resolve()
     experiment = Experiment(worlds=worlds, other_worlds=max(1, worlds // 2), **options)
-    content = measured(run_dir, out or run_dir.with_name(f"{run_dir.name}-learn"), experiment, terminal())
+    content = run_experiment(run_dir, out or run_dir.with_name(f"{run_dir.name}-learn"), experiment, terminal_bar())
     execute("09_learn", run_dir)
     if as_json:
         return click.echo(json.dumps(content, indent=2))

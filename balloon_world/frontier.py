@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rover_lib.workshop.judge.compare import gate
-from rover_lib.workshop.judge.recorded_range import shown_pct, worst
+from rover_lib.workshop.judge.recorded_range import format_pct, worst
 from rover_lib.workshop.notebook_table import Table
 
 NOBODY_DROVE = "Nobody drove: judged by errors on recordings alone."
@@ -24,7 +24,7 @@ def sign_test(only_one: int, only_other: int) -> float:
     return min(1.0, 2 * sum(math.comb(n, k) for k in range(fewer + 1)) / 2**n)
 
 
-def paired(row: Mapping[str, Any], teacher: Mapping[str, Any], drive: str) -> dict[str, Any] | None:
+def pair_worlds(row: Mapping[str, Any], teacher: Mapping[str, Any], drive: str) -> dict[str, Any] | None:
     """Compare a student with its teacher in the same worlds: count the worlds that only one of them hit.
 
     drive: a key of DRIVES. Returns None if either did not drive that way.
@@ -142,7 +142,7 @@ def _rule(limits: Mapping[str, Any], drove: bool) -> str:
 
 
 def _in_pairs(row: Mapping[str, Any], teacher: Mapping[str, Any], drive: str) -> str:
-    found = paired(row, teacher, drive)
+    found = pair_worlds(row, teacher, drive)
     if found is None:
         return "not driven."
     uneven, even = found["only_student"] + found["only_teacher"], found["sign_test_p"]
@@ -165,4 +165,4 @@ def _of(row: Mapping[str, Any], drive: str) -> str:
 
 
 def _plain(value: float | None) -> str:
-    return shown_pct(value).strip().removesuffix(" %")
+    return format_pct(value).strip().removesuffix(" %")

@@ -328,7 +328,7 @@ def from_above(drive: LateDrive, condition: Condition) -> dict[str, Any]:
     }
 
 
-def measured(
+def measure_latencies(
     run_dir: Path | str,
     *,
     worlds: int,
@@ -388,12 +388,12 @@ def measured(
         "policy": {"chunk": policies[0].chunk, "rate_hz": policies[0].rate_hz},
         "rows": rows,
         "gates": gates(rows, limit),
-        "from_above": _shown(reports, shown_ms),
+        "from_above": _choose_shown(reports, shown_ms),
     }
     return write_stage(path, "drive", params=given, metrics=metrics, inputs=inputs)
 
 
-def _shown(reports: Sequence[LatencyReport], shown_ms: float | None) -> list[dict[str, Any]]:
+def _choose_shown(reports: Sequence[LatencyReport], shown_ms: float | None) -> list[dict[str, Any]]:
     """Return, for one latency, the world in which the drives with and without compensation differ most."""
     pair = [
         r

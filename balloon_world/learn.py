@@ -176,7 +176,7 @@ class Experiment:
         return recipe.of_steps(self.steps) if self.steps else recipe
 
 
-def measured(
+def run_experiment(
     run_dir: Path | str, out_dir: Path | str, experiment: Experiment | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
     """Run both arms, round by round; write and return learn.json in the run's folder, stage 'learn'.
@@ -209,7 +209,7 @@ def measured(
     return write_stage(path, "learn", params=given, metrics=metrics, inputs=inputs)
 
 
-def left(run_dir: Path | str) -> dict[str, Any] | None:
+def read_experiment(run_dir: Path | str) -> dict[str, Any] | None:
     """Read what `measured` left in a run's folder; None if there is nothing."""
     path = Path(run_dir) / "learn.json"
     return read_stage(path, "learn") if path.is_file() else None
@@ -289,7 +289,7 @@ class _Lab:
     def _drive(self, artifact: Path, number: int) -> list[dict[str, Any]]:
         """Return a round's drives with a human beside the track, and first record those that are missing."""
         folder = self.folder / _name(CORRECTED, number)
-        done = _swept(folder)
+        done = _sweep_unfinished(folder)
         missing = [i for i in range(self.experiment.drives) if i not in done]
         if missing:
 
@@ -307,7 +307,7 @@ class _Lab:
     def _demonstrate(self, number: int, most_s: float) -> None:
         """Record most_s seconds of whole drives by the expert; the last drive is cut."""
         folder = self.folder / _name(DEMONSTRATED, number)
-        _swept(folder)
+        _sweep_unfinished(folder)
         i, left_s = 0, most_s
         while left_s > HALF_A_TICK_S:
             rows = _drives_of(folder)
@@ -373,7 +373,7 @@ def _drives_of(folder: Path, wanted: str = "drive") -> dict[int, dict[str, Any]]
     return {r["drive"]: r for r in _rows(folder / DRIVES_FILE) if wanted == "drive" or r[wanted]}
 
 
-def _swept(folder: Path) -> dict[int, dict[str, Any]]:
+def _sweep_unfinished(folder: Path) -> dict[int, dict[str, Any]]:
     """Return the drives that are complete, and remove what a killed process left of others."""
     done = _drives_of(folder)
     number = int(folder.name.rpartition("-")[2])

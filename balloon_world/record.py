@@ -21,7 +21,7 @@ from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.recording import episode as recording
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
-from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.progress import Progress, silent
 
 LABEL = "hit red balloon"
@@ -65,7 +65,7 @@ def record_episodes(
         raise WorldError(
             f"{out_dir}: exists and is not this recording", remedy="name another folder, or move it away first"
         )
-    made = cached_folder("episodes", key, lambda folder: _record_all(folder, count, seed, key, progress))
+    made = cache_folder("episodes", key, lambda folder: _record_all(folder, count, seed, key, progress))
     out_dir.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=out_dir.parent, prefix=f".{out_dir.name}."))
     try:
@@ -121,7 +121,7 @@ class WorldEpisode:
     def __init__(self, folder: Path, start: datetime, world: World):
         car = this_car()
         self._world, self._pwm, self._start_s = world, car.pwm, start.timestamp()
-        self._periods = [_measured_us(c.period_us) for c in (self._pwm.steering, self._pwm.throttle)]
+        self._periods = [_round_us(c.period_us) for c in (self._pwm.steering, self._pwm.throttle)]
         self.writer = EpisodeWriter(
             folder / episode_name(start),
             About(LABEL, fps=RATE_HZ, start_time_s=self._start_s, arduino_port="playground", car=car),
@@ -144,7 +144,7 @@ class WorldEpisode:
         t_s = self._world.state.time_s
         self.writer.frame(self._start_s + t_s, self._world.render())
         pulses = self._pwm.pulses(steering, throttle)
-        measured = _measured_us(pulses.steering_us), _measured_us(pulses.throttle_us)
+        measured = _round_us(pulses.steering_us), _round_us(pulses.throttle_us)
         at_s = self._start_s + t_s + CONTROL_LATENCY_S
         self.writer.control(at_s, round(1000 * t_s), *measured, *self._periods, **extra)
         sent = self._pwm.actions_from_pulses(*measured, *self._periods)
@@ -152,6 +152,6 @@ class WorldEpisode:
         return sent.steering, sent.throttle
 
 
-def _measured_us(pulse_us: float) -> int:
+def _round_us(pulse_us: float) -> int:
     """Round a pulse to the steps of the Arduino's timer."""
     return int(np.round(pulse_us / ARDUINO_STEP_US)) * ARDUINO_STEP_US

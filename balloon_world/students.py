@@ -81,7 +81,7 @@ class _Run:
         return 1e3 * self.manifest["gmac"] / PI5_SEEN_GMAC_PER_S
 
 
-def measured(
+def judge_students(
     run_dir: Path | str,
     students: Sequence[Path | str],
     *,
@@ -142,7 +142,7 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
     names = [student.name for student in students]
     if not names or len({*names, TEACHER}) <= len(names):
         raise DistillError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
-    taught = [_distilled(student) for student in students]
+    taught = [_read_distilled(student) for student in students]
     if (own := folder / "distill.json").is_file() and says_how_it_was_taught(own):
         raise DistillError(
             f"{folder}: was distilled itself, and its distill.json would be lost", remedy="begin with its own teacher"
@@ -170,7 +170,7 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
     return runs
 
 
-def _distilled(student: Path) -> dict[str, Any]:
+def _read_distilled(student: Path) -> dict[str, Any]:
     """Read the distill.json that `rover distill` left in a student's run."""
     path = student / "distill.json"
     if not path.is_file():
@@ -310,7 +310,7 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
     for name in asked:
         key = key_of(alike | {"how": name, "latency_ms": pushed_ms if name else None}, *sources)
         files[name] = cache_root() / f"drives-{key}.jsonl"
-    found = _driven(run, asked, files, range(SEED, SEED + worlds), progress)
+    found = _drive(run, asked, files, range(SEED, SEED + worlds), progress)
     row: dict[str, Any] = {"pushed_latency_ms": pushed_ms if worlds else None}
     for name in DRIVES:
         missed = [seed for seed, outcome in found[name].items() if outcome != "hit"] if name in found else None
@@ -326,7 +326,7 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
     return row
 
 
-def _driven(
+def _drive(
     run: _Run, asked: Mapping[str, Drive], files: Mapping[str, Path], seeds: range, progress: Progress
 ) -> dict[str, dict[int, str]]:
     """Return the outcomes by seed of each kind of drive.

@@ -41,8 +41,8 @@ from rover_learn.training import (
     optimiser,
     policy_loss,
     recorded_spread,
-    seeded,
-    swapped_states,
+    seed_inside,
+    swap_states,
     threads,
     to_cpu,
 )
@@ -53,7 +53,7 @@ from rover_lib.onboard.policy.preprocess import normalise
 from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop import act as act_module
 from rover_lib.workshop.act import ActConfig, lerobot_act
-from rover_lib.workshop.cache import cache_root, cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, cache_root, key_of
 from rover_lib.workshop.checkpoint.files import trainer_config
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import episodes as episodes_module
@@ -210,7 +210,7 @@ def train(
             with atomic_path(folder / "best_model.pth") as temporary:
                 torch.save({**trained, "config": config}, temporary)
 
-    made = cached_folder("checkpoint", key, make) / "best_model.pth"
+    made = cache_folder("checkpoint", key, make) / "best_model.pth"
     shutil.rmtree(unfinished, ignore_errors=True)
     with atomic_path(out_path) as temporary:
         shutil.copyfile(made, temporary)
@@ -274,7 +274,7 @@ def _train(
     plan = _plan(size, first, recipe, len(data), len(judges))
     saved.work = sum(count * cost for count, cost in plan.values())
 
-    with seeded(seed):
+    with seed_inside(seed):
         policy = lerobot_act(size)
         # Start with plans near the mean action: those of an untrained head are wild.
         with torch.no_grad():
@@ -414,7 +414,7 @@ def _transformer_steps(training: _Training, chosen: np.ndarray, views: dict[str,
     for step in training.steps("transformer", policy=policy, optimizer=optimizer, scheduler=scheduler):
         kept = training.rows(recipe.transformer_batch, len(chosen))
         rows = chosen[kept]
-        states, chunks = swapped_states(data, rows, training.rng), data.chunks[rows].copy()
+        states, chunks = swap_states(data, rows, training.rng), data.chunks[rows].copy()
         if step % 2:
             states[:, 0] *= -1
             chunks[:, :, 0] *= -1

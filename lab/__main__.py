@@ -11,7 +11,7 @@ import click
 from rover_lib.onboard.cli import ARTIFACT, FILE, Rover, drive_options, run_drive, show
 from rover_lib.onboard.kinds import Number
 from rover_lib.onboard.policy.confine import AS_ROOT
-from rover_lib.workshop.progress import terminal
+from rover_lib.workshop.progress import terminal_bar
 
 
 @click.group("lab", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -76,13 +76,13 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as
     from rover_lib.workshop.run.run import execute
 
     if pi4:
-        content = count_other_core(run_dir, A72, progress=terminal())
+        content = count_other_core(run_dir, A72, progress=terminal_bar())
         return click.echo(json.dumps(content, indent=2) if as_json else other_core_table(content))
-    count_run(run_dir, frames=frames, jobs=jobs, progress=terminal())
+    count_run(run_dir, frames=frames, jobs=jobs, progress=terminal_bar())
     if peers:
         from lab.a76.peers import count_peers
 
-        count_peers(run_dir, jobs=jobs, progress=terminal())
+        count_peers(run_dir, jobs=jobs, progress=terminal_bar())
     execute("06_arm", run_dir)
     content = read_stage(run_dir / "arm.json", "arm")
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
@@ -102,7 +102,7 @@ def full(run_dir: Path, steps: int, learned: bool, **options: Any) -> None:
     """
     from lab.a76.full import LEARNED_NOTE, NOTE, full_run
 
-    made = full_run(run_dir, steps=None if learned else steps, progress=terminal(), **options)
+    made = full_run(run_dir, steps=None if learned else steps, progress=terminal_bar(), **options)
     click.echo(f"made: {made} ({LEARNED_NOTE if learned else NOTE})")
 
 

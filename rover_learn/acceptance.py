@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.workshop.judge.recorded_range import shown_pct
+from rover_lib.workshop.judge.recorded_range import format_pct
 
 CHANCE = 0.05
 LEAST_EPISODES = 6  # with 5, all changed the same way, the chance is 2 in 32
@@ -125,7 +125,7 @@ def summary(content: Mapping[str, Any]) -> str:
         lines.append(f"errors on held-out episodes, % of the recorded range, before and after ({', '.join(actions)})")
         for row in rows:
             pairs = (
-                f"{shown_pct(row[f'before_{a}_pct']).strip()} to {shown_pct(row[f'after_{a}_pct']).strip()}"
+                f"{format_pct(row[f'before_{a}_pct']).strip()} to {format_pct(row[f'after_{a}_pct']).strip()}"
                 for a in actions
             )
             lines.append(f"{row['kind']} {row['episode']}: {'; '.join(pairs)}")

@@ -5,7 +5,7 @@
 A basic block's first convolution gives channels that its second one alone reads; no residual sum sees them. One after
 the other is kept that those before it explain least, and the second convolution is refitted to what all of them gave.
 LeRobot runs such a file as any other. Our policies are built without channels that are always zero
-(`act.folded_block`), and training keeps them so: where a filter and its reader are zero both, neither gets a gradient.
+(`act.fold_block`), and training keeps them so: where a filter and its reader are zero both, neither gets a gradient.
 """
 
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rover_learn.lessons import BatchedPolicy
-from rover_learn.refit import Gram, refitted
+from rover_learn.refit import Gram, refit_layer
 from rover_lib.workshop.act import ActConfig, Weights, backbone_blocks, norm_gain
 
 TILE = 16  # XNNPACK's INT8 kernels compute 16 channels at a time: 17 cost as much as 32
@@ -41,7 +41,7 @@ def without_channels(
     weights: by LeRobot's names without the leading `model.`, of a backbone of basic blocks. share: above 0, at most 1.
     pictures: (B, height, width, 3) uint8 RGB each, of the policy's size. rng: chooses where in the pictures.
     Returns the weights, float32, and of each block that lost channels {"block", "channels", "of", "error_pct",
-    "error_refit_pct"}: how far its second convolution is off on the pictures, see `refit.refitted`.
+    "error_refit_pct"}: how far its second convolution is off on the pictures, see `refit.refit_layer`.
     """
     made = {name: weight.detach().float().cpu().clone() for name, weight in weights.items()}
     names = backbone_blocks(config.backbone)
@@ -49,7 +49,7 @@ def without_channels(
     names = [name for name in names if kept_of(widths[name], share) < widths[name]]
     notes = []
     for name, gram in _grams(BatchedPolicy(config, made), names, pictures, rng).items():
-        kept = _chosen(gram, made[f"{name}.conv2.weight"], kept_of(widths[name], share))
+        kept = _choose(gram, made[f"{name}.conv2.weight"], kept_of(widths[name], share))
         errors = _leave_out(made, name, kept, gram)
         notes.append({"block": name, "channels": len(kept), "of": widths[name], **errors})
     return made, notes
@@ -78,7 +78,7 @@ def _grams(
     return {name: gram.mean() for name, gram in grams.items()}
 
 
-def _chosen(gram: Tensor, reader: Tensor, count: int) -> Tensor:
+def _choose(gram: Tensor, reader: Tensor, count: int) -> Tensor:
     """(count,) channels, in order: the next is always the one that those before it explain least, times its reader.
 
     That is a Cholesky decomposition with pivots. What a channel means alone, by its size or by its gradient, says
@@ -104,7 +104,7 @@ def _leave_out(weights: dict[str, Tensor], name: str, kept: Tensor, gram: Tensor
     outputs, channels = reader.shape[:2]
     whole = torch.cat([reader.double().flatten(1), torch.zeros(outputs, 1, dtype=torch.float64)], 1).T
     inputs = (kept[:, None] * TAPS + torch.arange(TAPS)).flatten()
-    refit, errors = refitted(whole, gram, inputs)
+    refit, errors = refit_layer(whole, gram, inputs)
     gone = torch.ones(channels, dtype=torch.bool)
     gone[kept] = False
     for part in ("conv1.weight", "bn1.weight", "bn1.bias"):

@@ -9,7 +9,7 @@ import click
 from rover_lib.cli.prepare import CHECKPOINT, EPISODES, size_option, with_source
 from rover_lib.onboard.cli import AS_JSON, FILE
 from rover_lib.onboard.kinds import Number
-from rover_lib.workshop.progress import terminal
+from rover_lib.workshop.progress import terminal_bar
 
 if TYPE_CHECKING:
     from rover_lib.workshop.recordings.samples import Source
@@ -65,7 +65,7 @@ def distill(
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
     shape = StudentShape(height, width, **parts)
     recipe = DistillRecipe.of(params(), steps, samples, seed, phases_of(shape, options["qat"]))
-    folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal(), **options)
+    folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal_bar(), **options)
     content = read_stage(folder / "distill.json", "distill")
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
 
@@ -110,7 +110,7 @@ def finetune(
 
     recipe = FinetuneRecipe.of(params(), correction_weight=weight, samples=samples, seed=seed)
     recipe = recipe.of_steps(steps) if steps else recipe
-    folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal(), **options)
+    folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal_bar(), **options)
     content = read_stage(folder / "finetune.json", "finetune")
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
 
@@ -135,7 +135,7 @@ def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | N
     jobs, folder = sweeping.Sheet.read(sheet).jobs(), out or Path("runs") / sheet.stem
     cluster = sweeping.on_cluster(scheduler) if scheduler else sweeping.on_this_machine(workers)
     with cluster as client:
-        failed = sweeping.sweep(jobs, folder, client, together=bool(scheduler), progress=terminal())
+        failed = sweeping.sweep(jobs, folder, client, together=bool(scheduler), progress=terminal_bar())
     content = sweeping.write_report(jobs, folder, failed)
     if as_json:
         click.echo(json.dumps(content, indent=2))

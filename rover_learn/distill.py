@@ -41,7 +41,7 @@ from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint.files import write_both, written_in
+from rover_lib.workshop.checkpoint.files import find_written, write_both
 from rover_lib.workshop.checkpoint.lerobot import read_origin
 from rover_lib.workshop.int8.choose import Chooser
 from rover_lib.workshop.int8.export import export
@@ -49,7 +49,7 @@ from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, quantize
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.judge.compare import gate
-from rover_lib.workshop.judge.recorded_range import Range, not_judged, pct_of_range, shown_pct, worst
+from rover_lib.workshop.judge.recorded_range import Range, format_pct, not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 from rover_lib.workshop.recordings.samples import Source, pick_evenly
@@ -57,7 +57,7 @@ from rover_lib.workshop.run import pipeline as quantization
 from rover_lib.workshop.run.run import files_of_a_run
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC, Opened, load, training_device
-from rover_lib.workshop.swap_folder import made_beside
+from rover_lib.workshop.swap_folder import build_beside
 from rover_lib.workshop.untrusted import numbers
 
 PHASES = ("backbone", "transformer", "together", "qat")
@@ -167,11 +167,11 @@ def distill(
         remedy = "give it a smaller picture, fewer layers or channels, or train it for INT8 with --qat"
         raise DistillError("this student would be its teacher", remedy=remedy)
     with (
-        made_beside(folder, _of_an_earlier_student) as new,
+        build_beside(folder, _of_an_earlier_student) as new,
         threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()),
     ):
         _refuse_another_policy(folder, teacher)
-        taught = _taught(work)
+        taught = _teach(work)
         _leave(new, name, work, taught)
     shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
     return folder
@@ -251,7 +251,7 @@ class _Taught:
     folder: Path
 
 
-def _taught(work: _Work) -> _Taught:
+def _teach(work: _Work) -> _Taught:
     """All phases. What depends on teacher, picture and samples alone stays in the cache, for its next student."""
     progress = work.progress
     samples = pick_evenly(work.opened.parts.calibration, work.recipe.samples)
@@ -398,10 +398,10 @@ def _start(room: _Room, backbone: dict[str, Tensor], folder: Path) -> tuple[dict
             weights, thinner = without_channels(weights, work.config, work.share, shown, work.rng("channels"))
         with atomic_path(path) as temporary:
             torch.save((weights, {"backbone": thinner, "feed_forward": narrowed}), temporary)
-    return _kept(path)
+    return _read_phase(path)
 
 
-def _kept(path: Path) -> Any:
+def _read_phase(path: Path) -> Any:
     """What a phase left. Raises TrainingError for a damaged file."""
     try:
         return torch.load(path, weights_only=True)
@@ -443,10 +443,10 @@ def _train_rounded(room: _Room, policy: BatchedPolicy, saved: Resumable, folder:
     work, recipe = room.work, room.work.recipe
     path, student = folder / "ranges.pt", _checkpoint(work, policy.weights())  # as it was before this phase
     if not path.exists():
-        calibration, scheme = _calibrated(work, student)
+        calibration, scheme = _calibrate(work, student)
         with atomic_path(path) as temporary:
             torch.save({"calibration": calibration.__dict__, "scheme": asdict(scheme)}, temporary)
-    kept = _kept(path)
+    kept = _read_phase(path)
     rounded = RoundedPolicy(student, Scheme(**kept["scheme"]), Calibration(**kept["calibration"])).to(work.device)
     exact = BatchedPolicy(work.config, student.weights).to(work.device)
     optimizer, scheduler = optimiser(policy.parameters(), recipe.qat_rate, max(recipe.qat_steps, 1))
@@ -465,7 +465,7 @@ def _checkpoint(work: _Work, weights: dict[str, Tensor]) -> Checkpoint:
     return Checkpoint(Path("student"), "trainer", work.config, weights, "not written yet", {})
 
 
-def _calibrated(work: _Work, student: Checkpoint) -> tuple[Calibration, Scheme]:
+def _calibrate(work: _Work, student: Checkpoint) -> tuple[Calibration, Scheme]:
     """Calibration, and static INT8 with the observer that loses least: as a run of the student would have them."""
     p, parts = params(), work.opened.parts
     how = quantization.Recipe.of(p)
@@ -476,10 +476,10 @@ def _calibrated(work: _Work, student: Checkpoint) -> tuple[Calibration, Scheme]:
     return calibration, chooser.observer(how.scheme, p["quantization"]["observers"], work.progress)[0]
 
 
-def _rounded(work: _Work, weights: dict[str, Tensor]) -> tuple[QuantizedPolicy, Calibration]:
+def _quantize(work: _Work, weights: dict[str, Tensor]) -> tuple[QuantizedPolicy, Calibration]:
     """A student in static INT8, and what calibrated it."""
     student = _checkpoint(work, weights)
-    calibration, scheme = _calibrated(work, student)
+    calibration, scheme = _calibrate(work, student)
     return quantize(student, scheme, calibration), calibration
 
 
@@ -552,13 +552,13 @@ def summary(content: dict[str, Any]) -> str:
             shape += f", {share:.0%} of the backbone's channels"
         pairs = []
         for to in ("teacher", "recorded"):
-            errors = [shown_pct(row[f"{to}_{action}_pct"]).strip() for action in actions]
+            errors = [format_pct(row[f"{to}_{action}_pct"]).strip() for action in actions]
             pairs.append(f"to the {'teacher' if to == 'teacher' else 'recordings'} {', '.join(errors)}")
         lines.append(f"{row['name']}: {shape}, {row['gmac']:.2f} GMAC; {'; '.join(pairs)}")
     for title, errors in (("before quantization-aware training", metrics["before_qat"]), ("", metrics["students"][1])):
         if errors:
             own, teachers = (
-                ", ".join(shown_pct(errors[f"{name}_{action}_pct"]).strip() for action in actions)
+                ", ".join(format_pct(errors[f"{name}_{action}_pct"]).strip() for action in actions)
                 for name in ("int8", "int8_teacher")
             )
             lines.append(f"in INT8{f', {title}' if title else ''}: to its own FP32 {own}; to the teacher {teachers}")
@@ -587,11 +587,11 @@ def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
             (_row(name, work.config, taught.weights, work.share, work.qat), own),
         )
     ]
-    rounded, calibration = _rounded(work, taught.weights)
+    rounded, calibration = _quantize(work, taught.weights)
     students[1] |= _int8_errors(work, taught.weights, rounded, held_out, planned)
     unrounded = None
     if taught.unrounded:
-        unrounded = _int8_errors(work, taught.unrounded, _rounded(work, taught.unrounded)[0], held_out, planned)
+        unrounded = _int8_errors(work, taught.unrounded, _quantize(work, taught.unrounded)[0], held_out, planned)
     chosen = _plans(work, work.config, taught.weights, choosing)
     driven = ~np.stack([s.is_pad for s in choosing])
     loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
@@ -606,7 +606,7 @@ def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
         "seed": work.recipe.seed,
     }
     hashes = write_both(new, work.config, taught.weights, loss, origin, **settings)
-    student = load_checkpoint(written_in(new))
+    student = load_checkpoint(find_written(new))
     samples, parity = pick_evenly(parts.choosing, quantization.CHOOSING_FRAMES), quantization.Recipe.of(params()).parity
     export(rounded, student, new / "policy_static.pt", samples, calibration, parity)
     write_stage(

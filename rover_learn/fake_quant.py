@@ -26,12 +26,12 @@ from rover_lib.workshop.act import (
     backbone_blocks,
     block_of,
     fits_columns,
-    folded,
-    folded_block,
+    fold,
+    fold_block,
     of_columns,
 )
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.int8.observe import Calibration, RangeObserver, observed_graph, scaled_model
+from rover_lib.workshop.int8.observe import Calibration, RangeObserver, restore_observed, scale_model
 from rover_lib.workshop.int8.scheme import KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 
 
@@ -58,10 +58,10 @@ class RoundedPolicy(nn.Module):
     def __init__(self, checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration):
         super().__init__()
         self.config = checkpoint.config
-        self.graph = observed_graph(checkpoint, scheme, calibration)
+        self.graph = restore_observed(checkpoint, scheme, calibration)
         _round_activations(self.graph)
         plain = ACT(checkpoint.config, checkpoint.weights, for_int8=True)
-        scaled = scaled_model(checkpoint, calibration, for_int8=True)
+        scaled = scale_model(checkpoint, calibration, for_int8=True)
         self.rounds = {
             name
             for name, module in plain.named_modules()
@@ -136,14 +136,14 @@ def parameters(config: ActConfig, weights: Mapping[str, Tensor]) -> Iterator[tup
     def pair(at: Weights) -> Pair:
         return at["weight"], at["bias"]
 
-    stem = folded(w.at("backbone.conv1"), w.at("backbone.bn1"))
+    stem = fold(w.at("backbone.conv1"), w.at("backbone.bn1"))
     yield "backbone.stem.0", of_columns(*stem, config.image_norm[0]) if fits_columns(config) else stem
     kind, _, _ = BACKBONES[config.backbone]
     for name in backbone_blocks(config.backbone):
-        for i, folded_pair in enumerate(folded_block(w.at(name), kind)):
+        for i, folded_pair in enumerate(fold_block(w.at(name), kind)):
             yield f"{name}.body.{2 * i}", folded_pair
         if f"{name}.downsample" in w:
-            yield f"{name}.shortcut", folded(w.at(f"{name}.downsample.0"), w.at(f"{name}.downsample.1"))
+            yield f"{name}.shortcut", fold(w.at(f"{name}.downsample.0"), w.at(f"{name}.downsample.1"))
     yield "image_project", pair(w.at("encoder_img_feat_input_proj"))
     yield "state_project", pair(w.at("encoder_robot_state_input_proj"))
     if config.pre_norm:

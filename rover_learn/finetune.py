@@ -66,7 +66,7 @@ from rover_lib.workshop.recordings.samples import (
 )
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC, check_sizes, training_device
-from rover_lib.workshop.swap_folder import made_beside
+from rover_lib.workshop.swap_folder import build_beside
 from rover_lib.workshop.untrusted import numbers
 
 OLD, NEW = "old", "new"
@@ -149,15 +149,15 @@ def finetune(
     if folder.exists():
         raise _is_there(folder)
     recipe = recipe or FinetuneRecipe.of(params())
-    parent, material = _opened(checkpoint, episodes, recipe, progress)
+    parent, material = _open_work(checkpoint, episodes, recipe, progress)
     work = _Work(parent, material, recipe, where, progress)
     with (
-        made_beside(folder) as new,
+        build_beside(folder) as new,
         threads(1 if gmac(parent.config) < SMALL_GMAC else torch.get_num_threads()),
     ):
         if folder.exists():  # another process has just made it
             raise _is_there(folder)
-        taught = _taught(work)
+        taught = _train_phases(work)
         _leave(new, name, work, taught)
         if folder.exists():  # another command made it meanwhile; what was learned is kept for another name
             raise _is_there(folder)
@@ -225,7 +225,7 @@ class _Material:
         return {name: (min(r[name][0] for r in ranges), max(r[name][1] for r in ranges)) for name in ranges[0]}
 
 
-def _opened(
+def _open_work(
     checkpoint: Path | str, episodes: Sequence[Path | str | Source], recipe: FinetuneRecipe, progress: Progress
 ) -> tuple[Checkpoint, _Material]:
     """Read the checkpoint and the recordings, and check that they belong together."""
@@ -254,10 +254,10 @@ def _opened(
     _refuse_another_car(read)
     _refuse_another_camera(read)
     _refuse_another_rate(read, policies[0].config.rate_hz)
-    return policies[0], _parted(read, recipe)
+    return policies[0], _part_episodes(read, recipe)
 
 
-def _parted(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Material:
+def _part_episodes(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Material:
     """Split the old and the new episodes into those to learn from and those that judge."""
     p = params()["calibration"]
     old = [e for e in read[0].episodes if not e.by_policy]
@@ -382,14 +382,14 @@ class _Taught:
     folder: Path
 
 
-def _taught(work: _Work) -> _Taught:
+def _train_phases(work: _Work) -> _Taught:
     """Train both phases. What the policy sees in each of the recordings stays in the cache, for its next training."""
     sources = [lessons_module, training, preprocess, act]
     recipe, material = work.recipe, work.material
     every = []
     for kind, samples in material.taught:
         folder = cache_root() / f"lessons-{key_of(_sees(work, kind, samples), *sources)}"
-        every.append((kind, _asked(work, kind, samples, folder)))
+        every.append((kind, _make_lessons(work, kind, samples, folder)))
         if kind == DEMONSTRATIONS:
             _refuse_strangers(work, every[-1][1])
     whole = {"lessons": [[kind, each.frames.path.parent.name] for kind, each in every], "recipe": asdict(recipe)}
@@ -429,7 +429,7 @@ def _sees(work: _Work, kind: str, samples: Sequence[Sample]) -> dict[str, Any]:
     }
 
 
-def _asked(work: _Work, kind: str, samples: tuple[Sample, ...], folder: Path) -> Lessons:
+def _make_lessons(work: _Work, kind: str, samples: tuple[Sample, ...], folder: Path) -> Lessons:
     """Make or complete the lessons: what the policy sees and plans on these samples before it learns."""
     config = work.parent.config
     channels = work.parent.weights["encoder_img_feat_input_proj.weight"].shape[1]
@@ -563,7 +563,7 @@ def _train(room: _Room, policy: BatchedPolicy, saved: Resumable, phase: str) -> 
 # --- judging and leaving ----------------------------------------------------------------------------------------------
 
 
-def _judged(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
+def _judge(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
     """Judge each held-out episode with the policy as it was before and after."""
     action_range = work.material.action_range()
     policies = [BatchedPolicy(work.parent.config, each).to(work.device) for each in (work.parent.weights, weights)]
@@ -585,7 +585,7 @@ def _judged(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
 def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
     """Judge the policy, and write its files and finetune.json into `new`, which becomes the run's folder."""
     parent, material, recipe = work.parent, work.material, work.recipe
-    judged = _judged(work, taught.weights)
+    judged = _judge(work, taught.weights)
     errors = [e for each in judged if each.kind == OLD for e in each.after.values() if e is not None]
     described = asdict(recipe) | {"device": work.device.type}
     origin = {"parent_sha256": parent.sha256, "parent_format": parent.format, "finetuned_by": described}

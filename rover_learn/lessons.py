@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_learn.training import Frames, Given, Resumable, RowFile, frames_of, swapped_states
+from rover_learn.training import Frames, Given, Resumable, RowFile, frames_of, swap_states
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine, lerobot_act
@@ -157,7 +157,7 @@ class Lessons:
         data = frames_of(samples, *size)
         grid = config.grid(*size)
         rows = np.arange(len(data))
-        asked = np.stack([swapped_states(data, rows, rng) for _ in VIEWS], 1)
+        asked = np.stack([swap_states(data, rows, rng) for _ in VIEWS], 1)
         asked[:, MIRRORED] *= MIRROR
         return cls(
             samples,

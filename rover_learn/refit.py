@@ -2,7 +2,7 @@
 
 gram = Gram()
 gram.add(rows)                                        # what the layer reads; may be called repeatedly
-weight, errors = refitted(whole, gram.mean(), kept)
+weight, errors = refit_layer(whole, gram.mean(), kept)
 """
 
 import torch
@@ -43,7 +43,7 @@ class Gram:
         self._count += len(x)
 
 
-def refitted(whole: Tensor, gram: Tensor, kept: Tensor) -> tuple[Tensor, dict[str, float]]:
+def refit_layer(whole: Tensor, gram: Tensor, kept: Tensor) -> tuple[Tensor, dict[str, float]]:
     """Compute the weights of the inputs that stay, by least squares.
 
     whole: (inputs + 1, outputs) float64, a row of weights for each input, and the bias last. gram: from `Gram.mean`.

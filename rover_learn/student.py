@@ -19,13 +19,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rover_learn.refit import Gram, refitted
+from rover_learn.refit import Gram, refit_layer
 from rover_lib.onboard.errors import DistillError
 from rover_lib.workshop.act import ACT, BACKBONES, ActConfig, FeedForward, multiply_accumulates
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.checkpoint.contents import expected_shapes
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
-from rover_lib.workshop.untrusted import listed
+from rover_lib.workshop.untrusted import quote_all
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def not_a_cars(config: ActConfig) -> str | None:
     c = config
     if len(c.cameras) == 1 and c.state_names == c.action_names == ACTION_NAMES:
         return None
-    states, actions = listed(c.state_names), listed(c.action_names)
+    states, actions = quote_all(c.state_names), quote_all(c.action_names)
     return f"{len(c.cameras)} cameras, of state {states}, of action {actions}"
 
 
@@ -125,7 +125,7 @@ def initial_weights(
     notes = []
     wide = replace(config, feedforward=teacher.config.feedforward)
     for name, gram in _grams(ACT(wide, teacher.weights), inputs).items():
-        layer, notes_of_layer = _narrowed(kept, name, gram, config.feedforward)
+        layer, notes_of_layer = _narrow(kept, name, gram, config.feedforward)
         kept |= layer
         notes.append(notes_of_layer)
     return kept, notes
@@ -170,14 +170,14 @@ def _lerobots(name: str) -> str:
     return f"{part}.layers.{index}"
 
 
-def _narrowed(
+def _narrow(
     weights: dict[str, Tensor], layer: str, gram: Tensor, units: int
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Keep one feed-forward's most important units, and refit `down` to the output that all units gave."""
     down, bias = weights[f"{layer}.linear2.weight"].double(), weights[f"{layer}.linear2.bias"].double()
     magnitude = gram[-1, :-1].abs() if (gram[-1, :-1] >= 0).all() else gram.diagonal()[:-1].sqrt()
     best = (magnitude * down.norm(dim=0)).topk(units).indices.sort().values
-    refit, errors = refitted(torch.cat([down, bias[:, None]], 1).T, gram, best)
+    refit, errors = refit_layer(torch.cat([down, bias[:, None]], 1).T, gram, best)
     made = {
         f"{layer}.linear1.weight": weights[f"{layer}.linear1.weight"][best].clone(),
         f"{layer}.linear1.bias": weights[f"{layer}.linear1.bias"][best].clone(),

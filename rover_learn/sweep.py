@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import yaml
 
-from rover_lib.onboard.columns import aligned, number
+from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import FOR_THIS_RUN, params, read_params
 from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
@@ -223,7 +223,7 @@ class Notebooks:
         """Teach the student in the run's own folder, or continue; return its checkpoint."""
         from rover_learn.distill import DistillRecipe, distill, phases_of
         from rover_learn.student import StudentShape
-        from rover_lib.workshop.checkpoint.files import written_in
+        from rover_lib.workshop.checkpoint.files import find_written
 
         _check_student(job.student)
         options = dict(job.student)
@@ -235,13 +235,13 @@ class Notebooks:
         made = distill(
             job.checkpoint, job.episodes, job.name, shape, runs_dir=folder, recipe=recipe, qat=qat, device="cpu"
         )
-        return written_in(made)
+        return find_written(made)
 
 
 @contextmanager
 def _settings_of(job: Job, folder: Path) -> Iterator[None]:
     """Apply the job's own values of params.yml inside the block, for this process and the kernels that it starts."""
-    from rover_lib.workshop.run.run import environment
+    from rover_lib.workshop.run.run import set_environment
 
     values: dict[str, Any] = {}
     for place, value in job.params.items():
@@ -253,7 +253,7 @@ def _settings_of(job: Job, folder: Path) -> Iterator[None]:
     path = folder / f".{job.name}.yml"
     path.write_text(yaml.safe_dump(values))
     try:
-        with environment({FOR_THIS_RUN: str(path)}):
+        with set_environment({FOR_THIS_RUN: str(path)}):
             yield
     finally:
         path.unlink(missing_ok=True)
@@ -439,7 +439,7 @@ def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> l
         if "benchmark" not in parts_done(job, Path(folder), marks[job.name]):
             continue
         compared = read_stage(run / "compare.json", "compare")["metrics"]
-        timed = _timed(run)
+        timed = _read_times(run)
         mode = compared["modes"][MODE]
         ours = [mode[f"{action}_mae_pct"] for action in compared["action_range"]]
         recorded = [mode.get(f"{action}_vs_recorded_pct") for action in compared["action_range"]]
@@ -461,7 +461,7 @@ def rows(jobs: Sequence[Job], folder: Path | str, marks: Mapping[str, str]) -> l
     return found
 
 
-def _timed(run: Path) -> dict[str, Any]:
+def _read_times(run: Path) -> dict[str, Any]:
     """Read the benchmark of the run's artifacts. Raises SweepError if there is none."""
     path = benchmark_of(run, read_stage(run / "quantize.json", "quantize")["metrics"]["modes"])
     if path is None:
@@ -503,4 +503,4 @@ def table(found: Sequence[Mapping[str, Any]]) -> list[str]:
         times = [number(row["latency_p50_ms"]), number(row["size_mb"])]
         lines.append(["*" if row["best"] else "", row["name"], *figures, *times, hits])
     names = max(len(line[1]) for line in lines)
-    return aligned([[line[0], line[1].ljust(names), *line[2:]] for line in lines])
+    return align([[line[0], line[1].ljust(names), *line[2:]] for line in lines])

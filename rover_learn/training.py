@@ -255,7 +255,7 @@ class Resumable:
 
 
 @contextmanager
-def seeded(seed: int) -> Iterator[None]:
+def seed_inside(seed: int) -> Iterator[None]:
     """Seed torch's random numbers inside the block, and restore their state afterwards."""
     devices = list(range(torch.cuda.device_count()))
     with torch.random.fork_rng(devices=devices):
@@ -277,7 +277,7 @@ def threads(count: int) -> Iterator[None]:
 def batch_of(data: Frames, rows: np.ndarray, rng: np.random.Generator, device: torch.device) -> dict[str, Tensor]:
     """Return a batch to train on: in another light, half of the samples mirrored, and half of the states swapped."""
     flipped = rng.random(len(rows)) < 0.5
-    images, states, chunks = data.images[rows], swapped_states(data, rows, rng), data.chunks[rows].copy()
+    images, states, chunks = data.images[rows], swap_states(data, rows, rng), data.chunks[rows].copy()
     images[flipped] = images[flipped, :, ::-1]
     states[flipped, 0] *= -1
     chunks[flipped, :, 0] *= -1
@@ -290,7 +290,7 @@ def batch_of(data: Frames, rows: np.ndarray, rng: np.random.Generator, device: t
     }
 
 
-def swapped_states(data: Frames, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def swap_states(data: Frames, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return these rows' states, (n, 2) float32, with half of those in motion replaced by another moving frame's."""
     states = data.states[rows].copy()
     moving = np.flatnonzero(data.states[:, 1] >= STANDING_THROTTLE)

@@ -36,7 +36,7 @@ import numpy as np
 from lab.debian import fetch_packages, install_packages, missing_packages, unpack_packages
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.confine import AS_ROOT
-from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run_program import last_words, run
 
@@ -123,7 +123,7 @@ def build_plugin() -> Path:
         # The emulator's functions need no library here: they are resolved when it loads the plugin.
         run("gcc", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "count.so", PLUGIN, error=CountError)
 
-    return cached_folder("arm-plugin", key_of({}, PLUGIN), make) / "count.so"
+    return cache_folder("arm-plugin", key_of({}, PLUGIN), make) / "count.so"
 
 
 def _userland(cpu: str) -> Path:
@@ -135,9 +135,7 @@ def _userland(cpu: str) -> Path:
         (root / "proc" / "cpuinfo").unlink()
         _write_cpuinfo(root, cpu)
 
-    return cached_folder(
-        "arm-userland", key_of(recipe, REQUIREMENTS), _make_userland if cpu == A76 else of_another_core
-    )
+    return cache_folder("arm-userland", key_of(recipe, REQUIREMENTS), _make_userland if cpu == A76 else of_another_core)
 
 
 def _make_userland(root: Path) -> None:

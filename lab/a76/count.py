@@ -15,7 +15,7 @@ from lab.a76.core import FOR_GUEST, GUEST, Core, emulate_script, fetch_wheels
 from lab.a76.symbols import GuestFunctions, by_kernel
 from rover_lib.onboard.artifact import engines
 from rover_lib.onboard.artifact.manifest import read_manifest
-from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
@@ -43,7 +43,7 @@ def onnxruntime_there() -> Path:
     def make(folder: Path) -> None:
         fetch_wheels(folder, "--require-hashes", *FOR_GUEST, "--requirement", wheels)
 
-    return cached_folder("arm-onnxruntime", key_of({"for": FOR_GUEST}, wheels), make)
+    return cache_folder("arm-onnxruntime", key_of({"for": FOR_GUEST}, wheels), make)
 
 
 def guest_of(artifact: Path) -> Guest:

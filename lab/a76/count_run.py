@@ -28,8 +28,8 @@ from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.judge.recorded_range import pct_of_range
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import pick_evenly
-from rover_lib.workshop.run.pipeline import requantized
-from rover_lib.workshop.run.session import Opened, opened
+from rover_lib.workshop.run.pipeline import requantize
+from rover_lib.workshop.run.session import Opened, open_run
 from rover_lib.workshop.run_program import run
 
 REFERENCE = "policy_fp32"
@@ -73,7 +73,7 @@ def count_run(
             f"{run_dir}: no {REFERENCE}.pt in it", found=sorted(artifacts), remedy="'rover run' makes a run"
         )
     manifests = {stem: read_manifest(path) for stem, path in artifacts.items()}
-    again = opened(run_dir)
+    again = open_run(run_dir)
     samples = pick_evenly(again.parts.held_out, frames)
     if not samples:
         raise CountError(
@@ -83,7 +83,7 @@ def count_run(
     plans = plans_of(manifests, len(samples))
     counts = _count_all(core, artifacts, plans, samples, jobs or os.cpu_count() or 1, progress)
     rows = {stem: artifact_metrics(counts[stem], manifests[stem]) for stem in artifacts}
-    for stem, judged in _judged(artifacts, plans, counts, samples, again, progress).items():
+    for stem, judged in _judge(artifacts, plans, counts, samples, again, progress).items():
         rows[stem] |= judged
     metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows}
     if (run_dir / "load.json").exists() and (note := read_stage(run_dir / "load.json", "load")["metrics"].get("note")):
@@ -107,7 +107,7 @@ def count_other_core(run_dir: Path | str, cpu: str, progress: Progress = silent)
     artifacts = {stem: run_dir / f"{stem}.pt" for stem in (REFERENCE, STATIC)}
     if missing := [path.name for path in artifacts.values() if not path.exists()]:
         raise CountError(f"{run_dir}: no {missing[0]} in it", remedy="'rover run' makes a run")
-    samples = pick_evenly(opened(run_dir).parts.held_out, STEADY)
+    samples = pick_evenly(open_run(run_dir).parts.held_out, STEADY)
     cores = {core: prepare(progress, core) for core in (A76, cpu)}
     counts = {
         (stem, name): partial(count_artifact, core, path, samples, counted=STEADY)
@@ -165,7 +165,7 @@ def _count_all(
     return side_by_side(counts, inferences, "emulated inferences", jobs, progress)
 
 
-def _judged(
+def _judge(
     artifacts: Mapping[str, Path],
     plans: Mapping[str, Plan],
     counts: Mapping[str, Counted],
@@ -221,12 +221,12 @@ def errors_pct(
 def backbone_bits(run_dir: Path, core: Core, checkpoint: Checkpoint, samples: Sequence[Any]) -> dict[str, int]:
     """Check whether policy_static's INT8 backbone gives the same bits in the emulated Pi as on this machine.
 
-    The backbone (up to the image projection's INT8 output) is cut out of the same graph (see pipeline.requantized) and
+    The backbone (up to the image projection's INT8 output) is cut out of the same graph (see pipeline.requantize) and
     run on prepared frames on both. Returns {frames, values, differing}: how many frames there were, how many values
     were compared, and how many of them differ. Raises QuantizeError if policy_static.pt was not made from the run's
     files.
     """
-    backbone = q.backbone_of(requantized(run_dir, checkpoint)).eval()
+    backbone = q.backbone_of(requantize(run_dir, checkpoint)).eval()
     inputs = [q.inputs_of(s, checkpoint.config) for s in samples]
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch, torch.inference_mode():
         folder = Path(scratch)

@@ -84,10 +84,10 @@ def full_run(
     few = replace(recipe, samples=min(samples, CURVE_SAMPLES))
     modes: dict[str, dict[str, Any]] = {}
     for at in curve:
-        modes |= _quantized(run_dir, loaded, at, few, fp32=False, progress=progress)
+        modes |= _quantize(run_dir, loaded, at, few, fp32=False, progress=progress)
     for at in sizes:
-        modes |= _quantized(run_dir, loaded, at, recipe, progress=progress)
-    modes |= _quantized(run_dir, loaded, None, recipe, progress=progress)
+        modes |= _quantize(run_dir, loaded, at, recipe, progress=progress)
+    modes |= _quantize(run_dir, loaded, None, recipe, progress=progress)
     write_quantize(run_dir, loaded.checkpoint, {"modes": modes})
     export_onnx(run_dir, progress)
     return run_dir
@@ -98,7 +98,7 @@ def suffix_of(size: tuple[int, int]) -> str:
     return f"_{size[0]}x{size[1]}"
 
 
-def _quantized(
+def _quantize(
     run_dir: Path,
     loaded: Opened,
     size: tuple[int, int] | None,

@@ -31,7 +31,7 @@ from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop import act
-from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.export import export
@@ -39,7 +39,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.pipeline import Recipe
-from rover_lib.workshop.run.session import Opened, opened
+from rover_lib.workshop.run.session import Opened, open_run
 from rover_lib.workshop.run_program import run
 
 FOLDER = GUEST / "peers"
@@ -107,7 +107,7 @@ def packages_here(engine: Engine) -> Path:
     def make(folder: Path) -> None:
         fetch_wheels(folder, "--python", sys.executable, *engine.packages)
 
-    return cached_folder(f"peer-{engine.name}", key_of(made), make)
+    return cache_folder(f"peer-{engine.name}", key_of(made), make)
 
 
 def packages_there(engine: Engine) -> Path:
@@ -120,7 +120,7 @@ def packages_there(engine: Engine) -> Path:
         if compiled:
             _compile(folder)
 
-    return cached_folder(f"arm-peer-{engine.name}", key_of(made, *([SHIM] if compiled else [])), make)
+    return cache_folder(f"arm-peer-{engine.name}", key_of(made, *([SHIM] if compiled else [])), make)
 
 
 def _compile(folder: Path) -> None:
@@ -152,7 +152,7 @@ class Made:
     report: dict[str, Any]
 
 
-def made_by(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> Made:
+def quantize_with(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> Made:
     """Quantize the policy with an engine's own tools into `folder`, unless it is there and its inputs are unchanged.
 
     samples: for calibration. Raises CountError if the tools fail, or if they leave a layer in float that is INT8 in our
@@ -229,9 +229,9 @@ def count_peers(
     artifacts, or if a peer cannot be had, made or run.
     """
     run_dir = Path(run_dir)
-    content, reference = counted_run(run_dir)
+    content, reference = open_counted_run(run_dir)
     artifacts = content["metrics"]["artifacts"]
-    again = opened(run_dir)
+    again = open_run(run_dir)
     samples = pick_evenly(again.parts.held_out, frames)
     core = prepare(progress)
     # Get the packages of all engines first: if some cannot be had, it fails before hours are spent on the others.
@@ -243,7 +243,7 @@ def count_peers(
     calibrating, _ = choose_calibration(again.parts.calibration, given["samples"], given["seed"])
     made: dict[str, Made] = {}
     for engine in progress(ENGINES, desc="peers' quantization", total=len(ENGINES)):
-        made[engine.name] = made_by(engine, again.checkpoint, calibrating, run_dir / "peers")
+        made[engine.name] = quantize_with(engine, again.checkpoint, calibrating, run_dir / "peers")
     judged = dict.fromkeys(made, samples)
     if AFFINE not in artifacts:
         made["torch_affine"], judged["torch_affine"] = affine(run_dir, again), samples[::2]
@@ -277,7 +277,7 @@ def file_mb(path: Path) -> float:
     return path.stat().st_size / 1e6
 
 
-def counted_run(run_dir: Path) -> tuple[dict[str, Any], Path]:
+def open_counted_run(run_dir: Path) -> tuple[dict[str, Any], Path]:
     """Return a run's arm.json and its FP32 artifact. Raises CountError unless the one was counted from the other."""
     path, reference = run_dir / "arm.json", run_dir / f"{REFERENCE}.pt"
     remedy = f"count the run's own artifacts first ('python -m lab arm {run_dir}')"

@@ -6,7 +6,7 @@ from typing import Any
 from lab.a76.core import A76
 from lab.a76.count import Counted
 from rover_lib.onboard.care.lower_bound import PI5_SEEN_GMAC_PER_S
-from rover_lib.onboard.columns import aligned
+from rover_lib.onboard.columns import align
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.recorded_range import worst
 
@@ -52,7 +52,7 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
     """Return one artifact's part of arm.json; _g are 10**9 instructions. The floor is SDOT alone, for every mode."""
     floor_g = manifest["gmac"] / SDOT_MACS
     inferences_g = [n / 1e9 for n in counted.inferences]
-    low_ms, high_ms = predicted_ms(counted.simd / 1e9, counted.steady / 1e9)
+    low_ms, high_ms = predict_ms(counted.simd / 1e9, counted.steady / 1e9)
     return {
         "instructions_g": counted.steady / 1e9,
         "simd_g": counted.simd / 1e9,
@@ -78,7 +78,7 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
     }
 
 
-def predicted_ms(simd_g: float, instructions_g: float) -> tuple[float, float]:
+def predict_ms(simd_g: float, instructions_g: float) -> tuple[float, float]:
     """Compute a range for the time of one inference on a Raspberry Pi 5, in ms, from counts. Nothing here was timed.
 
     low: the SIMD instructions alone at two per cycle, which is what a Cortex-A76 can issue (Arm's optimisation guide),
@@ -174,7 +174,7 @@ def table(content: dict[str, Any]) -> str:
         lines.append(" ".join([f"{stem:{wide}}", *cells]))
     lines += ["", f"computed from these counts for a Raspberry Pi 5, ms, never timed ({PREDICTED})"]
     for stem, m in rows:
-        low, high = predicted_ms(m["simd_g"], m["instructions_g"])
+        low, high = predict_ms(m["simd_g"], m["instructions_g"])
         lines.append(f"{stem:{wide}} {low:7.3g} to {high:.3g}")
     if note := metrics.get("note"):
         lines += ["", f"note: {note}"]
@@ -193,7 +193,7 @@ def other_core_table(content: dict[str, Any]) -> str:
     rows = [["", *(f"{name.removesuffix('_g')}, G instructions" for name in names), "ratio"]]
     for stem, m in content["metrics"]["artifacts"].items():
         rows.append([stem, *(f"{m[name]:.4g}" for name in names), f"{m['ratio']:.2f}"])
-    return "\n".join(aligned(rows))
+    return "\n".join(align(rows))
 
 
 def _cell(value: float | None, key: str, width: int) -> str:

@@ -18,7 +18,7 @@ from balloon_world.simulated_arduino import BOOT_S, REST_US, PinEvent
 from lab import debian
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.child_process import Child
 from rover_lib.workshop.run_program import run
 
@@ -80,7 +80,7 @@ def build() -> Built:
         compile_c("make", "-C", FIRMWARE, f"BUILD={folder}/firmware")
         compile_c(*CC, "-DPROGRAM", "-o", folder / "arduino", *WITH_SIMAVR)
 
-    folder = cached_folder("arduino", key_of({"names": [source.name for source in sources]}, *sources), make)
+    folder = cache_folder("arduino", key_of({"names": [source.name for source in sources]}, *sources), make)
     return Built(folder / "firmware" / "rover.elf", folder / "arduino")
 
 

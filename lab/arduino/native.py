@@ -13,7 +13,7 @@ from pathlib import Path
 from lab.arduino.emulator import CC, FIRMWARE, compile_c
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import Hello, Telemetry, frame, parse
-from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 
 SOURCES = (FIRMWARE / "rover" / "protocol.c", FIRMWARE / "rover" / "vehicle.c")
 STEERING, THROTTLE = range(2)
@@ -114,7 +114,7 @@ def library() -> ctypes.CDLL:
     def make(folder: Path) -> None:
         compile_c(*CC, "-shared", "-fPIC", "-o", folder / "native.so", *SOURCES)
 
-    folder = cached_folder("native-firmware", key_of({"command": CC}, *SOURCES, *headers), make)
+    folder = cache_folder("native-firmware", key_of({"command": CC}, *SOURCES, *headers), make)
     native = ctypes.CDLL(str(folder / "native.so"))
     vehicle, u32 = ctypes.POINTER(Vehicle), ctypes.c_uint32
     native.crc32.restype = u32

@@ -24,7 +24,7 @@ from lab.arduino.emulator import CC, NICE, EmulatedArduino, compile_c
 from lab.driving.cable import Cable
 from lab.driving.pins import BEFORE_S, STOPPED_THROTTLE_US
 from lab.driving.policy import PLAIN, RATE_HZ, make_artifact, pictures
-from lab.driving.priority import boost, boosted_priority
+from lab.driving.priority import boost, boost_priority
 from rover_lib.onboard.drive.flight_log import LogError, read_log
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.child_process import Child
@@ -58,7 +58,7 @@ def _break_logger() -> None:
     def broken(*_: Any) -> bytes:
         raise RuntimeError("raised in the logger")
 
-    telemetry._sealed = telemetry._tick_line = broken  # type: ignore[assignment]  # this is the fault
+    telemetry._seal = telemetry._tick_line = broken  # type: ignore[assignment]  # this is the fault
 
 
 INSIDE = {"end the loop's thread": _end_this_thread, "raise in the loop": _raise, "raise in the logger": _break_logger}
@@ -178,7 +178,7 @@ class DrivingBench:
             boost(self.arduino.pid)
             self.cable = Cable(self.arduino.port)
             self.feed = CameraFeed(self.camera, *self._pictures[PLAIN])
-            self._stack.enter_context(boosted_priority())
+            self._stack.enter_context(boost_priority())
         except BaseException:
             self._stack.close()
             raise

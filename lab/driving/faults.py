@@ -172,7 +172,7 @@ def fuzz(lines: int = FUZZ_LINES, seed: int = 1) -> dict[str, Any]:
     return {"lines": lines, "seed": seed, "unsafe_pulses": int(done.returncode != 0), "said": printed}
 
 
-def transmitted_and_replayed(bench: DrivingBench, steps: int = 24, step_s: float = 0.25) -> dict[str, Any]:
+def record_and_replay(bench: DrivingBench, steps: int = 24, step_s: float = 0.25) -> dict[str, Any]:
     """Record a transmitter's pulses by `rover record`, replay them by `rover drive --replay`, and compare the pins.
 
     Returns compare_steps()'s result. Raises FaultError if either command fails.
@@ -221,7 +221,7 @@ def compare_steps(
     result: dict[str, Any] = {"steps": len(sent), "worst_us": 0.0, "worst_ms": 0.0, "pulses": 0}
     for i, pin in enumerate(PERIOD_US):
         pulses = [e for e in events if e.pin == pin and e.kind == "pulse"]
-        off_us, begun_s = _followed(pin, pulses, [step[i] for step in sent])
+        off_us, begun_s = _follow(pin, pulses, [step[i] for step in sent])
         result[f"{pin}_steps"] = len(begun_s) + 1
         if len(begun_s) + 1 != len(sent):
             return result | {"worst_us": None}
@@ -234,7 +234,7 @@ def compare_steps(
     return result
 
 
-def _followed(pin: str, pulses: Sequence[PinEvent], levels: Sequence[float]) -> tuple[list[float], list[float]]:
+def _follow(pin: str, pulses: Sequence[PinEvent], levels: Sequence[float]) -> tuple[list[float], list[float]]:
     """Return how far (us) each pulse is from its level, and when each level but the first was set out for.
 
     The firmware moves a pin no faster than its slew. So the pulses on the way from one level to the next belong to
@@ -323,7 +323,7 @@ def run_faults(
     with ThreadPoolExecutor() as beside, DrivingBench() as bench:
         fuzzing = beside.submit(fuzz, fuzz_lines) if everything or "fuzz" in only else None
         if everything or "bytes" in only:
-            outcome.bytes = transmitted_and_replayed(bench)
+            outcome.bytes = record_and_replay(bench)
             echo(f"bytes: {outcome.bytes}")
             if outcome.bytes["worst_us"] is None or outcome.bytes["worst_us"] > gates.bytes_us:
                 outcome.wrong.append(f"bytes: {outcome.bytes}, {gates.bytes_us:g} us are allowed")

@@ -14,6 +14,6 @@ def boost(thread: int) -> None:
         os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(PRIORITY))
 
 
-def boosted_priority() -> contextlib.AbstractContextManager[bool]:
+def boost_priority() -> contextlib.AbstractContextManager[bool]:
     """Give all threads of this program that priority inside the context, if this user may."""
     return real_time(PRIORITY)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from lab.arduino.emulator import CC, FIRMWARE, compile_c
-from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 
 BOARD = Path(__file__).with_name("board.c")
 LIBRARY = "board.so"
@@ -47,7 +47,7 @@ def library() -> Path:
     """Get the sketch as a library for this machine, from the cache or compiled now. Raises ArduinoError without gcc."""
     sources = [BOARD, *sorted(p for p in (FIRMWARE / "rover").iterdir() if p.is_file())]
     key = key_of({"names": [source.name for source in sources]}, *sources)
-    return cached_folder("board", key, functools.partial(compile_sketch, FIRMWARE)) / LIBRARY
+    return cache_folder("board", key, functools.partial(compile_sketch, FIRMWARE)) / LIBRARY
 
 
 def compile_sketch(firmware: Path, folder: Path) -> None:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from lab.debian import fetch_packages
 from lab.pi.emulation import EmulationError, in_cgroup
-from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.run_program import run
 
 USER, HOST_NAME = "pi", "raspberrypi"
@@ -57,7 +57,7 @@ def debian_image() -> DebianImage:
     Call it within emulation(). Raises EmulationError or DebianError that says what could not be had.
     """
     recipe = {"made": [PACKAGES, CONFIGURE, RECIPE], "debian": _codename()}
-    folder = cached_folder("pi-system", key_of(recipe), _make)
+    folder = cache_folder("pi-system", key_of(recipe), _make)
     return DebianImage(folder / "root", folder / "key")
 
 

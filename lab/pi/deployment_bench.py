@@ -28,7 +28,7 @@ from lab.pi.emulation import EmulationError, wait_for
 from lab.pi.network import Network
 from lab.pi.playbooks import Play
 from rover_lib.onboard.care.release import POLICY, Releases, pack
-from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 
 STATE = "var/lib/rover"  # on the rover; it has models/, which has incoming/
 ROVER = "/opt/rover/venv/bin/rover"
@@ -143,7 +143,7 @@ def line_of(output: str, name: str) -> Line:
     raise EmulationError(f"status.yml has no line of {name}, it ends: {output[-600:]}")
 
 
-def changed_artifact(artifact: Path, target: Path, *, answers: float = 0.0, **changes: Any) -> Path:
+def write_changed_artifact(artifact: Path, target: Path, *, answers: float = 0.0, **changes: Any) -> Path:
     """Write the artifact with another manifest to `target`, with all checksums right, and return that.
 
     answers: by how much the plans of its parity vectors are made wrong. changes: of the manifest.
@@ -459,4 +459,4 @@ def _faketime() -> Path:
             packages = fetch_packages(Path(scratch), ["libfaketime"])
             unpack_packages([p for p in packages if p.name.startswith("libfaketime_")], folder)
 
-    return cached_folder("pi-faketime", key_of({"library": LIBRARY}), make)
+    return cache_folder("pi-faketime", key_of({"library": LIBRARY}), make)

@@ -32,11 +32,11 @@ from lab.pi.deployment_bench import (
     DeploymentBench,
     Disk,
     Missed,
-    changed_artifact,
     flip,
     give_first_model,
     in_parallel,
     rovers,
+    write_changed_artifact,
 )
 from lab.pi.emulation import EmulationError
 from rover_lib.onboard.care.release import ORIGIN, SPARE_BYTES
@@ -155,7 +155,7 @@ def _refused(message: str, **changes: Any) -> Callable[[DeploymentBench], None]:
     """
 
     def inject(bench: DeploymentBench) -> None:
-        bad = changed_artifact(bench.artifacts[bench.target], bench.folder / "changed.pt", **changes)
+        bad = write_changed_artifact(bench.artifacts[bench.target], bench.folder / "changed.pt", **changes)
         if bench.deploy(bad).ok:
             raise EmulationError(f"{bench.pi.name}: an artifact was deployed of which is true: {message}")
         there = bench.state / "by-hand.pt"
@@ -176,7 +176,7 @@ def _sign_by_another(bench: DeploymentBench) -> None:
 
 
 def _fail_parity(bench: DeploymentBench) -> None:
-    bench.deploy(changed_artifact(bench.artifacts[bench.target], bench.folder / "parity.pt", answers=0.5))
+    bench.deploy(write_changed_artifact(bench.artifacts[bench.target], bench.folder / "parity.pt", answers=0.5))
 
 
 def _two_at_once(bench: DeploymentBench) -> None:

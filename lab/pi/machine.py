@@ -37,7 +37,7 @@ from lab.debian import fetch_packages, missing_packages, unpack_packages, which
 from lab.pi.debian_image import USER, DebianImage, debian_image
 from lab.pi.emulation import emulation, free_port, make_sure
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.cache import cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.run_program import last_words, run
 
 PACKAGES = {  # commands, each with the Debian package that it comes from
@@ -117,7 +117,7 @@ def card() -> Card:
         flashed = debian_image()
     made = [RECIPE, CARD_GB, MODULES, FIRST_MODULES, INIT, NETWORK, MASKED, ROVER_PACKAGES, KERNEL_PACKAGES]
     key = key_of({"system": str(flashed.root), "made": made, "holds": "public key"})
-    return Card(cached_folder("pi-card", key, lambda folder: _make_card(flashed, folder)))
+    return Card(cache_folder("pi-card", key, lambda folder: _make_card(flashed, folder)))
 
 
 def _make_card(flashed: DebianImage, folder: Path) -> None:

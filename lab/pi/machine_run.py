@@ -32,7 +32,7 @@ from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.flight_log import Flight, read_log
 from rover_lib.onboard.drive.service import UNIT
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.cache import cache_root, cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, cache_root, key_of
 
 STAGE = "pi"
 REPOSITORY = Path(__file__).parents[2]
@@ -185,7 +185,7 @@ class _Run:
                     self.pi.power_off()
                 shutil.move(self.pi.disk, folder / "disk.qcow2")
 
-        folder = cached_folder("pi-provisioned", key, make)
+        folder = cache_folder("pi-provisioned", key, make)
         self.report.metrics["provisioned"] = "now" if made else "from the cache, and again"
         return folder / "disk.qcow2"
 

@@ -38,7 +38,7 @@ def update(root: Path = ROOT) -> list[Path]:
     nothing then.
     """
     old = pages(root)
-    new = written(old, root)
+    new = render_pages(old, root)
     changed = [path for path in old if new[path] != old[path]]
     for path in changed:
         with atomic_path(path) as temporary:
@@ -46,7 +46,7 @@ def update(root: Path = ROOT) -> list[Path]:
     return changed
 
 
-def written(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
+def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
     """The pages with their tables as results/ and notebooks/ in `root` have them. Raises TableError."""
     names = [match[2] for text in texts.values() for match in PLACE.finditer(text)]
     if sorted(names) != sorted(TABLES):

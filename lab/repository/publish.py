@@ -65,7 +65,7 @@ def publish(
         target, executed = notebooks_dir / f"{name}.ipynb", run_dir / f"{name}.ipynb"
         if not executed.is_file():
             raise NotebookError(f"{executed}: not there", remedy="execute the run first")
-        text = _published(nbformat.read(target, as_version=4), nbformat.read(executed, as_version=4), name)
+        text = _publish(nbformat.read(target, as_version=4), nbformat.read(executed, as_version=4), name)
         for folder in (run_dir, notebooks_dir.parent, Path.home(), Path(tempfile.gettempdir()), Path(sys.prefix)):
             if len(str(folder)) > 1 and f"{folder}/" in text:
                 raise NotebookError(f"{name}: an output shows a path below {folder}", remedy="print names, not paths")
@@ -115,7 +115,7 @@ def _result(path: Path) -> str:
     """A stage's JSON as it is committed. Raises NotebookError if it still holds a path, or is large."""
     content = json.loads(path.read_text())
     if len(inputs := content.get("inputs", {})) > MANY_INPUTS:
-        content["inputs"] = _summed_up(inputs)
+        content["inputs"] = _sum_up(inputs)
     text = json.dumps(_names_only(content), indent=1) + "\n"
     if (shown := ABSOLUTE.search(text)) is not None:
         around = text[max(shown.start() - 40, 0) : shown.end() + 40]
@@ -128,7 +128,7 @@ def _result(path: Path) -> str:
     return text
 
 
-def _summed_up(inputs: dict[str, str]) -> dict[str, str]:
+def _sum_up(inputs: dict[str, str]) -> dict[str, str]:
     """{file: sha256} of many files as one entry: their count, and a hash of all."""
     lines = "".join(f"{sha256}  {name}\n" for name, sha256 in sorted(inputs.items()))
     return {f"{len(inputs)} files": hashlib.sha256(lines.encode()).hexdigest()}
@@ -148,7 +148,7 @@ def _names_only(value: Any) -> Any:
 # --- the notebooks ----------------------------------------------------------------------------------------------------
 
 
-def _published(source: Any, executed: Any, name: str) -> str:
+def _publish(source: Any, executed: Any, name: str) -> str:
     outputs = {c.id: c for c in executed.cells if c.cell_type == "code"}
     for cell in source.cells:
         if cell.cell_type != "code":

@@ -97,11 +97,11 @@ def log(
     if video:
         from rover_lib.workshop.drive_log.film import write_film
         from rover_lib.workshop.drive_log.replay import load_replay
-        from rover_lib.workshop.progress import terminal
+        from rover_lib.workshop.progress import terminal_bar
 
         shown = load_replay(file, drive, pictures)
         width = video_width // 2 * 2
-        count = write_film(video, shown, rate_hz=video_hz, width=width, progress=terminal())
+        count = write_film(video, shown, rate_hz=video_hz, width=width, progress=terminal_bar())
         click.echo(f"drawn: {video}, {count} pictures, {video.stat().st_size / 1e6:.2f} MB", err=as_json)
     if mcap:
         from rover_lib.workshop.drive_log.mcap_log import write_mcap

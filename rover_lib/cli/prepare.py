@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
-from rover_lib.onboard.columns import aligned
+from rover_lib.onboard.columns import align
 from rover_lib.onboard.kinds import Output, PathTo
-from rover_lib.workshop.progress import terminal
+from rover_lib.workshop.progress import terminal_bar
 
 if TYPE_CHECKING:
     from rover_lib.workshop.recordings.samples import Source
@@ -73,7 +73,7 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     from rover_lib.workshop.run.run import run as run_notebooks
 
     chosen = {k: v for k, v in options.items() if v is not None}
-    folder = run_notebooks(checkpoint, episodes, progress=terminal(), **chosen)
+    folder = run_notebooks(checkpoint, episodes, progress=terminal_bar(), **chosen)
     _judge(folder)
 
 
@@ -109,7 +109,7 @@ def inspect(episodes: "Source", as_json: bool) -> None:
     """
     from rover_lib.workshop.run.describe import describe
 
-    show(describe(episodes, terminal()), as_json)
+    show(describe(episodes, terminal_bar()), as_json)
 
 
 @click.command("list", short_help="List the runs with their verdicts.")
@@ -164,8 +164,8 @@ def quantize(checkpoint: Path, episodes: "Source", output: Path, mode: str, samp
     if mode != "fp32":
         mode = "mixed" if mode == "static" and how["float_blocks"] else mode
         recipe = replace(recipe, scheme=replace(recipe.scheme, mode=mode, **how))
-    loaded = load(checkpoint, episodes, terminal())
-    digest, warnings = make_artifact(loaded, output, recipe, fp32=mode == "fp32", progress=terminal())
+    loaded = load(checkpoint, episodes, terminal_bar())
+    digest, warnings = make_artifact(loaded, output, recipe, fp32=mode == "fp32", progress=terminal_bar())
     for warning in warnings:
         click.echo(f"rover: warning: {warning}", err=True)
     click.echo(f"{output}: {mode}, {output.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
@@ -194,17 +194,17 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
     fp32 = load_policy(reference)
     if not episodes.cameras and len(fp32.cameras) > 1:
         episodes = replace(episodes, cameras=fp32.cameras)
-    recordings = load_recordings(episodes, fp32.chunk, p["sync_s"], terminal())
+    recordings = load_recordings(episodes, fp32.chunk, p["sync_s"], terminal_bar())
     held_out = split(recordings, p["held_out_share"], p["seed"]).held_out
     others = {name: load_policy(path) for name, path in distinct_names(artifacts, drop="policy_").items()}
-    report = c.fidelity(fp32, others, held_out, recordings.action_range(), terminal())
-    for warning in report.warnings() + look(fp32, report, progress=terminal()).warnings():
+    report = c.fidelity(fp32, others, held_out, recordings.action_range(), terminal_bar())
+    for warning in report.warnings() + look(fp32, report, progress=terminal_bar()).warnings():
         click.echo(f"rover: warning: {warning}", err=True)
     found = {name: report.summary(name) for name in others}
     if as_json:
         return show(found, as_json)
     sizes_mb = {name: policy.path.stat().st_size / 1e6 for name, policy in others.items()}
-    click.echo("\n".join(aligned(c.comparison_rows(found, sizes_mb, fp32.path.stat().st_size / 1e6))))
+    click.echo("\n".join(align(c.comparison_rows(found, sizes_mb, fp32.path.stat().st_size / 1e6))))
     click.echo(f"errors on {len(held_out)} held-out frames, of the recorded range, and microseconds of pulse")
 
 
@@ -228,15 +228,15 @@ def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
     if onnx:
         from rover_lib.workshop.run.pipeline import export_onnx
 
-        for name, digest in export_onnx(run_dir, terminal()).items():
+        for name, digest in export_onnx(run_dir, terminal_bar()).items():
             path = run_dir / name
             click.echo(f"{path}: {path.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
     if kit is None:
         return
     from rover_lib.workshop.hailo.kit import write_kit
-    from rover_lib.workshop.run.session import opened
+    from rover_lib.workshop.run.session import open_run
 
-    report = write_kit(opened(run_dir, terminal()), kit, samples=samples, progress=terminal())
+    report = write_kit(open_run(run_dir, terminal_bar()), kit, samples=samples, progress=terminal_bar())
     for name, network in report["networks"].items():
         errors = ", ".join(f"{action} {error:.3g}" for action, error in network["stand_in_actions"].items())
         click.echo(f"{name}: {network['gmac']:.2f} GMAC; in ONNX Runtime's INT8, actions differ by at most {errors}")
@@ -261,7 +261,7 @@ def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> 
     from rover_lib.workshop.recordings.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
     from rover_lib.workshop.recordings.export_dataset import export_dataset as write
 
-    report = write(episodes, out, progress=terminal(), **options)
+    report = write(episodes, out, progress=terminal_bar(), **options)
     for name in ("episodes_are", CAR, DRIVEN_BY, OUTCOMES):  # too long to print; the file has them
         del report[name]
     show({"exported": report | {"report": str(out / REPORT)}}, as_json)

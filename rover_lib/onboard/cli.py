@@ -16,7 +16,7 @@ from typing import Any, TextIO, cast
 
 import click
 
-from rover_lib.onboard.columns import aligned, benchmark_rows, number
+from rover_lib.onboard.columns import align, benchmark_rows, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
 
@@ -467,7 +467,7 @@ def benchmark(
         metrics["gates"] = check_gates(metrics, params()["gates"]["original"])
     if as_json:
         return show(metrics, as_json)
-    click.echo("\n".join(aligned(benchmark_rows(metrics))))
+    click.echo("\n".join(align(benchmark_rows(metrics))))
     machine = {key: metrics[key] for key in ("threads", "cores", "temperature_c", "clock_mhz", "throttled")}
     show({k: v for k, v in machine.items() if v is not None}, False)
     if gates and platform.machine() != "aarch64":
@@ -542,7 +542,7 @@ def release(
     from rover_lib.onboard.care import release as r
 
     expected = r.Expected(chunk=chunk, camera=camera, aspect=aspect)
-    ctx.obj = r.Releases(models, check=r.sandboxed if sandboxed else None, expected=expected, signers=signers)
+    ctx.obj = r.Releases(models, check=r.check_in_sandbox if sandboxed else None, expected=expected, signers=signers)
 
 
 ALLOW = click.option(

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+def align(rows: Sequence[Sequence[str]]) -> list[str]:
     """A line for each row, a header among them. Rows are of one length."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []

@@ -179,9 +179,9 @@ def conv(weight: Tensor, bias: Tensor, stride: int, padding: int, dilation: int 
     return _load(nn.Conv2d(in_channels, out_channels, size, stride, padding, dilation, device="meta"), weight, bias)
 
 
-def folded_conv(w: Weights, bn: Weights, stride: int, padding: int) -> nn.Conv2d:
+def fold_conv(w: Weights, bn: Weights, stride: int, padding: int) -> nn.Conv2d:
     """Merge a convolution without bias and the frozen batch norm behind it into one convolution."""
-    return conv(*folded(w, bn), stride, padding)
+    return conv(*fold(w, bn), stride, padding)
 
 
 def norm_gain(bn: Weights) -> Tensor:
@@ -189,19 +189,19 @@ def norm_gain(bn: Weights) -> Tensor:
     return bn["weight"] * (bn["running_var"] + 1e-5).rsqrt()  # eps of torchvision's FrozenBatchNorm2d
 
 
-def folded(w: Weights, bn: Weights) -> Pair:
+def fold(w: Weights, bn: Weights) -> Pair:
     """Return the weight and bias of `folded_conv`."""
     gain = norm_gain(bn)
     return w["weight"] * gain[:, None, None, None], bn["bias"] - bn["running_mean"] * gain
 
 
-def folded_block(w: Weights, kind: str) -> list[Pair]:
+def fold_block(w: Weights, kind: str) -> list[Pair]:
     """Return the weight and bias of a ResNet block's convolutions, without the channels inside it that are always zero.
 
     All weights of such a channel are zero and its bias is not positive, so after ReLU it is zero whatever the block
     sees, and the block without it computes the same function. The module `channels` makes such channels.
     """
-    pairs = [folded(w.at(f"conv{i}"), w.at(f"bn{i}")) for i in range(1, (2 if kind == "basic" else 3) + 1)]
+    pairs = [fold(w.at(f"conv{i}"), w.at(f"bn{i}")) for i in range(1, (2 if kind == "basic" else 3) + 1)]
     for i, (weight, bias) in enumerate(pairs[:-1]):
         alive = (weight != 0).flatten(1).any(1) | (bias > 0)
         alive[0] |= not alive.any()  # a convolution needs at least one channel
@@ -317,12 +317,12 @@ class Residual(nn.Module):
             "bottleneck": [(1, 0, 1), (stride, dilation, dilation), (1, 0, 1)],
         }
         layers: list[nn.Module] = []
-        for (weight, bias), geometry in zip(folded_block(w, kind), plans[kind], strict=True):
+        for (weight, bias), geometry in zip(fold_block(w, kind), plans[kind], strict=True):
             layers += [conv(weight, bias, *geometry), nn.ReLU()]
         self.body = nn.Sequential(*layers[:-1])
         has_shortcut = "downsample" in w
         self.shortcut = (
-            folded_conv(w.at("downsample.0"), w.at("downsample.1"), stride, 0) if has_shortcut else nn.Identity()
+            fold_conv(w.at("downsample.0"), w.at("downsample.1"), stride, 0) if has_shortcut else nn.Identity()
         )
         self.relu = nn.ReLU()
 
@@ -336,7 +336,7 @@ class Backbone(nn.Module):
     def __init__(self, w: Weights, config: ActConfig, columns: bool):
         super().__init__()
         kind, depths, _ = BACKBONES[config.backbone]
-        stem = folded_conv(w.at("conv1"), w.at("bn1"), 2, 3)
+        stem = fold_conv(w.at("conv1"), w.at("bn1"), 2, 3)
         if columns:
             stem = column_conv(stem, config.image_norm[0])
         self.stem = nn.Sequential(stem, nn.ReLU(), nn.MaxPool2d(3, 2, 1))

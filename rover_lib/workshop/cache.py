@@ -34,7 +34,7 @@ def car_in_key() -> dict[str, Any]:
     return {} if car.drives_like(Car()) else {"car": car.description()}
 
 
-def cached_folder(kind: str, key: str, make: Callable[[Path], None]) -> Path:
+def cache_folder(kind: str, key: str, make: Callable[[Path], None]) -> Path:
     """The folder <cache>/<kind>-<key>, made by `make(temporary folder)` if it is not there yet.
 
     It appears complete or not at all: made beside its place and renamed.

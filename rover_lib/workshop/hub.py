@@ -26,7 +26,7 @@ def absolute(path: Path | str) -> str:
     return str(path) if is_hub_id(path) else str(Path(path).resolve())
 
 
-def fetched(hub_id: Path | str, kind: str, error: type[RoverError], files: Sequence[str] | None = None) -> Path:
+def fetch(hub_id: Path | str, kind: str, error: type[RoverError], files: Sequence[str] | None = None) -> Path:
     """Fetch files of the Hub unless they are in the cache, and return the folder that holds them.
 
     kind: "model" or "dataset". files: patterns; None takes all that we read of such a repository. Raises `error`, in

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from rover_lib.onboard.columns import aligned
+from rover_lib.onboard.columns import align
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Table:
 
     def __str__(self) -> str:
         caption = [self.caption] if self.caption else []
-        return "\n".join([*caption, *aligned([self.header, *self.rows]), *self.notes])
+        return "\n".join([*caption, *align([self.header, *self.rows]), *self.notes])
 
     __repr__ = __str__
 

@@ -18,14 +18,14 @@ def silent(items: Iterable[T], **_: object) -> Iterable[T]:
     return items
 
 
-def terminal() -> Progress:
+def terminal_bar() -> Progress:
     """A bar if the output is a terminal; nothing if it goes to a log."""
     from tqdm import tqdm
 
     return partial(tqdm, disable=not sys.stderr.isatty(), leave=False)
 
 
-def watched() -> Progress:
+def notebook_bar() -> Progress:
     """A notebook's bar if somebody watches; in stored outputs, bars would only be noise.
 
     Somebody watches in the terminal where `rover run` was started, or in a JupyterLab session.

@@ -19,12 +19,12 @@ ADDED = ".added"  # a file in the folder of replaced files: names of the new fil
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[Path]:
+def lock_folder(folder: Path) -> Iterator[Path]:
     """An empty folder that only this process uses until the block ends; then it is removed with all its content.
 
     Whatever a killed process left in it is removed first. Raises RoverError while another process uses it.
     """
-    held = _taken(folder)
+    held = _lock(folder)
     try:
         for left in folder.iterdir():
             _remove(left)
@@ -35,7 +35,7 @@ def alone_in(folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def made_beside(folder: Path, replaced: Callable[[Path], Iterable[Path]] = lambda _: ()) -> Iterator[Path]:
+def build_beside(folder: Path, replaced: Callable[[Path], Iterable[Path]] = lambda _: ()) -> Iterator[Path]:
     """Give an empty folder `.<name>.new` beside `folder`; its content moves into `folder` if the block ends well.
 
     Either all of it moves or nothing; the hidden folder is removed in any case.
@@ -45,7 +45,7 @@ def made_beside(folder: Path, replaced: Callable[[Path], Iterable[Path]] = lambd
     call puts them back. Raises RoverError while another process makes something for that folder.
     """
     old = folder.with_name(f".{folder.name}.old")
-    with alone_in(folder.with_name(f".{folder.name}.new")) as new:
+    with lock_folder(folder.with_name(f".{folder.name}.new")) as new:
         if old.exists():  # the last process was killed during the swap
             _put_back(old, folder)
         yield new
@@ -86,7 +86,7 @@ def _put_back(old: Path, folder: Path) -> None:
     old.rmdir()
 
 
-def _taken(folder: Path) -> int:
+def _lock(folder: Path) -> int:
     """Lock the folder, which is made if needed; return the descriptor that holds the lock."""
     while True:
         folder.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ LONGEST = 60  # characters of one value
 LARGEST = 10**20  # Python refuses to print an integer of thousands of digits
 
 
-def shown(value: object) -> str:
+def quote(value: object) -> str:
     """A value for a sentence.
 
     Of what holds other values only the type and length: the whole could be endless, or hold itself.
@@ -28,10 +28,10 @@ def shown(value: object) -> str:
     return f"a {type(value).__name__}{length}"
 
 
-def listed(values: Iterable[object], most: int = 6) -> str:
+def quote_all(values: Iterable[object], most: int = 6) -> str:
     """The first values, separated by commas, names without quotes, and how many more there are."""
     values = list(values)
-    names = [v if isinstance(v, str) and v.isprintable() and len(v) <= LONGEST else shown(v) for v in values[:most]]
+    names = [v if isinstance(v, str) and v.isprintable() and len(v) <= LONGEST else quote(v) for v in values[:most]]
     return ", ".join(names) + (f" and {len(values) - most} more" if len(values) > most else "")
 
 
@@ -49,5 +49,5 @@ def numbers(kind: type[T], values: Mapping[str, Any], where: str, error: type[Ro
         whole = wanted[name] is int
         if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
             what, like = ("a whole number", "10") if whole else ("a number", "1.0e-3; 1e-3 is text in YAML")
-            raise error(f"{where}: {name} must be {what}", found=shown(value), remedy=f"write it like {like}")
+            raise error(f"{where}: {name} must be {what}", found=quote(value), remedy=f"write it like {like}")
     return kind(**values)

@@ -7,7 +7,7 @@ import pytest
 from balloon_world.frontier import (
     NOBODY_DROVE,
     gates_of,
-    paired,
+    pair_worlds,
     points_above,
     recommendation,
     sentences,
@@ -109,9 +109,9 @@ def test_the_sign_test_is_of_coins_that_fall_as_unevenly(one, other):
 def test_pairs_are_of_the_same_worlds():
     student = row("s", missed=SEEDS[3:8])
     teacher = row("teacher", missed=SEEDS[:4])
-    found = paired(student, teacher, "")
+    found = pair_worlds(student, teacher, "")
     assert (found["only_student"], found["only_teacher"]) == (3, 4)
-    assert paired(row("s", **NOT_DRIVEN), teacher, "") is None
+    assert pair_worlds(row("s", **NOT_DRIVEN), teacher, "") is None
 
 
 def test_the_recommendation_is_said_in_words():

@@ -227,7 +227,7 @@ HOW = {"worlds": 2, "latencies_ms": [0, 150, 600], "pushes": 2, "pushed_latencie
 
 @pytest.mark.slow
 def test_a_run_is_measured_once_for_each_policy_and_question(run_dir):
-    first = latency.measured(run_dir.path, **HOW)
+    first = latency.measure_latencies(run_dir.path, **HOW)
     assert run_dir.loaded and read_stage(run_dir.path / "drive.json", "drive") == first
     rows = [(r["latency_ms"], r["compensate"], r["pushes"], r["ensemble"]) for r in first["metrics"]["rows"]]
     calm = [(0, True), (150, True), (150, False), (600, True), (600, False)]
@@ -235,23 +235,23 @@ def test_a_run_is_measured_once_for_each_policy_and_question(run_dir):
     assert [g["passed"] for g in first["metrics"]["gates"]] == [True]
     assert [d["compensate"] for d in first["metrics"]["from_above"]] == [True, False]
     run_dir.loaded.clear()
-    assert latency.measured(run_dir.path, **HOW) == first and not run_dir.loaded
-    latency.measured(run_dir.path, **HOW | {"worlds": 1})
+    assert latency.measure_latencies(run_dir.path, **HOW) == first and not run_dir.loaded
+    latency.measure_latencies(run_dir.path, **HOW | {"worlds": 1})
     assert run_dir.loaded
     run_dir.loaded.clear()
     write_policy(run_dir.path, "a policy", serial="2")  # exported again: other bytes, the same policy
-    latency.measured(run_dir.path, **HOW | {"worlds": 1})
+    latency.measure_latencies(run_dir.path, **HOW | {"worlds": 1})
     assert not run_dir.loaded
     write_policy(run_dir.path, "another policy")
-    latency.measured(run_dir.path, **HOW | {"worlds": 1})
+    latency.measure_latencies(run_dir.path, **HOW | {"worlds": 1})
     assert run_dir.loaded
 
 
 def test_what_cannot_be_measured_is_a_sentence(run_dir):
     with pytest.raises(WorldError, match="at least one"):
-        latency.measured(run_dir.path, worlds=1, latencies_ms=[])
+        latency.measure_latencies(run_dir.path, worlds=1, latencies_ms=[])
     with pytest.raises(WorldError, match=r"policy_static\.pt: not there"):
-        latency.measured(run_dir.path / "nothing", worlds=1, latencies_ms=[0])
+        latency.measure_latencies(run_dir.path / "nothing", worlds=1, latencies_ms=[0])
 
 
 def rows(hits_at):
@@ -282,7 +282,7 @@ def test_the_command_measures_again_and_prints_a_table(run_dir, monkeypatch):
 
     def execute(name, folder, worlds):
         assert name == "07_drive" and not (folder / "drive.json").exists()
-        latency.measured(folder, **HOW | {"worlds": worlds})
+        latency.measure_latencies(folder, **HOW | {"worlds": worlds})
 
     monkeypatch.setattr(runs, "execute", execute)
     result = CliRunner().invoke(main, ["world", "latency", str(run_dir.path), "--worlds", "1"])

@@ -8,7 +8,7 @@ from policies import of_a_cars_size
 
 from balloon_world import learn, plots
 from balloon_world.latency import Condition, drive_in
-from balloon_world.learn import Experiment, Human, demonstrate, drive_corrected, gates, measured, sentences, table
+from balloon_world.learn import Experiment, Human, demonstrate, drive_corrected, gates, run_experiment, sentences, table
 from balloon_world.world import World, expert
 from rover_learn.finetune import human_samples
 from rover_lib.onboard.drive.pilot import Order
@@ -173,7 +173,7 @@ def test_what_is_shown_and_what_where_nothing_is(tmp_path):
     assert figure._suptitle.get_text() == (
         "Pushed, it hit 31 of 40 worlds; corrected 39, after as many seconds of demonstrations 37"
     )
-    assert learn.left(tmp_path) is None
+    assert learn.read_experiment(tmp_path) is None
     assert "rover world learn" in str(table(None)) and "rover world learn" in str(learn.rounds_table(None))
     assert "nothing has been learned" in repr(plots.hits_by_round([]))
 
@@ -221,11 +221,11 @@ def test_both_arms_learn_from_as_many_seconds_and_a_kill_costs_nothing(run_dir, 
     with monkeypatch.context() as patch:
         patch.setattr(learn, "drive_corrected", dies_at(2))
         with pytest.raises(KeyboardInterrupt):
-            measured(run_dir, out, FEW)
+            run_experiment(run_dir, out, FEW)
     assert not (run_dir / "learn.json").exists()
     (out / "corrected-1" / ".episode_half.part").mkdir(parents=True, exist_ok=True)
-    content = measured(run_dir, out, FEW)
-    assert content == read_stage(run_dir / "learn.json", "learn") == measured(run_dir, tmp_path / "unused", FEW)
+    content = run_experiment(run_dir, out, FEW)
+    assert content == read_stage(run_dir / "learn.json", "learn") == run_experiment(run_dir, tmp_path / "unused", FEW)
     assert not (tmp_path / "unused").exists() and not (out / "corrected-1" / ".episode_half.part").exists()
     metrics = content["metrics"]
     names = ["before", "corrected-1", "corrected-2", "demonstrated-1", "demonstrated-2"]
@@ -238,15 +238,15 @@ def test_both_arms_learn_from_as_many_seconds_and_a_kill_costs_nothing(run_dir, 
             seconds[arm] = sum(s.driver == HUMAN for e in episodes for s in e.samples) / 30
         assert seconds["corrected"] == pytest.approx(row["human_s"], abs=0.1)
         assert seconds["demonstrated"] == pytest.approx(row["human_s"], abs=0.1)
-    more = measured(run_dir, out, replace(FEW, worlds=3))  # only what is missing is driven
+    more = run_experiment(run_dir, out, replace(FEW, worlds=3))  # only what is missing is driven
     assert [row["pushed"]["trials"] for row in more["metrics"]["policies"]] == [3] * 5
     with pytest.raises(WorldError, match="holds another experiment"):
-        measured(run_dir, out, replace(FEW, drives=3))
+        run_experiment(run_dir, out, replace(FEW, drives=3))
 
 
 def test_what_is_missing_is_said(tmp_path):
     with pytest.raises(WorldError, match=r"best_model.pth: not there; `make demo` makes it"):
-        measured(tmp_path, tmp_path / "out")
+        run_experiment(tmp_path, tmp_path / "out")
     with pytest.raises(WorldError, match="at least one round"):
         Experiment(rounds=0)
     assert not list(tmp_path.iterdir())

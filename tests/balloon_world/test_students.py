@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from balloon_world import students
 from balloon_world.latency import SEED
-from balloon_world.students import measured
+from balloon_world.students import judge_students
 from rover_learn import plots
 from rover_lib.cli import main
 from rover_lib.onboard.car.car import FILE_VARIABLE, Car, yaml_of
@@ -111,7 +111,7 @@ KEYS = [
 def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
     counted(made.teacher, 56, 90)
     counted(made.student, 13, 20)
-    content = measured(made.teacher, [made.student], worlds=3)
+    content = judge_students(made.teacher, [made.student], worlds=3)
     assert content == read_stage(made.teacher / "distill.json", "distill")
     teacher, student = content["metrics"]["students"]
     assert set(KEYS) <= set(teacher) and set(teacher) == set(student)
@@ -131,7 +131,7 @@ def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
 
 def test_without_counts_all_are_estimated_alike_and_it_is_said(made):
     counted(made.student, 13, 20)
-    found = measured(made.teacher, [made.student], worlds=1)["metrics"]
+    found = judge_students(made.teacher, [made.student], worlds=1)["metrics"]
     late = [row["pushed_latency_ms"] for row in found["students"]]
     assert late == pytest.approx([15e3 / 207, 3e3 / 207])
     assert found["latency"] == "estimated" and found["students"][0]["instructions_g"] is None
@@ -144,31 +144,31 @@ def test_a_student_that_is_not_counted_is_not_pushed(made):
     counted(made.teacher, 56, 90)
     counted(made.student, 13, 20)
     artifact(made.student / "policy_static.pt", "student's", off=0.003)  # another one than was counted
-    row = measured(made.teacher, [made.student], worlds=1)["metrics"]["students"][1]
+    row = judge_students(made.teacher, [made.student], worlds=1)["metrics"]["students"][1]
     assert row["pushed_trials"] is row["pushed_latency_ms"] is row["instructions_g"] is None and row["hits"] == 1
 
 
 def test_what_was_driven_once_is_kept(made):
-    measured(made.teacher, [made.student], worlds=2)
+    judge_students(made.teacher, [made.student], worlds=2)
     assert len(made.driven) == 8
     first = read_stage(made.teacher / "distill.json", "distill")["metrics"]
     made.driven.clear()
-    assert measured(made.teacher, [made.student], worlds=2)["metrics"] == first and not made.driven
-    measured(made.teacher, [made.student], worlds=3)  # one more world for each
+    assert judge_students(made.teacher, [made.student], worlds=2)["metrics"] == first and not made.driven
+    judge_students(made.teacher, [made.student], worlds=3)  # one more world for each
     assert len(made.driven) == 4 and {seed for _, seed, _ in made.driven} == {SEED + 2}
     made.driven.clear()
     artifact(made.student / "policy_static.pt", "student's", off=0.004)
-    measured(made.teacher, [made.student], worlds=3)
+    judge_students(made.teacher, [made.student], worlds=3)
     assert len(made.driven) == 6 and {off for off, *_ in made.driven} == {0.004}
 
 
 def test_what_another_car_drove_is_not_taken_for_this_ones(made, monkeypatch, tmp_path):
-    measured(made.teacher, [made.student], worlds=1)
+    judge_students(made.teacher, [made.student], worlds=1)
     made.driven.clear()
     path = tmp_path / "car.yml"
     path.write_text(yaml_of(replace(Car(), wheelbase_m=0.5)))
     monkeypatch.setenv(FILE_VARIABLE, str(path))
-    measured(made.teacher, [made.student], worlds=1)
+    judge_students(made.teacher, [made.student], worlds=1)
     assert len(made.driven) == 4
 
 
@@ -185,16 +185,16 @@ def test_a_kill_costs_the_drives_that_had_not_ended(made, monkeypatch):
 
     monkeypatch.setattr(students, "_append", dies)
     with pytest.raises(KeyboardInterrupt):
-        measured(made.teacher, [made.student], worlds=3)
+        judge_students(made.teacher, [made.student], worlds=3)
     assert not (made.teacher / "distill.json").exists()
     monkeypatch.setattr(students, "_append", append)
     made.driven.clear()
-    rows = measured(made.teacher, [made.student], worlds=3)["metrics"]["students"]
+    rows = judge_students(made.teacher, [made.student], worlds=3)["metrics"]["students"]
     assert len(made.driven) == 12 - 3 and [row["hits"] for row in rows] == [3, 2]
 
 
 def test_where_there_is_no_world_nobody_drives(made):
-    found = measured(made.teacher, [made.student], worlds=0)["metrics"]
+    found = judge_students(made.teacher, [made.student], worlds=0)["metrics"]
     assert not made.driven and found["notes"][0].startswith("Nobody drove")
     assert all(row["hits"] is row["trials"] is row["pushed_latency_ms"] is None for row in found["students"])
     assert plots.frontier(found["students"], "teacher").axes and len(plots.frontier(found["students"], "").axes) == 2
@@ -204,7 +204,7 @@ def test_where_there_is_no_world_nobody_drives(made):
 def test_rows_are_drawn(made):
     counted(made.teacher, 56, 90)
     counted(made.student, 13, 20)
-    rows = measured(made.teacher, [made.student], worlds=3)["metrics"]["students"]
+    rows = judge_students(made.teacher, [made.student], worlds=3)["metrics"]["students"]
     work, hits, errors = plots.frontier(rows, "fast").axes
     assert [label.get_text().split("\n")[0] for label in work.get_yticklabels()] == ["teacher", "fast"]
     assert {"13 to 20", "56 to 90"} <= {text.get_text() for text in work.texts}
@@ -244,17 +244,17 @@ def test_what_does_not_belong_together_is_refused(made, breaks, says):
     student = breaks(made)
     before = {p: p.read_bytes() for p in made.teacher.iterdir()}
     with pytest.raises(DistillError, match=says):
-        measured(made.teacher, [student], worlds=1)
+        judge_students(made.teacher, [student], worlds=1)
     assert {p: p.read_bytes() for p in made.teacher.iterdir()} == before
     with pytest.raises(DistillError, match="names of their own"):
-        measured(made.teacher, [student, student], worlds=1)
+        judge_students(made.teacher, [student, student], worlds=1)
 
 
 def test_the_teachers_report_is_replaced_and_is_no_students(made):
-    measured(made.teacher, [made.student], worlds=1)
-    measured(made.teacher, [made.student], worlds=2)
+    judge_students(made.teacher, [made.student], worlds=1)
+    judge_students(made.teacher, [made.student], worlds=2)
     with pytest.raises(DistillError, match="is a teacher's run, not a student's"):
-        measured(made.student, [made.teacher], worlds=1)
+        judge_students(made.student, [made.teacher], worlds=1)
 
 
 def test_the_command_drives_and_executes_the_notebook(made, monkeypatch):

@@ -379,23 +379,23 @@ def test_committed_results_are_small_and_show_no_path():
 
 def test_what_was_opened_must_not_have_changed(tiny, tiny_file, tmp_path, monkeypatch):
     with pytest.raises(runs.RoverError, match="stage 'load'"):
-        session.opened(tmp_path)
+        session.open_run(tmp_path)
     report = {"sha256": "another", "macs_by_block": {"head": 1}}
     given = {"checkpoint": str(tiny_file), "episodes": "episodes"}
     write_stage(tmp_path / "load.json", "load", params=given, metrics={"checkpoint": report, "split": {}}, inputs={})
     parts = SimpleNamespace(episodes={})
     monkeypatch.setattr(session, "load", lambda *paths: session.Opened(tiny, SimpleNamespace(root="episodes"), parts))
     with pytest.raises(runs.RoverError, match="is not what notebook 01 loaded"):
-        session.opened(tmp_path)
+        session.open_run(tmp_path)
     report["sha256"] = tiny.sha256
     write_stage(tmp_path / "load.json", "load", params=given, metrics={"checkpoint": report, "split": {}}, inputs={})
-    assert session.opened(tmp_path).checkpoint is tiny
+    assert session.open_run(tmp_path).checkpoint is tiny
     parts.episodes["held_out"] = ["another"]
     with pytest.raises(runs.RoverError, match="other episodes"):
-        session.opened(tmp_path)
+        session.open_run(tmp_path)
 
 
 def test_nobody_watches_a_test(monkeypatch):
     monkeypatch.delenv("JPY_SESSION_NAME", raising=False)
     monkeypatch.setenv(runs.TTY_VARIABLE, "")
-    assert progress.watched() is progress.silent
+    assert progress.notebook_bar() is progress.silent

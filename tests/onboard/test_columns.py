@@ -1,10 +1,10 @@
 """Tables of text: aligned columns, a dash where nothing was measured, ratios to the first row."""
 
-from rover_lib.onboard.columns import aligned, benchmark_rows, number, ratio
+from rover_lib.onboard.columns import align, benchmark_rows, number, ratio
 
 
 def test_columns_stand_under_each_other():
-    assert aligned([["", "MB"], ["static", "11.9"], ["fp32", "-"]]) == ["          MB", "static  11.9", "fp32       -"]
+    assert align([["", "MB"], ["static", "11.9"], ["fp32", "-"]]) == ["          MB", "static  11.9", "fp32       -"]
 
 
 def test_what_was_not_measured_is_a_dash():

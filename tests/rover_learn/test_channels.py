@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from policies import memory_samples
 
-from rover_learn.channels import _chosen, _leave_out, kept_of, without_channels
+from rover_learn.channels import _choose, _leave_out, kept_of, without_channels
 from rover_learn.fake_quant import parameters
 from rover_learn.lessons import BatchedPolicy
 from rover_learn.refit import Gram
@@ -136,7 +136,7 @@ def block():
 
 def test_what_others_can_say_goes_first(block):
     """Everything that varies is in four channels and their mixtures, so the four that stay must span it."""
-    kept = _chosen(block.gram, block.weights["b.conv2.weight"], 4)
+    kept = _choose(block.gram, block.weights["b.conv2.weight"], 4)
     values = block.h.transpose(0, 1).flatten(1)
     centred = values - values.mean(1, keepdim=True)
     rank = torch.linalg.matrix_rank

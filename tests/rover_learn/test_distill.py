@@ -121,7 +121,7 @@ def test_what_was_begun_with_other_settings_is_not_gone_on_with(teacher, episode
         for settings in ("", str(tmp_path / "other.yml")):
             monkeypatch.setenv("ROVER_PARAMS", settings)
             with pytest.raises(KeyboardInterrupt):
-                distill_module._taught(work)
+                distill_module._teach(work)
     lessons, students = places[::2], places[1::2]
     assert len(set(lessons)) == 1
     assert students[0] != students[1] and students[2] == students[3]  # the settings matter only with QAT
@@ -245,14 +245,14 @@ def test_a_teacher_with_other_statistics_is_asked_again(teacher, episodes, recip
 
 @pytest.mark.slow
 def test_a_student_may_be_called_teacher_and_its_name_is_one_process(teacher, episodes, recipe, tmp_path, monkeypatch):
-    real, arguments = distill_module._taught, {"runs_dir": tmp_path, "recipe": recipe.of_steps(4), "device": "cpu"}
+    real, arguments = distill_module._teach, {"runs_dir": tmp_path, "recipe": recipe.of_steps(4), "device": "cpu"}
 
     def while_another_starts(work):
         with pytest.raises(RoverError, match="another process is at work in it"):
             distill(teacher, episodes, "teacher", SHAPE, **arguments)
         return real(work)
 
-    monkeypatch.setattr(distill_module, "_taught", while_another_starts)
+    monkeypatch.setattr(distill_module, "_teach", while_another_starts)
     folder = distill(teacher, episodes, "teacher", SHAPE, **arguments)
     rows = json.loads((folder / "distill.json").read_text())["metrics"]["students"]
     assert [row["name"] for row in rows] == ["teacher", "teacher"] and rows[0]["gmac"] > rows[1]["gmac"]
@@ -310,12 +310,12 @@ def test_a_damaged_file_of_a_phase_is_one_sentence(tmp_path):
     torch.save({"weights": torch.ones(100)}, tmp_path / "start.pt")
     (tmp_path / "start.pt").write_bytes((tmp_path / "start.pt").read_bytes()[:-200])
     with pytest.raises(TrainingError, match=r"start.pt: cannot go on from it, found \w+; remove .* to teach from the"):
-        distill_module._kept(tmp_path / "start.pt")
+        distill_module._read_phase(tmp_path / "start.pt")
 
 
 def test_phases_that_another_process_has_removed_are_no_error(teacher, episodes, tmp_path, monkeypatch):
     """A process that learns the same under another name uses the same folder, and may finish first."""
-    monkeypatch.setattr(distill_module, "_taught", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
+    monkeypatch.setattr(distill_module, "_teach", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
     monkeypatch.setattr(distill_module, "_leave", lambda new, *_: (new / "distill.json").touch())
     folder = distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path, device="cpu")
     assert [p.name for p in folder.iterdir()] == ["distill.json"]
@@ -348,7 +348,7 @@ def test_an_artifact_of_another_run_is_not_replaced_by_a_student(teacher, episod
 def test_what_was_killed_while_it_took_its_place_is_an_earlier_students_again(teacher, episodes, tmp_path, monkeypatch):
     """The checkpoint had moved and the run's report stayed, so the folder looked like another policy's run."""
     monkeypatch.setattr(distill_module, "_is_student", lambda path: True)
-    monkeypatch.setattr(distill_module, "_taught", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
+    monkeypatch.setattr(distill_module, "_teach", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
     monkeypatch.setattr(distill_module, "_leave", lambda new, *_: (new / "distill.json").touch())
     for name in ("fast/quantize.json", ".fast.old/best_model.pth"):
         (tmp_path / name).parent.mkdir()

@@ -8,7 +8,7 @@ from torch.func import functional_call
 from rover_learn.fake_quant import RoundedPolicy, parameters
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.int8.observe import calibrate, scaled_model
+from rover_lib.workshop.int8.observe import calibrate, scale_model
 from rover_lib.workshop.int8.quantize import int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme
 
@@ -140,7 +140,7 @@ def test_other_shapes(shape, tmp_path):
         checkpoint = load_checkpoint(tmp_path)
     calibration = calibrate(checkpoint, memory_samples(4))
     rounded = RoundedPolicy(checkpoint, Scheme("static"), calibration)
-    expected = dict(scaled_model(checkpoint, calibration, for_int8=True).named_parameters())
+    expected = dict(scale_model(checkpoint, calibration, for_int8=True).named_parameters())
     rounded.rounds = set()
     made = rounded.parameters_of(checkpoint.weights)
     assert {name.replace(".0.weight", ".weight") for name in made}

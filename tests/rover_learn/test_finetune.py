@@ -343,7 +343,7 @@ def test_a_recipe_that_cannot_be_is_refused(recipe, values, says):
 
 def test_phases_that_another_process_has_removed_are_no_error(checkpoint, old, new, tmp_path, monkeypatch):
     """A process that learns the same under another name uses the same folder, and may finish first."""
-    monkeypatch.setattr(finetune_module, "_taught", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
+    monkeypatch.setattr(finetune_module, "_train", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
     monkeypatch.setattr(finetune_module, "_leave", lambda new, *_: (new / "finetune.json").touch())
     assert finetune(checkpoint, [old, new], "better", runs_dir=tmp_path, device="cpu").is_dir()
 
@@ -354,9 +354,11 @@ def test_a_run_that_is_there_is_not_overwritten(checkpoint, old, new, tmp_path):
 
 
 def test_a_run_that_another_process_made_meanwhile_is_not_overwritten(checkpoint, old, new, tmp_path, monkeypatch):
-    real = finetune_module._opened
+    real = finetune_module._open_work
     monkeypatch.setattr(
-        finetune_module, "_opened", lambda *args: ((tmp_path / "runs" / "better").mkdir(parents=True), real(*args))[1]
+        finetune_module,
+        "_open_work",
+        lambda *args: ((tmp_path / "runs" / "better").mkdir(parents=True), real(*args))[1],
     )
     with pytest.raises(FinetuneError, match="is there already"):
         finetune(checkpoint, [old, new], "better", runs_dir=tmp_path / "runs", device="cpu")
@@ -366,7 +368,7 @@ def test_a_run_that_another_process_made_meanwhile_is_not_overwritten(checkpoint
 def test_ended_while_the_run_takes_its_place_it_goes_on(checkpoint, old, new, tmp_path, monkeypatch):
     """A run's folder with only some of its files would keep the same command from going on."""
     taught = SimpleNamespace(folder=tmp_path / "phases")
-    monkeypatch.setattr(finetune_module, "_taught", lambda work: taught)
+    monkeypatch.setattr(finetune_module, "_train", lambda work: taught)
 
     def leave(folder, *_):
         for name in ("best_model.pth", "finetune.json"):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from rover_learn.training import Resumable, RowFile, descend, frames_of, in_memory, optimiser, seeded
+from rover_learn.training import Resumable, RowFile, descend, frames_of, in_memory, optimiser, seed_inside
 from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.workshop.recordings.episodes import Sample
 
@@ -29,7 +29,7 @@ def train(folder: Path, kill_at: int = -1, **options) -> tuple[list[float], torc
     """
     rng = np.random.default_rng(0)
     made = 0
-    with seeded(0), Resumable(folder, **{"every_s": 0.0, **options}) as saved:
+    with seed_inside(0), Resumable(folder, **{"every_s": 0.0, **options}) as saved:
         model = nn.Sequential(nn.Linear(3, 8), nn.Dropout(0.5), nn.Linear(8, 1))
         rows = RowFile(folder / "rows", (3,))
         for _ in saved.steps("features", STEPS, rng, rows=rows):
@@ -123,7 +123,7 @@ def test_one_bar_over_all_phases_begins_where_the_training_was(tmp_path):
 
     with pytest.raises(Killed):
         train(tmp_path, kill_at=STEPS + 2)
-    with seeded(0), Resumable(tmp_path, progress, work=100) as saved:
+    with seed_inside(0), Resumable(tmp_path, progress, work=100) as saved:
         for phase, cost in (("features", 10), ("network", 5)):
             parts = {"rows": RowFile(tmp_path / "rows", (3,))} if phase == "features" else {}
             for _ in saved.steps(phase, STEPS, np.random.default_rng(0), cost=cost, **parts):

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from rover_lib.workshop.cache import cache_root, cached_folder, key_of
+from rover_lib.workshop.cache import cache_folder, cache_root, key_of
 from rover_lib.workshop.recordings import episodes
 
 
@@ -23,7 +23,7 @@ def test_a_cached_folder_is_made_once(monkeypatch, tmp_path):
         made.append(folder)
         (folder / "file").write_text("x")
 
-    assert cached_folder("thing", "1", make) == cached_folder("thing", "1", make) == tmp_path / "thing-1"
+    assert cache_folder("thing", "1", make) == cache_folder("thing", "1", make) == tmp_path / "thing-1"
     assert len(made) == 1
 
 

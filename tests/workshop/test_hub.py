@@ -80,8 +80,8 @@ def test_a_dataset_of_another_version_is_refused_before_it_is_fetched(cache, mon
     (snapshot / "meta").mkdir()
     (snapshot / "meta/info.json").write_text(json.dumps({"codebase_version": "v2.1"}))
     asked = []
-    fetch = hub.fetched
-    monkeypatch.setattr(hub, "fetched", lambda *a, **o: asked.append(o.get("files")) or fetch(*a, **o))
+    fetch = hub.fetch
+    monkeypatch.setattr(hub, "fetch", lambda *a, **o: asked.append(o.get("files")) or fetch(*a, **o))
     with pytest.raises(EpisodeError, match="only v3 is read; convert it once"):
         load_recordings("user/drives@main")
     assert asked == [("meta/*",)]

@@ -10,32 +10,32 @@ import pytest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop import swap_folder as alone
 from rover_lib.workshop.run.run_folder import run_folder
-from rover_lib.workshop.swap_folder import alone_in, made_beside
+from rover_lib.workshop.swap_folder import build_beside, lock_folder
 
 
 def test_while_one_is_in_it_another_is_refused(tmp_path):
-    with alone_in(tmp_path / ".mine.new") as folder:
+    with lock_folder(tmp_path / ".mine.new") as folder:
         (folder / "made").write_text("half")
-        with pytest.raises(RoverError, match="another process is at work in it; wait for it"), alone_in(folder):
+        with pytest.raises(RoverError, match="another process is at work in it; wait for it"), lock_folder(folder):
             pass
         assert (folder / "made").read_text() == "half"
     assert not list(tmp_path.iterdir())
-    with alone_in(tmp_path / ".mine.new") as folder:
+    with lock_folder(tmp_path / ".mine.new") as folder:
         assert not list(folder.iterdir())
 
 
 def test_what_a_killed_process_left_goes_first(tmp_path):
     lines = (
         "import os, sys, pathlib",
-        "from rover_lib.workshop.swap_folder import alone_in",
-        "with alone_in(pathlib.Path(sys.argv[1])) as folder:",
+        "from rover_lib.workshop.swap_folder import lock_folder",
+        "with lock_folder(pathlib.Path(sys.argv[1])) as folder:",
         "    (folder / 'sub').mkdir()",
         "    (folder / 'link').symlink_to('/nowhere')",
         "    os.kill(os.getpid(), 9)",
     )
     assert subprocess.run([sys.executable, "-c", "\n".join(lines), tmp_path / ".mine.new"]).returncode == -9
     assert {p.name for p in (tmp_path / ".mine.new").iterdir()} == {"sub", "link"}
-    with alone_in(tmp_path / ".mine.new") as folder:
+    with lock_folder(tmp_path / ".mine.new") as folder:
         assert not list(folder.iterdir())
 
 
@@ -50,9 +50,9 @@ def test_a_folder_that_vanishes_while_it_is_taken_is_made_again(tmp_path, monkey
         real(*args)
 
     monkeypatch.setattr(alone.fcntl, "flock", locked)
-    with alone_in(tmp_path / ".mine.new") as folder:
+    with lock_folder(tmp_path / ".mine.new") as folder:
         assert folder.is_dir()
-        with pytest.raises(RoverError), alone_in(folder):
+        with pytest.raises(RoverError), lock_folder(folder):
             pass
 
 
@@ -68,7 +68,7 @@ def test_a_run_that_is_a_link_is_made_where_the_link_leads(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "mine").symlink_to("../disk/large")
     for _ in ("not there yet", "there"):
-        with made_beside(run_folder(tmp_path / "runs", "mine", RoverError)) as new:
+        with build_beside(run_folder(tmp_path / "runs", "mine", RoverError)) as new:
             assert new.parent == tmp_path / "disk"
             (new / "last.json").touch()
     assert [p.name for p in (tmp_path / "runs" / "mine").iterdir()] == ["last.json"]
@@ -89,7 +89,7 @@ def write(folder, *names, text):
 
 def make(folder):
     """Make a run that replaces a file by a folder and a folder by a file, adds one, and leaves no report.html."""
-    with made_beside(folder, lambda folder: [folder / "report.html", folder / "figures"]) as new:
+    with build_beside(folder, lambda folder: [folder / "report.html", folder / "figures"]) as new:
         write(new, "figures/one", "pretrained_model/config.json", "policy_mixed.pt", "fast.json", text="new")
 
 
@@ -132,7 +132,7 @@ def test_an_interrupt_or_a_kill_while_it_takes_its_place_costs_nothing(tmp_path,
                 patch.setattr(alone, "_put_back", lambda *_: None)
             make(tmp_path / "mine")
         if killed:
-            with contextlib.suppress(RuntimeError), made_beside(tmp_path / "mine"):
+            with contextlib.suppress(RuntimeError), build_beside(tmp_path / "mine"):
                 raise RuntimeError  # the next process puts it back, even if it fails itself
         assert whole(tmp_path) == as_it_was
     make(tmp_path / "mine")

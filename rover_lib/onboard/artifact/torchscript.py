@@ -101,7 +101,7 @@ def unknown_operators(graph: Any) -> list[str]:
     return sorted(kinds - known)
 
 
-def _parsed(source: bytes) -> ast.Module:
+def _parse(source: bytes) -> ast.Module:
     """Parse a program. Raises like ast.parse(), but SystemError only if each of PARSED attempts does.
 
     Python 3.11 counts a tree's depth for the whole process. If another thread parses at the same time, or if garbage
@@ -121,7 +121,7 @@ class _Program:
         if not SOURCE.fullmatch(source):
             raise Unknown(f"the character {SOURCE.sub(b'', source, count=1)[:1].decode('latin-1')!r}")
         try:
-            body = _parsed(source).body
+            body = _parse(source).body
         except (SyntaxError, ValueError, RecursionError, MemoryError, SystemError) as e:
             raise Unknown(f"a program that cannot be read ({type(e).__name__})") from None
         match body:

@@ -318,9 +318,9 @@ def _reader(
     if stat.S_ISFIFO(mode):
         return _fifo(path, closing)
     if stat.S_ISDIR(mode):
-        return _paced(_folder(path), rate_hz, closing, begun)
+        return _pace(_folder(path), rate_hz, closing, begun)
     if path.suffix == ".mjpeg":
-        return _paced(lambda: _split(_contents(path)), rate_hz, closing, begun)
+        return _pace(lambda: _split(_contents(path)), rate_hz, closing, begun)
     raise CameraError(
         f"{source}: neither a camera nor a folder, a FIFO or an .mjpeg file of JPEGs",
         remedy=f"ffmpeg -i {path.name} -q:v 3 {path.stem}.mjpeg makes one of a video",
@@ -367,7 +367,7 @@ def _contents(path: Path, piece: int = 1 << 20) -> Iterator[bytes]:
             yield data
 
 
-def _paced(
+def _pace(
     pictures: Callable[[], Iterable[bytes]], rate_hz: float, closing: threading.Event, begun: threading.Event
 ) -> Reader:
     """Yield stored pictures at a camera's rate: again and again until `begun` is set, and then once."""

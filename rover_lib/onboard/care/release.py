@@ -146,7 +146,7 @@ def pack(
     artifact, folder = Path(artifact), Path(folder)
     manifest = inspect_artifact(artifact, expected, allow)
     signature = sign(artifact, key) if key else None
-    for old in _packed_before(artifact, folder):
+    for old in _read_earlier_pack(artifact, folder):
         old.unlink()
     folder.mkdir(parents=True, exist_ok=True)
     about = {**_about(artifact, manifest), "parts": 0}
@@ -159,13 +159,13 @@ def pack(
             (folder / SIGNATURE).write_bytes(signature)
         (folder / ORIGIN).write_text(json.dumps(about, indent=1, sort_keys=True) + "\n")
     except BaseException:
-        for half in _packed_before(artifact, folder):  # make room on a full disk
+        for half in _read_earlier_pack(artifact, folder):  # make room on a full disk
             half.unlink()
         raise
     return about
 
 
-def _packed_before(artifact: Path, folder: Path) -> list[Path]:
+def _read_earlier_pack(artifact: Path, folder: Path) -> list[Path]:
     """Return the files of an earlier pack(), release.json first. Raises ReleaseError if there are other files."""
     if not folder.exists():
         return []
@@ -655,7 +655,7 @@ class Releases:
         shutil.rmtree(away)
 
 
-def sandboxed(name: str) -> None:
+def check_in_sandbox(name: str) -> None:
     """Check a release by `rover release verify NAME` in the service's sandbox, with the unit of provision.yml.
 
     Raises ReleaseError, with the check's own sentence, if it does not pass.

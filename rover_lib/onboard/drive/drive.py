@@ -25,7 +25,7 @@ from rover_lib.onboard.car.host import default_log, default_view
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
-from rover_lib.onboard.drive.inference import Planner, PolicyProcess, delayed
+from rover_lib.onboard.drive.inference import Planner, PolicyProcess, delay
 from rover_lib.onboard.drive.loop import Arm, Hooks, Report, Until, Warnings, drive
 from rover_lib.onboard.drive.pilot import Pilot, PolicyPilot, ReplayPilot
 from rover_lib.onboard.drive.plan import Commanded, Settings
@@ -35,14 +35,14 @@ from rover_lib.onboard.drive.watch import (
     HealthWatch,
     MemoryWatch,
     artifact_changes,
-    boosted_priority,
+    boost_priority,
     exit_if_hung,
-    stopped_by_signals,
-    unfinished_drive,
+    find_unfinished_drive,
+    stop_on_signals,
 )
 from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver, sentence_of
 from rover_lib.onboard.params import params
-from rover_lib.onboard.recording.episode import About, Controls, read_controls, recorded_car
+from rover_lib.onboard.recording.episode import About, Controls, read_car_of, read_controls
 from rover_lib.onboard.recording.recorder import Recorder, room_for
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.status_line import StatusLine
@@ -122,7 +122,7 @@ def drive_car(
     )
     this = this_car()
     controls = read_controls(options.replay) if options.replay else None
-    if options.replay and not (recorded := recorded_car(options.replay)).drives_like(this):
+    if options.replay and not (recorded := read_car_of(options.replay)).drives_like(this):
         raise ParamsError(
             f"{options.replay}: its pulses are of another car",
             found=f"{recorded.name!r} there, and this car is {this.name!r}",
@@ -132,9 +132,9 @@ def drive_car(
     if not (controls or car or options.dry_run or options.film):
         check_no_film(options.camera)
     with ExitStack() as stack:
-        log = stack.enter_context(_flight_log(options, settings, report))
+        log = stack.enter_context(_open_flight_log(options, settings, report))
         stop = SignalEvent()
-        stack.enter_context(stopped_by_signals(stop, log))
+        stack.enter_context(stop_on_signals(stop, log))
         stack.enter_context(exit_if_hung(report, log))
         if car:
             other = stack.enter_context(car())
@@ -187,7 +187,7 @@ def _replay(opened: _Opened, controls: Controls) -> None:
             arm = partial(arm_when_ready, arm, link, opened.until.stop, log.event)
     warnings = _all_of(HealthWatch(report, link), MemoryWatch(report, [os.getpid()]))
     try:
-        with boosted_priority(log):
+        with boost_priority(log):
             opened.run(pilot, Hooks(arm, warnings, show=partial(opened.feed.tick, report, None, None)))
     finally:
         opened.feed.ended(report, None, link)
@@ -202,7 +202,7 @@ def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:
             log.event(f"the policy's process is not confined: {policy.unconfined}", level=logging.WARNING)
-        predict = delayed(policy.predict, options.latency_ms / 1e3) if options.latency_ms else policy.predict
+        predict = delay(policy.predict, options.latency_ms / 1e3) if options.latency_ms else policy.predict
         commanded = Commanded()
         planner = stack.enter_context(
             Planner(camera, predict, commanded, policy.rate_hz, rest_s=REST_S, limits=this.limits)
@@ -246,7 +246,7 @@ def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
                 show = partial(feed.tick, report, camera, pilot)
                 record = attempt.record if options.record else None
                 try:
-                    opened.run(pilot, Hooks(_then(arm, camera.begin), warnings, record, show))
+                    opened.run(pilot, Hooks(_arm_then(arm, camera.begin), warnings, record, show))
                 except (DriveFault, TakenOver) as error:
                     if link and isinstance(error, TakenOver):
                         attempt.record_human(link, stop, human_over)
@@ -273,7 +273,7 @@ def another_car(manifest: dict[str, Any], this: Car) -> str:
     )
 
 
-def _then(arm: Arm, begin: Callable[[], object]) -> Arm:
+def _arm_then(arm: Arm, begin: Callable[[], object]) -> Arm:
     """Return a function that arms and then calls begin(): a film must start with the loop, not while arming waits."""
 
     def armed() -> Telemetry | None:
@@ -384,7 +384,7 @@ class _Arming:
             if self._options.record:
                 recorder = recording.enter_context(self._new_recorder(self._options.record))
                 self._recorder = TakeoverRecorder(recorder, self._mode)
-            driving.enter_context(boosted_priority(self._log))
+            driving.enter_context(boost_priority(self._log))
             self._planner.renew(self._settings.fade_s)
             self._pilot.check_sight()
             limit = self._settings.throttle_limit
@@ -444,7 +444,7 @@ def _all_of(*sources: Warnings) -> Warnings:
 
 
 @contextlib.contextmanager
-def _flight_log(options: DriveOptions, settings: Settings, report: Report) -> Iterator[FlightLog]:
+def _open_flight_log(options: DriveOptions, settings: Settings, report: Report) -> Iterator[FlightLog]:
     """Open a flight log whose events are also lines on the terminal, above the report's status."""
     (max_bytes, keep), path = log_limits(), options.log_file or default_log()
     header: dict[str, Any] = {"artifact": str(options.artifact or options.replay), "hz": options.hz, **vars(settings)}
@@ -452,7 +452,7 @@ def _flight_log(options: DriveOptions, settings: Settings, report: Report) -> It
         header["car"] = car.description()
     with StatusLine(lambda: report.status, sys.stderr) as status:
         logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status.handler], force=True)
-        unfinished = unfinished_drive(path)
+        unfinished = find_unfinished_drive(path)
         with FlightLog(path, header=header, max_bytes=max_bytes, keep=keep) as log:
             if unfinished:
                 log.event(unfinished, level=logging.WARNING)

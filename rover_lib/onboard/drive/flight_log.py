@@ -112,7 +112,7 @@ class Event(NamedTuple):
         return "; ".join([self.text, *(f"{name} {value}" for name, value in self.fields.items())])
 
 
-def _sealed(row: dict[str, Any]) -> bytes:
+def _seal(row: dict[str, Any]) -> bytes:
     """Return a line of JSON with its checksum as the last member."""
     body = json.dumps(plain(row), separators=(",", ":"), default=str)[:-1].encode()
     return b'%s,"crc":"%04X"}\n' % (body, binascii.crc_hqx(body, 0))
@@ -129,7 +129,7 @@ def _event_line(event: Event) -> bytes:
     if len(whole := repr(fields)) > EVENT_CHARACTERS:  # a log file is bounded, a traceback is not
         fields = {"cut": whole[:EVENT_CHARACTERS]}
     text = event.text[:EVENT_CHARACTERS]
-    return _sealed({"kind": "event", "t_s": round(event.t_s, 4), "event": text, "fields": fields})
+    return _seal({"kind": "event", "t_s": round(event.t_s, 4), "event": text, "fields": fields})
 
 
 def log_limits() -> tuple[int, int]:
@@ -320,7 +320,7 @@ class FlightLog:
         row["temperature_c"] = self._host.temperature_c()
         row["throttled"] = self._host.throttled() if self._vcgencmd else None
         self.machine = {name: row[name] for name in ("temperature_c", "throttled")}
-        return _sealed(row)
+        return _seal(row)
 
     def _fail(self, error: Exception) -> None:
         self.failures += 1
@@ -364,7 +364,7 @@ class _LogFile:
             return self._fd
         path = self._path
         path.parent.mkdir(parents=True, exist_ok=True)
-        header = _sealed(self._header | {"part": self._part + 1})
+        header = _seal(self._header | {"part": self._part + 1})
         if path.is_file() and path.stat().st_size + len(header) > self._max_bytes:
             self._shift()
         fd = self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
@@ -399,14 +399,14 @@ class _LogFile:
             if int(old.suffix[1:]) >= self._keep:
                 old.unlink()
             else:
-                old.replace(_numbered(self._path, int(old.suffix[1:]) + 1))
+                old.replace(_number_lines(self._path, int(old.suffix[1:]) + 1))
         if self._keep:
-            self._path.replace(_numbered(self._path, 1))
+            self._path.replace(_number_lines(self._path, 1))
         else:
             self._path.unlink()
 
 
-def _numbered(path: Path, number: int) -> Path:
+def _number_lines(path: Path, number: int) -> Path:
     return path.with_name(f"{path.name}.{number}")
 
 

@@ -30,7 +30,7 @@ from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.drive.plan import LIMITS, Commanded, Plan
 from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
-from rover_lib.onboard.policy.confine import confine, memory_mb, open_no_more
+from rover_lib.onboard.policy.confine import confine, forbid_opening, memory_mb
 
 LOAD_S = 120.0  # time to load an engine and a full-size policy from a slow card
 POLL_S = 0.05
@@ -278,7 +278,7 @@ class PolicyProcess:
         return PolicyError(f"{self.artifact}: the policy's process ended ({how})", remedy="is there enough memory?")
 
 
-def delayed(predict: Predict, latency_s: float) -> Predict:
+def delay(predict: Predict, latency_s: float) -> Predict:
     """Return a `predict` whose answers take at least latency_s each."""
 
     def predict_delayed(frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
@@ -312,7 +312,7 @@ def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any],
                     remedy="this car has one camera, steering and throttle, by these names (quantize: --action-names)",
                 )
             loaded(policy)
-            open_no_more()
+            forbid_opening()
         except RoverError as error:
             return pipe.send_bytes(_refusal(error))
         except Exception as error:

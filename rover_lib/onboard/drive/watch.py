@@ -58,7 +58,7 @@ def real_time(priority: int) -> Iterator[bool]:
 
 
 @contextlib.contextmanager
-def boosted_priority(log: FlightLog) -> Iterator[None]:
+def boost_priority(log: FlightLog) -> Iterator[None]:
     """Inside the context, let this process go before less urgent ones, if its user may ask for that.
 
     With four busy processes on two cores, the loop's lateness at p99 was 0.7 ms; it was 4 to 9 ms with only the loop's
@@ -83,7 +83,7 @@ def schedule(policy: int, priority: int) -> None:
 
 
 @contextlib.contextmanager
-def stopped_by_signals(stop: SignalEvent, log: FlightLog) -> Iterator[None]:
+def stop_on_signals(stop: SignalEvent, log: FlightLog) -> Iterator[None]:
     """Inside the context, each of SIGNALS sets `stop`; the second time, the same signal does what it did before.
 
     Only the main thread may use this.
@@ -125,7 +125,7 @@ def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
         done.set()
 
 
-def unfinished_drive(log: Path | str) -> str | None:
+def find_unfinished_drive(log: Path | str) -> str | None:
     """Return a sentence if the last drive in a flight log was armed but has no end. Call this before a new drive.
 
     A process that was killed, or lost its power, could not log its own end.

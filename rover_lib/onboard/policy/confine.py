@@ -141,7 +141,7 @@ def _bytes_with(limit_mb: float) -> int:
     return int(status.partition("VmData:")[2].split()[0]) * 1024 + int(limit_mb * 1e6)
 
 
-def open_no_more() -> None:
+def forbid_opening() -> None:
     """Forbid this process to open any file from now on, even for reading."""
     _lower(resource.RLIMIT_NOFILE, 0)
 

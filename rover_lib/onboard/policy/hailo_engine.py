@@ -29,7 +29,7 @@ class HailoEngine(SessionEngine):
     """
 
     def __init__(self, path: Path, manifest: dict[str, Any], threads: int | None):
-        self._path, self._runs = path, _checked(manifest, path)
+        self._path, self._runs = path, _check_manifest(manifest, path)
         cameras = manifest["cameras"]
         self._frames = [f"frame_{c['name']}" for c in cameras]
         shapes = {f"frame_{c['name']}": [c["height"], c["width"], 3] for c in cameras}
@@ -122,7 +122,7 @@ def load(path: Path, manifest: dict[str, Any], threads: int | None) -> HailoEngi
         ) from None
 
 
-def _checked(manifest: dict[str, Any], path: Path) -> dict[str, Any]:
+def _check_manifest(manifest: dict[str, Any], path: Path) -> dict[str, Any]:
     """Return the manifest's "hailo". Raises ArtifactError if it does not say how the network runs.
 
     It has network ("backbone" or "whole"), outputs (name: shape), original_names, and state and actions, each None or

@@ -410,7 +410,7 @@ def arduino_step_s(before_s: float, after_s: float) -> float:
     return step_s if step_s > 0 else math.nan
 
 
-def arrived_late(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[bool]:
+def find_backlog(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[bool]:
     """Return for each control whether the next one arrived so soon after it that both had waited in a buffer.
 
     The usual interval is the median of the steps of the Arduino's clock. The last control is never late.
@@ -435,7 +435,7 @@ class Controls:
     left_out: int
 
 
-def recorded_car(folder: Path | str) -> Car:
+def read_car_of(folder: Path | str) -> Car:
     """Return the car whose pulses an episode folder contains, from its metadata.
 
     If the metadata do not describe one, it is the default, the car of the first recordings. Raises CarError if the
@@ -457,7 +457,7 @@ def read_controls(folder: Path | str) -> Controls:
     control is usable, CarError as recorded_car() does.
     """
     folder = Path(folder)
-    pwm = recorded_car(folder).pwm
+    pwm = read_car_of(folder).pwm
     for name, read in (("control_data.csv", _csv_rows), ("episode_data.json", json_controls)):
         rows = read(folder / name)
         timed = []
@@ -502,7 +502,7 @@ def _times(system_s: list[float], arduino_s: list[float]) -> np.ndarray:
     """Return the seconds from the first control to each, never decreasing, in the order of the file."""
     steps_s = np.diff(system_s)
     clock_s = np.array([arduino_step_s(a, b) for a, b in pairwise(arduino_s)])
-    late = "".join("x" if x else " " for x in arrived_late(system_s, arduino_s))
+    late = "".join("x" if x else " " for x in find_backlog(system_s, arduino_s))
     with np.errstate(invalid="ignore"):
         was_set = (steps_s < 0) | (np.abs(steps_s - clock_s) > CLOCKS_APART_S)
     if was_set.any() or "x" * BURST_MIN in late:

@@ -31,11 +31,11 @@ def label(episodes: Sequence[Path], outcome: str) -> None:
 
     All episodes are read before the first is written.
     """
-    for path, text in [labelled(episode, outcome) for episode in episodes]:
+    for path, text in [relabel(episode, outcome) for episode in episodes]:
         _replace(path, text)
 
 
-def labelled(episode: Path, outcome: str) -> tuple[Path, bytes]:
+def relabel(episode: Path, outcome: str) -> tuple[Path, bytes]:
     """Return an episode's file and its new content. Raises EpisodeError if it has no complete episode_data.json."""
     if outcome not in CHOICES:
         raise EpisodeError(f"an outcome is one of {', '.join(CHOICES)}", found=outcome)
@@ -52,11 +52,11 @@ def labelled(episode: Path, outcome: str) -> tuple[Path, bytes]:
     try:
         encoding = json.detect_encoding(data)
         text = data.decode(encoding, "surrogatepass")
-        before = _parsed(text)
+        before = _parse(text)
         if not isinstance(before, dict) or not isinstance(before.get("metadata", {}), dict):
             raise ValueError("no object with an object of metadata in it")
         text = _with_outcome(text, None if outcome == NONE else json.dumps(outcome))
-        after = _parsed(text)
+        after = _parse(text)
     except (ValueError, RecursionError) as error:
         raise EpisodeError(f"{path}: not readable as JSON ({str(error)[:120]})", remedy=_WHOLE) from None
     wanted = before | {"metadata": {k: v for k, v in before.get("metadata", {}).items() if k != "outcome"}}
@@ -67,7 +67,7 @@ def labelled(episode: Path, outcome: str) -> tuple[Path, bytes]:
     return path, text.encode(encoding, "surrogatepass")
 
 
-def _parsed(text: str) -> Any:
+def _parse(text: str) -> Any:
     """Parse JSON, with numbers kept as text, so that two files can be compared even if they contain NaN."""
     return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
 
@@ -77,16 +77,16 @@ def _with_outcome(text: str, outcome: str | None) -> str:
     start = _skip(text, 0)
     for name, _, value, end in _members(text, start):
         if name == "metadata":
-            return text[:value] + _changed(text[value:end], outcome) + text[end:]
-    return text if outcome is None else _added(text, start, f'"metadata": {{"outcome": {outcome}}}')
+            return text[:value] + _change_metadata(text[value:end], outcome) + text[end:]
+    return text if outcome is None else _add_member(text, start, f'"metadata": {{"outcome": {outcome}}}')
 
 
-def _changed(text: str, outcome: str | None) -> str:
+def _change_metadata(text: str, outcome: str | None) -> str:
     """Do the same for the text of the metadata object alone."""
     members = list(_members(text, 0))
     found = [i for i, (name, *_) in enumerate(members) if name == "outcome"]
     if not found:
-        return text if outcome is None else _added(text, 0, f'"outcome": {outcome}')
+        return text if outcome is None else _add_member(text, 0, f'"outcome": {outcome}')
     _, begin, value, end = members[found[0]]
     if outcome is not None:
         return text[:value] + outcome + text[end:]
@@ -97,7 +97,7 @@ def _changed(text: str, outcome: str | None) -> str:
     return "{" + text[end:].lstrip()
 
 
-def _added(text: str, start: int, member: str) -> str:
+def _add_member(text: str, start: int, member: str) -> str:
     """Add a member at the end of the object that begins at `start`, spaced like its first member; return the text."""
     members = list(_members(text, start))
     if not members:

@@ -301,9 +301,9 @@ class View:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
         if not self._address.is_ours(request.headers.get("Host", "")):
-            return _refused("this is not the name of this machine")
+            return _refuse("this is not the name of this machine")
         if not hmac.compare_digest(request.query.get("token", "").encode(), self._token.encode()):
-            return _refused("this page needs its token: use the URL that `rover view` has printed")
+            return _refuse("this page needs its token: use the URL that `rover view` has printed")
         return await handler(request)
 
     async def _give_page(self, request: web.Request) -> web.Response:
@@ -319,7 +319,7 @@ class View:
 
     async def _talk(self, request: web.Request) -> web.StreamResponse:
         if request.headers.get("Origin") != f"http://{request.host}":
-            return _refused("only the view's own page may ask this")
+            return _refuse("only the view's own page may ask this")
         if self._pages >= PAGES:
             return web.Response(status=503, text=f"{PAGES} pages are open already\n")
         page = _Page()
@@ -382,7 +382,7 @@ def _parts(html: bytes) -> tuple[bytes, bytes]:
     return style[1], script[1]
 
 
-def _refused(why: str) -> web.Response:
+def _refuse(why: str) -> web.Response:
     return web.Response(status=403, text=f"{why}\n")
 
 

@@ -21,7 +21,7 @@ from rover_lib.workshop.checkpoint.contents import CORRECT_IT, TWO_ACTIONS, Cont
 from rover_lib.workshop.checkpoint.lerobot import lerobot_folder, read_lerobot
 from rover_lib.workshop.checkpoint.trainer import read_trainer
 from rover_lib.workshop.recordings.samples import Layout
-from rover_lib.workshop.untrusted import listed, shown
+from rover_lib.workshop.untrusted import quote, quote_all
 
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
 SQUEEZED = 0.05  # largest relative change of the aspect ratio; 432x240 instead of 640x360 is 0.013
@@ -64,7 +64,7 @@ class Checkpoint:
         if not all(isinstance(n, int) and not isinstance(n, bool) for n in (height, width)):
             raise CheckpointError(
                 "an image size must be two whole numbers",
-                found=f"{shown(height)} and {shown(width)}",
+                found=f"{quote(height)} and {quote(width)}",
                 remedy="give height and width in pixels",
             )
         if min(height, width) < FEATURE_PX:
@@ -113,8 +113,9 @@ class Checkpoint:
             pairs = (c.state_names, layout.state_names), (c.action_names, layout.action_names)
             if any(own == TWO_ACTIONS != recorded_names for own, recorded_names in pairs):
                 raise CheckpointError(
-                    f"{self.path}: a policy of {listed(TWO_ACTIONS)}",
-                    found=f"recordings of state {listed(layout.state_names)} and action {listed(layout.action_names)}",
+                    f"{self.path}: a policy of {quote_all(TWO_ACTIONS)}",
+                    found="recordings of state "
+                    f"{quote_all(layout.state_names)} and action {quote_all(layout.action_names)}",
                     remedy="if they are the same, say so in the order of the recordings' numbers: --action-names",
                 )
             return self
@@ -157,17 +158,17 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
     Raises CheckpointError, in one sentence, for a file that is missing or damaged, that would have to run code, or
     whose config and weights do not agree, and for a policy that this project cannot run.
     """
-    path = hub.fetched(path, "model", CheckpointError) if hub.is_hub_id(path) else Path(path)
+    path = hub.fetch(path, "model", CheckpointError) if hub.is_hub_id(path) else Path(path)
     if path.is_dir():
         path = lerobot_folder(path) or path
-        return _checked(path, read_lerobot(path))
+        return _check_policy(path, read_lerobot(path))
     if not path.is_file():
         what = "neither a file nor a folder" if path.exists() else "not found"
         raise CheckpointError(
             f"{path}: {what}",
             remedy="give the trainer's .pth file, LeRobot's pretrained_model folder, or user/name@revision of the Hub",
         )
-    return _checked(path, read_trainer(path))
+    return _check_policy(path, read_trainer(path))
 
 
 def normalisation(c: ActConfig) -> dict[str, str]:
@@ -189,24 +190,24 @@ def normalisation(c: ActConfig) -> dict[str, str]:
     return words
 
 
-def _checked(path: Path, read: Contents) -> Checkpoint:
+def _check_policy(path: Path, read: Contents) -> Checkpoint:
     config, weights = read.config, read.weights
     expected = expected_shapes(config)
     shapes = {k: tuple(v.shape) for k, v in weights.items()}
     problems = []
     if missing := sorted(expected.keys() - shapes.keys()):
-        problems.append(f"missing: {listed(missing)}")
+        problems.append(f"missing: {quote_all(missing)}")
     if unknown := sorted(shapes.keys() - expected.keys()):
-        problems.append(f"unknown: {listed(unknown)}")
+        problems.append(f"unknown: {quote_all(unknown)}")
     if wrong := [
         f"{k} is {shapes[k]}, not {expected[k]}" for k in expected if k in shapes and shapes[k] != expected[k]
     ]:
-        problems.append(f"of another shape: {listed(wrong)}")
+        problems.append(f"of another shape: {quote_all(wrong)}")
     if problems:
         raise CheckpointError(f"{path}: config and weights do not agree ({'; '.join(problems)})", remedy=CORRECT_IT)
     if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
         raise CheckpointError(
-            f"{path}: NaN or Inf in {listed(bad)}", remedy="training diverged, take an earlier checkpoint"
+            f"{path}: NaN or Inf in {quote_all(bad)}", remedy="training diverged, take an earlier checkpoint"
         )
     parts: dict[str, int] = {}
     for k, v in weights.items():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig
-from rover_lib.workshop.untrusted import listed, shown
+from rover_lib.workshop.untrusted import quote, quote_all
 
 TWO_ACTIONS = ("steering", "throttle")
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)  # what weights and statistics can be
@@ -50,15 +50,15 @@ def named_weights(path: Path, state: dict[Any, Any], file_bytes: int) -> dict[st
     odd = [k for k, v in state.items() if not isinstance(k, str) or not isinstance(v, Tensor)]
     if odd:
         raise CheckpointError(
-            f"{path}: these weights are not tensors: {listed(odd)}", remedy="save policy.state_dict() as it is"
+            f"{path}: these weights are not tensors: {quote_all(odd)}", remedy="save policy.state_dict() as it is"
         )
     if outside := [k for k in state if not k.startswith("model.")]:
-        raise CheckpointError(f"{path}: names outside 'model.': {listed(outside)}", remedy=IS_IT_WHOLE)
+        raise CheckpointError(f"{path}: names outside 'model.': {quote_all(outside)}", remedy=IS_IT_WHOLE)
     weights = {k.removeprefix("model."): v for k, v in state.items()}
     for name, weight in weights.items():
         if problem := _unusable(weight):
             raise CheckpointError(
-                f"{path}: weight {shown(name)} is {problem}", remedy="save the weights as trained, dense and in floats"
+                f"{path}: weight {quote(name)} is {problem}", remedy="save the weights as trained, dense and in floats"
             )
     claimed = sum(map(_bytes, weights.values()))
     if claimed > file_bytes:  # weights that share their values, or repeat one
@@ -93,7 +93,7 @@ def positive(path: Path, raw: dict[str, Any], key: str, most: int = LARGEST_SIZE
     if not isinstance(value, int) or not is_size(value, most):
         raise CheckpointError(
             f"{path}: config '{key}' must be a whole number of at least 1 and at most {most}",
-            found=shown(value),
+            found=quote(value),
             remedy=CORRECT_IT,
         )
     return value
@@ -103,14 +103,14 @@ def flag(path: Path, raw: dict[str, Any], key: str) -> bool:
     value = raw.get(key)
     if value is None or (isinstance(value, int) and value in (0, 1)):
         return bool(value)
-    raise CheckpointError(f"{path}: config '{key}' must be true or false", found=shown(value), remedy=CORRECT_IT)
+    raise CheckpointError(f"{path}: config '{key}' must be true or false", found=quote(value), remedy=CORRECT_IT)
 
 
 def one_observation(path: Path, raw: dict[str, Any]) -> None:
     steps = raw.get("n_obs_steps", 1)
     if not isinstance(steps, (int, float)) or steps != 1:
         raise CheckpointError(
-            f"{path}: n_obs_steps is {shown(steps)}", remedy="ACT acts on one observation, train with 1"
+            f"{path}: n_obs_steps is {quote(steps)}", remedy="ACT acts on one observation, train with 1"
         )
 
 
@@ -127,7 +127,7 @@ def config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActConf
         value = known.get(key, "relu")
         if not isinstance(value, str) or value not in choices:
             raise CheckpointError(
-                f"{path}: {key} {shown(value)} is not known here", remedy=f"known are {', '.join(sorted(choices))}"
+                f"{path}: {key} {quote(value)} is not known here", remedy=f"known are {', '.join(sorted(choices))}"
             )
     if known.get("dilation") and BACKBONES[known["backbone"]][0] == "basic":
         raise CheckpointError(

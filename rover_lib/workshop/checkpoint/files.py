@@ -118,7 +118,7 @@ def write_both(
     return {name: sha256_of(path) for name, path in files.items()}
 
 
-def written_in(folder: Path) -> Path:
+def find_written(folder: Path) -> Path:
     """What `write_both` left there for `load_checkpoint`: the trainer's file where there is one."""
     trainers = folder / "best_model.pth"
     return trainers if trainers.is_file() else folder / "pretrained_model"

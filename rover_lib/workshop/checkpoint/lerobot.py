@@ -26,7 +26,7 @@ from rover_lib.workshop.checkpoint.contents import (
     positive,
 )
 from rover_lib.workshop.recordings.samples import camera_names
-from rover_lib.workshop.untrusted import listed, shown
+from rover_lib.workshop.untrusted import quote, quote_all
 
 RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
 
@@ -60,7 +60,7 @@ def lerobot_folder(path: Path) -> Path | None:
         if found := sorted(p.parent.name for p in steps.glob(f"*/{PRETRAINED}")):
             raise CheckpointError(
                 f"{steps}: it does not say which of its checkpoints is the last",
-                found=listed(found),
+                found=quote_all(found),
                 remedy=f"give one of them, as in {steps / found[-1]}",
             )
     return None
@@ -76,7 +76,7 @@ def _act_config(folder: Path) -> dict[str, Any]:
         )
     if raw.get("type") != "act":
         raise CheckpointError(
-            f"{folder}/config.json: policy type is {shown(raw.get('type'))}",
+            f"{folder}/config.json: policy type is {quote(raw.get('type'))}",
             remedy="only 'act' is known here"
             if raw.get("type")
             else "only 'act' is known here; if it is one from before 2025, convert it by LeRobot's "
@@ -92,18 +92,18 @@ def _picture_sizes(folder: Path, inputs: Mapping[str, tuple[str, list[int]]]) ->
         if kind == "VISUAL":
             if len(shape) != 3 or shape[0] != 3 or max(shape) > LARGEST_SIDE_PX:
                 raise CheckpointError(
-                    f"{folder}: camera {shown(name)} has shape {shape[:4]}",
+                    f"{folder}: camera {quote(name)} has shape {shape[:4]}",
                     remedy=f"only (3, height, width) works here, up to {LARGEST_SIDE_PX} pixels a side",
                 )
             sizes[name] = (shape[1], shape[2])
         elif kind == "ENV":
             raise CheckpointError(
-                f"{folder}: input {shown(name)} is an environment state, which no camera car has",
+                f"{folder}: input {quote(name)} is an environment state, which no camera car has",
                 remedy="train a policy without it",
             )
     if not sizes:
         raise CheckpointError(
-            f"{folder}: the policy has no camera input (it has {listed(inputs) or 'none'})",
+            f"{folder}: the policy has no camera input (it has {quote_all(inputs) or 'none'})",
             remedy="nothing to drive by",
         )
     return sizes
@@ -129,7 +129,7 @@ def read_lerobot(folder: Path) -> Contents:
     if "action" not in outputs:
         raise CheckpointError(
             f"{folder}: the policy has no 'action' output",
-            found=listed(outputs) or "none",
+            found=quote_all(outputs) or "none",
             remedy="train one that acts",
         )
     one_observation(folder, raw)
@@ -186,7 +186,7 @@ def _own_rate_hz(folder: Path) -> float:
     rate_hz = read_origin(folder).get("rate_hz", RATE_HZ)
     if isinstance(rate_hz, bool) or not isinstance(rate_hz, (int, float)) or not 0 < rate_hz <= 1000:
         raise CheckpointError(
-            f"{folder / ORIGIN}: 'rate_hz' must be above 0 and at most 1000", found=shown(rate_hz), remedy=COPY_AGAIN
+            f"{folder / ORIGIN}: 'rate_hz' must be above 0 and at most 1000", found=quote(rate_hz), remedy=COPY_AGAIN
         )
     return float(rate_hz)
 
@@ -196,15 +196,15 @@ def _features(folder: Path, raw: Mapping[str, Any], key: str) -> dict[str, tuple
     features = raw.get(key) or {}
     if not isinstance(features, dict):
         raise CheckpointError(
-            f"{folder}/config.json: '{key}' is not an object", found=shown(features), remedy=COPY_AGAIN
+            f"{folder}/config.json: '{key}' is not an object", found=quote(features), remedy=COPY_AGAIN
         )
     checked = {}
     for name, feature in features.items():
         kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
         if not isinstance(kind, str) or not isinstance(shape, list) or not shape or not all(map(is_size, shape)):
             raise CheckpointError(
-                f"{folder}/config.json: feature {shown(name)} has no type and shape",
-                found=f"{shown(kind)} and {shown(shape)}",
+                f"{folder}/config.json: feature {quote(name)} has no type and shape",
+                found=f"{quote(kind)} and {quote(shape)}",
                 remedy=COPY_AGAIN,
             )
         checked[name] = kind, shape
@@ -256,7 +256,7 @@ class Normaliser:
         if not texts or not isinstance(self.eps, (int, float)) or not 0 <= self.eps <= 1:
             raise CheckpointError(
                 f"{self.where}: norm_map must map names to texts, and eps must be from 0 to 1",
-                found=f"{shown(self.modes)} and {shown(self.eps)}",
+                found=f"{quote(self.modes)} and {quote(self.eps)}",
                 remedy=COPY_AGAIN,
             )
 
@@ -267,11 +267,11 @@ class Normaliser:
             config = step["config"]
             if renames := config.get("rename_map"):
                 raise CheckpointError(
-                    f"{self.where}: renames observations ({shown(renames)})", remedy="rename the inputs instead"
+                    f"{self.where}: renames observations ({quote(renames)})", remedy="rename the inputs instead"
                 )
             if step["registry_name"] not in known:
                 raise CheckpointError(
-                    f"{self.where}: has a processor step that is not known here: {shown(step['registry_name'])}",
+                    f"{self.where}: has a processor step that is not known here: {quote(step['registry_name'])}",
                     remedy="train without it, or do in the recordings what it does",
                 )
             if step["registry_name"] == step_name:
@@ -306,7 +306,7 @@ class Normaliser:
     def _read_statistics(self, folder: Path, name: Any) -> dict[str, Tensor]:
         if not isinstance(name, str) or Path(name).name != name or not name.isprintable():
             raise CheckpointError(
-                f"{self.where}: its state file {shown(name)} is not a file in the folder", remedy=COPY_AGAIN
+                f"{self.where}: its state file {quote(name)} is not a file in the folder", remedy=COPY_AGAIN
             )
         return _read_safetensors(folder / name, STATISTICS_BYTES)
 
@@ -332,13 +332,13 @@ class Normaliser:
         }
         if mode not in pairs:
             raise CheckpointError(
-                f"{self.where}: normalisation mode {shown(mode)} of '{key}' is not known here",
+                f"{self.where}: normalisation mode {quote(mode)} of '{key}' is not known here",
                 remedy=f"known are IDENTITY, {', '.join(pairs)}",
             )
         if missing := [p for p in pairs[mode] if p not in stats]:
             raise CheckpointError(
                 f"{self.where}: mode '{mode}' of '{key}' needs {missing}",
-                found=listed(sorted(stats)),
+                found=quote_all(sorted(stats)),
                 remedy="copy the whole folder again, or compute the statistics again",
             )
         if odd := [p for p in pairs[mode] if stats[p].dtype not in FLOATS]:
@@ -381,9 +381,9 @@ class Normaliser:
         )
         if mode is None:
             return CheckpointError(f"{self.where}: no normalisation mode for '{key}' ({kind})", remedy=remedy)
-        needs = f"no statistics of '{key}', whose mode is {shown(mode)}"
+        needs = f"no statistics of '{key}', whose mode is {quote(mode)}"
         if stats:
-            needs = f"'{key}' is not among the features that it normalises, and its mode is {shown(mode)}"
+            needs = f"'{key}' is not among the features that it normalises, and its mode is {quote(mode)}"
         beside = "no processor file beside it, and " if self.old and not self.stats else ""
         return CheckpointError(f"{self.where}: {beside}{needs}", remedy=remedy)
 
@@ -430,4 +430,4 @@ def _read_safetensors(path: Path, most_bytes: int | None = None) -> dict[str, Te
     except CheckpointError:
         raise
     except Exception as e:  # whatever safetensors or torch raise for a wrong header
-        raise CheckpointError(f"{path}: not readable as safetensors ({shown(str(e))})", remedy=COPY_AGAIN) from None
+        raise CheckpointError(f"{path}: not readable as safetensors ({quote(str(e))})", remedy=COPY_AGAIN) from None

@@ -27,7 +27,7 @@ from rover_lib.workshop.checkpoint.contents import (
     positive,
     tensor_bytes,
 )
-from rover_lib.workshop.untrusted import LARGEST, listed, shown
+from rover_lib.workshop.untrusted import LARGEST, quote, quote_all
 
 TRAINER_KEYS = {  # of the trainer's config: what the shape of the policy needs
     "image_width", "image_height", "chunk_size", "hidden_size", "n_encoder_layers", "n_decoder_layers", "n_heads",
@@ -53,7 +53,7 @@ def read_trainer(path: Path) -> Contents:
         if not isinstance(content.get(key), dict):
             raise CheckpointError(
                 f"{path}: no '{key}' in it",
-                found=listed(content),
+                found=quote_all(content),
                 remedy="is this a trainer checkpoint, or only its weights?",
             )
     raw, weights = content["config"], named_weights(path, content["model_state_dict"], file_bytes)
@@ -79,10 +79,10 @@ def read_trainer(path: Path) -> Contents:
     )
     extra = {
         "normalisation_from": {"in": "ImageNet's, as the trainer does", "out": "none, as the trainer does"},
-        "epoch": _reported(content.get("epoch")),
+        "epoch": _describe_value(content.get("epoch")),
         "best_val_loss": _loss(path, content.get("best_val_loss")),
         "optimizer_mb": tensor_bytes(content.get("optimizer_state_dict")) / 1e6,
-        "trainer_config": _reported(raw),
+        "trainer_config": _describe_value(raw),
     }
     return Contents("trainer", config, weights, sha256_of(path), file_bytes, extra)
 
@@ -95,11 +95,11 @@ def _loss(path: Path, value: Any) -> float | None:
     if is_plain(value) and value.numel() == 1:
         return float(value)
     raise CheckpointError(
-        f"{path}: best_val_loss is not a number", found=shown(value), remedy="save it as one, or leave it out"
+        f"{path}: best_val_loss is not a number", found=quote(value), remedy="save it as one, or leave it out"
     )
 
 
-def _reported(value: Any, depth: int = 3) -> Any:
+def _describe_value(value: Any, depth: int = 3) -> Any:
     """A value for the report, in JSON's types: what is endless or no number, text or list of them is only named."""
     if isinstance(value, np.generic):
         value = value.item()
@@ -107,9 +107,9 @@ def _reported(value: Any, depth: int = 3) -> Any:
         return value
     if depth and isinstance(value, (dict, list, tuple)) and len(value) <= REPORTED:
         if isinstance(value, dict):
-            return {k if isinstance(k, str) else shown(k): _reported(v, depth - 1) for k, v in value.items()}
-        return [_reported(v, depth - 1) for v in value]
-    return shown(value)
+            return {k if isinstance(k, str) else quote(k): _describe_value(v, depth - 1) for k, v in value.items()}
+        return [_describe_value(v, depth - 1) for v in value]
+    return quote(value)
 
 
 def _numpy_scalars() -> list[Any]:

@@ -72,7 +72,7 @@ def _pictures(replay: Replay, rate_hz: float, width: int, progress: Progress) ->
         frame = moment.frame_bgr()
         if frame is None:
             continue
-        picture = drawn(moment.head, frame, shape, replay.car.pwm)
+        picture = draw_moment(moment.head, frame, shape, replay.car.pwm)
         size = size or (width, round(width * picture.shape[0] / picture.shape[1] / 2) * 2)
         if size != picture.shape[1::-1]:
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
@@ -103,7 +103,7 @@ def _write_webp(path: Path, pictures: Iterator[np.ndarray], rate_hz: float, qual
     return len(images)
 
 
-def drawn(head: dict[str, Any], frame_bgr: np.ndarray, shape: CarShape, pwm: PwmCalibration) -> np.ndarray:
+def draw_moment(head: dict[str, Any], frame_bgr: np.ndarray, shape: CarShape, pwm: PwmCalibration) -> np.ndarray:
     """Return a moment's picture, (h, WIDTH, 3) uint8 RGB, with the planned path drawn into it and the commands below.
 
     head: a Moment's. frame_bgr: (h, w, 3) uint8. shape, pwm: of the car that was driven.

@@ -97,10 +97,10 @@ def load_replay(file: Path | str, drive: int = -1, pictures: Path | None = None)
     if "flight log" not in kinds_of(file):
         return _of_recording(file)
     flight = read_log(file, drive)
-    return Replay(flight.car, _of_flight(flight, pictures or recorded_with(flight)))
+    return Replay(flight.car, _of_flight(flight, pictures or find_recording(flight)))
 
 
-def recorded_with(flight: Flight) -> Path:
+def find_recording(flight: Flight) -> Path:
     """Return the folder of the episode recorded with a drive. Raises EpisodeError if there is none, or it is gone."""
     for event in reversed(flight.events):
         if event.text.startswith(RECORDED):

@@ -64,7 +64,7 @@ def write_kit(
             "schema": 1,
             "samples": samples,
             "networks": {
-                network.name: _described(splits, network, errors[network.name], recipe)
+                network.name: _describe_network(splits, network, errors[network.name], recipe)
                 for network in (splits.front, splits.whole)
             },
             "manifest": _manifest(judged, samples, folder),
@@ -91,7 +91,7 @@ def _write_networks(splits: Splits, samples: int, folder: Path) -> None:
     shutil.copyfile(Path(__file__).with_name("compile.py"), folder / "compile.py")
 
 
-def _described(splits: Splits, network: Network, error: Error, recipe: Recipe) -> dict[str, Any]:
+def _describe_network(splits: Splits, network: Network, error: Error, recipe: Recipe) -> dict[str, Any]:
     """Return what kit.json says of a network."""
     whole, of_front = splits.whole, network is splits.front
     # An action may be off by STAND_IN_TIMES the stand-in's error, but not by more than an artifact may allow.

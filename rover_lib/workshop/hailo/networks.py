@@ -128,13 +128,13 @@ def networks(policy: ACT) -> tuple[Network, Network, onnx.ModelProto]:
     whole = _network(
         "whole", Whole(policy), {"state": state[:, :, None, None], **pictures}, ["actions"], [macs, weights]
     )
-    return front, whole, _tidied(onnx_model(graph_of(Rest(policy)), {"state": state, **features}, ["chunk"]))
+    return front, whole, _tidy(onnx_model(graph_of(Rest(policy)), {"state": state, **features}, ["chunk"]))
 
 
 def _network(
     name: str, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str], counts: list[dict[str, int]]
 ) -> Network:
-    model = _tidied(onnx_model(graph_of(module), inputs, outputs))
+    model = _tidy(onnx_model(graph_of(module), inputs, outputs))
     if unknown := {node.op_type for node in model.graph.node} - OPERATORS.keys():
         raise QuantizeError(f"{name}: nothing is known of {', '.join(sorted(unknown))} in Hailo's parser")
     biases = {i.name for i in model.graph.initializer if len(i.dims) == 1}
@@ -153,7 +153,7 @@ def _network(
     )
 
 
-def _tidied(model: onnx.ModelProto) -> onnx.ModelProto:
+def _tidy(model: onnx.ModelProto) -> onnx.ModelProto:
     """Merge two transposes in a row, multiply constants, and remove Identity; the model computes the same as before."""
     graph = model.graph
     constants = {i.name: i for i in graph.initializer}

@@ -20,7 +20,7 @@ from torch.fx import GraphModule, Interpreter, Node
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, block_of, blocks, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.int8.observe import Calibration, observed_graph
+from rover_lib.workshop.int8.observe import Calibration, restore_observed
 from rover_lib.workshop.int8.quantize import convert, forget_graphs, quantize
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.recorded_range import Range, constant_actions, not_judged, pct_of_range, worst
@@ -96,7 +96,7 @@ class Chooser:
 
     def sensitivity(self, scheme: Scheme, progress: Progress = silent) -> dict[str, Errors]:
         """Each block quantized alone, everything else in float: {block: errors}."""
-        graph = observed_graph(self.checkpoint, scheme, self.calibration)
+        graph = restore_observed(self.checkpoint, scheme, self.calibration)
         config, plain = self.checkpoint.config, replace(scheme, float_blocks=())
         before = _BeforeBlocks(graph, blocks(config), self.inputs)
         table = {}
@@ -116,7 +116,7 @@ class Chooser:
         is not better, stays INT8. Returns the mixed scheme and its steps {float_blocks, cost_pct, <action>_mae_pct},
         static first; the last is the best within the cost, in the budget or not.
         """
-        graph = observed_graph(self.checkpoint, scheme, self.calibration)
+        graph = restore_observed(self.checkpoint, scheme, self.calibration)
         costs = float_costs_pct(self.checkpoint)
         order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]) ** 2 / costs[block], reverse=True)
         best = replace(scheme, mode="mixed", float_blocks=())

@@ -316,7 +316,7 @@ def _behind(prepared: nn.Module, node: Node) -> Node | None:
     return next((n for n in node.users if _is_observer(prepared, n)), None)
 
 
-def observed_graph(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:
+def restore_observed(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:
     """The observed graph as calibration left it, its observers seeing no more.
 
     Raises QuantizeError for a calibration of another checkpoint, picture size, scheme or version.
@@ -334,7 +334,7 @@ def observed_graph(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibrat
             f"the calibration was made with smooth {calibration.smooth}, the scheme has {scheme.smooth}"
         )
     torch.backends.quantized.engine = ENGINE
-    prepared = _prepare(scaled_model(checkpoint, calibration, for_int8=True), scheme)
+    prepared = _prepare(scale_model(checkpoint, calibration, for_int8=True), scheme)
     state = prepared.state_dict()
     names = {k for k in state if "activation_post_process" in k}
     if names != set(calibration.observers):
@@ -348,7 +348,7 @@ def observed_graph(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibrat
     return prepared
 
 
-def scaled_model(checkpoint: Checkpoint, calibration: Calibration, *, for_int8: bool) -> ACT:
+def scale_model(checkpoint: Checkpoint, calibration: Calibration, *, for_int8: bool) -> ACT:
     """The float policy with the calibration's channel scales, if it has some. for_int8: as of ACT."""
     model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
     if calibration.smooth is not None:

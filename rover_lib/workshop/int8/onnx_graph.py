@@ -241,7 +241,7 @@ def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
 STACK, STRIDE = 4, 2  # rows in a stack of columns, and rows from one stack's first to the next one's
 
 
-def stacked(weight: Tensor) -> Tensor:
+def stack_stem(weight: Tensor) -> Tensor:
     """Turn the stem's weight over columns, (out, 24, 7, 1), into one over stacks of 4 rows: (out, 96, 2, 1)."""
     out_channels, in_channels, _, _ = weight.shape
     eight = F.pad(weight, (0, 0, 0, 1)).reshape(out_channels, in_channels, 2, STACK)
@@ -266,7 +266,7 @@ def _geometry(m: nn.Conv2d | int8.Conv2d | nn.MaxPool2d, *, of_stacks: bool = Fa
 def _conv(w: _Writer, n: Node, result: Tensor, m: Any, output: str = "") -> str:
     assert m.bias is not None
     source, of_stacks = _args(n)[0], w._is_columns(_args(n)[0])
-    weight = stacked(m.weight) if of_stacks else m.weight
+    weight = stack_stem(m.weight) if of_stacks else m.weight
     inputs = [w._float(source, n.name), w._constant(f"{n.target}.weight", weight)]
     inputs.append(w._constant(f"{n.target}.bias", m.bias))
     return w._add("Conv", inputs, output or n.name, **_geometry(m, of_stacks=of_stacks))
@@ -288,7 +288,7 @@ def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
     w.calls[n.target] += 1
     again = f"_{w.calls[n.target]}" if w.calls[n.target] > 1 else ""
     for part, values, steps, zero_type in (
-        ("weight", stacked(weight.int_repr()) if of_stacks else weight.int_repr(), scales, np.int8),
+        ("weight", stack_stem(weight.int_repr()) if of_stacks else weight.int_repr(), scales, np.int8),
         ("bias", whole_bias, sums, np.int32),
     ):
         # The backbone runs once for each camera. Its weights are stored once, its biases for each camera, because their

@@ -32,7 +32,7 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.memory import give_back_freed
 from rover_lib.workshop.act import ACT, EMBEDDINGS, ActConfig, Columns, block_of, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.int8.observe import Calibration, observed_graph, qconfig_mapping, scaled_model
+from rover_lib.workshop.int8.observe import Calibration, qconfig_mapping, restore_observed, scale_model
 from rover_lib.workshop.int8.scales import projections
 from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 from rover_lib.workshop.recordings.episodes import Sample
@@ -62,7 +62,7 @@ def quantize(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -
         module = _dynamic(checkpoint, calibration)
         expected = list(projections(ACT(checkpoint.config, checkpoint.weights)))
     else:
-        module = convert(observed_graph(checkpoint, scheme, calibration), checkpoint.config, scheme)
+        module = convert(restore_observed(checkpoint, scheme, calibration), checkpoint.config, scheme)
         left_float = {*scheme.float_blocks, *STAYS_FLOAT}
         float_model = ACT(checkpoint.config, checkpoint.weights, for_int8=True)
         convs = [n for n, m in float_model.named_modules() if isinstance(m, nn.Conv2d)]
@@ -164,7 +164,7 @@ def _why_slow(m: Int8Layer, x: Tensor) -> str | None:
 
 def _dynamic(checkpoint: Checkpoint, calibration: Calibration) -> nn.Module:
     torch.backends.quantized.engine = ENGINE
-    model = scaled_model(checkpoint, calibration, for_int8=False)
+    model = scale_model(checkpoint, calibration, for_int8=False)
     spec = dict.fromkeys(projections(model), per_channel_dynamic_qconfig)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -259,7 +259,7 @@ def inspect_layers(
     """
     if quantized.scheme.mode == "dynamic":
         return []
-    prepared = observed_graph(checkpoint, quantized.scheme, calibration)
+    prepared = restore_observed(checkpoint, quantized.scheme, calibration)
     layers = int8_layers(quantized.module)
     _, low, high = KINDS[quantized.scheme.kind]
     seen: dict[str, deque[Tensor]] = {n: deque() for n in layers}  # the backbone runs once for each camera
@@ -302,7 +302,7 @@ def inspect_layers(
     ]
 
 
-def clipped_warnings(rows: list[dict[str, Any]], limit_pct: float) -> list[str]:
+def warn_of_clipping(rows: list[dict[str, Any]], limit_pct: float) -> list[str]:
     """A sentence for each layer that clips more than `limit_pct` of its values."""
     return [
         f"{r['name']}: {r['clipped_pct']:.1f} % of its values are clipped (more than {limit_pct} %); "

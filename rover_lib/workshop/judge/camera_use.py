@@ -16,7 +16,7 @@ import numpy as np
 
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.workshop.judge.compare import Fidelity
-from rover_lib.workshop.judge.recorded_range import follows, shown_pct
+from rover_lib.workshop.judge.recorded_range import follows, format_pct
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import pick_evenly
@@ -52,7 +52,7 @@ class Looking:
         """Return the changes as a table for people."""
         found, rows = self.summary(), []
         for action in self.report.action_names:
-            pct = (shown_pct(found[f"{action}_{name}_pct"]).strip() for name in ("by_picture", "by_state", "apart"))
+            pct = (format_pct(found[f"{action}_{name}_pct"]).strip() for name in ("by_picture", "by_state", "apart"))
             rows.append((action, *pct))
         return Table(("a plan moves by", "another picture", "another state", "both"), rows)
 
@@ -68,7 +68,7 @@ class Looking:
 
     def _moves(self, actions: list[tuple[int, str]]) -> str:
         def pct(moved: np.ndarray, i: int, action: str) -> str:
-            return shown_pct(self.report.in_pct(float(moved[i]), action)).strip()
+            return format_pct(self.report.in_pct(float(moved[i]), action)).strip()
 
         return ", ".join(
             f"another picture moves {a} by {pct(self.by_picture, i, a)}, another state by {pct(self.by_state, i, a)}"

@@ -217,7 +217,7 @@ def hashes(run_dir: Path | str) -> dict[str, str]:
     return {path.name: content_hash(path) for path in artifacts(run_dir).values()}
 
 
-def driven(trials: Mapping[str, Any], at_most: int = 200) -> tuple[Observation, ...]:
+def observe_trials(trials: Mapping[str, Any], at_most: int = 200) -> tuple[Observation, ...]:
     """Observations from the (frame_bgr, state) that trial reports kept: places no recording went to."""
     frames = [frame for trial in trials.values() for frame in trial.frames]
     return tuple(Observation(frame, np.asarray(state, np.float32)) for frame, state in pick_evenly(frames, at_most))

@@ -76,7 +76,7 @@ def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
             here = folder == Path(run_dir) and content["env"]["host"] == socket.gethostname()
             by_host[THIS if here else path.stem.removeprefix("benchmark-")] = content
     ours = {sha: _mode(file) for file, sha in by_host.get(THIS, {"inputs": {}})["inputs"].items()}
-    by_host = {host: content if host == THIS else _named(content, ours) for host, content in by_host.items()}
+    by_host = {host: content if host == THIS else _name_by_mode(content, ours) for host, content in by_host.items()}
     return Benchmarks({h: by_host[h] for h in sorted(by_host, key=lambda h: (h != THIS, h))}, unusable)
 
 
@@ -125,7 +125,7 @@ def _mode(name: str) -> str:
     return Path(name).stem.removeprefix("policy_")
 
 
-def _named(content: Mapping[str, Any], ours: Mapping[str, str]) -> dict[str, Any]:
+def _name_by_mode(content: Mapping[str, Any], ours: Mapping[str, str]) -> dict[str, Any]:
     """Return a benchmark with its artifacts named by mode. On a rover the file in use is always called policy.pt.
 
     ours: {sha256: mode} of the run's artifacts.

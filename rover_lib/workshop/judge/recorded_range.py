@@ -37,6 +37,6 @@ def follows(moved: float, apart: float) -> bool:
     return moved > FOLLOWS * apart
 
 
-def shown_pct(value: float | None) -> str:
+def format_pct(value: float | None) -> str:
     """A share of the recorded range as people read it."""
     return "not judged" if value is None else f"{value:6.2f} %"

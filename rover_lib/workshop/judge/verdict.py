@@ -62,7 +62,7 @@ def verdict(stages: Stages, params: Mapping[str, Any], names: Names) -> dict[str
     params: the content of params.yml. "deploy" in the result is None if no artifact of this policy should drive a car.
     """
     rows = _rows(stages, params)
-    failed = _failed(stages, params, names, rows)
+    failed = _list_failures(stages, params, names, rows)
     unfit = _does_not_drive(stages, failed)
     best = _best(list(rows.values()), params["verdict"])
     deploy = None if unfit else best["mode"]
@@ -107,12 +107,12 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
             "hits": found["hits"],
             "trials": found["trials"],
             "float_blocks": stages["quantize"]["modes"].get(mode, {}).get("float_blocks", []),
-            "missed_gates": [] if mode == "fp32" else _missed(compared, params["gates"], mode),
+            "missed_gates": [] if mode == "fp32" else _list_missed(compared, params["gates"], mode),
         }
     return rows
 
 
-def _missed(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str) -> list[dict[str, Any]]:
+def _list_missed(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str) -> list[dict[str, Any]]:
     """Return the gates that a mode misses, each once.
 
     The original's general gates of accuracy and size are left out if a gate of our own for the same thing is missed.
@@ -236,7 +236,7 @@ def gate_in_words(gate: str) -> str:
     return (in_words(mode, key) + original).replace(CALLED[mode], f"{CALLED[mode]}{at}{engine}")
 
 
-def _failed(
+def _list_failures(
     stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """Return each gate that the policy, or the mode that a Pi is meant to run, misses, with its remedies, best first.
@@ -373,7 +373,7 @@ def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
     """Say why this mode was chosen, each reason in a sentence."""
     if best is fp32:
         return ["No INT8 mode keeps every gate and is worth its cost, so this is FP32, the policy as it was trained."]
-    errors = [f"{action} {judge.shown_pct(e).strip()}" for action, e in best["errors_pct"].items()]
+    errors = [f"{action} {judge.format_pct(e).strip()}" for action, e in best["errors_pct"].items()]
     lines = [f"It keeps every gate: it differs from FP32 by {', '.join(errors)} of the recorded range."]
     if best["trials"]:
         lines.append(f"It hits {best['hits']} of {best['trials']} balloons; FP32 hits {fp32['hits']}.")

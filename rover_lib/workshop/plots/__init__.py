@@ -11,9 +11,9 @@ from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.plots.benchmarks import latency, soak
 from rover_lib.workshop.plots.comparison import action_error, drives_from_above, hits, sizes, worst_frames
 from rover_lib.workshop.plots.counting import (
-    counted,
-    counted_by_kernel,
-    counted_by_size,
+    draw_counts,
+    draw_counts_by_kernel,
+    draw_counts_by_size,
     instruction_counts,
     whole_size,
 )

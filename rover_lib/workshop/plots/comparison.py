@@ -23,7 +23,7 @@ from rover_lib.workshop.plots.style import (
     legend_below,
     new_figure,
     note,
-    shown_picture,
+    picture_of,
 )
 
 
@@ -86,7 +86,7 @@ def worst_frames(
     fig, axes = new_figure(len(frames), 1 + max(len(every), 1), height_in=1.2 + 1.9 * len(frames))
     times_s = np.arange(report.reference.shape[1]) / rate_hz
     for row, worst in zip(axes, frames, strict=True):
-        row[0].imshow(shown_picture(worst.sample))
+        row[0].imshow(picture_of(worst.sample))
         row[0].axis("off")
         row[0].set_title(f"{worst.action} {worst.error_pct:.2f} % off", fontsize=10)
         recorded = getattr(worst.sample, "chunk", None)

@@ -54,7 +54,7 @@ def whole_size(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     return dict(sorted(counted.items(), key=lambda item: -item[1]["instructions_g"]))
 
 
-def counted(metrics: Mapping[str, Any]) -> Figure:
+def draw_counts(metrics: Mapping[str, Any]) -> Figure:
     """Draw instructions against the floor, and beside them the error on the same core. metrics: those of arm.json."""
     rows = whole_size(metrics)
     fig, axes = new_figure(1, 2, height_in=1.7 + 0.4 * len(rows), sharey=True, width_ratios=(1.5, 1))
@@ -89,7 +89,7 @@ def counted(metrics: Mapping[str, Any]) -> Figure:
     return fig
 
 
-def counted_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
+def draw_counts_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
     """Draw what the instructions do. groups: {artifact or peer: {group: 10**9 instructions}}, all in the same order."""
     totals = {name: sum(by_group.values()) for name, by_group in groups.items()}
     near = {name: by_group for name, by_group in groups.items() if totals[name] < NEAR * min(totals.values())}
@@ -113,7 +113,7 @@ def counted_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
     return fig
 
 
-def counted_by_size(metrics: Mapping[str, Any]) -> Figure:
+def draw_counts_by_size(metrics: Mapping[str, Any]) -> Figure:
     """Draw what a smaller image saves: static INT8 and its floor by image size. metrics: those of arm.json."""
     rows = [m for stem, m in metrics["artifacts"].items() if re.fullmatch(r"policy_static(_\d+x\d+)?", stem)]
     rows.sort(key=lambda m: m["gmac"])

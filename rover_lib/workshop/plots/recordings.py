@@ -33,7 +33,7 @@ from rover_lib.workshop.plots.style import (
     legend_below,
     new_figure,
     part_colours,
-    shown_picture,
+    picture_of,
 )
 from rover_lib.workshop.recordings.episodes import Episode, Recordings, Sample
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
@@ -106,7 +106,7 @@ def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pi
     grid = fig.add_gridspec(1 + rows, pictures, height_ratios=(1.1, *([1.3] if car else [0.6]) * rows))
     for i, sample in enumerate(shown):
         ax = fig.add_subplot(grid[0, i])
-        ax.imshow(shown_picture(sample))
+        ax.imshow(picture_of(sample))
         ax.set_title(f"{sample.time_s:.1f} s", fontsize=9)
         ax.axis("off")
     draw = _drive if car else _motion
@@ -122,7 +122,7 @@ def frame(sample: Sample, actions: Sequence[str] = ACTION_NAMES, rate_hz: float 
     """Draw what one sample saw, and what was done from there on, which is the plan that a perfect policy would make."""
     fig, axes = new_figure(1, 2, height_in=2.6)
     left, right = axes[0]
-    left.imshow(shown_picture(sample))
+    left.imshow(picture_of(sample))
     left.axis("off")
     known = ~sample.is_pad
     times_s = np.arange(len(sample.chunk)) / rate_hz

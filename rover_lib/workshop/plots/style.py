@@ -116,7 +116,7 @@ def figure_of(count: int, columns: int, row_in: float) -> tuple[Figure, list[Any
     return fig, list(axes.flat[:count])
 
 
-def shown_picture(sample: Any) -> np.ndarray:
+def picture_of(sample: Any) -> np.ndarray:
     """Return what a sample saw, (h, w, 3) uint8 RGB.
 
     The pictures of several cameras are side by side, all as high as the highest.

@@ -50,17 +50,17 @@ from rover_lib.onboard.recording.episode import (
     NOBODY,
     OUTCOMES,
     arduino_step_s,
-    arrived_late,
     driver_of,
+    find_backlog,
     no_pulse,
     number_of,
-    recorded_car,
+    read_car_of,
 )
 from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source, relative
-from rover_lib.workshop.untrusted import listed, shown
+from rover_lib.workshop.untrusted import quote, quote_all
 
 DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
@@ -136,7 +136,7 @@ def load_recordings(
     if chunk < 1 or not sync_s > 0:
         raise EpisodeError("chunk must be at least 1 and sync_s above 0", found=f"{chunk} and {sync_s}")
     if hub.is_hub_id(root):
-        return lerobot_dataset.load_dataset(lerobot_dataset.fetched(source), chunk, progress)
+        return lerobot_dataset.load_dataset(lerobot_dataset.fetch_dataset(source), chunk, progress)
     if lerobot_dataset.is_dataset(root):
         return lerobot_dataset.load_dataset(source, chunk, progress)
     if source.action_names not in ((), ACTION_NAMES):
@@ -190,7 +190,7 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: _Faults) -> E
         faults.add(folder, "no_data", f"none of {', '.join(DATA_FILES)} is there")
         return None
     try:
-        car = recorded_car(folder)
+        car = read_car_of(folder)
     except CarError as e:
         faults.add(folder, "no_car", str(e))
         return None
@@ -233,7 +233,7 @@ def _read_tables(folder: Path, faults: _Faults) -> tuple[tuple[str, str | None],
     metadata = content.get("metadata")
     outcome = metadata.get("outcome") if isinstance(metadata, dict) else None
     if outcome is not None and outcome not in OUTCOMES:
-        faults.add(folder / "episode_data.json", "unknown_outcome", f"{shown(outcome)}: rover label says it anew")
+        faults.add(folder / "episode_data.json", "unknown_outcome", f"{quote(outcome)}: rover label says it anew")
         outcome = None
     tables = {}
     for key, name, fields in (
@@ -287,7 +287,7 @@ def _read_json(path: Path, faults: _Faults) -> dict[str, Any]:
     try:
         content = json.loads(data)
     except (ValueError, RecursionError) as e:  # bad syntax or encoding, or brackets nested without end
-        faults.add(path, "broken_json", shown(str(e)))
+        faults.add(path, "broken_json", quote(str(e)))
         return {}
     if not isinstance(content, dict):
         faults.add(path, "wrong_type", f"holds a {type(content).__name__}, not an object")
@@ -308,7 +308,7 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict
             return []
         rows.extend(table)
     except csv.Error as e:
-        faults.add(path, "broken_csv", shown(str(e)))
+        faults.add(path, "broken_csv", quote(str(e)))
     return rows
 
 
@@ -326,10 +326,10 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
         bad = [name for name in wanted if name not in values]
         nan = [name for name, value in values.items() if math.isnan(value)]
         if bad:
-            faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {shown(row.get(bad[0]))}")
+            faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {quote(row.get(bad[0]))}")
             continue  # the recorder did not write such a row, so nothing in it can be trusted
         if nan:
-            faults.add(path, "not_finite", f"control {i}: {nan[0]} is {shown(row.get(nan[0]))}")
+            faults.add(path, "not_finite", f"control {i}: {nan[0]} is {quote(row.get(nan[0]))}")
         if "system_timestamp" in nan:
             continue  # without a time it cannot be the action of a frame
         for name in lost:
@@ -338,7 +338,7 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
             None if name in lost else _read_action(name, values, i, path, pwm, faults) for name in ACTION_NAMES
         )
         if (driver := driver_of(row)) is None:
-            faults.add(path, "unknown_driver", f"control {i}: {shown(row.get('driver'))} drove; left out")
+            faults.add(path, "unknown_driver", f"control {i}: {quote(row.get('driver'))} drove; left out")
             continue
         times_s = values["system_timestamp"], values["arduino_timestamp"] / 1000
         controls.append(_Control(*times_s, (steering, throttle), driver))
@@ -396,7 +396,7 @@ def _was_set_back(times_s: list[float], i: int) -> bool:
 
 def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list[_Control]:
     """Give the controls of a serial burst the times at which they were measured, or drop them."""
-    late = arrived_late([c.system_s for c in controls], [c.arduino_s for c in controls])
+    late = find_backlog([c.system_s for c in controls], [c.arduino_s for c in controls])
     placed: list[_Control] = []
     moved = dropped = 0
     farthest_s = 0.0
@@ -449,10 +449,10 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
             row.get("image_path"),
         )
         if number is None or time_s is None or not isinstance(name, str) or not name:
-            faults.add(path, "wrong_type", f"frame {i}: {listed(row.get(name) for name in FRAME_FIELDS)}")
+            faults.add(path, "wrong_type", f"frame {i}: {quote_all(row.get(name) for name in FRAME_FIELDS)}")
             continue
         if math.isnan(number) or math.isnan(time_s):
-            faults.add(path, "not_finite", f"frame {i}: {shown(row.get('timestamp'))}")
+            faults.add(path, "not_finite", f"frame {i}: {quote(row.get('timestamp'))}")
             continue
         if number in numbers:
             faults.add(path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts")
@@ -476,17 +476,17 @@ def _check_picture(folder: Path, picture: Path, name: str, path: Path, faults: _
     """Whether a listed picture is there, inside the episode's folder, and whole. Only its two ends are read."""
     try:
         if Path(name).is_absolute() or not _inside(picture, folder):
-            faults.add(path, "path_leaves_folder", f"{shown(name)} is outside of the episode")
+            faults.add(path, "path_leaves_folder", f"{quote(name)} is outside of the episode")
             return False
         if not stat.S_ISREG(picture.stat().st_mode):  # opening a pipe would wait for ever
-            faults.add(path, "frame_missing", f"{shown(name)} is no file")
+            faults.add(path, "frame_missing", f"{quote(name)} is no file")
             return False
         with picture.open("rb") as f:
             head = f.read(2)
             f.seek(max(f.seek(0, os.SEEK_END) - JPEG_TAIL, 0))
             problem = _jpeg_problem(head, f.read())
     except (OSError, ValueError):  # not there, unreadable, a name too long, or with a zero byte in it
-        faults.add(path, "frame_missing", f"{shown(name)} is listed but cannot be read")
+        faults.add(path, "frame_missing", f"{quote(name)} is listed but cannot be read")
         return False
     if problem:
         faults.add(picture, "broken_jpeg", problem)

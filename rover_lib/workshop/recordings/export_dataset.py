@@ -53,7 +53,7 @@ from rover_lib.workshop.recordings.samples import (
     frame_rate_hz,
     is_another_rate,
 )
-from rover_lib.workshop.swap_folder import alone_in
+from rover_lib.workshop.swap_folder import lock_folder
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
 REWARD, DONE = "next.reward", "next.done"
@@ -91,7 +91,7 @@ def export_dataset(
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = _rate_hz(recordings)
     car = car_of(recordings.samples)
-    with alone_in(out.with_name(f".{out.name}.new")) as beside:
+    with lock_folder(out.with_name(f".{out.name}.new")) as beside:
         new = beside / out.name
         report = _write(recordings, new, rate_hz, video, size, progress) | {CAR: car.description()}
         (new / REPORT).write_text(json.dumps(report, indent=2) + "\n")

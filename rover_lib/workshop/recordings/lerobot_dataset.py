@@ -32,7 +32,7 @@ from rover_lib.workshop.recordings.samples import (
     Source,
     camera_names,
 )
-from rover_lib.workshop.untrusted import listed, shown
+from rover_lib.workshop.untrusted import quote, quote_all
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -128,14 +128,14 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     info = _read_info(root)
     layout, cameras = _layout(root, info, source)
     _check_tables(root, info["features"], {*NUMBERS, INTERVENTION, SUCCESS, *(camera.key for camera in cameras)})
-    dataset = _opened(root)
+    dataset = _open_local(root)
     columns = _columns(root, dataset, layout)
     pictures = _Pictures(dataset, cameras)
     _check_rate(root, columns, float(info["fps"]))
     number = columns["episode_index"]
     _check_episodes(root, dataset, number)
     starts = np.flatnonzero(np.diff(number, prepend=-1))
-    exported, faults = _exported(root, len(starts), INTERVENTION in columns)
+    exported, faults = _read_export(root, len(starts), INTERVENTION in columns)
     _check_numbers(root, columns, layout, exported.car)
     episodes = []
     parts = np.split(np.arange(len(number)), starts[1:])
@@ -161,7 +161,7 @@ class _Exported:
     car: Car
 
 
-def _exported(root: Path, episodes: int, marked: bool) -> tuple[_Exported, tuple[Fault, ...]]:
+def _read_export(root: Path, episodes: int, marked: bool) -> tuple[_Exported, tuple[Fault, ...]]:
     """Read our own export's REPORT. Return what it says, and the faults found in it.
 
     If there is no REPORT, or one for other episodes (a fault), the result has what is known without it. LeRobot's
@@ -186,18 +186,18 @@ def _exported(root: Path, episodes: int, marked: bool) -> tuple[_Exported, tuple
         if not set(driven_by) <= {POLICY, HUMAN} or not set(outcomes) <= {None, HIT, MISSED}:
             raise ValueError("it names who drove, or what it came to, by unknown words")
     except (OSError, ValueError, RecursionError, TypeError, KeyError, CarError) as e:
-        return default, (Fault(REPORT, "another_export", 1, f"not used: {shown(str(e))}"),)
+        return default, (Fault(REPORT, "another_export", 1, f"not used: {quote(str(e))}"),)
     return replace(default, drivers=driven_by, outcomes=outcomes), ()
 
 
-def fetched(source: Source) -> Source:
+def fetch_dataset(source: Source) -> Source:
     """Fetch a dataset of the Hub, and return the same source with its local folder.
 
     The version is checked first, before gigabytes are fetched.
     """
     given = source.path, "dataset", EpisodeError
-    _read_info(hub.fetched(*given, files=("meta/*",)))
-    return replace(source, path=hub.fetched(*given))
+    _read_info(hub.fetch(*given, files=("meta/*",)))
+    return replace(source, path=hub.fetch(*given))
 
 
 def _read_info(root: Path) -> dict[str, Any]:
@@ -207,11 +207,11 @@ def _read_info(root: Path) -> dict[str, Any]:
             raise EpisodeError(f"{path}: is larger than any that LeRobot writes", remedy=COPY_AGAIN)
         info = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as e:
-        raise EpisodeError(f"{path}: not readable as JSON ({shown(str(e))})", remedy=COPY_AGAIN) from None
+        raise EpisodeError(f"{path}: not readable as JSON ({quote(str(e))})", remedy=COPY_AGAIN) from None
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if not isinstance(version, str) or not version.startswith("v"):
         raise EpisodeError(
-            f"{path}: does not name a version of LeRobot's format", found=shown(version), remedy=COPY_AGAIN
+            f"{path}: does not name a version of LeRobot's format", found=quote(version), remedy=COPY_AGAIN
         )
     if version.startswith(("v1", "v2")):
         raise EpisodeError(
@@ -219,10 +219,10 @@ def _read_info(root: Path) -> dict[str, Any]:
             remedy=f"convert it once by LeRobot's own '{CONVERTER} --repo-id=... --root={root}'",
         )
     if not version.startswith("v3"):
-        raise EpisodeError(f"{root}: a LeRobotDataset {shown(version)}, only v3 is known here")
+        raise EpisodeError(f"{root}: a LeRobotDataset {quote(version)}, only v3 is known here")
     features, fps = info.get("features"), info.get("fps")
     if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
-        raise EpisodeError(f"{path}: does not give a number of frames per second", found=shown(fps), remedy=COPY_AGAIN)
+        raise EpisodeError(f"{path}: does not give a number of frames per second", found=quote(fps), remedy=COPY_AGAIN)
     if not isinstance(features, dict) or not all(_is_feature(f) for f in features.values()):
         raise EpisodeError(f"{path}: its features are not objects with a dtype and a shape", remedy=COPY_AGAIN)
     return info
@@ -238,23 +238,25 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
     features = info["features"]
     keys = camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
     if not keys:
-        raise EpisodeError(f"{root}: has no camera", found=listed(features), remedy="record one that sees")
+        raise EpisodeError(f"{root}: has no camera", found=quote_all(features), remedy="record one that sees")
     names = source.cameras or (tuple(keys) if len(keys) == 1 else ())
     missing = [name for name in names if name not in keys]
     if missing or not names:
-        what = f"has no camera {shown(missing[0])}" if missing else f"has {len(keys)} cameras"
+        what = f"has no camera {quote(missing[0])}" if missing else f"has {len(keys)} cameras"
         remedy = "say what the policy looks through: --camera NAME, with commas between several"
-        raise EpisodeError(f"{root}: {what}", found=listed(keys), remedy=remedy)
+        raise EpisodeError(f"{root}: {what}", found=quote_all(keys), remedy=remedy)
     if len(set(names)) < len(names):
-        raise EpisodeError(f"{root}: a camera is given twice", found=listed(names), remedy="name each once: --camera")
+        raise EpisodeError(
+            f"{root}: a camera is given twice", found=quote_all(names), remedy="name each once: --camera"
+        )
     cameras = tuple(_Camera(name, keys[name], _picture_size(root, keys[name], features[keys[name]])) for name in names)
     for key in (STATE, ACTION):
         if key not in features or len(features[key]["shape"]) != 1:
-            found = features[key]["shape"] if key in features else listed(features)
+            found = features[key]["shape"] if key in features else quote_all(features)
             what = f"{root}: its '{key}' is missing or not a row of numbers"
             raise EpisodeError(what, found=found, remedy="record one")
-    actions, action_order = _named(root, features, ACTION, source.action_names)
-    states, state_order = _named(root, features, STATE, _state_names(features, source.action_names))
+    actions, action_order = _name_numbers(root, features, ACTION, source.action_names)
+    states, state_order = _name_numbers(root, features, STATE, _state_names(features, source.action_names))
     return Layout(names, states, actions, float(info["fps"]), state_order, action_order), cameras
 
 
@@ -272,7 +274,7 @@ def _state_names(features: Mapping[str, Any], said: tuple[str, ...]) -> tuple[st
     return said
 
 
-def _named(
+def _name_numbers(
     root: Path, features: Mapping[str, Any], key: str, said: tuple[str, ...]
 ) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Return the names of a feature's numbers, and their columns: [steering, throttle] for a car, else as they lie."""
@@ -286,7 +288,7 @@ def _named(
         )
     if len(names) != size or len(set(names)) != size:
         raise EpisodeError(
-            f"{root}: '{key}' has {size} numbers, their names are {listed(names)}",
+            f"{root}: '{key}' has {size} numbers, their names are {quote_all(names)}",
             remedy="name each once: --action-names with commas between",
         )
     if set(names) == set(ACTION_NAMES):
@@ -330,10 +332,12 @@ def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> No
         with _said_of(path, "LeRobot cannot read it"):
             columns = parquet.read_schema(path).names
         if missing := [name for name in wanted if name not in columns]:
-            raise EpisodeError(f"{path}: has no column {listed(missing)}", found=listed(columns), remedy=COPY_AGAIN)
+            raise EpisodeError(
+                f"{path}: has no column {quote_all(missing)}", found=quote_all(columns), remedy=COPY_AGAIN
+            )
 
 
-def _opened(root: Path) -> "LeRobotDataset":
+def _open_local(root: Path) -> "LeRobotDataset":
     """Open a local folder by LeRobot's own loader. The loader would fetch missing files; here they are an error."""
     # Imported here, because it takes seconds, and our own recordings do not need it.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
@@ -347,7 +351,7 @@ def _opened(root: Path) -> "LeRobotDataset":
         meta = LeRobotDatasetMetadata(**given)
         if meta.total_episodes > len(meta.episodes):  # LeRobot would list as many as the file claims
             raise EpisodeError(
-                f"{root}: {INFO} says {shown(meta.total_episodes)} episodes",
+                f"{root}: {INFO} says {quote(meta.total_episodes)} episodes",
                 found=f"{len(meta.episodes)} in meta/episodes",
                 remedy=COPY_AGAIN,
             )

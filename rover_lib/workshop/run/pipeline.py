@@ -29,7 +29,7 @@ from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
-from rover_lib.workshop.run.session import Opened, opened
+from rover_lib.workshop.run.session import Opened, open_run
 
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
 
@@ -106,7 +106,7 @@ def export_policies(
     return described
 
 
-def requantized(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
+def requantize(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
     """The policy that a run's policy_static.pt was exported from, made again from the run's calibration.
 
     Raises QuantizeError if the run's files are not those that the artifact was made from.
@@ -130,11 +130,11 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     `requantized` and `export` do, RoverError if the run's checkpoint or recordings have changed.
     """
     run_dir = Path(run_dir)
-    again = opened(run_dir, progress)
+    again = open_run(run_dir, progress)
     checkpoint, parts = again.checkpoint, again.parts
     samples = pick_evenly(parts.choosing or parts.calibration, CHOOSING_FRAMES)
     exporter = Exporter(checkpoint, samples, Recipe.of(params()).parity)
-    static = requantized(run_dir, checkpoint)  # before anything is written: it refuses a run whose files do not fit
+    static = requantize(run_dir, checkpoint)  # before anything is written: it refuses a run whose files do not fit
     made = {
         "fp32": (ACT(checkpoint.config, checkpoint.weights), None),
         "static": (static, Calibration.load(run_dir / "calibration.pt")),

@@ -28,7 +28,7 @@ from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
 from rover_lib.workshop.run.run_folder import run_folder, says_how_it_was_taught
-from rover_lib.workshop.swap_folder import made_beside
+from rover_lib.workshop.swap_folder import build_beside
 
 NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
@@ -103,7 +103,7 @@ def run(
     if unknown := sorted(set(overrides) - known):
         raise NotebookError(f"no notebook has a parameter {unknown}", remedy=f"known are {sorted(known)}")
     given = {"checkpoint": absolute(checkpoint), "episodes": absolute(episodes), **overrides}
-    with made_beside(folder, files_of_a_run) as new:
+    with build_beside(folder, files_of_a_run) as new:
         given["run_dir"] = str(new)
         others = _benchmarks_of_other_hosts(folder)
         for path in others:  # notebook 05 shows them
@@ -163,7 +163,10 @@ def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> N
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
     terminal = os.ttyname(sys.stderr.fileno()) if bars and _is_terminal(sys.stderr) else ""
-    with environment({TTY_VARIABLE: terminal, **KERNEL_ENVIRONMENT}), atomic_path(folder / source.name) as temporary:
+    with (
+        set_environment({TTY_VARIABLE: terminal, **KERNEL_ENVIRONMENT}),
+        atomic_path(folder / source.name) as temporary,
+    ):
         try:
             papermill.execute_notebook(
                 str(source),
@@ -181,7 +184,7 @@ def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> N
 
 
 @contextmanager
-def environment(values: dict[str, str]) -> Iterator[None]:
+def set_environment(values: dict[str, str]) -> Iterator[None]:
     """Set these values in os.environ, which a kernel inherits, and restore the old ones afterwards."""
     before = {k: os.environ.get(k) for k in values}
     os.environ.update(values)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.artifact.manifest import content_hash
-from rover_lib.onboard.columns import aligned, number
+from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
@@ -60,7 +60,7 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         files["benchmark"] = _benchmark(folder, made)
         contents["benchmark"] = read_stage(files["benchmark"], "benchmark")
         given = contents["load"]["params"]
-        names = Names(*(_typed(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
+        names = Names(*(_relative(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
         judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names)
         judged = {"headline": headline(judged), "host": contents["benchmark"]["env"]["host"], **judged}
     except KeyError as missing:
@@ -125,7 +125,7 @@ def _refuse_other_artifacts(folder: Path, modes: Mapping[str, Any], compared: Ma
             )
 
 
-def _typed(path: Path | str) -> str:
+def _relative(path: Path | str) -> str:
     """A path as it would be typed here: relative where it is below this folder."""
     path = Path(path)
     return os.path.relpath(path) if path.is_absolute() and path.is_relative_to(Path.cwd()) else str(path)
@@ -182,7 +182,7 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 def table(judged: Mapping[str, Any]) -> list[str]:
     """`columns` in a terminal, and below it what each mode is worth."""
-    return aligned(columns(judged)) + [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
+    return align(columns(judged)) + [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
 
 
 # --- as a page --------------------------------------------------------------------------------------------------------
@@ -233,13 +233,13 @@ def _html_table(judged: Mapping[str, Any]) -> str:
 
 
 def _list(lines: list[str]) -> str:
-    return "<ul>" + "".join(f"<li>{_marked(line)}</li>" for line in lines) + "</ul>"
+    return "<ul>" + "".join(f"<li>{_to_html(line)}</li>" for line in lines) + "</ul>"
 
 
 def _paragraphs(lines: list[str]) -> str:
-    return "".join(f"<p>{_marked(line)}</p>" for line in lines)
+    return "".join(f"<p>{_to_html(line)}</p>" for line in lines)
 
 
-def _marked(line: str) -> str:
+def _to_html(line: str) -> str:
     """A sentence as HTML, what is between backticks as code."""
     return re.sub("`([^`]+)`", r"<code>\1</code>", escape(line))

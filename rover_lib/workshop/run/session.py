@@ -16,7 +16,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.recordings.samples import Source
-from rover_lib.workshop.untrusted import shown
+from rover_lib.workshop.untrusted import quote
 
 SMALL_GMAC = 1.0  # a policy below this gains less from a second thread than the thread costs on a busy machine
 
@@ -59,7 +59,7 @@ def _check_limits(policy: Checkpoint) -> None:
             if not is_name(name):
                 raise CheckpointError(
                     f"{policy.path}: the names of {what} must have 1 to {NAME_LENGTH} characters and no '/'",
-                    found=shown(name),
+                    found=quote(name),
                     remedy="give them other names in the dataset's meta/info.json and the policy's config.json",
                 )
 
@@ -87,7 +87,7 @@ def _within(policy: Checkpoint, what: str, value: float, limits: tuple[float, fl
         )
 
 
-def opened(run_dir: Path | str, progress: Progress = silent) -> Opened:
+def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
     """Load again what notebook 01 loaded. Raises RoverError if it did not run, or if the files have changed since.
 
     For a policy of less than SMALL_GMAC, this sets torch to one thread; a benchmark sets its own number.

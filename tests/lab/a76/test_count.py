@@ -191,7 +191,7 @@ def test_a_run_is_counted(report, tiny_run):
     assert 0 < static["steering_mae_pct"] < 2 * static["workstation_steering_mae_pct"]
     assert 100 < static["peak_memory_mb"] < 500
     assert static["threads"] == 1 and static["frames_on_the_core"] == 12
-    low_ms, high_ms = reports.predicted_ms(static["simd_g"], static["instructions_g"])
+    low_ms, high_ms = reports.predict_ms(static["simd_g"], static["instructions_g"])
     assert static["computed_pi5_ms"] == {"low": low_ms, "high": high_ms, "formula": reports.PREDICTED}
     assert "policy_static" in reports.table(report)
 

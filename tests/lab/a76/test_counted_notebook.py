@@ -28,7 +28,7 @@ def counted(fewer: float, **changed):
         "peak_memory_loading_mb": 300,
         "frames_on_the_core": 50,
         "reference": "policy_fp32",
-        "computed_pi5_ms": dict(zip(("low", "high"), report.predicted_ms(fewer, 1.2 * fewer + 0.2), strict=True)),
+        "computed_pi5_ms": dict(zip(("low", "high"), report.predict_ms(fewer, 1.2 * fewer + 0.2), strict=True)),
     }
     errors = {f"{where}{action}_mae_pct": 0.1 for where in ("", "workstation_") for action in ("steering", "throttle")}
     return values | errors | changed

@@ -13,7 +13,7 @@ from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.recordings.samples import pick_evenly
-from rover_lib.workshop.run.session import opened
+from rover_lib.workshop.run.session import open_run
 
 pytestmark = pytest.mark.slow  # each makes a policy of a size that is no toy's
 
@@ -45,7 +45,7 @@ def test_leaves_what_counting_needs(run_dir):
         "policy_static_36x64": (36, 64),
     }
     assert len({p.manifest["checkpoint"]["sha256"] for p in artifacts.values()}) == 1
-    again = opened(run_dir)
+    again = open_run(run_dir)
     assert len(pick_evenly(again.parts.held_out, 50)) == 50
     assert read_stage(run_dir / "load.json", "load")["metrics"]["note"] == NOTE and "does not drive" in NOTE
     assert read_stage(run_dir / "calibrate.json", "calibrate")["metrics"]["samples"] == 6
@@ -56,7 +56,7 @@ def test_leaves_what_counting_needs(run_dir):
 def test_quantize_json_says_how_to_make_it_again(run_dir, suffix):
     made = read_stage(run_dir / "quantize.json", "quantize")["metrics"]["modes"][f"static{suffix}"]
     scheme = Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
-    checkpoint = opened(run_dir).checkpoint
+    checkpoint = open_run(run_dir).checkpoint
     checkpoint = checkpoint.at_size(54, 96) if suffix else checkpoint
     again = quantize(checkpoint, scheme, Calibration.load(run_dir / f"calibration{suffix}.pt"))
     assert json.loads(json.dumps(again.report["layers"])) == made["layers"]

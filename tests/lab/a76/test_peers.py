@@ -156,26 +156,26 @@ def tools(tiny, monkeypatch):
 def test_an_engine_gets_the_calibration_frames_and_is_asked_once(tiny, tools, tmp_path):
     engine, samples = ENGINES[0], file_samples(tmp_path, 4, seed=2)
     out = tmp_path / "peers"
-    made = peers.made_by(engine, tiny, samples, out)
+    made = peers.quantize_with(engine, tiny, samples, out)
     path = made.path
     assert (path.name, path.read_bytes(), made.report["versions"]) == ("onnxruntime.onnx", b"made", {"tool": "1"})
     ((script, given, python_path),) = tools.calls
     assert (script, python_path) == ("make_onnxruntime.py", "/packages/onnxruntime")
     np.testing.assert_array_equal(given["state"], [s.state for s in samples])
     np.testing.assert_array_equal(given["frames"][2], prepare_frame(samples[2].frame_bgr(), 72, 128))
-    assert peers.made_by(engine, tiny, samples, out) == made
+    assert peers.quantize_with(engine, tiny, samples, out) == made
     assert len(tools.calls) == 1
-    peers.made_by(engine, tiny, samples[:3], out)
+    peers.quantize_with(engine, tiny, samples[:3], out)
     assert len(tools.calls) == 2, "other frames"
     path.write_bytes(b"damaged")
-    peers.made_by(engine, tiny, samples[:3], out)
+    peers.quantize_with(engine, tiny, samples[:3], out)
     assert (len(tools.calls), path.read_bytes()) == (3, b"made")
 
 
 def test_a_layer_left_in_float_is_no_peer(tiny, tools, tmp_path):
     tools.int8_layers -= 1
     with pytest.raises(CountError, match=r"executorch: .* became INT8, and \d+ in ours"):
-        peers.made_by(ENGINES[1], tiny, file_samples(tmp_path, 2, seed=2), tmp_path / "peers")
+        peers.quantize_with(ENGINES[1], tiny, file_samples(tmp_path, 2, seed=2), tmp_path / "peers")
     assert not list((tmp_path / "peers").iterdir())
 
 
@@ -247,7 +247,7 @@ def without_engines(tiny_run, monkeypatch):
         on_step()
         return counted(np.stack([policy.predict_chunk(s.frame_bgr(), s.state) for s in given]) + np.float32([0.01, 0]))
 
-    monkeypatch.setattr(peers, "made_by", made_by)
+    monkeypatch.setattr(peers, "quantize_with", made_by)
     monkeypatch.setattr(peers, "count_artifact", count)
 
 

@@ -69,10 +69,10 @@ def test_groups_sum_to_the_whole_in_one_order():
 
 
 def test_the_computed_time_is_a_range():
-    low_ms, high_ms = report.predicted_ms(simd_g=1.08, instructions_g=1.43)
+    low_ms, high_ms = report.predict_ms(simd_g=1.08, instructions_g=1.43)
     assert low_ms == pytest.approx(56.25)  # 1.08e9 / (2 x 4 x 2.4e9)
     # the published run itself: 207 GMAC/s in loops of 80 instructions per 64 SDOT
-    assert report.predicted_ms(0, 15.02 / 16 * 80 / 64)[1] == pytest.approx(1e3 * 15.02 / 207)
+    assert report.predict_ms(0, 15.02 / 16 * 80 / 64)[1] == pytest.approx(1e3 * 15.02 / 207)
     assert low_ms < high_ms < 2 * low_ms
 
 

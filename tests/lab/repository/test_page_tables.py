@@ -19,13 +19,13 @@ def checkout(tmp_path):
 
 
 def lines_of(root):
-    return [line for text in tables.written(tables.pages(root), root).values() for line in text.splitlines()]
+    return [line for text in tables.render_pages(tables.pages(root), root).values() for line in text.splitlines()]
 
 
 def test_pages_say_what_results_and_notebooks_say():
     """Fails where a number in a page was typed, results/ was published or a notebook changed without `make tables`."""
     texts = tables.pages()
-    assert tables.written(texts, tables.ROOT) == texts
+    assert tables.render_pages(texts, tables.ROOT) == texts
 
 
 def test_a_number_that_was_typed_is_written_over(checkout):
@@ -78,4 +78,4 @@ def test_pages_without_a_table_are_left_as_they_are(checkout, change, message):
 def test_results_without_their_json(checkout):
     shutil.rmtree(checkout / "results")
     with pytest.raises(tables.TableError, match=r"compare\.json must be there once, found none"):
-        tables.written(tables.pages(checkout), checkout)
+        tables.render_pages(tables.pages(checkout), checkout)

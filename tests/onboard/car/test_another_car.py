@@ -21,7 +21,7 @@ from rover_lib.onboard.drive.pilot import ReplayPilot
 from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.recording.episode import About, Controls, EpisodeWriter, read_controls, recorded_car
+from rover_lib.onboard.recording.episode import About, Controls, EpisodeWriter, read_car_of, read_controls
 from rover_lib.workshop.plots.recordings import episode_overview
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import car_of as car_of_samples
@@ -48,7 +48,7 @@ def episode(folder, car, name="episode_20260101_000000"):
 
 def test_a_recording_carries_its_car(tmp_path):
     folder = episode(tmp_path, CRAWLER)
-    assert recorded_car(folder) == CRAWLER
+    assert read_car_of(folder) == CRAWLER
     assert set(read_controls(folder).throttle_us.tolist()) == {1550, 1450}
     actions = np.concatenate([s.chunk for s in load_recordings(tmp_path).samples])
     assert actions[:, 1].min() == pytest.approx(-0.1)
@@ -59,7 +59,7 @@ def test_a_recording_carries_its_car(tmp_path):
 def test_a_recording_of_the_first_car_is_as_ever(tmp_path):
     folder = episode(tmp_path, Car())
     assert "car" not in json.loads((folder / "episode_data.json").read_text())["metadata"]
-    assert recorded_car(folder) == Car()
+    assert read_car_of(folder) == Car()
 
 
 def test_samples_know_their_car_whatever_this_machine_has(tmp_path):

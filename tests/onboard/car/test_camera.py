@@ -145,11 +145,11 @@ def test_a_folder_and_its_end(tmp_path):
 def test_a_film_begins_when_it_is_told_to():
     """Until then its pictures repeat, so that arming may take its time; then each comes once, from the first on."""
     begun, pictures = threading.Event(), [b"a", b"b", b"c"]
-    reader = c._paced(lambda: iter(pictures), 1000, threading.Event(), begun)
+    reader = c._pace(lambda: iter(pictures), 1000, threading.Event(), begun)
     assert [next(reader)[0] for _ in range(7)] == [b"a", b"b", b"c", b"a", b"b", b"c", b"a"]
     begun.set()
     assert [picture for picture, _ in reader] == pictures
-    assert list(c._paced(lambda: iter(()), 1000, threading.Event(), threading.Event())) == []
+    assert list(c._pace(lambda: iter(()), 1000, threading.Event(), threading.Event())) == []
 
 
 def test_a_film_that_begins_again_is_no_frozen_camera():

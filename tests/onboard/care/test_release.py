@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from lab.pi.deployment_bench import changed_artifact
+from lab.pi.deployment_bench import write_changed_artifact
 from rover_lib.cli import main
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.care.release import Expected, ReleaseError, Releases, inspect_artifact, pack, sign
@@ -435,7 +435,7 @@ def test_a_wrong_hash(releases, two):
     ],
 )
 def test_refused_by_its_manifest_before_it_travels_and_on_arrival(releases, two, tmp_path, changes, sentence):
-    old, bad = releases.current, changed_artifact(two[1], tmp_path / "bad.pt", **changes)
+    old, bad = releases.current, write_changed_artifact(two[1], tmp_path / "bad.pt", **changes)
     with pytest.raises(RoverError, match=sentence):
         pack(bad, tmp_path / "packed")
     assert not (tmp_path / "packed").exists()
@@ -469,14 +469,14 @@ def test_a_rover_with_another_chunk_or_camera(two):
 
 
 def test_fp32_that_says_it_is_static(releases, signed, tmp_path):
-    lie = changed_artifact(signed["fp32"], tmp_path / "lie.pt", mode="static")
+    lie = write_changed_artifact(signed["fp32"], tmp_path / "lie.pt", mode="static")
     with pytest.raises(ArtifactError, match="its manifest says static, its code is not"):
         releases.stage(lie, unsigned=True)
 
 
 @pytest.mark.slow
 def test_parity_vectors_that_fail_keep_it_from_being_used(releases, two, tmp_path):
-    bad = changed_artifact(two[1], tmp_path / "bad.pt", answers=0.5)
+    bad = write_changed_artifact(two[1], tmp_path / "bad.pt", answers=0.5)
     proving = Releases(releases.models)
     old, name = releases.current, proving.stage(bad, unsigned=True).name
     with pytest.raises(ArtifactError, match="computes something else here"):

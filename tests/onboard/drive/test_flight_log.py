@@ -294,7 +294,7 @@ def test_what_is_no_log(tmp_path):
     with pytest.raises(LogError, match="cannot be read"):
         read_log(tmp_path)
     other = tmp_path / "new.log"
-    other.write_bytes(telemetry._sealed({"schema": 2, "kind": "header", "start": "x"}))
+    other.write_bytes(telemetry._seal({"schema": 2, "kind": "header", "start": "x"}))
     with pytest.raises(LogError, match="of version 2, this program reads 1"):
         read_log(other)
 
@@ -315,7 +315,7 @@ ROWS = {  # with a right checksum, and no lines of a flight log all the same
 
 @pytest.mark.parametrize("what", ROWS)
 def test_a_line_of_another_form_is_skipped(tmp_path, good, what):
-    flight = read_bytes(good + telemetry._sealed(ROWS[what]), tmp_path)
+    flight = read_bytes(good + telemetry._seal(ROWS[what]), tmp_path)
     assert flight.damaged == 1 and flight.summary()["ticks"] == 40
 
 

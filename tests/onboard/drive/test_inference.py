@@ -13,7 +13,7 @@ import pytest
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.car.camera import CameraError, Frame
-from rover_lib.onboard.drive.inference import Planner, PolicyProcess, delayed
+from rover_lib.onboard.drive.inference import Planner, PolicyProcess, delay
 from rover_lib.onboard.drive.plan import Commanded
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy.confine import PROCESSORS
@@ -159,7 +159,7 @@ def test_how_long_it_has_been_asked():
 
 def test_late_is_late():
     start = time.monotonic()
-    assert delayed(lambda frame, state: CHUNK, 0.05)(FRAME, None) is CHUNK
+    assert delay(lambda frame, state: CHUNK, 0.05)(FRAME, None) is CHUNK
     assert time.monotonic() - start >= 0.05
 
 

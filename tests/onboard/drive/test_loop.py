@@ -26,9 +26,9 @@ from rover_lib.onboard.drive.watch import (
     MemoryWatch,
     _processors,
     artifact_changes,
+    find_unfinished_drive,
     memory_mb,
-    stopped_by_signals,
-    unfinished_drive,
+    stop_on_signals,
 )
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
 from rover_lib.onboard.recording.episode import Controls
@@ -592,7 +592,7 @@ def test_signals_ask_it_to_stop(number, ignored):
         if ignored:
             signal.signal(number, signal.SIG_IGN)
         stop, log, before = threading.Event(), Log(), signal.getsignal(number)
-        with stopped_by_signals(stop, log):
+        with stop_on_signals(stop, log):
             os.kill(os.getpid(), number)
             time.sleep(0.01)
             assert stop.is_set()
@@ -709,15 +709,15 @@ TICK, MACHINE = "0.0333,0.1,A,a", '{"kind":"machine"}'
 def test_a_drive_before_that_has_no_end_is_noticed(tmp_path, lines, ended):
     path = tmp_path / "flight.log"
     path.write_text("".join(f"{line}\n" for line in lines))
-    said = unfinished_drive(path)
+    said = find_unfinished_drive(path)
     assert (said is None) == ended
     assert ended or "the drive before this one has no end" in said
-    assert unfinished_drive(tmp_path / "none.log") is None
+    assert find_unfinished_drive(tmp_path / "none.log") is None
 
 
 def test_a_log_that_is_a_fifo_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "flight.log")
-    assert unfinished_drive(tmp_path / "flight.log") is None
+    assert find_unfinished_drive(tmp_path / "flight.log") is None
 
 
 def test_a_real_log_ends(tmp_path, link, clock):
@@ -725,9 +725,9 @@ def test_a_real_log_ends(tmp_path, link, clock):
     with FlightLog(path, header={}, max_bytes=100_000, keep=1) as log:
         go(Always(), link, clock, log, until=Until(ticks=5))
         log_cut = path.with_name("cut.log")
-    assert unfinished_drive(path) is None
+    assert find_unfinished_drive(path) is None
     log_cut.write_bytes(path.read_bytes().partition(b'"event":"ended')[0].rpartition(b"\n")[0])
-    assert unfinished_drive(log_cut)
+    assert find_unfinished_drive(log_cut)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from rover_lib.cli import main
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording import outcome as module
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
-from rover_lib.onboard.recording.outcome import label, labelled
+from rover_lib.onboard.recording.outcome import label, relabel
 from rover_lib.workshop.recordings.episodes import load_recordings
 
 FRAME = np.full((18, 32, 3), (30, 90, 200), np.uint8)
@@ -150,13 +150,13 @@ def test_what_is_no_episodes_file_stays_as_it_is(tmp_path, data, says):
 def test_a_folder_of_episodes_or_nothing_or_a_link_is_no_episode(episode, tmp_path):
     for path in (tmp_path, tmp_path / "nothing"):
         with pytest.raises(EpisodeError, match="no episode with"):
-            labelled(path, "hit")
+            relabel(path, "hit")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "episode_data.json").symlink_to(episode / "episode_data.json")
     with pytest.raises(EpisodeError, match="no episode with"):
-        labelled(tmp_path / "other", "hit")
+        relabel(tmp_path / "other", "hit")
     with pytest.raises(EpisodeError, match="one of hit, missed, none"):
-        labelled(episode, "perhaps")
+        relabel(episode, "perhaps")
 
 
 def test_all_or_none_are_labelled_where_one_is_no_episode(episode, tmp_path):

@@ -89,14 +89,14 @@ def test_the_ribbon_and_the_bars_are_of_the_moment():
             "pins": [1456, 120], "who": "A", "missed": 0,
             "events": [[1.0, "armed"]], "sent_s": 0.0, "plan": plan}  # fmt: skip
     shape, pwm = CarShape.of(), PwmCalibration()
-    picture = f.drawn(head, frame, shape, pwm)
+    picture = f.draw_moment(head, frame, shape, pwm)
     assert picture.shape == (360 + f.PANEL, 640, 3)
     way = np.argwhere(picture[:360, :, 1].astype(int) > picture[:360, :, 0] + 15)
     assert way[:, 0].min() > 125 and abs(way[:, 1].mean() - 320) < 2  # below the horizon, straight ahead
-    to_the_left = f.drawn(head | {"plan": plan | {"actions": [[0.6, 0.09]] * 30}}, frame, shape, pwm)
+    to_the_left = f.draw_moment(head | {"plan": plan | {"actions": [[0.6, 0.09]] * 30}}, frame, shape, pwm)
     way = np.argwhere(to_the_left[:360, :, 1].astype(int) > to_the_left[:360, :, 0] + 15)
     assert way[:, 1].mean() < 310
-    assert (f.drawn(head | {"plan": plan | {"actions": [[0.6, 0.0]] * 30}}, frame, shape, pwm)[:360] == 90).all()
+    assert (f.draw_moment(head | {"plan": plan | {"actions": [[0.6, 0.0]] * 30}}, frame, shape, pwm)[:360] == 90).all()
     bar = picture[360 + 19, 84:265]  # steering fills half of the bar's left half, and the pin's line is in the middle
     filled = np.flatnonzero((bar == f.FILL).all(axis=1))
     assert (84 + filled.min(), 84 + filled.max()) == pytest.approx((129, 172), abs=3)
@@ -118,8 +118,8 @@ def test_a_film_is_of_the_car_that_was_driven(tmp_path):
     replay = r.load_replay(drive(tmp_path, car=OTHER))
     assert replay.car == OTHER
     moment = replay.moments[10]
-    picture = f.drawn(moment.head, moment.frame_bgr(), CarShape.of(OTHER), OTHER.pwm)
-    with_this_machines = f.drawn(moment.head, moment.frame_bgr(), CarShape.of(), PwmCalibration())
+    picture = f.draw_moment(moment.head, moment.frame_bgr(), CarShape.of(OTHER), OTHER.pwm)
+    with_this_machines = f.draw_moment(moment.head, moment.frame_bgr(), CarShape.of(), PwmCalibration())
     filmed = list(f._pictures(replay, PICTURES_HZ, f.WIDTH, silent))[10]
     assert (filmed == picture).all() and (filmed != with_this_machines).any()
     # Its steering pin stood at 1500 us, which is neutral for that car: the line is in the middle of the bar.

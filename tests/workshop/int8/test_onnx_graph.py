@@ -17,7 +17,7 @@ from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.observe import calibrate
-from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model, stacked
+from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model, stack_stem
 from rover_lib.workshop.int8.quantize import int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme
 
@@ -96,7 +96,7 @@ def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibrati
     stored = {i.name: onnx.numpy_helper.to_array(i) for i in written.graph.initializer}
     for name, layer in int8_layers(quantized.module).items():
         weight = layer.weight().int_repr()
-        weight = stacked(weight) if name == "backbone.stem.0" else weight
+        weight = stack_stem(weight) if name == "backbone.stem.0" else weight
         assert np.array_equal(stored[f"{name}.weight"], weight.numpy())
 
 

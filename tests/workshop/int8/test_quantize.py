@@ -24,7 +24,7 @@ from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.choose import Chooser, float_costs_pct
 from rover_lib.workshop.int8.export import export
-from rover_lib.workshop.int8.observe import Calibration, RangeObserver, calibrate, observed_graph, qconfig_mapping
+from rover_lib.workshop.int8.observe import Calibration, RangeObserver, calibrate, qconfig_mapping, restore_observed
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scales import apply_channel_scales, channel_maxima, projections
 from rover_lib.workshop.int8.scheme import ENGINE, KINDS, OBSERVERS, SMALLEST_SCALE, Scheme
@@ -225,7 +225,7 @@ def test_a_calibration_serves_one_image_size(tiny, calibration):
 def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration, made):
     """The first layer's INT8 output against quantize -> float convolution -> quantize, to one step."""
     quantized = made(Scheme("static"))
-    prepared = observed_graph(tiny, Scheme("static"), calibration)
+    prepared = restore_observed(tiny, Scheme("static"), calibration)
     seen = {}
     conv = quantized.module.get_submodule("backbone.stem.0")
     hook = conv.register_forward_hook(lambda m, args, out: seen.update(x=args[0], y=out))
@@ -308,13 +308,13 @@ def test_inspect_layers_sees_clipping(tiny, calibration):
     # The calibration's own samples, min-max: nothing is clipped, and every layer carries a signal.
     assert max(r["clipped_pct"] for r in rows.values()) < 0.5
     assert min(r["snr_db"] for r in rows.values()) > 5
-    assert not q.clipped_warnings(list(rows.values()), 1.0)
+    assert not q.warn_of_clipping(list(rows.values()), 1.0)
     conv = quantized.module.get_submodule("backbone.layer1.0.body.0")
     conv.scale = float(conv.scale) / 4
     rows = q.inspect_layers(quantized, tiny, calibration, memory_samples(2))
     row = next(r for r in rows if r["name"] == "backbone.layer1.0.body.0")
     assert row["clipped_pct"] > 1
-    assert any("layer1.0.body.0" in w for w in q.clipped_warnings(rows, 1.0))
+    assert any("layer1.0.body.0" in w for w in q.warn_of_clipping(rows, 1.0))
 
 
 @pytest.mark.slow
@@ -327,7 +327,7 @@ def test_chooses_by_error(tiny, calibration):
     sensitivity = chooser.sensitivity(scheme)
     assert list(sensitivity) == act.blocks(tiny.config)
     assert all(max(e.values()) > 0 for e in sensitivity.values())  # each block alone does something
-    graph = observed_graph(tiny, scheme, calibration)
+    graph = restore_observed(tiny, scheme, calibration)
     for block, error in sensitivity.items():  # what is before a block is not run again: the same as running all of it
         assert chooser.error(q.convert(graph, tiny.config, replace(scheme, float_blocks=()), only=[block])) == error
     costs = float_costs_pct(tiny)

@@ -191,7 +191,7 @@ def test_picking_evenly_keeps_first_and_last():
 def test_frames_of_drives_become_observations():
     frame = np.zeros((4, 6, 3), np.uint8)
     trial = SimpleNamespace(frames=[(frame, np.array([0.1, 0.2]))] * 3)
-    seen = compare.driven({"fp32": trial, "static": trial}, at_most=4)
+    seen = compare.observe_trials({"fp32": trial, "static": trial}, at_most=4)
     assert len(seen) == 4 and seen[0].frame_bgr() is frame and seen[0].state.dtype == np.float32
     base = np.zeros((3, 2))
     on_drives = compare.fidelity(Fixed(base), {"static": Fixed(base)}, seen, RANGE)

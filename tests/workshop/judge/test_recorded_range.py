@@ -1,6 +1,6 @@
 """Errors as shares of the recorded range, and actions that were never moved."""
 
-from rover_lib.workshop.judge.recorded_range import constant_actions, not_judged, pct_of_range, shown_pct, worst
+from rover_lib.workshop.judge.recorded_range import constant_actions, format_pct, not_judged, pct_of_range, worst
 
 RANGES = {"steering": (-0.5, 0.5), "throttle": (0.06, 0.06)}
 
@@ -21,4 +21,4 @@ def test_what_is_not_judged_is_never_the_worst():
 
 
 def test_what_is_not_judged_is_said_so():
-    assert shown_pct(0.114) == "  0.11 %" and shown_pct(None) == "not judged"
+    assert format_pct(0.114) == "  0.11 %" and format_pct(None) == "not judged"

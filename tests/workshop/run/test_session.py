@@ -11,7 +11,7 @@ from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.files import write_lerobot
 from rover_lib.workshop.run import session
 from rover_lib.workshop.run.pipeline import write_load
-from rover_lib.workshop.run.session import load, opened
+from rover_lib.workshop.run.session import load, open_run
 
 
 @pytest.fixture
@@ -31,10 +31,10 @@ def test_statistics_that_changed_since_are_refused(written, tmp_path):
     """Of the same weights: the plans of an artifact that is made now would be other ones than the run judged."""
     drives = record_drives(tmp_path / "episodes", frames=40)
     write_load(tmp_path, load(written(0.02), drives))
-    assert opened(tmp_path).checkpoint.config.action_unnorm.scale == pytest.approx((0.4, 0.02))
+    assert open_run(tmp_path).checkpoint.config.action_unnorm.scale == pytest.approx((0.4, 0.02))
     written(0.03)
     with pytest.raises(RoverError, match="not what notebook 01 loaded any more, found the same weights, and another"):
-        opened(tmp_path)
+        open_run(tmp_path)
 
 
 @pytest.mark.slow
@@ -47,7 +47,7 @@ def test_recordings_that_now_name_their_numbers_otherwise_are_refused(written, t
     )
     (tmp_path / "load.json").write_text(json.dumps(stage))
     with pytest.raises(RoverError, match="says something else of its numbers"):
-        opened(tmp_path)
+        open_run(tmp_path)
 
 
 @pytest.mark.parametrize(
