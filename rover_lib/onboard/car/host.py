@@ -22,7 +22,7 @@ THROTTLED_VALUE = re.compile(r"0x[0-9a-fA-F]{1,8}")  # as get_throttled prints t
 
 
 def boottime() -> float:
-    """Return the seconds since the start of this machine, suspended ones included, which time.monotonic() leaves out."""
+    """Return the seconds since this machine started, with those in which it was suspended."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 

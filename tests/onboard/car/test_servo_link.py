@@ -280,7 +280,7 @@ def test_the_arduino_is_told_when_somebody_asked():
         assert next(b for b in board.heard if b.startswith(">A")).split()[4] == str(asked)
         link.request()
         board.status("M", "r", "-", boot=9)
-        board.say("<H 4 4.0.0 9 0 w %d" % DEFAULT)
+        board.say(f"<H 4 4.0.0 9 0 w {DEFAULT}")
         until(lambda: link.resets)
         with pytest.raises(LinkError, match="reset since the car was asked for"):
             link.arm()
