@@ -385,7 +385,7 @@ def arm_car(
     transmitter; each such sentence is passed to `notify`.
     """
     state = ask_service(unit, ask="state")
-    if model and state["model"] != model:
+    if model and state["model"] != model.partition("-")[0]:  # a release's name may end in -2
         raise ServiceError(
             f"{unit} has loaded another model than {model[:12]}",
             found=state["model"][:12],

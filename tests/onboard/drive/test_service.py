@@ -239,6 +239,8 @@ def test_a_request_names_the_model_that_it_arms(systemd):
     def operator() -> None:
         with pytest.raises(s.ServiceError, match=r"has loaded another model than cd34, found ab12; did somebody"):
             s.arm_car(s.Request(), model="cd34")
+        with pytest.raises(ZeroDivisionError):  # the second copy of a release that was damaged is that model too
+            s.arm_car(s.Request(), model="ab12-2", confirm=lambda state: 1 / 0)
         state = s.ask_service(ask="state")
         for wrong in ({"model": "cd34"}, {"ticket": "of the start before"}, {"ticket": ""}):
             answers.append(s.ask_service(**{"ask": "arm", "model": "ab12", "ticket": state["ticket"], **wrong}))
