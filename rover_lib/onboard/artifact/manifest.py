@@ -115,17 +115,21 @@ def content_hash(path: Path | str) -> str:
     """Return the hex SHA-256 of everything in the artifact that has an effect: the same inputs give the same hash.
 
     The bytes of the file may differ, because TorchScript also writes debug tables (source positions), a serial number,
-    and class names with a counter of all classes that the process ever made. Raises ArtifactError like open_archive().
+    and in the class's name a counter of all classes that the process ever made. Raises ArtifactError like
+    open_archive().
     """
     digest = hashlib.sha256()
     with open_archive(path) as z:
+        code = (r for r in z.infolist() if r.filename.startswith("archive/code/") and r.filename.endswith(".py"))
+        programs = [r.filename for r in code if r.file_size]
+        module = programs[0][13:-3].replace("/", ".").encode() if len(programs) == 1 else b""
         for name in sorted(z.namelist()):
             if name.endswith((".debug_pkl", "/.data/serialization_id")):
                 continue
             record = read_record(z, name)
-            if not name.startswith(("archive/constants/", ONNX)):
-                record = MANGLED.sub(b"", record)
-            digest.update(MANGLED.sub(b"", name.encode()) + b"\0")
+            if name in ("archive/data.pkl", *programs):  # each names the class once; all other names there are kept
+                record = record.replace(module, MANGLED.sub(b"", module), 1)
+            digest.update((MANGLED.sub(b"", name.encode()) if name in programs else name.encode()) + b"\0")
             digest.update(hashlib.sha256(record).digest())
     return digest.hexdigest()
 

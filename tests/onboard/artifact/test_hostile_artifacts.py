@@ -571,6 +571,17 @@ def test_no_parts_of_another_form_are_joined(artifacts, tmp_path, monkeypatch, w
     refused(tmp_path / "packed", tmp_path, message)
 
 
+def test_names_that_look_like_torchs_counter_are_kept_in_the_content_hash(artifacts, tmp_path):
+    """They were dropped from it, so that two programs could have one hash."""
+    hashes = {artifact.content_hash(artifacts["static"])}
+    for name in (b"x___torch_mangle_1", b"x___torch_mangle_2", b"x"):
+        with zipfile.ZipFile(artifacts["static"]) as z:
+            program = next(r.filename for r in z.infolist() if r.filename.endswith(".py") and r.file_size)
+        changes = {program.removeprefix("archive/"): lambda raw, name=name: raw.replace(b"input", name, 1)}
+        hashes.add(artifact.content_hash(rewritten(artifacts["static"], tmp_path / "other.pt", changes)))
+    assert len(hashes) == 4
+
+
 # Signatures
 
 
