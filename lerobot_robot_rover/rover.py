@@ -149,7 +149,8 @@ class Rover(Robot):
         if self._ride:
             self._ride.check()
             if self._ride.over:
-                self._ride, self._action = None, NEUTRAL
+                self._end_ride()
+                self._action = NEUTRAL
         if not self._ride:
             self._link.latest()
             if not self._line.transmitters:
@@ -253,3 +254,4 @@ class Rover(Robot):
         ride, self._ride = self._ride, None
         if ride:
             ride.end()
+            self._line.drives_ended += 1
