@@ -134,6 +134,9 @@ def drive_car(
         check_no_film(options.camera)
     with ExitStack() as stack:
         log = stack.enter_context(_open_flight_log(options, settings, report))
+        if artifact:
+            most_m = settings.throttle_limit * params()["view"]["speed_mps"] * settings.blind_s
+            log.event(f"one picture drives the car for {most_m:.1f} m at most, at throttle {settings.throttle_limit:g}")
         stop = SignalEvent()
         stack.enter_context(stop_on_signals(stop, log))
         stack.enter_context(exit_if_hung(report, log))
