@@ -64,8 +64,8 @@ def open_plain(path: Path | str, refusal: RoverError) -> BinaryIO:
 
 
 def sha256_of(path: Path | str) -> str:
-    """Return the hex SHA-256 of a file's bytes."""
-    with Path(path).open("rb") as f:
+    """Return the hex SHA-256 of a file's bytes. Raises RoverError for what is no plain file."""
+    with open_plain(path, RoverError(f"{path}: not a plain file")) as f:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
 
