@@ -249,7 +249,10 @@ class Staged:
 
 @dataclass(frozen=True)
 class Release:
-    """One release on the disk. signed: by a laptop that the rover knows now. wrong: with its bytes, empty if nothing."""
+    """One release on the disk.
+
+    signed: whether a laptop that the rover knows now has signed it. wrong: what is wrong with its bytes, "" if nothing.
+    """
 
     name: str
     current: bool
@@ -392,9 +395,9 @@ class Releases:
         """Make a release of an artifact, or of a folder that pack() wrote. The release in use stays in use.
 
         The signature is policy.pt.sig in that folder, or lies beside the artifact with .sig added to its name. sha256:
-        what the artifact's must be, if it is known. unsigned: accept it without a signature. A release that exists
-        and is intact only gets the signature that it may lack. A damaged one is replaced; if it is in use, a second copy is made beside it.
-        Raises ReleaseError, ArtifactError.
+        what the artifact's must be, if it is known. unsigned: accept it without a signature. A release that exists and
+        is intact only gets the signature that it may lack. A damaged one is replaced; if it is in use, a second copy
+        is made beside it. Raises ReleaseError, ArtifactError.
         """
         source = Path(source)
         with _disk_errors_explained(), _memory_limited(source), self._exclusively():
@@ -441,7 +444,7 @@ class Releases:
             return Staged(name, True)
 
     def _accept(self, name: str, signature: Path, unsigned: bool) -> Staged:
-        """Take an intact release as staged again. One that came in unsigned needs a signature now, unless `unsigned`."""
+        """Stage an intact release again. One that came in unsigned needs a signature now, unless `unsigned`."""
         if unsigned or self.is_signed(name):
             return Staged(name, False)
         policy = self.path_of(name)
@@ -464,7 +467,8 @@ class Releases:
     def switch(self, name: str, *, unsigned: bool = False) -> bool:
         """Check a release, switch to it, and check it again through `current`; switch back if that fails.
 
-        unsigned: use it also if no laptop that this rover knows now has signed it. Returns whether anything changed. Raises ReleaseError, whose text says which release is in use now.
+        unsigned: use it also if no laptop that this rover knows now has signed it. Returns whether anything changed.
+        Raises ReleaseError, whose text says which release is in use now.
         """
         with _disk_errors_explained(), self._exclusively():
             before = self.current
