@@ -10,7 +10,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
 
-STAGES = ("load", "calibrate", "quantize", "compare", "drive", "distill")
+STAGES = ("load", "calibrate", "quantize", "compare", "drive", "students")
 
 
 def stage_of(folder, name):
@@ -68,7 +68,7 @@ def test_late_plans_are_drawn(demo_run):
 
 def test_a_student_of_its_own_is_judged_beside_it(demo_run):
     """It is trained for a few steps only, so it need not be as good; but the report must say what was measured."""
-    metrics = stage_of(demo_run, "distill")["metrics"]
+    metrics = stage_of(demo_run, "students")["metrics"]
     teacher, student = metrics["students"]
     assert (student["name"], student["width"], student["feedforward"]) == ("demo-small", 96, 256)
     assert student["gmac"] < 0.6 * teacher["gmac"]

@@ -39,7 +39,7 @@ def test_troubleshooting_names_lines_that_the_doctor_has():
     symptoms = (ROOT / "docs" / "troubleshooting.md").read_text().partition("\n## ")[0]
     rows = re.findall(r"^\| .+? \| (.*?) \|", symptoms, re.M)
     named = {name for row in rows for name in re.findall(r"`([^`]+)`", row) if not name.startswith("rover ")}
-    source = (ROOT / "rover_lib" / "onboard" / "doctor.py").read_text()
+    source = (ROOT / "rover_lib" / "onboard" / "care" / "doctor.py").read_text()
     assert len(named) > 10 and not [name for name in named if f'"{name}"' not in source]
 
 

@@ -458,7 +458,7 @@ def _cautions(
         )
     if best["mode"] == "fp32" and best["floor_ms"]:
         lines.append(f"A plan in FP32 takes a Pi 5 at least {best['floor_ms']:.0f} ms (computed).")
-    student = stages.get("distill", {}).get("recommendation", {}).get("name", "teacher")
+    student = stages.get("students", {}).get("recommendation", {}).get("name", "teacher")
     if student != "teacher":
         lines.append(f"A smaller policy may replace this one: {student}, as `rover world students` found.")
     return lines

@@ -12,7 +12,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Source
 
 BULK = 200  # characters; of a longer value in a report only the number of its items is shown
-STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "distill", "finetune", "learn")
+STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "students", "distill", "finetune", "learn")
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:

@@ -19,10 +19,9 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.judge.hosts import benchmark_of, is_of
 from rover_lib.workshop.judge.verdict import CALLED, Names, against, count, error_pct, verdict
-from rover_lib.workshop.run.run_folder import says_how_it_was_taught
 
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
-LATER = ("arm", "distill")  # that `make arm` and `rover world students` add to a run
+LATER = ("arm", "students")  # that `make arm` and `rover world students` add to a run
 PAGE = "report.html"
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
@@ -90,10 +89,7 @@ def _files(folder: Path) -> dict[str, Path]:
         raise RoverError(
             f"{folder}: no verdict without {', '.join(missing)}", remedy="rover run makes them, of a checkpoint"
         )
-    files = {stage: path for stage, path in files.items() if path.is_file()}
-    if "distill" in files and says_how_it_was_taught(files["distill"]):
-        del files["distill"]
-    return files
+    return {stage: path for stage, path in files.items() if path.is_file()}
 
 
 def _benchmark(folder: Path, modes: Mapping[str, Any]) -> Path:
