@@ -22,6 +22,14 @@ def real_episode() -> Path:
     pytest.skip("no real recording here: put one at shared/sample_episode/episode_*/ to run this test on it")
 
 
+def real_drives() -> list[Path]:
+    """Return the folders of whole real drives in shared/, as real_episode() does."""
+    for base in (REPO, REPO.parent, REPO.parent.parent):
+        if found := sorted((base / "shared" / "recordings").glob("episode_*")):
+            return found
+    pytest.skip("no real drives here: put some at shared/recordings/episode_*/ to run this test on them")
+
+
 def record_drives(root: Path, drives: int = 4, frames: int = 24) -> Path:
     """Record drives in which steering, throttle and pictures change. Returns `root`."""
     rng, pwm = np.random.default_rng(0), PwmCalibration()

@@ -571,10 +571,13 @@ def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, all
     show(pack_parts(artifact, folder, releases.expected, allow, sign_key), True)
 
 
+UNSIGNED = click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")
+
+
 @release.command(short_help="Make a release of an artifact without using it.")
 @click.argument("source", type=FILE)
 @click.option("--sha256", help="The SHA-256 that the artifact must have.")
-@click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")
+@UNSIGNED
 @ALLOW
 @click.pass_obj
 def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow: tuple[str, ...]) -> None:
@@ -605,10 +608,11 @@ def verify(releases: Any, name: str, confined: bool) -> None:
 
 @release.command(short_help="Use a release from now on.")
 @click.argument("name")
+@UNSIGNED
 @click.pass_obj
-def switch(releases: Any, name: str) -> None:
+def switch(releases: Any, name: str, unsigned: bool) -> None:
     """Use the release NAME from now on. It is verified before and after; if that fails, the old one is used again."""
-    show({"name": name, "changed": releases.switch(name)}, True)
+    show({"name": name, "changed": releases.switch(name, unsigned=unsigned)}, True)
 
 
 @release.command(short_help="Go back to the release before the one in use.")

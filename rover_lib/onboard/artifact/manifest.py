@@ -143,17 +143,20 @@ class Artifact:
         """The hex SHA-256 of everything in the artifact that has an effect: the same inputs give the same hash.
 
         The bytes of the file may differ, because TorchScript also writes debug tables (source positions), a serial
-        number, and class names with a counter of all classes that the process ever made. Reading each record for it
+        number, and in the class's name a counter of all classes that the process ever made. Reading each record for it
         also checks the record's checksum.
         """
         digest = hashlib.sha256()
+        code = (r for r in self._z.infolist() if r.filename.startswith("archive/code/") and r.filename.endswith(".py"))
+        programs = [r.filename for r in code if r.file_size]
+        module = programs[0][13:-3].replace("/", ".").encode() if len(programs) == 1 else b""
         for name in sorted(self.names):
             record = self.record(name)
             if name.endswith((".debug_pkl", "/.data/serialization_id")):
                 continue
-            if not name.startswith(("archive/constants/", ONNX)):
-                record = MANGLED.sub(b"", record)
-            digest.update(MANGLED.sub(b"", name.encode()) + b"\0")
+            if name in ("archive/data.pkl", *programs):  # each names the class once; all other names there are kept
+                record = record.replace(module, MANGLED.sub(b"", module), 1)
+            digest.update((MANGLED.sub(b"", name.encode()) if name in programs else name.encode()) + b"\0")
             digest.update(hashlib.sha256(record).digest())
         return digest.hexdigest()
 
@@ -188,7 +191,7 @@ class Artifact:
         """
         if self._proven:
             return
-        assert self.content_hash  # which reads every byte
+        _ = self.content_hash  # which reads every byte
         if self.kind == "onnxruntime":
             check_model(self._z, self.path)
         elif self.kind == "torch":  # only HailoRT and the chip can read a HEF

@@ -118,7 +118,7 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
         manifest = artifact.manifest
         code = b"".join(artifact.record(n) for n in artifact.names if n.endswith(".py") or n == ONNX)
         of_mode = OF_MODE[artifact.kind]
-        assert artifact.parity  # has the shapes that the manifest says
+        _ = artifact.parity  # has the shapes that the manifest says
     if (wanted := of_mode.get(manifest["mode"])) and wanted not in code:
         raise ArtifactError(f"{path}: its manifest says {manifest['mode']}, its code is not", remedy="quantize again")
     for kind, why in expected.refusals(manifest).items():
@@ -250,7 +250,7 @@ class Staged:
 
 @dataclass(frozen=True)
 class Release:
-    """One release on the disk. wrong: what is wrong with it, empty if nothing."""
+    """One release on the disk. signed: by a laptop that the rover knows now. wrong: with its bytes, "" if nothing."""
 
     name: str
     current: bool
@@ -321,7 +321,9 @@ class Releases:
         with contextlib.ExitStack() as stack:
             try:
                 _read_json(folder / ORIGIN)
-                if (folder / DIGEST).read_text().split()[:1] != [sha256_of(folder / POLICY)]:
+                with _open_file(folder / DIGEST) as file:
+                    digest = file.read(JSON_BYTES).decode()
+                if digest.split()[:1] != [sha256_of(folder / POLICY)]:
                     return f"{POLICY} is not what {DIGEST} says"
                 artifact = stack.enter_context(Artifact(folder / POLICY))
                 content = artifact.content_hash
@@ -342,8 +344,8 @@ class Releases:
                 megabytes = (self.releases / name / POLICY).stat().st_size / 1e6
             except (OSError, ValueError, KeyError, TypeError, ReleaseError):
                 mode, origin, megabytes = "?", "?", 0.0
-            signed = (self.releases / name / SIGNATURE).is_file()
             wrong = self.wrong_with(name)
+            signed = not wrong and self.is_signed(name)
             releases.append(Release(name, name == current, mode, origin, round(megabytes, 1), signed, wrong))
         return releases
 
@@ -397,7 +399,8 @@ class Releases:
 
         The signature is policy.pt.sig in that folder, or lies beside the artifact with .sig added to its name. sha256:
         what the artifact's must be, if it is known. unsigned: accept it without a signature. A release that exists
-        and is intact is left as it is. A damaged one is replaced; if it is in use, a second copy is made beside it.
+        and is intact only gets the signature that it may lack. A damaged one is replaced; if it is in use, a second
+        copy is made beside it.
         Raises ReleaseError, ArtifactError.
         """
         source = Path(source)
@@ -408,7 +411,7 @@ class Releases:
                 )
             about = self._packed(source) if source.is_dir() else None
             if about and (existing := self._intact(about["name"])):
-                return Staged(existing, False)
+                return self._accept(existing, source / SIGNATURE, unsigned)
             self._check_free_space(about["bytes"] if about else source.stat().st_size)
             new = self.releases / ".new"
             new.mkdir()
@@ -435,7 +438,7 @@ class Releases:
                 )
             here["origin"] = about["origin"] if about else {**here["origin"], "file": _file(source)}
             if existing := self._intact(here["name"]):
-                return Staged(existing, False)
+                return self._accept(existing, new / SIGNATURE, unsigned)
             _write(new / DIGEST, f"{arrived}  {POLICY}\n")
             _write(new / ORIGIN, json.dumps(here, indent=1, sort_keys=True) + "\n")
             _sync(new)
@@ -444,10 +447,32 @@ class Releases:
             _sync(self.releases)
             return Staged(name, True)
 
-    def switch(self, name: str) -> bool:
+    def _accept(self, name: str, signature: Path, unsigned: bool) -> Staged:
+        """Take an intact release as staged again. One that came in unsigned needs a signature, unless `unsigned`."""
+        if unsigned or self.is_signed(name):
+            return Staged(name, False)
+        policy = self.path_of(name)
+        check_signature(policy, signature, self.signers)
+        new = policy.with_name(f".{SIGNATURE}")
+        new.unlink(missing_ok=True)
+        _join([signature], new, JSON_BYTES)
+        new.replace(policy.with_name(SIGNATURE))
+        _sync(policy.parent)
+        return Staged(name, True)
+
+    def is_signed(self, name: str) -> bool:
+        """Whether a laptop that this rover knows now has signed the release."""
+        try:
+            check_signature(self.releases / name / POLICY, self.releases / name / SIGNATURE, self.signers)
+        except ReleaseError:
+            return False
+        return True
+
+    def switch(self, name: str, *, unsigned: bool = False) -> bool:
         """Check a release, switch to it, and check it again through `current`; switch back if that fails.
 
-        Returns whether anything changed. Raises ReleaseError, whose text says which release is in use now.
+        unsigned: use it also if no laptop that this rover knows now has signed it. Returns whether anything changed.
+        Raises ReleaseError, whose text says which release is in use now.
         """
         with _disk_errors_explained(), self._exclusively():
             before = self.current
@@ -455,6 +480,12 @@ class Releases:
                 raise ReleaseError("'current' is in use already", remedy="name the release to switch to")
             self.path_of(name)
             self.check(name)
+            if not unsigned:
+                policy = self.path_of(name)
+                try:
+                    check_signature(policy, policy.with_name(SIGNATURE), self.signers)
+                except ReleaseError as error:
+                    raise ReleaseError(f"{error.what}; {self._in_use()}", remedy=error.remedy) from None
             if before == name:
                 return False
             self._point_current_at(name)
@@ -470,11 +501,16 @@ class Releases:
             return True
 
     def rollback(self) -> str:
-        """Switch to the newest earlier release that passes its checks. Returns its name."""
+        """Switch to the newest earlier release that passes its checks. Returns its name.
+
+        One that was accepted unsigned may come back. One whose key this rover no longer knows may not.
+        """
         with _disk_errors_explained(), self._exclusively():
             refused = []
             for name in self._used_before():
                 try:
+                    if (self.releases / name / SIGNATURE).exists() and not self.is_signed(name):
+                        raise ReleaseError("the laptop that signed it is not known any more")
                     self.check(name)
                 except RoverError as error:
                     refused.append(f"{name[:12]}: {error}")
