@@ -460,6 +460,10 @@ def _cautions(
     lines: list[str] = []
     if recomputed := stages["load"].get("recordings", {}).get("recomputed"):
         lines.append(f"{recomputed[0].upper()}{recomputed[1:]}.")
+    if mirrored := stages["load"].get("steering", {}).get("mirrored", []):
+        lines.append(
+            f"The pictures of {_some(mirrored)} are mirrored beside the others': leave them out, or turn them."
+        )
     most, limit = compared.get("action_range", {}).get("throttle", (0, 0))[1], params["drive"]["throttle_limit"]
     if most > limit:
         lines.append(

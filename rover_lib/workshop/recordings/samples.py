@@ -129,11 +129,16 @@ class Sample:
     driver: str = HUMAN
     car: Car = field(default_factory=Car)
     pulses_us: tuple[float, float] | None = None
+    mirrored: bool = False  # turn the picture over, as it is mirrored beside the other recordings'
 
     @property
     def frame_name(self) -> str:
         """The picture's name within its episode."""
         return self.frame_path.name
+
+    def turned(self, frame: np.ndarray) -> np.ndarray:
+        """The picture as it is, or turned over if it is mirrored."""
+        return np.ascontiguousarray(frame[:, ::-1]) if self.mirrored else frame
 
     def frame_bgr(self) -> np.ndarray:
         """Read the picture: (h, w, 3) uint8 BGR.
@@ -141,7 +146,7 @@ class Sample:
         Raises EpisodeError if the file is gone, or is not a whole JPEG of a size that a camera gives.
         """
         try:
-            return read_jpeg(self.frame_path)
+            return self.turned(read_jpeg(self.frame_path))
         except OSError as e:
             raise EpisodeError(
                 f"{self.frame_path}: cannot be read ({e.strerror})", remedy="restore it or load again"
