@@ -376,13 +376,16 @@ def calibrate(
     the ground and unplug the motor first. Ctrl-C leaves everything as it was.
     """
     from rover_lib.onboard.car.calibrate import measure, refuse_existing, write_car
-    from rover_lib.onboard.car.car import Car, default_place, yaml_of
+    from rover_lib.onboard.car.car import Car, default_place, read_car, yaml_of
     from rover_lib.onboard.car.servo_link import ServoLink
+    from rover_lib.onboard.errors import CarError
 
     path = output or default_place()
     refuse_existing(path, force)
     check_output(path, None)
     more: dict[str, Any] = {"name": name}
+    with contextlib.suppress(CarError):  # measured again, its actions must mean what they meant
+        more["positive"] = read_car(path).positive
     if field_of_view_deg is not None:
         more["camera"] = {"field_of_view_deg": field_of_view_deg}
     if wheelbase_m is not None:

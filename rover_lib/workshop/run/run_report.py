@@ -12,7 +12,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.artifact.manifest import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
+from rover_lib.onboard.care.release import THIS_CAR
 from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
@@ -60,7 +61,9 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         contents["benchmark"] = read_stage(files["benchmark"], "benchmark")
         given = contents["load"]["params"]
         names = Names(*(_relative(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
-        judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names)
+        there = {mode: path for mode in made if (path := folder / f"policy_{mode}.pt").is_file()}
+        refusals = {mode: THIS_CAR.refusals(read_manifest(path)) for mode, path in there.items()}
+        judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names, refusals)
         judged = {"headline": headline(judged), "host": contents["benchmark"]["env"]["host"], **judged}
     except KeyError as missing:
         raise RoverError(
@@ -135,7 +138,7 @@ def headline(judged: Mapping[str, Any]) -> str:
     failed = judged["failed"]
     misses = f"; {count(len(failed), 'gate')} failed" if failed else ""
     if judged["deploy"] is None:
-        return f"deploy nothing{misses}"
+        return f"not ready to drive{misses}"
     row = next(row for row in judged["modes"] if row["mode"] == judged["deploy"])
     return f"deploy {judged['artifact']}, {row['size_mb']:.1f} MB, {error_pct(row):.2f} % off{misses}"
 
