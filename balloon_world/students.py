@@ -111,7 +111,7 @@ def judge_students(
         rows.append(_row(run) | errors | _drives(run, worlds, pushed_ms, progress))
     notes = [COUNTED if counted else ESTIMATED] if worlds else [NOBODY_DROVE]
     if missing := [run.name for run in runs if run.counts is None]:
-        notes.append(f"Not counted, or another artifact was: {', '.join(missing)}. `make arm` counts.")
+        notes.append(f"Not counted, or another artifact was: {', '.join(missing)}. `make count` counts.")
     metrics = {
         "students": rows,
         "recommendation": recommendation(rows, p["students"]),

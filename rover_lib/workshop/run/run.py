@@ -32,7 +32,7 @@ from rover_lib.workshop.swap_folder import build_beside
 
 NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
-# Notebooks for a finished run, which `make arm` and `rover world latency`, `students` and `learn` execute.
+# Notebooks for a finished run, which `make count` and `rover world latency`, `students` and `learn` execute.
 AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")
 OWN_FILES = ("calibration*.pt", "policy_*.pt", f"policy_*{ONNX_SUFFIX}")
 KERNEL_ENVIRONMENT = {

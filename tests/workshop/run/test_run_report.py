@@ -110,6 +110,19 @@ def test_leaves_the_same_verdict_as_json_page_and_words(run_dir):
         assert f"{mode['size_mb']:.1f}" in page.text and f"{mode['size_mb']:.1f}" in words
 
 
+def test_commands_work_as_they_are_printed(run_dir, monkeypatch):
+    """`make demo` activates no environment, so `rover` alone would be another program, or none."""
+    programs = run_dir.parents[1] / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    (programs / "rover").touch(0o755)
+    monkeypatch.setattr(report.sys, "executable", str(programs / "python"))
+    monkeypatch.setenv("PATH", "/usr/bin")
+    assert report.typed("rover list") == ".venv/bin/rover list" and report.typed("make watch") == "make watch"
+    assert "\n  .venv/bin/rover drive runs/mine" in report.text(report.write(run_dir)["metrics"])
+    monkeypatch.setenv("PATH", str(programs))
+    assert report.typed("rover list") == "rover list"
+
+
 def test_the_page_needs_no_other_file_and_fits_a_phone(run_dir):
     report.write(run_dir)
     html = (run_dir / report.PAGE).read_text()
