@@ -91,7 +91,7 @@ class Rover(Robot):
 
     @cached_property
     def action_features(self) -> dict[str, type]:
-        """steering in [-1, 1], positive to the left, and throttle in [0, 1], or from -1 on a car with reverse."""
+        """steering in [-1, 1], its side as car.yml says, and throttle in [0, 1], or from -1 on a car with reverse."""
         return dict.fromkeys(ACTIONS, float)
 
     @property

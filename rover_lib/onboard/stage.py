@@ -17,8 +17,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 
@@ -51,7 +52,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def open_plain(path: Path | str, refusal: RoverError) -> BinaryIO:
+def open_plain(path: Path | str, refusal: RoverError) -> BufferedReader:
     """Open a plain file for reading. Raises OSError, and `refusal` if it is no plain file.
 
     Path.open() would wait for a writer of a FIFO, and reading a device might never end.

@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from rover_lib.onboard.artifact.manifest import car_of, content_hash
+from rover_lib.onboard.artifact.manifest import Artifact, car_of
 from rover_lib.onboard.car.camera import Camera, CameraError, path_of
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import boottime, default_log, default_view
@@ -129,12 +129,12 @@ def drive_car(
             found=f"{recorded.name!r} there, and this car is {this.name!r}",
             remedy="replay one of this car's",
         )
-    artifact = options.artifact.resolve() if options.artifact else None  # `current` may point to another one later
+    path = options.artifact.resolve() if options.artifact else None  # `current` may point to another one later
     if not (controls or car or options.dry_run or options.film):
         check_no_film(options.camera)
     with ExitStack() as stack:
         log = stack.enter_context(_open_flight_log(options, settings, report))
-        if artifact:
+        if path:
             most_m = settings.throttle_limit * params()["view"]["speed_mps"] * settings.blind_s
             log.event(f"one picture drives the car for {most_m:.1f} m at most, at throttle {settings.throttle_limit:g}")
         stop = SignalEvent()
@@ -145,8 +145,9 @@ def drive_car(
             options = replace(options, camera=other.camera, port=other.port)
             stack.callback(lambda: report.world.update(other.summary()))
         service = None
+        artifact = stack.enter_context(Artifact(path)) if path else None
         if options.service and artifact:
-            service = stack.enter_context(Service(report, stop, log.event, model=content_hash(artifact)))
+            service = stack.enter_context(Service(report, stop, log.event, model=artifact.content_hash))
         title = (options.artifact or options.replay or Path()).name
         feed = stack.enter_context(contextlib.closing(Feed(options.view or default_view(), log, title)))
         over = _first_of(*([service.over] if service else []), feed.over)
@@ -197,7 +198,7 @@ def _replay(opened: _Opened, controls: Controls) -> None:
         opened.feed.ended(report, None, link)
 
 
-def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
+def _drive_by(artifact: Artifact, opened: _Opened, service: Service | None) -> None:
     """Drive by an artifact's plans: once, or as a service each time that a human arms the car."""
     options, report, log, link, feed = opened.options, opened.report, opened.log, opened.link, opened.feed
     this, stop = this_car(), opened.until.stop
@@ -232,7 +233,7 @@ def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
         while True:
             pilot = PolicyPilot(camera, planner, commanded, opened.settings, policy.rate_hz, calibration=this.pwm)
             warnings = _all_of(
-                artifact_changes(artifact),
+                artifact_changes(artifact.path),
                 pilot.warnings,
                 HealthWatch(report, link),
                 MemoryWatch(report, [os.getpid(), *policy.pids]),

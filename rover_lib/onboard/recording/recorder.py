@@ -230,12 +230,8 @@ def room_for(folder: Path | str, most_mb: float) -> int:
 def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
     """Open an episode in `folder`, named by its start; if that name is taken, by the next free second."""
     if killed := find_killed(folder):
-        _log.warning(
-            "%s: %d recordings were killed; `rover record %s --finish` keeps what they have",
-            folder,
-            len(killed),
-            folder,
-        )
+        text = f"{len(killed)} recordings here were killed; `rover record {folder} --finish` keeps what they have"
+        _log.warning(text)
     while True:
         name = time.strftime("episode_%Y%m%d_%H%M%S", time.localtime(start_s))
         writer = EpisodeWriter(folder / name, about, resolution=None, flags=True)

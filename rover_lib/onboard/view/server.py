@@ -217,6 +217,7 @@ class View:
         head |= {
             "n": self._number,
             "ribbon": ribbon,
+            "left": self._shape.left,
             "replay": self._replay,
             "pins": pins,
             "pins_actions": self._actions(pins),

@@ -171,7 +171,7 @@ def test_a_camera_that_is_frozen_but_for_a_strip_is_frozen(at, axis):
 
 def test_no_picture_of_a_real_drive_counts_as_frozen():
     """The most equal ones share a fiftieth of their blocks."""
-    for episode in recorded.real_drives():
+    for episode in sorted(recorded.real_recordings().glob("episode_*")):
         camera = Camera("recorded")
         for jpeg in sorted((episode / "frames").glob("*.jpg")):
             camera._add(decode_jpeg(jpeg.read_bytes()), 0.0, None)
