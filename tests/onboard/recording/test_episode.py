@@ -64,12 +64,12 @@ def killed(folder, controls=5, frames=3):
         "w = e.EpisodeWriter(sys.argv[1], e.About('hit'), resolution=None, flags=True); w.open()\n"
         "[w.control(100 + i / 30, 33 * i, 1500, 136, 21308, 1016, driver='human') for i in range(int(sys.argv[2]))]\n"
         "[w.frame(100 + i / 30, np.full((36, 64, 3), 99, np.uint8)) for i in range(int(sys.argv[3]))]\n"
-        "print(len(e.find_killed(w.folder.parent))); os.kill(os.getpid(), 9)"
+        "print(len(e.find_killed(w.folder.parent)), flush=True); os.kill(os.getpid(), 9)"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, folder, str(controls), str(frames)], capture_output=True, text=True
     )
-    assert done.stdout == "", done
+    assert done.stdout == "0\n", done
     return folder.with_name(f".{folder.name}.part")
 
 
