@@ -183,6 +183,30 @@ def plant_mutants(ctx: click.Context, output: Path | None, only: tuple[str, ...]
     ctx.exit(1 if survived else 0)
 
 
+@main.command("kills")
+@click.argument("output", type=FILE, required=False)
+@click.option("--each", type=click.IntRange(min=1), default=50, show_default=True, help="Kills of each.")
+@click.pass_context
+def kill_commands(ctx: click.Context, output: Path | None, each: int) -> None:
+    """Kill what writes files at random moments, and fill its disk (as root). Exit code 1 if anything is lost."""
+    import tempfile
+
+    from lab.repository import kills
+    from rover_lib.onboard.stage import write_stage
+
+    metrics: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = kills.make_inputs(Path(folder))
+        for work in kills.WORKS:
+            metrics[f"{work.name}_killed"] = kills.kill_randomly(work, inputs, each)
+            if os.geteuid() == 0:
+                metrics[f"{work.name}_disk_full"] = kills.fill_randomly(work, inputs, max(1, each // 5))
+    if output:
+        write_stage(output, "kills", params={"each": each}, metrics=metrics)
+    show(metrics, False)
+    ctx.exit(1 if any(found["wrong"] for found in metrics.values()) else 0)
+
+
 @main.command("random")
 @click.argument("output", type=FILE, required=False)
 @click.option("--drives", type=click.IntRange(min=1), default=10_000, show_default=True, help="How many.")

@@ -71,7 +71,7 @@ class Outcome:
 
 WORKER = """
 import json, os, sys
-import cv2, numpy, pytest, hypothesis, serial, torch
+import cv2, numpy, pytest, hypothesis, serial
 for line in sys.stdin:
     ask = json.loads(line)
     if not (child := os.fork()):
