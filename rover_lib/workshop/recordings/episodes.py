@@ -357,7 +357,7 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) 
         rows_of = {i: values for i, values, lost, _ in read if name not in lost}
         actions[name], formula = _read_actions(pwm.channel(name), rows_of, path, faults)
         if formula:
-            formulas[name] = str(formula)
+            formulas[name] = formula
     controls = []
     for i, values, _, driver in read:
         pair = actions["steering"].get(i), actions["throttle"].get(i)
