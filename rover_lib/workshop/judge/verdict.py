@@ -460,6 +460,8 @@ def _cautions(
     lines: list[str] = []
     if recomputed := stages["load"].get("recordings", {}).get("recomputed"):
         lines.append(f"{recomputed[0].upper()}{recomputed[1:]}.")
+    if units := (stages["load"]["checkpoint"].get("normalisation") or {}).get("units"):
+        lines.append(f"The policy was {units} once, in its artifacts: its 0.1687 meant stopped.")
     if mirrored := stages["load"].get("steering", {}).get("mirrored", []):
         lines.append(
             f"The pictures of {_some(mirrored)} are mirrored beside the others': leave them out, or turn them."
