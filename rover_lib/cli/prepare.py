@@ -12,6 +12,7 @@ import click
 
 from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
 from rover_lib.onboard.columns import align
+from rover_lib.onboard.errors import printable
 from rover_lib.onboard.kinds import Output, PathTo
 from rover_lib.workshop.progress import terminal_bar
 
@@ -123,7 +124,7 @@ def list_runs(runs_dir: Path, as_json: bool) -> None:
     if as_json:
         return show(found, True)
     for each in found:
-        click.echo(f"{each['name']:<16} {each['verdict']}")
+        click.echo(printable(f"{each['name']:<16} {each['verdict']}"))
     if not found:
         click.echo(f"no run in {runs_dir}: make demo, or rover run, makes the first")
 

@@ -18,8 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from rover_lib.onboard.artifact.manifest import car_of, content_hash
-from rover_lib.onboard.car.camera import Camera, CameraError, path_of
+from rover_lib.onboard.artifact.manifest import car_of, content_hash, read_manifest, seen_size
+from rover_lib.onboard.car.camera import Camera, CameraError, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import default_log, default_view
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink, Telemetry
@@ -129,6 +129,7 @@ def drive_car(
             remedy="replay one of this car's",
         )
     artifact = options.artifact.resolve() if options.artifact else None  # `current` may point to another one later
+    seen = seen_size(read_manifest(artifact)) if artifact else (0, 0)  # read first: it may be missing, or no artifact
     if not (controls or car or options.dry_run or options.film):
         check_no_film(options.camera)
     with ExitStack() as stack:
@@ -152,7 +153,7 @@ def drive_car(
         if controls:
             _replay(opened, controls)
         elif artifact:
-            _drive_by(artifact, opened, service)
+            _drive_by(artifact, seen, opened, service)
         else:
             raise ParamsError("a drive needs an artifact or a replay")
 
@@ -193,12 +194,17 @@ def _replay(opened: _Opened, controls: Controls) -> None:
         opened.feed.ended(report, None, link)
 
 
-def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
-    """Drive by an artifact's plans: once, or as a service each time that a human arms the car."""
+def _drive_by(artifact: Path, seen: tuple[int, int], opened: _Opened, service: Service | None) -> None:
+    """Drive by an artifact's plans: once, or as a service each time that a human arms the car.
+
+    seen: (width, height) of the pictures that the policy was made with.
+    """
     options, report, log, link, feed = opened.options, opened.report, opened.log, opened.link, opened.feed
     this, stop = this_car(), opened.until.stop
     with ExitStack() as stack:
-        camera = stack.enter_context(Camera(options.camera, held=options.film))
+        camera = stack.enter_context(Camera(options.camera, size=size_like(*seen), held=options.film))
+        if frame := camera.latest():
+            check_shape(options.camera, frame.image, seen)
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:
             log.event(f"the policy's process is not confined: {policy.unconfined}", level=logging.WARNING)
