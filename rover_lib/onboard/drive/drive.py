@@ -203,7 +203,7 @@ def _drive_by(artifact: Path, seen: tuple[int, int], opened: _Opened, service: S
     this, stop = this_car(), opened.until.stop
     with ExitStack() as stack:
         camera = stack.enter_context(Camera(options.camera, size=size_like(*seen), held=options.film))
-        if frame := camera.latest():
+        if (frame := camera.latest()) and not path_of(options.camera).is_dir():  # a folder is of an episode, for a look
             check_shape(options.camera, frame.image, seen)
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:
