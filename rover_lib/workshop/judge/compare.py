@@ -119,6 +119,8 @@ class Fidelity:
         for i, action in enumerate(self.action_names):
             e, us = errors[..., i], self.us(action)
             summary[f"{action}_mae_pct"] = self.in_pct(e.mean(), action)
+            tenth = np.sort(e.mean(1))[-math.ceil(len(e) / 10) :]
+            summary[f"{action}_worst_tenth_pct"] = self.in_pct(tenth.mean(), action)
             summary[f"{action}_p95_pct"] = self.in_pct(np.quantile(e, 0.95), action)
             summary[f"{action}_max_pct"] = self.in_pct(e.max(), action)
             summary[f"{action}_mae_recorded_steps_pct"] = self.in_pct(e[~self.is_pad].mean(), action)
