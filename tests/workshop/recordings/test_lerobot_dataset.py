@@ -11,7 +11,7 @@ import pyarrow
 import pytest
 import torch
 from click.testing import CliRunner
-from policies import TINY, lerobot_policy, memory_samples, smooth_frame
+from policies import TINY, lerobot_policy, memory_samples, normalised, smooth_frame
 from pyarrow import parquet
 
 from rover_lib.cli import main
@@ -341,8 +341,6 @@ def test_numbers_that_no_rover_has_are_refused(datasets, value):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A LeRobot policy of two numbers that its dataset calls [throttle, steering], with statistics of both."""
-    from test_checkpoint import normalised
-
     folder = tmp_path_factory.mktemp("trained")
     policy = lerobot_policy(**TINY)
     inner, outer, _ = normalised(policy, "MEAN_STD")
