@@ -56,7 +56,7 @@ $(READY): pyproject.toml lerobot_robot_rover/pyproject.toml
 demo: $(READY)
 	@rm -f $(DEMO)
 	$(ROVER) world record runs/demo/episodes
-	$(ROVER) world train runs/demo/episodes runs/demo/best_model.pth
+	$(ROVER) train runs/demo/episodes runs/demo/best_model.pth
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
 	@touch $(DEMO)
 	@echo

@@ -70,7 +70,7 @@ def test_late_plans_are_drawn(demo_run):
 
 @pytest.mark.release
 def test_a_student_of_its_own_is_judged_beside_it(demo_run):
-    metrics = stage_of(demo_run, "distill")["metrics"]
+    metrics = stage_of(demo_run, "students")["metrics"]
     teacher, student = metrics["students"]
     assert (student["name"], student["width"], student["feedforward"]) == ("demo-small", 96, 256)
     assert student["gmac"] < 0.6 * teacher["gmac"]

@@ -158,7 +158,7 @@ def _drives(root: Path) -> list[Row]:
 
 def _students(run: str, root: Path) -> list[Row]:
     """The policy of that run, and what was distilled from it."""
-    rows = _metrics(root / "results" / run, "distill")["students"]
+    rows = _metrics(root / "results" / run, "students")["students"]
     actions = [key.removeprefix("recorded_").removesuffix("_pct") for key in rows[0] if key.startswith("recorded_")]
 
     def row(student: Mapping[str, Any]) -> Row:

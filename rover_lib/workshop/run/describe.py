@@ -12,7 +12,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Source
 
 BULK = 200  # characters; of a longer value in a report only the number of its items is shown
-STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "distill", "finetune", "learn")
+STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "students", "distill", "finetune", "learn")
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
@@ -38,8 +38,14 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         return {"report": _report(path)}
     if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
         from rover_lib.workshop.recordings.episodes import load_recordings
+        from rover_lib.workshop.recordings.turning import measure_sides
 
-        return {"recordings": load_recordings(source, progress=progress).summary()}
+        recordings = load_recordings(source, progress=progress)
+        sides = measure_sides(recordings, progress)
+        steers = (
+            {"steering": sides.words(), "by_episode": [t.words() for t in sides.turnings]} if sides.turnings else {}
+        )
+        return {"recordings": recordings.summary() | steers}
     from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
     checkpoint = load_checkpoint(path)

@@ -14,17 +14,17 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.artifact.manifest import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
+from rover_lib.onboard.care.release import THIS_CAR
 from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.judge.hosts import benchmark_of, is_of
 from rover_lib.workshop.judge.verdict import CALLED, Names, against, count, error_pct, verdict
-from rover_lib.workshop.run.run_folder import says_how_it_was_taught
 
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
-LATER = ("arm", "distill")  # that `make count` and `rover world students` add to a run
+LATER = ("arm", "students")  # that `make count` and `rover world students` add to a run
 PAGE = "report.html"
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
@@ -63,7 +63,9 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         contents["benchmark"] = read_stage(files["benchmark"], "benchmark")
         given = contents["load"]["params"]
         names = Names(*(_relative(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
-        judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names)
+        there = {mode: path for mode in made if (path := folder / f"policy_{mode}.pt").is_file()}
+        refusals = {mode: THIS_CAR.refusals(read_manifest(path)) for mode, path in there.items()}
+        judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names, refusals)
         judged = {"headline": headline(judged), "host": contents["benchmark"]["env"]["host"], **judged}
     except KeyError as missing:
         raise RoverError(
@@ -92,10 +94,7 @@ def _files(folder: Path) -> dict[str, Path]:
         raise RoverError(
             f"{folder}: no verdict without {', '.join(missing)}", remedy="rover run makes them, of a checkpoint"
         )
-    files = {stage: path for stage, path in files.items() if path.is_file()}
-    if "distill" in files and says_how_it_was_taught(files["distill"]):
-        del files["distill"]
-    return files
+    return {stage: path for stage, path in files.items() if path.is_file()}
 
 
 def _benchmark(folder: Path, modes: Mapping[str, Any]) -> Path:
@@ -148,7 +147,7 @@ def headline(judged: Mapping[str, Any]) -> str:
     failed = judged["failed"]
     misses = f"; {count(len(failed), 'gate')} failed" if failed else ""
     if judged["deploy"] is None:
-        return f"deploy nothing{misses}"
+        return f"not ready to drive{misses}"
     row = next(row for row in judged["modes"] if row["mode"] == judged["deploy"])
     return f"deploy {judged['artifact']}, {row['size_mb']:.1f} MB, {error_pct(row):.2f} % off{misses}"
 

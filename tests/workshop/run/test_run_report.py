@@ -148,13 +148,6 @@ def test_what_others_wrote_is_no_markup(run_dir):
     assert "<script" not in html and "<b>mine" not in html and "&lt;script&gt;" in html
 
 
-def test_a_students_own_distill_json_is_no_comparison(run_dir):
-    content = json.loads((run_dir / "distill.json").read_text())
-    content["metrics"] = {"losses": {}}
-    (run_dir / "distill.json").write_text(json.dumps(content))
-    assert "distill.json" not in report.write(run_dir)["inputs"]
-
-
 def test_a_run_that_is_not_whole_has_no_verdict(run_dir, tmp_path):
     with pytest.raises(RoverError, match="there is no such run"):
         report.write(tmp_path / "nothing")
