@@ -78,6 +78,27 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     _judge(folder)
 
 
+@click.command(short_help="Execute one notebook of a run again.")
+@click.argument("name")
+@click.argument("run_dir", type=PathTo("run"))
+@click.option("-p", "turned", type=(str, str), multiple=True, metavar="PARAMETER VALUE", help="May be repeated.")
+def notebook(name: str, run_dir: Path, turned: tuple[tuple[str, str], ...]) -> None:
+    """Execute the notebook NAME, such as 03_quantize, on the run in RUN_DIR, with other parameters.
+
+    Its results replace those in RUN_DIR, so take a copy of a run that you want to keep (`make notebooks-open NAME=demo
+    AS=try1`). A value is YAML: 0.5, affine, [static, mixed]. A parameter that the notebook does not have is refused.
+    """
+    import yaml
+
+    from rover_lib.workshop.run.run import execute
+
+    try:
+        given = {key: yaml.safe_load(value) for key, value in turned}
+    except yaml.YAMLError as error:
+        raise click.BadParameter(f"a value is not YAML: {' '.join(str(error).split())}") from None
+    click.echo(f"executed: {execute(name.removesuffix('.ipynb'), run_dir, **given)}")
+
+
 @click.command(short_help="Judge an existing run again.")
 @click.argument("run_dir", type=PathTo("run"))
 @AS_JSON
