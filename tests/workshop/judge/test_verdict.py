@@ -59,6 +59,13 @@ def test_the_demo_deploys_static(demo):
     assert "rover_artifact=runs/mine/policy_static.pt" in commands(judged)[1]
 
 
+def test_of_two_that_are_as_good_the_smaller_is_deployed(monkeypatch):
+    for name, value in (("_candidates", list), ("_work_key", lambda rows: None), ("error_pct", lambda row: 1.0)):
+        monkeypatch.setattr(v, name, value)
+    rows = [{"mode": mode, "size_mb": size} for mode, size in zip(v.PREFERRED, (100, 20), strict=False)]
+    assert v._best(rows, {"worth_pct": 10, "better_points": 0.1})["size_mb"] == 20
+
+
 def test_what_a_workstation_measures_of_memory_fails_nothing(demo):
     demo["benchmark"]["peak_memory_mb"] = demo["benchmark"]["latency_mean_ms"] = 5000.0
     assert judge(demo)["failed"] == []
