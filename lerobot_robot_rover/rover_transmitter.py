@@ -51,7 +51,7 @@ class RoverTransmitter(Teleoperator):
 
     @cached_property
     def action_features(self) -> dict[str, type]:
-        """steering in [-1, 1], positive to the left, and throttle in [0, 1], or from -1 on a car with reverse."""
+        """steering in [-1, 1], its side as car.yml says, and throttle in [0, 1], or from -1 on a car with reverse."""
         return dict(FEATURES)
 
     @property

@@ -43,13 +43,13 @@ def test_troubleshooting_names_lines_that_the_doctor_has():
     symptoms = (ROOT / "docs" / "troubleshooting.md").read_text().partition("\n## ")[0]
     rows = re.findall(r"^\| .+? \| (.*?) \|", symptoms, re.M)
     named = {name for row in rows for name in re.findall(r"`([^`]+)`", row) if not name.startswith("rover ")}
-    source = (ROOT / "rover_lib" / "onboard" / "doctor.py").read_text()
+    source = (ROOT / "rover_lib" / "onboard" / "care" / "doctor.py").read_text()
     assert len(named) > 10 and not [name for name in named if f'"{name}"' not in source]
 
 
 SOURCES = [*ROOT.glob("rover_*/**/*.py"), *ROOT.glob("balloon_world/**/*.py"), *ROOT.glob("lerobot_robot_rover/*.py")]
 PLAYS = [*ROOT.glob("ansible/**/*.yml"), *ROOT.glob("ansible/**/*.j2")]
-PROGRAM = r"rover|lab|make|ansible-playbook|lerobot-[a-z-]+|python -m \S+"
+PROGRAM = r"rover|lab|make|ansible-playbook|lerobot-[a-z-]+|python -m [\w.]+"
 
 
 def texts(path: Path) -> Iterator[str]:
@@ -57,7 +57,7 @@ def texts(path: Path) -> Iterator[str]:
     if path.suffix != ".py":
         text = path.read_text().replace("\\\n", " ")
         yield from re.findall(r"^    (\S.*)$", text, re.M) if path in PAGES else ()
-        yield from (f"`{code}`" for code in re.findall(r"[`']([^`'\n]+)[`']", text))
+        yield from (f"`{code}`" for code in re.findall(r"[`']([^`'\n]+)[`'](?! there)", text))
         return
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.JoinedStr):
@@ -74,19 +74,19 @@ def commands(path: Path) -> Iterator[tuple[str, list[str], bool]]:
     for text in texts(path):
         for match in re.finditer(rf"(?:^|(?<=[`'\s(/]))({PROGRAM}) +(--?\w|[a-zX][\w./X-]*)?([^`'\n;|&]*)", text):
             start = text[: match.start()].rstrip()
-            whole = not start or start.endswith(("`", ".venv/bin/", "&&", "sudo")) or path in PAGES
+            whole = start.endswith(("`", "'", ".venv/bin/", "&&", "sudo")) or (path in PAGES and not start)
             rest = (match[2] or "") + match[3].partition(" #")[0]
             yield match[1], rest.split() if '"' in rest or "{" in rest else shlex.split(rest, posix=True), whole
 
 
 def refusal_of(group: click.Command, words: list[str], whole: bool) -> str:
-    """Say why click would refuse the words; "" if it would not. Behind a command that is not whole a sentence goes on."""
+    """Say why click would refuse the words, else "". Behind a command that is not whole, a sentence goes on."""
     while isinstance(group, click.Group):
         if not words or words[0].startswith("-") or words[0] == "X":
             words = [w for w in words if w.startswith("--")]
             break
         if words[0] not in group.commands:
-            return f"no command {words[0]}" if whole else ""
+            return f"no command {words[0]}" if whole and not words[0].endswith(":") else ""
         group, words = group.commands[words[0]], words[1:]
     words = [word.rstrip(".,:)") for word in words]
     known = {"--help": 0, **{o: int(not getattr(p, "is_flag", False)) for p in group.params for o in p.opts}}
@@ -114,7 +114,7 @@ def test_every_command_that_we_print_is_one():
     from lab.__main__ import main as lab
     from rover_lib.cli import main as rover
 
-    targets = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.M))
+    targets = set(" ".join(re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.M)).split())
     variables = set(re.findall(r"^ +(\w+):", (ROOT / "ansible/roles/rover/meta/argument_specs.yml").read_text(), re.M))
     variables |= {"ansible_user", "ansible_host", "ansible_ssh_private_key_file"}
     seen: Counter[str] = Counter()
@@ -145,6 +145,13 @@ def test_every_command_that_we_print_is_one():
                 refused.append(f"{path.relative_to(ROOT)}: {program} {' '.join(words)}: {wrong}")
     assert not refused, "\n".join(refused)
     assert seen["rover"] > 400 and seen["make"] > 40 and seen["ansible"] > 20 and seen["lab"] > 20, seen
+
+
+def test_readme_says_how_to_begin_in_few_words():
+    text = (ROOT / "README.md").read_text()
+    first = [line.split("#")[0].split() for line in re.findall(r"^    (\S.*)$", text, re.M)[:3]]
+    assert first == [["make", "demo"], ["make", "test"], ["make", "notebooks-open", "NAME=demo"]]
+    assert len(text.split()) <= 700 and re.search(r"\[!\[.*\]\(pictures/\w+\.png\)\]\(notebooks/\w+\.ipynb\)", text)
 
 
 def test_the_first_hour_is_eight_commands_at_most():

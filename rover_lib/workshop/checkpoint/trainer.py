@@ -75,6 +75,7 @@ def read_trainer(path: Path) -> Contents:
         encoder_layers=positive(path, raw, "n_encoder_layers"),
         decoder_layers=positive(path, raw, "n_decoder_layers"),
         backbone=raw["vision_encoder"],
+        rate_hz=float(positive(path, raw | {"rate_hz": raw.get("rate_hz", 30)}, "rate_hz")),
         image_norm=(imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
     )
     extra = {

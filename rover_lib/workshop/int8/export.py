@@ -167,7 +167,8 @@ class Exporter:
         }
         for at, camera in enumerate(config.cameras, 1):
             vectors[f"frame_{camera}"] = np.stack([self.inputs[i][at].numpy() for i in self.stored])
-        names_car = bool({*config.action_names} & {*ACTION_NAMES}) and not self.car.drives_like(Car())
+        other = not self.car.drives_like(Car()) or self.car.positive != Car().positive
+        names_car = bool({*config.action_names} & {*ACTION_NAMES}) and other
         manifest = _manifest(policy, checkpoint, calibration, form, self.recorded) | {
             **({"car": self.car.description()} if names_car else {}),
             "weights_mb": _weights_mb(module),

@@ -112,7 +112,7 @@ class LerobotSample(Sample):
         Raises EpisodeError if it cannot be decoded.
         """
         frames = self.pictures.frames_bgr(self.row, self.frame_path)
-        return frames if len(frames) > 1 else next(iter(frames.values()))
+        return frames if len(frames) > 1 else self.turned(next(iter(frames.values())))
 
 
 def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Recordings:

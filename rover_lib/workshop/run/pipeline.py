@@ -29,6 +29,7 @@ from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.recordings.turning import Sides
 from rover_lib.workshop.run.session import Opened, open_run
 
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
@@ -150,8 +151,16 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
 # --- what the stages of a run leave -----------------------------------------------------------------------------------
 
 
-def write_load(run_dir: Path | str, loaded: Opened, note: str = "", fit: Mapping[str, Any] | None = None) -> None:
-    """load.json: where a run starts from. note: what is special about its policy. fit: `plausible.Fit.summary`."""
+def write_load(
+    run_dir: Path | str,
+    loaded: Opened,
+    note: str = "",
+    fit: Mapping[str, Any] | None = None,
+    sides: Sides | None = None,
+) -> None:
+    """load.json: where a run starts from. note: what is special about its policy. fit: `plausible.Fit.summary`. sides:
+    which way the recordings' car steers.
+    """
     checkpoint, recordings = loaded.checkpoint, loaded.recordings
     model = ACT(checkpoint.config, checkpoint.weights)
     work = {"macs_by_block": multiply_accumulates(model), "parameters_by_block": parameters_by_block(model)}
@@ -164,6 +173,8 @@ def write_load(run_dir: Path | str, loaded: Opened, note: str = "", fit: Mapping
         metrics["note"] = note
     if fit:
         metrics["fit"] = fit
+    if sides and sides.turnings:
+        metrics["steering"] = {"side": sides.side, "mirrored": sides.mirrored, "words": sides.words()}
     source = recordings.source
     given = {
         "checkpoint": checkpoint.path.resolve(),
