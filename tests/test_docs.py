@@ -80,7 +80,7 @@ def commands(path: Path) -> Iterator[tuple[str, list[str], bool]]:
 
 
 def refusal_of(group: click.Command, words: list[str], whole: bool) -> str:
-    """Say why click would refuse the words, else "". Behind a command that is not whole, a sentence goes on."""
+    """Say why click would refuse the words; "" if it would not. Behind a command that is not whole, words are prose."""
     while isinstance(group, click.Group):
         if not words or words[0].startswith("-") or words[0] == "X":
             words = [w for w in words if w.startswith("--")]

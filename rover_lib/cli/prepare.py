@@ -78,6 +78,27 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     _judge(folder)
 
 
+@click.command(short_help="Execute one notebook of a run again.")
+@click.argument("name")
+@click.argument("run_dir", type=PathTo("run"))
+@click.option("-p", "turned", type=(str, str), multiple=True, metavar="PARAMETER VALUE", help="May be repeated.")
+def notebook(name: str, run_dir: Path, turned: tuple[tuple[str, str], ...]) -> None:
+    """Execute the notebook NAME, such as 03_quantize, on the run in RUN_DIR, with other parameters.
+
+    Its results replace those in RUN_DIR, so take a copy of a run that you want to keep (`make notebooks-open NAME=demo
+    AS=try1`). A value is YAML: 0.5, affine, [static, mixed]. A parameter that the notebook does not have is refused.
+    """
+    import yaml
+
+    from rover_lib.workshop.run.run import execute
+
+    try:
+        given = {key: yaml.safe_load(value) for key, value in turned}
+    except yaml.YAMLError as error:
+        raise click.BadParameter(f"a value is not YAML: {' '.join(str(error).split())}") from None
+    click.echo(f"executed: {execute(name.removesuffix('.ipynb'), run_dir, **given)}")
+
+
 @click.command(short_help="Judge an existing run again.")
 @click.argument("run_dir", type=PathTo("run"))
 @AS_JSON
@@ -266,13 +287,43 @@ def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> 
     fifth as long. What is repaired in the recordings or left out is printed, and kept in OUT/rover_export.json. In a
     drive of a policy, each frame says whether a human had taken over: LeRobot's `intervention`.
     """
-    from rover_lib.workshop.recordings.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
     from rover_lib.workshop.recordings.export_dataset import export_dataset as write
 
     report = write(episodes, out, progress=terminal_bar(), **options)
+    _say_export(report, out, "exported", as_json)
+
+
+def _say_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> None:
+    from rover_lib.workshop.recordings.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
+    from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
+
     for name in ("episodes_are", CAR, DRIVEN_BY, OUTCOMES):  # too long to print; the file has them
         del report[name]
-    show({"exported": report | {"report": str(out / REPORT)}}, as_json)
+    show({done: report | {"report": str(out / REPORT)}}, as_json)
+    if not as_json:
+        click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
+
+
+@click.command("import", short_help="Write a donkeycar tub as a LeRobotDataset v3.")
+@click.argument("tub", type=PathTo("tub"))
+@click.argument("out", type=FILE)
+@click.option(
+    "--size", callback=size_option, metavar="WIDTHxHEIGHT", help="Size of the pictures [default: as recorded]."
+)
+@AS_JSON
+def import_tub(tub: Path, out: Path, size: tuple[int, int] | None, as_json: bool) -> None:
+    """Write the donkeycar tub in the folder TUB, of any age, as a LeRobotDataset v3 to the new folder OUT.
+
+    Steering and throttle become those of this machine's car (car.yml). Deleted records and those at which a pilot drove
+    are left out, and episodes end where records are missing. What was left out is printed, and kept in
+    OUT/rover_export.json.
+    """
+    from rover_lib.onboard.car.car import this_car
+    from rover_lib.workshop.recordings.export_dataset import export_dataset as write
+    from rover_lib.workshop.recordings.tub import read_tub
+
+    report = write(read_tub(tub, this_car(), terminal_bar()), out, size=size, progress=terminal_bar())
+    _say_export(report, out, "imported", as_json)
 
 
 @click.command(short_help="Collect the packages for a Pi without internet.")

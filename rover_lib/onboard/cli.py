@@ -706,11 +706,12 @@ def open_view(
     feed: Path | None,
     drive_user: str | None,
     opened: Callable[[str], object] = lambda url: None,
-    replay: Any = None,
+    shown: Any = None,
 ) -> None:
     """Serve the view until SIGINT or SIGTERM.
 
-    opened: called with its URL. replay: a Replay of drive_log, shown instead of the drives that connect.
+    opened: called with its URL. shown: what is shown instead of the drives that connect, a Replay of drive_log, or
+    balloon_world's Simulation, whose `ask` gets what is asked for on the page.
     """
     import asyncio
 
@@ -718,14 +719,16 @@ def open_view(
     from rover_lib.onboard.view.server import Address, View, new_token, read_token
 
     token = read_token(token_file) if token_file else new_token()
-    place = None if replay else feed or default_view()
+    place = None if shown else feed or default_view()
+    ask = getattr(shown, "ask", None)
     view = View(
         Address(web_port, interface),
         token,
         place,
         drive_user=drive_user,
-        replay=replay is not None,
-        car=replay and replay.car,
+        replay=shown is not None and ask is None,
+        car=shown and shown.car,
+        ask=ask,
     )
 
     def tell(url: str) -> None:
@@ -734,7 +737,7 @@ def open_view(
         sys.stdout.flush()
         opened(url)
 
-    asyncio.run(view.run(tell, replay and replay.show))
+    asyncio.run(view.run(tell, shown and shown.show))
 
 
 @main.command(short_help="Summarize a flight log.")

@@ -29,6 +29,7 @@ CALLED = {
     "flight log": "a flight log",
     "recordings": "a folder of recordings",
     "dataset": "a LeRobotDataset",
+    "tub": "a donkeycar tub",
     "run": "a run's folder",
     "checkpoint part": "a part of a LeRobot checkpoint",
     "dataset part": "a part of a LeRobotDataset",
@@ -39,6 +40,7 @@ WANTED = {  # what a command wants: the kinds that it accepts, and how to get on
     "checkpoint": (("checkpoint", "pretrained"), "give the trainer's best_model.pth, or LeRobot's pretrained_model"),
     "recordings": (("recordings", "dataset"), "give the folder that holds episode_*, or a LeRobotDataset's"),
     "run": (("run",), "give a folder that rover run has made, such as runs/mine"),
+    "tub": (("tub",), "give the folder with manifest.json and the catalogs, or with record_<number>.json"),
     "flight log": (("flight log",), "give the file that rover drive wrote, named by its --log"),
 }
 INSTEAD = {  # (what was given, what was wanted): what to do instead
@@ -50,6 +52,7 @@ INSTEAD = {  # (what was given, what was wanted): what to do instead
     ("dataset", "checkpoint"): "recordings come second: rover run CHECKPOINT EPISODES",
     ("checkpoint", "recordings"): "the checkpoint comes first: rover run CHECKPOINT EPISODES",
     ("pretrained", "recordings"): "the checkpoint comes first: rover run CHECKPOINT EPISODES",
+    ("tub", "recordings"): "rover import TUB OUT makes a LeRobotDataset of it",
     ("recordings", "flight log"): "rover inspect says what is in recordings; a flight log is a file of its own",
     ("run", "artifact"): "give one of its policy_<mode>.pt; rover report says which",
     ("run", "checkpoint"): "give the checkpoint that it was made of, which its load.json names",
@@ -176,6 +179,11 @@ def _of_folder(folder: Path) -> tuple[str, ...]:
         kinds.append("pretrained")
     if names & set(EPISODE_FILES) or any(n.startswith("episode_") and (folder / n).is_dir() for n in names):
         kinds.append("recordings")
+    if not kinds and (
+        {"catalog_0.catalog", "record_0.json"} & names
+        or ("manifest.json" in names and any(n.endswith(".catalog") for n in names))
+    ):
+        kinds.append("tub")
     return tuple(kinds)
 
 

@@ -37,6 +37,7 @@ PREFERRED = ("fp32", "static", "mixed", "dynamic")  # between equals: the policy
 COUNTED = "counted on an emulated Cortex-A76"
 NEXT_COMMANDS = 3
 MOST_EPISODES = 3  # a remedy names at most this many
+EARLY_FRAMES = 30  # odd frames below this number all belong to the beginning of a drive
 
 Stages = Mapping[str, Mapping[str, Any]]
 
@@ -292,10 +293,14 @@ def _remedies(
     if key in ("size_mb", "model_size_mb"):
         return [f"INT8 cannot make it smaller; a smaller policy can: `{_smaller(stages, names)}`."]
     action = key.removesuffix("_mae_pct").removesuffix("_of_spread_pct") if key.endswith("_pct") else None
-    remedies = [
-        _of_mixed(params, rows),
-        f"Train it for INT8: `{_qat(names)}`, then `rover run` on what it leaves.",
-    ]
+    remedies = [_of_mixed(params, rows)]
+    if stages["quantize"].get("odd"):  # then training with INT8's rounding was tried, and repaired nothing
+        remedies.append(
+            "The frames that the cautions name take the steps of INT8 from all others: leave out drives that should "
+            "not be there, or train on more frames like them, so that the policy answers them as it does the others."
+        )
+    else:
+        remedies.append(f"Train it for INT8: `{_qat(names)}`, then `rover run` on what it leaves.")
     if action and (block := _worst_block(stages["quantize"].get("sensitivity", {}), action)):
         remedies.append(f"Most of it comes from {block[0]}: {block[1]:.2f} % with that alone in INT8 (notebook 03).")
     if clipped := _clipped(stages["quantize"], params):
@@ -469,6 +474,8 @@ def _cautions(
     lines: list[str] = []
     if recomputed := stages["load"].get("recordings", {}).get("recomputed"):
         lines.append(f"{recomputed[0].upper()}{recomputed[1:]}.")
+    if units := (stages["load"]["checkpoint"].get("normalisation") or {}).get("units"):
+        lines.append(f"The policy was {units} once, in its artifacts: its 0.1687 meant stopped.")
     if mirrored := stages["load"].get("steering", {}).get("mirrored", []):
         lines.append(
             f"The pictures of {_some(mirrored)} are mirrored beside the others': leave them out, or turn them."
@@ -492,6 +499,8 @@ def _cautions(
         )
     notes = stages["load"]["checkpoint"].get("notes", [])
     told = (*notes, *compared.get("warnings", []), *stages["quantize"].get("warnings", []))
+    if odd := stages["quantize"].get("odd"):
+        lines.append(_of_odd_frames(odd))
     lines += [f"{warning}." for warning in dict.fromkeys(told)]  # two stages may say the same
     if _timing(rows) == "measured here":
         lines.append(
@@ -509,6 +518,24 @@ def _cautions(
     if student != "teacher":
         lines.append(f"A smaller policy may replace this one: {student}, as `rover world students` found.")
     return lines
+
+
+def _of_odd_frames(odd: Mapping[str, Any]) -> str:
+    """Name the frames that the policy answers far more strongly than the others, and how far INT8 is off there.
+
+    odd: `frames.describe_odd`, and errors: {usual, odd: {<action>_mae_pct}} of static INT8.
+    """
+    off = {
+        kind: ", ".join(f"{k.removesuffix('_mae_pct')} {v:.2f}" for k, v in errors.items() if v is not None)
+        for kind, errors in odd["errors"].items()
+    }
+    episodes, rows = list(odd["episodes"]), odd["rows"]
+    at_start = f", frame {max(rows)} or earlier" if max(rows) < EARLY_FRAMES else ""
+    return (
+        f"In {odd['share_pct']:.1f} % of the frames ({_some(episodes)}{at_start}) {odd['block']} answers "
+        f"{odd['times']:.0f} times more than usual: what is special there? Static INT8 is off by {off['odd']} % on "
+        f"them, by {off['usual']} % on the others."
+    )
 
 
 def count(number: int, what: str) -> str:
@@ -549,7 +576,8 @@ def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[
     else:
         if deploy == "mixed":
             commands.append((deploying, "put it on the rover"))
-        commands.append((_qat(names), "train static INT8 to keep its gates"))
-        commands.append((run, "and judge that"))
+        if not stages["quantize"].get("odd"):
+            commands.append((_qat(names), "train static INT8 to keep its gates"))
+            commands.append((run, "and judge that"))
         commands.append((f"make notebooks-open NAME={_shell(names.name)}", "notebook 03 has the blocks, 04 the frames"))
     return [{"command": command, "why": why} for command, why in commands[:NEXT_COMMANDS]]

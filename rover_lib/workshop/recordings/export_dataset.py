@@ -63,14 +63,16 @@ SHORTEST = 2  # rows in the shortest episode: a single row has no spread to norm
 
 
 def export_dataset(
-    episodes: Path | str,
+    episodes: Path | str | Recordings,
     out: Path | str,
     *,
     video: bool = False,
     size: tuple[int, int] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Write all usable samples below `episodes` to `out`, a new folder, and return what was written and left out.
+    """Write all usable samples to `out`, a new folder, and return what was written and left out.
+
+    episodes: the recordings, or the folder that has them.
 
     video: True writes AV1, LeRobot's default, which is far smaller but loses detail; False writes PNG inside parquet,
     which loses nothing. size: (height, width) to which the pictures are resized, as a rover resizes what its camera
@@ -87,7 +89,10 @@ def export_dataset(
         raise EpisodeError(
             f"pictures must have {SIDES_PX[0]} to {SIDES_PX[1]} pixels a side", found=f"{size[1]}x{size[0]}"
         )
-    recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
+    if isinstance(episodes, Recordings):
+        recordings = episodes
+    else:
+        recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
     if recordings.layout.rate_hz is not None:
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = _rate_hz(recordings)

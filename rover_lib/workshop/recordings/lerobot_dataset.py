@@ -554,3 +554,11 @@ def _episode(
         corrects=bool(taken_over.any()),
         outcome=outcome,
     )
+
+
+def lerobot_train(dataset: Path | str) -> str:
+    """Return the command of LeRobot's own that trains an ACT on a LeRobotDataset."""
+    return (
+        f"lerobot-train --dataset.repo_id=local/drives --dataset.root={dataset} --policy.type=act "
+        "--policy.push_to_hub=false --policy.chunk_size=32 --policy.n_action_steps=32 --output_dir=trained"
+    )

@@ -18,6 +18,7 @@ from rover_lib.onboard.car.picture import PictureError, read_jpeg
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
+from rover_lib.workshop.recordings.formula import Formula
 
 OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has another rate
 
@@ -212,8 +213,8 @@ class Episode:
     samples: tuple[Sample, ...]
     files: tuple[Path, ...]  # those that the numbers came from
     outcome: str | None = None
+    formulas: Mapping[str, Formula] = field(default_factory=dict)
     corrects: bool = False  # whether a human intervened in it: lerobot-rollout can leave out what the policy drove
-    formulas: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def by_policy(self) -> bool:

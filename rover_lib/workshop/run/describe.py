@@ -7,7 +7,7 @@ from typing import Any
 
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import kinds_of
+from rover_lib.onboard.kinds import check_kind, kinds_of
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Source
@@ -37,6 +37,8 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         return {"calibration": _calibration(path)}
     if kind == "stage":
         return {"report": _report(path)}
+    if kind == "tub":
+        check_kind(path, "recordings")  # says what to do with it
     if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
         from rover_lib.workshop.recordings.episodes import load_recordings
         from rover_lib.workshop.recordings.turning import measure_sides

@@ -176,12 +176,16 @@ def _say_final_paths(new: Path, folder: Path) -> None:
 def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:
     """Execute one notebook on an existing run, and return the path of the executed notebook in the run's folder.
 
-    Raises NotebookError, in one sentence with the notebook, the cell and its error; an earlier executed one then stays.
+    Raises NotebookError for an unknown parameter, before anything runs; then in one sentence with the notebook, the
+    cell and its error. An earlier executed one then stays.
     """
     folder, source = Path(run_dir).resolve(), Path(notebooks) / f"{name}.ipynb"
     if not source.is_file() or not folder.is_dir():
         missing = folder if source.is_file() else source
         raise NotebookError(f"{missing}: not found", remedy="run from a checkout, on a run of it")
+    if unknown := sorted(set(overrides) - parameters_of(source)):  # papermill would only warn, and work for minutes
+        known = sorted(parameters_of(source) - {"run_dir"})
+        raise NotebookError(f"{source.name} has no parameter {', '.join(unknown)}", remedy=f"known are {known}")
     _execute(source, folder, {"run_dir": str(folder), **overrides}, False)
     return folder / source.name
 

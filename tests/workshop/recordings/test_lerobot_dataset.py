@@ -16,7 +16,7 @@ import pyarrow
 import pytest
 import torch
 from click.testing import CliRunner
-from policies import TINY, lerobot_policy, memory_samples, smooth_frame
+from policies import TINY, lerobot_policy, memory_samples, normalised, smooth_frame
 from pyarrow import parquet
 
 from rover_lib.cli import main
@@ -436,8 +436,6 @@ def test_what_we_print_converts_a_dataset_of_v21(datasets, tmp_path):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A LeRobot policy of two numbers that its dataset calls [throttle, steering], with statistics of both."""
-    from test_checkpoint import normalised
-
     folder = tmp_path_factory.mktemp("trained")
     policy = lerobot_policy(**TINY)
     inner, outer, _ = normalised(policy, "MEAN_STD")

@@ -110,17 +110,6 @@ def test_leaves_the_same_verdict_as_json_page_and_words(run_dir):
         assert f"{mode['size_mb']:.1f}" in page.text and f"{mode['size_mb']:.1f}" in words
 
 
-def test_a_card_says_what_the_verdict_says_and_replaces_only_cards(run_dir):
-    content = report.write(run_dir)["metrics"]
-    for _ in range(2):
-        text = report.write_card(run_dir).read_text()
-    assert text.startswith("---\nlibrary_name: lerobot\n") and content["headline"] in text
-    assert f"`rover drive {content['artifact']}`" in text and all(line in text for line in content["cautions"])
-    (run_dir / "README.md").write_text("mine")
-    with pytest.raises(RoverError, match="is not a card that this has written; move it away"):
-        report.write_card(run_dir)
-
-
 def test_commands_work_as_they_are_printed(run_dir, monkeypatch):
     """`make demo` activates no environment, so `rover` alone would be another program, or none."""
     programs = run_dir.parents[1] / ".venv" / "bin"
@@ -132,6 +121,17 @@ def test_commands_work_as_they_are_printed(run_dir, monkeypatch):
     assert "\n  .venv/bin/rover drive runs/mine" in report.text(report.write(run_dir)["metrics"])
     monkeypatch.setenv("PATH", str(programs))
     assert report.typed("rover list") == "rover list"
+
+
+def test_a_card_says_what_the_verdict_says_and_replaces_only_cards(run_dir):
+    content = report.write(run_dir)["metrics"]
+    for _ in range(2):
+        text = report.write_card(run_dir).read_text()
+    assert text.startswith("---\nlibrary_name: lerobot\n") and content["headline"] in text
+    assert f"`rover drive {content['artifact']}`" in text and all(line in text for line in content["cautions"])
+    (run_dir / "README.md").write_text("mine")
+    with pytest.raises(RoverError, match="is not a card that this has written; move it away"):
+        report.write_card(run_dir)
 
 
 def test_the_page_needs_no_other_file_and_fits_a_phone(run_dir):
