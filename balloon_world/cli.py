@@ -99,7 +99,7 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
 
     Each folder has a policy_static.pt, and an arm.json if its instructions were counted. All policies drive through
     the same worlds: left alone, and pushed with plans that are as late as was computed for the policy. Leaves
-    distill.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its teacher's place. If
+    students.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its teacher's place. If
     it is ended at any moment, the same command continues where it was.
     """
     from balloon_world.frontier import sentences, table

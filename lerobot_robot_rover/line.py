@@ -20,6 +20,7 @@ class Line:
 
     transmitters: the teleoperators on the port; if there is one, a human may drive without arming anything.
     humans_action: whether a teleoperator has returned the human's own action, and the robot has not been given it yet.
+    drives_ended: how many drives have ended; what was planned for one is not for the next.
     before_drive: waits until the car can be armed; None while no robot is connected.
     """
 
@@ -27,6 +28,7 @@ class Line:
         self.port = port
         self.transmitters: WeakSet[object] = WeakSet()
         self.humans_action = False
+        self.drives_ended = 0
         self.before_drive: Callable[[], None] | None = None
         self._link: ServoLink | None = None
         self._users = 0
@@ -71,6 +73,11 @@ def line_to(port: str) -> Line:
     if line is None or os.path.realpath(line.port) != key:
         line = _lines[key] = Line(port)
     return line
+
+
+def count_ended_drives() -> int:
+    """Return how many drives of this process's robots have ended."""
+    return sum(line.drives_ended for line in list(_lines.values()))
 
 
 def wait_for_humans() -> None:

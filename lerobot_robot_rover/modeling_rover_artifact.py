@@ -14,8 +14,9 @@ from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig, not_trained
-from lerobot_robot_rover.line import wait_for_humans
+from lerobot_robot_rover.line import count_ended_drives, wait_for_humans
 from rover_lib.onboard.car.car import this_car
+from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.drive.drive import another_car
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.drive.plan import Plan, Settings
@@ -42,6 +43,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         self.config: RoverArtifactConfig = config
         self._limits = this_car().limits
         self._queue: deque[Tensor] = deque()
+        self._planned_s, self._planned_in = 0.0, 0  # when the queue was filled, and after how many drives
         self._plans = 0
         self._process = PolicyProcess(config.file, threads=config.threads)
         self._close = weakref.finalize(self, self._process.close)  # at the program's end too
@@ -71,8 +73,14 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         wait_for_humans()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps, that of a new chunk."""
+        """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps, that of a new chunk.
+
+        A chunk that is older than the stop_s of params.yml, or from before the car was disarmed, is dropped.
+        """
+        if boottime() - self._planned_s > _stop_s() or self._planned_in != count_ended_drives():
+            self._queue.clear()
         if not self._queue:
+            self._planned_s, self._planned_in = boottime(), count_ended_drives()
             chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
             self._queue.extend(chunk.transpose(0, 1))
         return self._queue.popleft()

@@ -17,7 +17,7 @@ from lerobot_robot_rover.line import line_to
 from lerobot_robot_rover.ride import HOLD_S, RATE_HZ, Ride
 from rover_lib.onboard.car.camera import Camera, CameraError
 from rover_lib.onboard.car.car import this_car
-from rover_lib.onboard.car.host import default_log
+from rover_lib.onboard.car.host import boottime, default_log
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.drive import arm_when_ready, check_no_film
@@ -129,7 +129,7 @@ class Rover(Robot):
             stack.callback(self.cameras.update, {self.config.camera_name: None})
             self._sight = Sight(self._camera, self.settings)
             self._seen = 0  # number of the newest frame that LeRobot was given
-            self._captured_s = 0.0
+            self._captured_s = self._looked_s = 0.0
             self._action, self._acted_s = NEUTRAL, 0.0
             self._log.event(NO_PROMISE)
             if not self._line.transmitters:
@@ -149,7 +149,8 @@ class Rover(Robot):
         if self._ride:
             self._ride.check()
             if self._ride.over:
-                self._ride, self._action = None, NEUTRAL
+                self._end_ride()
+                self._action = NEUTRAL
         if not self._ride:
             self._link.latest()
             if not self._line.transmitters:
@@ -160,7 +161,7 @@ class Rover(Robot):
             self._sight.watch(frame, now_s)
         if now_s - self._acted_s > HOLE_S:  # another episode
             self._action = NEUTRAL
-        self._seen, self._captured_s = frame.number, frame.captured_s
+        self._seen, self._captured_s, self._looked_s = frame.number, frame.captured_s, boottime()
         picture = prepare_frame(frame.image, self.config.height, self.config.width)
         return {**dict(zip(ACTIONS, self._action, strict=True)), self.config.camera_name: picture}
 
@@ -237,7 +238,8 @@ class Rover(Robot):
             self._ride.put(steering, throttle)
             return steering, throttle
         self._camera.latest()  # raises if it failed
-        if (age_s := time.monotonic() - self._captured_s) > self.settings.stop_s:
+        age_s = max(time.monotonic() - self._captured_s, boottime() - self._looked_s)
+        if age_s > self.settings.stop_s:
             self._log.event(f"an action came {age_s:.1f} s after its picture, and was not driven by")
             return NEUTRAL
         self._ride = Ride(self._camera, self._link, self.settings, self._log)
@@ -252,3 +254,4 @@ class Rover(Robot):
         ride, self._ride = self._ride, None
         if ride:
             ride.end()
+            self._line.drives_ended += 1

@@ -39,7 +39,7 @@ def test_troubleshooting_names_lines_that_the_doctor_has():
     symptoms = (ROOT / "docs" / "troubleshooting.md").read_text().partition("\n## ")[0]
     rows = re.findall(r"^\| .+? \| (.*?) \|", symptoms, re.M)
     named = {name for row in rows for name in re.findall(r"`([^`]+)`", row) if not name.startswith("rover ")}
-    source = (ROOT / "rover_lib" / "onboard" / "doctor.py").read_text()
+    source = (ROOT / "rover_lib" / "onboard" / "care" / "doctor.py").read_text()
     assert len(named) > 10 and not [name for name in named if f'"{name}"' not in source]
 
 
@@ -66,7 +66,7 @@ def test_commands_and_options_in_the_pages_are_there():
     from lab.__main__ import main as lab
     from rover_lib.cli import main as rover
 
-    targets = set(re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(), re.M))
+    targets = set(" ".join(re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.M)).split())
     seen = 0
     for page in PAGES:
         for program, *words in filter(None, typed(page)):
@@ -80,6 +80,13 @@ def test_commands_and_options_in_the_pages_are_there():
             seen += 1
             assert not unknown, f"{page.name}: {program} {' '.join(words)}: {unknown}"
     assert seen > 200
+
+
+def test_readme_says_how_to_begin_in_few_words():
+    text = (ROOT / "README.md").read_text()
+    first = [line.split("#")[0].split() for line in re.findall(r"^    (\S.*)$", text, re.M)[:3]]
+    assert first == [["make", "demo"], ["make", "test"], ["make", "notebooks-open", "NAME=demo"]]
+    assert len(text.split()) <= 700 and re.search(r"\[!\[.*\]\(pictures/\w+\.png\)\]\(notebooks/\w+\.ipynb\)", text)
 
 
 def test_the_first_hour_is_eight_commands_at_most():

@@ -83,7 +83,7 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
 def report(run_dir: Path, as_json: bool) -> None:
     """Judge the existing run in RUN_DIR again, as `rover run` does at its end.
 
-    Use it after `make arm` has counted instructions, after `rover world students`, or when params.yml has changed.
+    Use it after `make count` has counted instructions, after `rover world students`, or when params.yml has changed.
     """
     _judge(run_dir, as_json)
 

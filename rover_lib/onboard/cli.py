@@ -413,10 +413,11 @@ def inspect(file: Path, as_json: bool) -> None:
 
 def describe_artifact(file: Path) -> dict[str, Any]:
     """Return what `rover inspect` says of an intact artifact. Raises ArtifactError for any other file."""
-    from rover_lib.onboard.artifact.manifest import check_artifact, content_hash, read_manifest
+    from rover_lib.onboard.artifact.manifest import Artifact
 
-    check_artifact(file)
-    return {"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}
+    with Artifact(file) as artifact:
+        artifact.prove()
+        return {"artifact": {"content_hash": artifact.content_hash, **artifact.manifest}}
 
 
 @main.command(short_help="Time artifacts on this machine.")
@@ -443,7 +444,7 @@ def benchmark(
     With --json or --output the first artifact's figures are at the top level. Needs nothing but the artifacts: this is
     what runs on the Pi.
     """
-    from rover_lib.onboard.artifact.manifest import content_hash, distinct_names, read_parity
+    from rover_lib.onboard.artifact.manifest import Artifact, distinct_names
     from rover_lib.onboard.care.benchmark import BenchmarkOptions
     from rover_lib.onboard.care.benchmark import benchmark as measure
     from rover_lib.onboard.care.limits import check_gates
@@ -452,8 +453,13 @@ def benchmark(
     from rover_lib.onboard.stage import write_stage
 
     files = distinct_names(artifacts)
-    policies = {name: load_policy(path) for name, path in files.items()}
-    vectors = read_parity(artifacts[0])
+    policies, contents, vectors = {}, {}, None
+    for name, path in files.items():
+        with Artifact(path) as artifact:
+            policies[name] = load_policy(artifact)
+            contents[f"{name}{path.suffix}"] = artifact.content_hash
+            vectors = artifact.parity if vectors is None else vectors
+    assert vectors is not None, "click asks for an artifact at least"
     first = next(iter(policies.values()))
     frames = [
         {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
@@ -464,8 +470,7 @@ def benchmark(
     if busy > BUSY:
         click.echo(f"rover: warning: this machine was busy before ({busy:.0%} of its cores): times are rough", err=True)
     if output:
-        inputs = {f"{name}{path.suffix}": content_hash(path) for name, path in files.items()}
-        write_stage(output, "benchmark", params=options, metrics=metrics, inputs=inputs)
+        write_stage(output, "benchmark", params=options, metrics=metrics, inputs=contents)
     if gates:
         metrics["gates"] = check_gates(metrics, params()["gates"]["original"])
     if as_json:
@@ -569,10 +574,13 @@ def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, all
     show(pack_parts(artifact, folder, releases.expected, allow, sign_key), True)
 
 
+UNSIGNED = click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")
+
+
 @release.command(short_help="Make a release of an artifact without using it.")
 @click.argument("source", type=FILE)
 @click.option("--sha256", help="The SHA-256 that the artifact must have.")
-@click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")
+@UNSIGNED
 @ALLOW
 @click.pass_obj
 def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow: tuple[str, ...]) -> None:
@@ -589,10 +597,12 @@ def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow
 def verify(releases: Any, name: str, confined: bool) -> None:
     """Verify that a release is complete and computes here what it should, by checksums and parity vectors."""
     if confined and (path := releases.path_of(name)).exists():
+        from rover_lib.onboard.artifact.manifest import Artifact
         from rover_lib.onboard.policy.confine import confine, memory_mb
         from rover_lib.onboard.policy.load import import_engine
 
-        import_engine(path)
+        with Artifact(path) as artifact:
+            import_engine(artifact)
         if unconfined := confine(memory_mb(path, os.cpu_count() or 1)):
             click.echo(f"rover: not confined: {unconfined}", err=True)
     releases.check(name)
@@ -601,10 +611,11 @@ def verify(releases: Any, name: str, confined: bool) -> None:
 
 @release.command(short_help="Use a release from now on.")
 @click.argument("name")
+@UNSIGNED
 @click.pass_obj
-def switch(releases: Any, name: str) -> None:
+def switch(releases: Any, name: str, unsigned: bool) -> None:
     """Use the release NAME from now on. It is verified before and after; if that fails, the old one is used again."""
-    show({"name": name, "changed": releases.switch(name)}, True)
+    show({"name": name, "changed": releases.switch(name, unsigned=unsigned)}, True)
 
 
 @release.command(short_help="Go back to the release before the one in use.")

@@ -17,7 +17,7 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.artifact.archive import HEF, ONNX
+from rover_lib.onboard.artifact.archive import DIRECTORY_BYTES, HEF, ONNX
 from rover_lib.onboard.errors import RoverError
 
 CALLED = {
@@ -187,10 +187,13 @@ def _of_file(file: Path) -> tuple[str, ...]:
 def _of_archive(file: Path) -> tuple[str, ...]:
     """Return the kinds of a zip file that torch or `rover export` wrote; none for a damaged one."""
     try:
+        with file.open("rb") as f:  # an artifact's directory, which names its records, is not opened as a zip for that
+            f.seek(max(0, file.stat().st_size - DIRECTORY_BYTES))
+            directory = f.read()
+        if any(name.encode() in directory for name in (ONNX, HEF, "/code/__torch__")):
+            return ("artifact",)
         with zipfile.ZipFile(file) as z:
             names = z.namelist()
-            if ONNX in names or HEF in names or any("/code/" in name for name in names):
-                return ("artifact",)
             pickled = next((name for name in names if name.endswith("/data.pkl")), None)
             if pickled is None:
                 return ()

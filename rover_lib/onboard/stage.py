@@ -17,8 +17,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 
@@ -51,7 +52,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def open_plain(path: Path | str, refusal: RoverError) -> BinaryIO:
+def open_plain(path: Path | str, refusal: RoverError) -> BufferedReader:
     """Open a plain file for reading. Raises OSError, and `refusal` if it is no plain file.
 
     Path.open() would wait for a writer of a FIFO, and reading a device might never end.
@@ -64,8 +65,8 @@ def open_plain(path: Path | str, refusal: RoverError) -> BinaryIO:
 
 
 def sha256_of(path: Path | str) -> str:
-    """Return the hex SHA-256 of a file's bytes."""
-    with Path(path).open("rb") as f:
+    """Return the hex SHA-256 of a file's bytes. Raises RoverError for what is no plain file."""
+    with open_plain(path, RoverError(f"{path}: not a plain file")) as f:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
 

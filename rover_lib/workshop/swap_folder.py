@@ -1,6 +1,6 @@
 """Build a folder's new content in a hidden folder beside it, one process at a time, and swap it in when complete.
 
-    with made_beside(folder, files_of_a_run) as new:
+    with build_beside(folder, files_of_a_run) as new:
         ...                                                     # fill it
 
 Without this, two commands with the same --name would remove each other's files.

@@ -115,6 +115,6 @@ def test_names_the_thing_and_the_remedy(here, command, thing, remedy):
     assert contents(here) == before  # nothing half-written, and nothing lost
 
 
-def test_a_workstations_command_on_the_rover_says_where_it_belongs():
+def test_a_command_that_a_rover_lacks_says_where_there_are_more():
     result = CliRunner().invoke(onboard, ["list"])
-    assert result.exit_code == 2 and "a workstation's command" in result.output
+    assert result.exit_code == 2 and "type it on a workstation, which has more" in result.output

@@ -258,12 +258,12 @@ def test_an_interrupt_while_it_takes_its_place_leaves_the_last_one(one_notebook,
     assert contents(old_run.parent) == before
 
 
-@pytest.mark.parametrize("judged", [False, True], ids=["a student's", "a teacher's"])
-def test_what_says_how_a_student_was_taught_outlives_a_run_of_it(one_notebook, old_run, monkeypatch, judged):
-    """A teacher's distill.json is of its old artifact, also where notebook 08 failed; a student's of its checkpoint."""
-    write_stage(old_run / "distill.json", "distill", params={}, metrics={} if judged else {"losses": {}})
+def test_what_says_how_a_student_was_taught_outlives_a_run_of_it(one_notebook, old_run, monkeypatch):
+    """A student's distill.json is of its checkpoint; a teacher's students.json is of its old artifact."""
+    for stage in ("distill", "students"):
+        write_stage(old_run / f"{stage}.json", stage, params={}, metrics={})
     run_with(monkeypatch, one_notebook, old_run, whole)
-    assert (old_run / "distill.json").exists() != judged
+    assert (old_run / "distill.json").exists() and not (old_run / "students.json").exists()
 
 
 def test_a_run_that_was_killed_while_it_took_its_place_is_undone_by_the_next(one_notebook, old_run, monkeypatch):
@@ -362,12 +362,6 @@ def test_publishing_leaves_the_json_behind_the_outputs(one_notebook, tmp_path):
     with pytest.raises(runs.NotebookError, match="shows a path of this machine"):
         publish.publish(tmp_path / "mine", one_notebook, ("01_load",))
     assert read_stage(path, "load") == content
-
-
-def test_students_are_told_from_their_teachers(tmp_path):
-    write_stage(tmp_path / "full" / "distill.json", "distill", params={}, metrics={"students": []})
-    write_stage(tmp_path / "fast" / "distill.json", "distill", params={}, metrics={"losses": {"qat": [0.1]}})
-    assert publish.students(tmp_path) == [tmp_path / "fast" / "distill.json"]
 
 
 def test_committed_results_are_small_and_show_no_path():

@@ -10,6 +10,7 @@ from lab.driving.bench import DrivingBench
 from lab.driving.pins import CONTINUES, REFUSED, STOPPED
 from lab.driving.policy import PLAIN, SIZE, pictures
 from lab.driving.row import FaultKind
+from rover_lib.onboard.car.picture import decode_jpeg
 
 FAULTS = FaultKind("perception")
 
@@ -58,6 +59,15 @@ def _flicker(bench: DrivingBench) -> None:
     shown = [np.full((*SIZE, 3), 128, np.uint8) for _ in range(40)]
     for i, picture in enumerate(shown):
         picture[50, 50] = 6 * i
+    bench.feed.show(*shown)
+
+
+@FAULTS.add("all but a strip is frozen", STOPPED, "the camera is frozen", "a strip of 5 % still changes")
+def _freeze_but_a_strip(bench: DrivingBench) -> None:
+    shown = [decode_jpeg(jpeg).copy() for jpeg in pictures(PLAIN)]
+    rows = SIZE[0] // 20
+    for picture in shown[1:]:
+        picture[:-rows] = shown[0][:-rows]
     bench.feed.show(*shown)
 
 

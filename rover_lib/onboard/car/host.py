@@ -11,6 +11,7 @@ import resource
 import socket
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,11 @@ from typing import Any
 # Bits of vcgencmd get_throttled: true now, and 16 bits higher: has been true since the start
 THROTTLED_BITS = {0: "under-voltage", 1: "frequency capped", 2: "throttled", 3: "soft temperature limit"}
 THROTTLED_VALUE = re.compile(r"0x[0-9a-fA-F]{1,8}")  # as get_throttled prints the bits
+
+
+def boottime() -> float:
+    """Return the seconds since this machine started, with those in which it was suspended."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 @dataclass(frozen=True)

@@ -458,7 +458,7 @@ def read_controls(folder: Path | str) -> Controls:
 
     They are read from control_data.csv, or from episode_data.json if that gives none. Times are the system's, unless
     its clock was set meanwhile or controls arrived in a burst; then they are the Arduino's. Raises EpisodeError if no
-    control is usable, CarError as recorded_car() does.
+    control is usable, CarError as read_car_of() does.
     """
     folder = Path(folder)
     pwm = read_car_of(folder).pwm

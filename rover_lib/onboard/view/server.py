@@ -19,6 +19,7 @@ import hashlib
 import hmac
 import ipaddress
 import json
+import logging
 import os
 import pwd
 import re
@@ -43,6 +44,8 @@ from rover_lib.onboard.view.path_overlay import CarShape, from_now
 PORT = 8470
 MESSAGE_BYTES = 1 << 20  # no message of a drive is larger (MOST_BYTES in feed.py)
 PAGES = 32
+CONNECTIONS = 2 * PAGES  # at a time, of all browsers; a peer may have three quarters of them
+REQUEST_S = 5.0  # a connection that is no page's by then is closed
 ACCEPT_AGAIN_S = 0.5
 BEAT_S = 5.0  # between two pings; a page that does not answer one is gone
 GONE = "gone"
@@ -152,6 +155,8 @@ class View:
         self._picture = b""
         self._news = asyncio.Event()
         self._pages = 0
+        self._browsers: dict[asyncio.BaseTransport, str] = {}  # open connections and their peers, the oldest first
+        self._talking: set[asyncio.BaseTransport] = set()  # those of pages
         self._html = PAGE.read_bytes()
 
     async def run(
@@ -180,7 +185,10 @@ class View:
         app = web.Application(middlewares=[self._guard], client_max_size=1024)
         app.router.add_get("/", self._give_page)
         app.router.add_get("/ws", self._talk)
-        runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=0.5, keepalive_timeout=10)
+        silent = logging.getLogger(f"{__name__}.library")
+        silent.disabled = True  # it would write whole requests into the log, with the token and as often as they come
+        asyncio.get_running_loop().set_exception_handler(lambda *_: None)
+        runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=0.5, logger=silent)
         wire = self._address.open()
         stack.callback(wire.close)
         if self._place:
@@ -190,7 +198,7 @@ class View:
             stack.push_async_callback(_end, asyncio.create_task(self._accept(drives)))
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
-        await web.SockSite(runner, wire).start()
+        stack.push_async_callback(_end, asyncio.create_task(self._admit(wire, runner.server)))
         name = f"{socket.gethostname()}.local" if self._address.interface else "127.0.0.1"
         return f"http://{name}:{wire.getsockname()[1]}/?token={self._token}"
 
@@ -299,6 +307,38 @@ class View:
 
     # ---- browsers
 
+    async def _admit(self, wire: socket.socket, server: Any) -> None:
+        """Accept browsers, but from nobody so many that others find no place. Runs until it is cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                browser, (peer, _) = await loop.sock_accept(wire)
+                if self._make_room(peer):
+                    transport, _ = await loop.connect_accepted_socket(server, browser)
+                    self._browsers[transport] = peer
+                    loop.call_later(REQUEST_S, self._drop, transport)
+                else:
+                    browser.close()
+            except OSError:  # no file descriptor is free, or the browser has gone again
+                await asyncio.sleep(ACCEPT_AGAIN_S)
+
+    def _make_room(self, peer: str) -> bool:
+        """Close connections that are no page's, the oldest first, until another of that peer may come."""
+        self._browsers = {t: p for t, p in self._browsers.items() if not t.is_closing()}
+        for limit, who in ((CONNECTIONS * 3 // 4, {peer}), (CONNECTIONS, {*self._browsers.values()})):
+            theirs = [t for t, p in self._browsers.items() if p in who]
+            if len(theirs) < limit:
+                continue
+            if not (idle := [t for t in theirs if t not in self._talking]):
+                return False
+            self._drop(idle[0])
+        return True
+
+    def _drop(self, transport: Any) -> None:
+        if transport not in self._talking:
+            transport.abort()
+            self._browsers.pop(transport, None)
+
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
         if not self._address.is_ours(request.headers.get("Host", "")):
@@ -326,7 +366,9 @@ class View:
         page = _Page()
         wire = web.WebSocketResponse(heartbeat=BEAT_S, max_msg_size=64, compress=False)
         self._pages += 1
+        transport: Any = request.transport
         try:
+            self._talking.add(transport)
             await wire.prepare(request)
             sending = asyncio.create_task(self._send(wire, page))
             try:
@@ -342,6 +384,7 @@ class View:
                 await _end(sending)
         finally:
             self._pages -= 1
+            self._talking.discard(transport)
         return wire
 
     async def _send(self, wire: web.WebSocketResponse, page: "_Page") -> None:

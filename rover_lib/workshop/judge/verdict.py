@@ -496,7 +496,7 @@ def _cautions(
         )
     if best["mode"] == "fp32" and best["floor_ms"]:
         lines.append(f"A plan in FP32 takes a Pi 5 at least {best['floor_ms']:.0f} ms (computed).")
-    student = stages.get("distill", {}).get("recommendation", {}).get("name", "teacher")
+    student = stages.get("students", {}).get("recommendation", {}).get("name", "teacher")
     if student != "teacher":
         lines.append(f"A smaller policy may replace this one: {student}, as `rover world students` found.")
     return lines
@@ -515,7 +515,10 @@ def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[
     run = _shell("rover", "run", f"runs/{student}/{left}", names.episodes, "--name", student)
     if deploy is None:
         commands = [
-            (f"make lab NAME={_shell(names.name)}", "look at notebook 01, what the car saw, and 04, what it plans"),
+            (
+                f"make notebooks-open NAME={_shell(names.name)}",
+                "look at notebook 01, what the car saw, and 04, what it plans",
+            ),
             ("rover record --max-seconds 30 episodes", "more drives, with corrections; on the car"),
             (_shell("rover", "inspect", names.episodes), "what is in the recordings, and what is wrong with them"),
         ]
@@ -539,5 +542,5 @@ def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[
             commands.append((deploying, "put it on the rover"))
         commands.append((_qat(names), "train static INT8 to keep its gates"))
         commands.append((run, "and judge that"))
-        commands.append((f"make lab NAME={_shell(names.name)}", "notebook 03 has the blocks, 04 the frames"))
+        commands.append((f"make notebooks-open NAME={_shell(names.name)}", "notebook 03 has the blocks, 04 the frames"))
     return [{"command": command, "why": why} for command, why in commands[:NEXT_COMMANDS]]

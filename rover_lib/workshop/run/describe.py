@@ -7,12 +7,12 @@ from typing import Any
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import check_kind, kinds_of
-from rover_lib.onboard.stage import read_stage
+from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Source
 
 BULK = 200  # characters; of a longer value in a report only the number of its items is shown
-STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "distill", "finetune", "learn")
+STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "students", "distill", "finetune", "learn")
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
@@ -95,11 +95,18 @@ def runs(folder: Path | str) -> list[dict[str, str]]:
     return [{"name": p.name, "verdict": verdict_of(p)} for p in paths if set(kinds_of(p)) & {"run", "pretrained"}]
 
 
+def _changed(path: Path, sha256: str) -> bool:
+    return path.is_file() and sha256_of(path) != sha256
+
+
 def verdict_of(run_dir: Path) -> str:
     """A run's verdict in one line; if it has none yet, the command that makes one."""
     if (run_dir / "run.json").is_file():
         try:
-            return str(read_stage(run_dir / "run.json", "run")["metrics"]["headline"])
+            judged = read_stage(run_dir / "run.json", "run")
+            if changed := [name for name, sha256 in judged["inputs"].items() if _changed(run_dir / name, sha256)]:
+                return f"{', '.join(changed)} made again since its verdict: rover report {run_dir}"
+            return str(judged["metrics"]["headline"])
         except (RoverError, KeyError):
             return f"its run.json cannot be used: rover report {run_dir}"
     if (run_dir / "compare.json").is_file():

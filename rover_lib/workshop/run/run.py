@@ -14,7 +14,7 @@ import shutil
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +27,12 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
-from rover_lib.workshop.run.run_folder import run_folder, says_how_it_was_taught
+from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.swap_folder import build_beside
 
 NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
-# Notebooks for a finished run, which `make arm` and `rover world latency`, `students` and `learn` execute.
+# Notebooks for a finished run, which `make count` and `rover world latency`, `students` and `learn` execute.
 AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")
 OWN_FILES = ("calibration*.pt", "policy_*.pt", f"policy_*{ONNX_SUFFIX}")
 KERNEL_ENVIRONMENT = {
@@ -120,12 +120,9 @@ def run(
 
 def files_of_a_run(folder: Path) -> list[Path]:
     """List what a run left in its folder and what was later made from its artifacts. A new run replaces all of it."""
-    stages = ("load", "calibrate", "quantize", "compare", "run", "arm", "parts", "drive", "learn")
+    stages = ("load", "calibrate", "quantize", "compare", "run", "arm", "parts", "drive", "students", "learn")
     names = [f"{stage}.json" for stage in (*stages, f"benchmark-{socket.gethostname()}")]
     names += [*(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures", "report.html"]
-    with suppress(RoverError):  # a distill.json that is damaged, or missing, belongs to no run
-        if not says_how_it_was_taught(folder / "distill.json"):
-            names.append("distill.json")
     own = [folder / n for n in names] + [p for pattern in OWN_FILES for p in folder.glob(pattern)]
     return [path for path in own if path.exists()]
 

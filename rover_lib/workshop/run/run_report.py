@@ -6,6 +6,8 @@ print(text(content["metrics"]))
 
 import os
 import re
+import shutil
+import sys
 from base64 import b64encode
 from collections.abc import Mapping
 from html import escape
@@ -20,10 +22,9 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.judge.hosts import benchmark_of, is_of
 from rover_lib.workshop.judge.verdict import CALLED, Names, against, count, error_pct, verdict
-from rover_lib.workshop.run.run_folder import says_how_it_was_taught
 
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
-LATER = ("arm", "distill")  # that `make arm` and `rover world students` add to a run
+LATER = ("arm", "students")  # that `make count` and `rover world students` add to a run
 PAGE = "report.html"
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
@@ -48,7 +49,7 @@ code{font-size:.9rem;overflow-wrap:anywhere}li{margin:.3rem 0}
 def write(run_dir: Path | str) -> dict[str, Any]:
     """Judge a run and leave run.json and report.html in its folder. Returns run.json's content.
 
-    Made anew of what is there, so that `make arm` and `rover world students` count once they were made. Raises
+    Made anew of what is there, so that `make count` and `rover world students` count once they were made. Raises
     RoverError where a stage is missing, is of other artifacts or lacks what is to be judged, and where an artifact is
     another one than was compared.
     """
@@ -93,10 +94,7 @@ def _files(folder: Path) -> dict[str, Path]:
         raise RoverError(
             f"{folder}: no verdict without {', '.join(missing)}", remedy="rover run makes them, of a checkpoint"
         )
-    files = {stage: path for stage, path in files.items() if path.is_file()}
-    if "distill" in files and says_how_it_was_taught(files["distill"]):
-        del files["distill"]
-    return files
+    return {stage: path for stage, path in files.items() if path.is_file()}
 
 
 def _benchmark(folder: Path, modes: Mapping[str, Any]) -> Path:
@@ -134,6 +132,13 @@ def _relative(path: Path | str) -> str:
     return os.path.relpath(path) if path.is_absolute() and path.is_relative_to(Path.cwd()) else str(path)
 
 
+def typed(command: str) -> str:
+    """A command as it works in this shell: a program of this environment that is not on PATH gets its folder."""
+    program, space, rest = command.partition(" ")
+    beside = Path(sys.executable).with_name(program)
+    return command if shutil.which(program) or not beside.is_file() else f"{_relative(beside)}{space}{rest}"
+
+
 # --- in words ---------------------------------------------------------------------------------------------------------
 
 
@@ -156,7 +161,7 @@ def text(judged: Mapping[str, Any]) -> str:
             lines += [f"  {against(row)}", *(f"    - {remedy}" for remedy in row["remedies"])]
     if judged["cautions"]:
         lines += ["", "Keep in mind:", *(f"  {line}" for line in judged["cautions"])]
-    lines += ["", "Next:", *(f"  {step['command']}\n      {step['why']}" for step in judged["next"])]
+    lines += ["", "Next:", *(f"  {typed(step['command'])}\n      {step['why']}" for step in judged["next"])]
     return "\n".join(lines)
 
 
@@ -211,7 +216,9 @@ def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) ->
         parts += [f"<p><b>{escape(against(row))}</b></p>", _list(row["remedies"])]
     if judged["cautions"]:
         parts += ["<h2>Keep in mind</h2>", _list(judged["cautions"])]
-    steps = "".join(f"<li><code>{escape(s['command'])}</code><br>{escape(s['why'])}</li>" for s in judged["next"])
+    steps = "".join(
+        f"<li><code>{escape(typed(s['command']))}</code><br>{escape(s['why'])}</li>" for s in judged["next"]
+    )
     parts += ["<h2>Next</h2>", f"<ol>{steps}</ol>"]
     for figure, caption in FIGURES.items():
         if figure in figures:
