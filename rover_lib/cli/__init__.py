@@ -19,6 +19,7 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
     "Look": (drive.view, drive.log),
     "Step by step": (
         prepare.quantize,
+        prepare.notebook,
         prepare.compare,
         ROVERS["benchmark"],
         prepare.export,

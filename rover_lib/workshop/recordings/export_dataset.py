@@ -30,6 +30,7 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.recording.episode import HIT, HUMAN, NOBODY, POLICY
+from rover_lib.workshop.lerobot_moved import no_progress_bars
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.lerobot_dataset import (
@@ -149,7 +150,6 @@ def _write(
     os.environ.setdefault("SVT_LOG", "1")  # without it the AV1 encoder prints its settings at every episode
     # Imported here, because it takes seconds that no other command should wait for.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from lerobot.datasets.utils import SuppressProgressBars
 
     recorded = recordings.samples[0].frame_bgr().shape
     shape = (*size, 3) if size else recorded
@@ -169,7 +169,7 @@ def _write(
     origins: list[str] = []
     driven_by: list[str] = []
     outcomes: list[str | None] = []
-    with SuppressProgressBars(), warnings.catch_warnings():
+    with no_progress_bars(), warnings.catch_warnings():
         warnings.filterwarnings(
             "ignore", "Converting input from bool"
         )  # numpy warns when LeRobot computes statistics of yes and no

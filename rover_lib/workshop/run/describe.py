@@ -1,6 +1,7 @@
 """Describe a file or a folder of this project, for `rover inspect`, and list the runs, for `rover list`."""
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,7 @@ def verdict_of(run_dir: Path) -> str:
             return f"its run.json cannot be used: rover report {run_dir}"
     if (run_dir / "compare.json").is_file():
         return f"no verdict yet: rover report {run_dir}"
-    if (run_dir / "best_model.pth").is_file():
-        return f"a checkpoint: rover run {run_dir / 'best_model.pth'} EPISODES --name {run_dir.name}"
+    made = run_dir / "best_model.pth" if (run_dir / "best_model.pth").is_file() else run_dir
+    if made != run_dir or "pretrained" in kinds_of(run_dir):
+        return f"a checkpoint: rover run {shlex.quote(str(made))} EPISODES --name {shlex.quote(run_dir.name)}"
     return "not whole: rover run makes it again"

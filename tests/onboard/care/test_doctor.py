@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from test_servo_link import board_of
+from pty_board import board_of
 
 from rover_lib.cli import main
 from rover_lib.onboard.car.camera import CameraError, Frame

@@ -225,7 +225,7 @@ def test_nobody_who_drove_and_an_action_that_is_not_judged_are_said(demo):
         if "throttle_mae_pct" in found:
             found["throttle_mae_pct"] = None
     judged = judge(demo)
-    assert judged["deploy"] == "static" and "not judged" in judged["why"][0]
+    assert judged["deploy"] == "static" and "throttle" not in judged["why"][0]
     assert any("Nobody drove" in line for line in judged["cautions"])
     assert "deploy.yml" in commands(judged)[0] and "drive.yml" in commands(judged)[2]
 
