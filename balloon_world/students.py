@@ -26,7 +26,7 @@ from balloon_world.latency import SEED, Condition, drive_late
 from balloon_world.trial import run_trials, wilson_interval
 from rover_learn.distill import errors_of
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
-from rover_lib.onboard.care.lower_bound import PI5_SEEN_GMAC_PER_S
+from rover_lib.onboard.care.pi5 import estimate_ms
 from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import DistillError
@@ -48,13 +48,9 @@ WORLDS, PUSHES = 200, 4
 HELD_OUT_FRAMES = 300
 TEACHER = "teacher"
 ARTIFACT = f"policy_{GATED}.pt"
-COUNTED = (
-    "Pushed at the high end of the time computed from counted instructions: what such kernels were seen to reach; "
-    "the low end is what no program can beat."
-)
+COUNTED = "Pushed at the high end of the time that was computed for a Raspberry Pi 5 from counted work."
 ESTIMATED = (
-    f"Pushed at an estimate, as the teacher's instructions are not counted: multiply-accumulates at "
-    f"{PI5_SEEN_GMAC_PER_S:g} G a second, the rate that such kernels were seen to reach."
+    "Pushed at an estimate for a Raspberry Pi 5 by multiply-accumulates, as the teacher's instructions are not counted."
 )
 
 
@@ -78,7 +74,7 @@ class _Run:
 
     @property
     def estimated_ms(self) -> float:
-        return 1e3 * self.manifest["gmac"] / PI5_SEEN_GMAC_PER_S
+        return estimate_ms(self.manifest["gmac"])
 
 
 def judge_students(

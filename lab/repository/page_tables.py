@@ -4,6 +4,7 @@
 
 A table stands in README.md or in a page of docs/ between `<!-- table NAME, by make tables -->` and `<!-- end -->`, each
 once. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is left out.
+A computed time in a sentence stands between `<!-- ms POLICY -->` and `<!-- end -->`, and comes from the clock's JSON too.
 """
 
 import re
@@ -12,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.care.pi5 import DRIVING
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path, read_stage
 from rover_lib.workshop.run.run import parameters_in
@@ -20,6 +22,7 @@ ROOT = Path(__file__).parents[2]
 MODES = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed"}
 BEST = "static"
 PLACE = re.compile(r"(<!-- table (\w+), by make tables -->\n)(.*?)(<!-- end -->)", re.S)
+TIME = re.compile(r"(<!-- ms ([^>]+?) -->)(.*?)(<!-- end -->)")
 
 Row = tuple[str, ...]
 
@@ -57,7 +60,35 @@ def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
         lines = [header, ("---",) * len(header), *rows]
         return match[1] + "".join(map(_line, lines)) + match[4]
 
-    return {path: PLACE.sub(place, text) for path, text in texts.items()}
+    times = _clock(root)
+
+    def tell(match: re.Match[str]) -> str:
+        if match[2] not in times:
+            raise TableError(
+                f"no time of {match[2]!r} is computed", found=sorted(times), remedy="add it to lab/a76/network_counts.py"
+            )
+        return match[1] + times[match[2]] + match[4]
+
+    return {path: TIME.sub(tell, PLACE.sub(place, text)) for path, text in texts.items()}
+
+
+def _clock(root: Path) -> dict[str, str]:
+    """What each policy takes on the cores that drive, as "low to high"; on others as "POLICY, 4 threads"."""
+    times = {}
+    for row in _metrics(root / "results" / "clock", "clock")["policies"]:
+        span = f"{row['predicted_low_ms']:.2g} to {row['predicted_high_ms']:.2g}"
+        times[f"{row['name']}, {row['threads']} threads"] = span
+        if row["threads"] == DRIVING:
+            times[row["name"]] = span
+            times[shape_of(row)] = span
+    return times
+
+
+def shape_of(row: Mapping[str, Any]) -> str:
+    """Return what tells a policy from others: its picture, its decoder, and how much of its backbone it computes."""
+    return "x".join(
+        str(row.get(key)) for key in ("width", "height", "decoder_layers", "feedforward", "backbone_channels")
+    )
 
 
 def _line(fields: Row) -> str:
@@ -172,25 +203,25 @@ def _students(run: str, root: Path) -> list[Row]:
     """The policy of that run, and what was distilled from it."""
     rows = _metrics(root / "results" / run, "distill")["students"]
     actions = [key.removeprefix("recorded_").removesuffix("_pct") for key in rows[0] if key.startswith("recorded_")]
+    times = _clock(root)
 
     def row(student: Mapping[str, Any]) -> Row:
         count = student["decoder_layers"]
         layers = f"{count} decoder layer{'s' if count > 1 else ''} of {student['feedforward']}"
-        low, high = student["computed_ms"]
         if share := student.get("backbone_channels"):
             layers += f", {share:.0%} of the backbone's channels"
         return (
             f"{student['name']}: {student['width']}x{student['height']}, {layers}",
             format(student["size_mb"], ".1f"),
             f"{student['instructions_g']:.3g} ({student['simd_g']:.3g})",
-            f"{low:.2g} to {high:.2g}",
+            times.get(shape_of(student), ""),
             f"{student['hits']} of {student['trials']}",
             f"{student['pushed_hits']} of {student['pushed_trials']} at {student['pushed_latency_ms']:.2g} ms",
             " / ".join(f"{student[f'recorded_{action}_pct']:.2f}" for action in actions),
         )
 
     counted = "10^9 instructions (SIMD), *counted*", "ms on a Pi 5, *computed*"
-    driven = "balloons hit, left alone", "balloons hit, pushed, with its computed latency"
+    driven = "balloons hit, left alone", "balloons hit, pushed, with plans as late as"
     return [("", "MB", *counted, *driven, f"{' / '.join(actions)} error against the recordings, %"), *map(row, rows)]
 
 
