@@ -4,7 +4,7 @@
 
 A table stands in README.md or in a page of docs/ between `<!-- table NAME, by make tables -->` and `<!-- end -->`, each
 once. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is left out.
-A computed time in a sentence stands between `<!-- ms POLICY -->` and `<!-- end -->`, and comes from the clock's JSON too.
+A computed time in a sentence stands between `<!-- ms POLICY -->` and `<!-- end -->`; it is from the clock's JSON too.
 """
 
 import re
@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.care.pi5 import DRIVING
+from rover_lib.onboard.care.pi5 import CORES, DRIVING
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path, read_stage
 from rover_lib.workshop.run.run import parameters_in
@@ -21,6 +21,7 @@ from rover_lib.workshop.run.run import parameters_in
 ROOT = Path(__file__).parents[2]
 MODES = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed"}
 BEST = "static"
+GHZ, LINE = 2.4, 64  # of a Raspberry Pi 5; bytes of a cache line
 PLACE = re.compile(r"(<!-- table (\w+), by make tables -->\n)(.*?)(<!-- end -->)", re.S)
 TIME = re.compile(r"(<!-- ms ([^>]+?) -->)(.*?)(<!-- end -->)")
 
@@ -65,7 +66,9 @@ def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
     def tell(match: re.Match[str]) -> str:
         if match[2] not in times:
             raise TableError(
-                f"no time of {match[2]!r} is computed", found=sorted(times), remedy="add it to lab/a76/network_counts.py"
+                f"no time of {match[2]!r} is computed",
+                found=sorted(times),
+                remedy="add it to lab/a76/network_counts.py",
             )
         return match[1] + times[match[2]] + match[4]
 
@@ -82,6 +85,62 @@ def _clock(root: Path) -> dict[str, str]:
             times[row["name"]] = span
             times[shape_of(row)] = span
     return times
+
+
+def _policies(root: Path) -> list[Row]:
+    """What our policies take by threads."""
+    rows = _metrics(root / "results" / "clock", "clock")["policies"]
+    times = _clock(root)
+    table = [
+        ("a plan, ms, *computed*: policy", "10^9 instructions", *(f"{n} thread{'s' * (n > 1)}" for n in range(1, 5)))
+    ]
+    for row in rows[::CORES]:
+        what = f"{row['name']}: {row['width']}x{row['height']}, {row['decoder_layers']} x {row['feedforward']}"
+        spans = (times[f"{row['name']}, {n} threads"] for n in range(1, CORES + 1))
+        table.append((what, f"{row['instructions_g']:.3g}", *spans))
+    return table
+
+
+def _fit(root: Path) -> list[Row]:
+    """What the fit found that one of each takes."""
+    instruction, near, far = _metrics(root / "results" / "clock", "clock")["fit"]["ns"]
+    return [
+        ("what", "ns", "that is"),
+        ("an instruction", f"{instruction:.3f}", f"{1 / (GHZ * instruction):.1f} a cycle at {GHZ} GHz"),
+        ("a near line", f"{near:.2f}", f"{GHZ * near:.1f} cycles, most of its way hidden"),
+        ("a far line", f"{far:.2f}", f"{LINE / far:.1f} GB/s"),
+    ]
+
+
+def _judged(root: Path) -> list[Row]:
+    """How far off the computed times were."""
+    metrics = _metrics(root / "results" / "clock", "clock")
+    rows = [("", "times", "median error, %", "worst error, %", "in the interval, %")]
+    for n, found in metrics["judged"].items():
+        shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct", "held_pct"))
+        rows.append((f"{n} thread{'s' * (n != '1')}, architecture left out", *shown))
+    for runtime, found in metrics["other_runtime"].items():
+        shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct"))
+        rows.append((f"4 threads, all of {runtime} left out", *shown, ""))
+    return rows
+
+
+def _networks(root: Path) -> list[Row]:
+    """Published against computed, a row a network."""
+    rows: dict[tuple[str, ...], dict[int, Mapping[str, Any]]] = {}
+    for row in _metrics(root / "results" / "clock", "clock")["networks"]:
+        rows.setdefault((row["runtime"], row["name"], row["precision"]), {})[row["threads"]] = row
+    table = [("network", "10^9 instructions", *(f"{n}: published, computed" for n in ("1 thread", "4 threads")))]
+    for (runtime, name, precision), by_threads in rows.items():
+        cells = (_against(by_threads[n]) if n in by_threads else "" for n in (1, CORES))
+        any_row = next(iter(by_threads.values()))
+        table.append((f"{runtime} {name}, {precision}", f"{any_row['instructions_g']:.3g}", *cells))
+    return table
+
+
+def _against(row: Mapping[str, Any]) -> str:
+    computed, low, high = (row[f"predicted{end}_ms"] for end in ("", "_low", "_high"))
+    return f"{row['published_ms']:.3g}, {computed:.3g} ({low:.3g} to {high:.3g})"
 
 
 def shape_of(row: Mapping[str, Any]) -> str:
@@ -260,6 +319,10 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "faster": partial(_students, "faster"),
     "learning": _learning,
     "parameters": _parameters,
+    "policies": _policies,
+    "fit": _fit,
+    "judged": _judged,
+    "networks": _networks,
 }
 
 
