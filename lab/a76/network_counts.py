@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from balloon_world.train import SIZES
+from rover_learn.train import SIZES
 from lab.a76 import peers
 from lab.a76.core import FOR_GUEST, GUEST, Core, CountError, Emulation, emulate_script, fetch_wheels
 from lab.a76.count import STEADY, count_artifact
