@@ -15,11 +15,19 @@ REPO = Path(__file__).resolve().parents[1]
 
 def real_episode() -> Path:
     """Return the folder of a real recording in shared/, in or beside the checkout. Skips the test if there is none."""
+    return _shared("sample_episode/episode_*/episode_data.json", "a real recording").parent
+
+
+def odd_policy() -> Path:
+    """Return a folder with a policy that answers some frames far more strongly than others, and its recordings."""
+    return _shared("outliers/best_model.pth", "a policy with odd frames").parent
+
+
+def _shared(pattern: str, what: str) -> Path:
     for base in (REPO, REPO.parent):
-        found = sorted((base / "shared" / "sample_episode").glob("episode_*/episode_data.json"))
-        if found:
-            return found[0].parent
-    pytest.skip("no real recording here: put one at shared/sample_episode/episode_*/ to run this test on it")
+        if found := sorted((base / "shared").glob(pattern)):
+            return found[0]
+    pytest.skip(f"not here: put {what} at shared/{pattern} to run this test on it")
 
 
 def record_drives(root: Path, drives: int = 4, frames: int = 24) -> Path:
