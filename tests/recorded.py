@@ -11,11 +11,17 @@ from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
 
 REPO = Path(__file__).resolve().parents[1]
+BESIDE = (REPO, *REPO.parents[:2])  # where shared/ may be
 
 
 def real_episode() -> Path:
     """Return the folder of a real recording in shared/, in or beside the checkout. Skips the test if there is none."""
     return _shared("sample_episode/episode_*/episode_data.json", "a real recording").parent
+
+
+def real_recordings() -> Path:
+    """Return the folder of several whole real recordings in shared/. Skips the test if there is none."""
+    return _shared("recordings/episode_*/frames", "several real recordings").parents[1]
 
 
 def odd_policy() -> Path:
@@ -24,10 +30,10 @@ def odd_policy() -> Path:
 
 
 def _shared(pattern: str, what: str) -> Path:
-    for base in (REPO, REPO.parent):
+    for base in BESIDE:
         if found := sorted((base / "shared").glob(pattern)):
             return found[0]
-    pytest.skip(f"not here: put {what} at shared/{pattern} to run this test on it")
+    pytest.skip(f"no {what.split(maxsplit=1)[1]} here: put {what} at shared/{pattern} to run this test")
 
 
 def record_drives(root: Path, drives: int = 4, frames: int = 24) -> Path:

@@ -178,7 +178,13 @@ class Chooser:
         return table
 
     def mixed(
-        self, scheme: Scheme, sensitivity: Mapping[str, Errors], *, budget_pct: float, max_cost_pct: float
+        self,
+        scheme: Scheme,
+        sensitivity: Mapping[str, Errors],
+        *,
+        budget_pct: float,
+        max_cost_pct: float,
+        blocks: Sequence[str] | None = None,
     ) -> tuple[Scheme, list[dict[str, Any]]]:
         """Leave blocks in float that take much of the error for few instructions, until every action is in the budget.
 
@@ -186,13 +192,21 @@ class Chooser:
         left of `max_cost_pct`, the instructions that mixed may have more than static, or after which the worse action
         is not better, stays INT8. Returns the mixed scheme and its steps {float_blocks, cost_pct, <action>_mae_pct},
         static first; the last is the best within the cost, in the budget or not.
+
+        blocks: leave these in float instead, whatever they cost. Raises QuantizeError for an unknown one.
         """
+        if unknown := [block for block in blocks or () if block not in sensitivity]:
+            raise QuantizeError(f"there is no block {', '.join(unknown)}", remedy=f"known: {', '.join(sensitivity)}")
         graph = restore_observed(self.checkpoint, scheme, self.calibration)
         costs = float_costs_pct(self.checkpoint)
         order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]) ** 2 / costs[block], reverse=True)
         best = replace(scheme, mode="mixed", float_blocks=())
         cost, error = 0.0, self.error(convert(graph, self.checkpoint.config, best))
         steps: list[dict[str, Any]] = [{"float_blocks": [], "cost_pct": cost, **error}]
+        if blocks is not None:
+            best, cost = replace(best, float_blocks=tuple(blocks)), sum(costs[block] for block in blocks)
+            error = self.error(convert(graph, self.checkpoint.config, best))
+            return best, [*steps, {"float_blocks": list(blocks), "cost_pct": cost, **error}]
         for block in order:
             if _worst(error) <= budget_pct:
                 break

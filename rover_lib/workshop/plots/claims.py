@@ -205,7 +205,7 @@ def _and(numbers: Sequence[float]) -> str:
 
 
 def student(students: Sequence[Mapping[str, Any]], chosen: str) -> str:
-    """students: rows of distill.json, the teacher first. chosen: the name of the recommended one."""
+    """students: rows of students.json, the teacher first. chosen: the name of the recommended one."""
     teacher = students[0]
     row = next((r for r in students[1:] if r["name"] == chosen), None)
     if row is None:

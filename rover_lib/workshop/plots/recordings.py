@@ -38,7 +38,7 @@ from rover_lib.workshop.plots.style import (
     picture_of,
 )
 from rover_lib.workshop.recordings.episodes import Episode, Recordings, Sample
-from rover_lib.workshop.recordings.samples import ACTION_NAMES
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, HANDLED
 
 
 def checkpoint_size(report: Mapping[str, Any]) -> Figure:
@@ -150,11 +150,13 @@ def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) 
     """Draw a car's steering and throttle, and their pulses."""
     times_s = [s.time_s for s in samples]
     actions = np.stack([s.chunk[0] for s in samples])
-    pulses = [samples[0].car.pwm.pulses(*(float(v) for v in a)) for a in actions]
+    pulses = [s.pulses_us or vars(s.car.pwm.pulses(*s.chunk[0].tolist())).values() for s in samples]
+    steering_us, throttle_us = zip(*pulses, strict=True)
+    unit = "{} pulse (us)" if samples[0].pulses_us else "{} pulse (us, computed)"
     upper, lower = fields
     rows = (
         (upper, actions[:, 0], actions[:, 1], "{} (share of full)"),
-        (lower, [p.steering_us for p in pulses], [p.throttle_us for p in pulses], "{} pulse (us)"),
+        (lower, steering_us, throttle_us, unit),
     )
     for ax, steering, throttle, unit in rows:
         other = ax.twinx()
@@ -168,22 +170,26 @@ def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) 
 
 
 def faults(recordings: Recordings) -> Figure | Note:
-    """Draw what was wrong in the recordings, by kind. Reading them left it out, or repaired it as `episodes` says."""
-    counts: dict[str, int] = {}
-    for fault in recordings.faults:
-        counts[fault.kind] = counts.get(fault.kind, 0) + fault.count
-    kinds = sorted(counts, key=lambda k: -counts[k])
+    """Draw what was wrong in the recordings, by kind, coloured by what was done about it."""
+    counted = recordings.faults_by_kind()
+    bars = [(kind, count, handled) for handled, kinds in counted.items() for kind, count in kinds.items()]
+    bars.sort(key=lambda bar: -bar[1])
     used = f"{len(recordings.episodes)} episodes give {len(recordings.samples)} samples"
-    if not kinds:
+    if not bars:
         return Note(f"{used}; no fault was found in them")
-    fig, axes = new_figure(1, height_in=1.6 + 0.28 * len(kinds))
+    colours = dict(zip(HANDLED, (BLUE, SLATE, OTHERS[1], RED), strict=True))
+    fig, axes = new_figure(1, height_in=1.6 + 0.28 * len(bars))
     ax = axes[0, 0]
-    ax.barh(range(len(kinds)), [counts[k] for k in kinds], color=RED)
-    bar_values(ax, range(len(kinds)), [counts[k] for k in kinds], "{:d}")
-    ax.set_yticks(range(len(kinds)), [k.replace("_", " ") for k in kinds])
+    ax.barh(range(len(bars)), [count for _, count, _ in bars], color=[colours[handled] for *_, handled in bars])
+    bar_values(ax, range(len(bars)), [count for _, count, _ in bars], "{:d}")
+    ax.set_yticks(range(len(bars)), [kind.replace("_", " ") for kind, *_ in bars])
     ax.invert_yaxis()
     ax.set_xlabel("times")
-    claim(fig, f"{used}; {sum(counts.values())} faults were left out or repaired")
+    for handled in counted:
+        ax.barh(0, 0, color=colours[handled], label=handled)
+    legend(ax, loc="lower right")
+    totals = ", ".join(f"{sum(kinds.values())} {handled}" for handled, kinds in counted.items())
+    claim(fig, f"{used}; faults: {totals}")
     return fig
 
 

@@ -12,7 +12,7 @@ and the laboratory share: which frames, which options, which files.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,11 @@ from rover_lib.workshop.int8.frames import describe_odd, odd_samples, odd_share
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, quantize
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
+from rover_lib.workshop.judge.compare import ARTIFACTS
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.recordings.turning import Sides
 from rover_lib.workshop.run.session import Opened, open_run
 
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
@@ -79,6 +81,29 @@ def prepare_chooser(
     return Chooser(checkpoint, calibration, few, loaded.recordings.action_range(), odd)
 
 
+def turn_params(**sections: Mapping[str, Any]) -> dict[str, Any]:
+    """params.yml's content with a notebook's parameters in it: turn_params(calibration={"samples": 50}).
+
+    A parameter that is None leaves what params.yml says.
+    """
+    p = params()
+    for section, turned in sections.items():
+        p[section] |= {key: value for key, value in turned.items() if value is not None}
+    return p
+
+
+def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None) -> dict[str, Scheme]:
+    """The schemes of a run's artifacts beside FP32, by name: static, which all others are held against, and `modes`.
+
+    modes: None means all. Raises QuantizeError for an unknown one.
+    """
+    dynamic, affine = replace(static, mode="dynamic"), replace(static, kind="affine")
+    schemes = {"dynamic": dynamic, "static": static, "mixed": mixed, "static_affine": affine}
+    if unknown := [mode for mode in modes or () if mode not in schemes]:
+        raise QuantizeError(f"there is no mode {', '.join(unknown)}", remedy=f"known are {', '.join(schemes)}")
+    return {name: each for name, each in schemes.items() if modes is None or name in ("static", *modes)}
+
+
 def make_artifact(
     loaded: Opened, path: Path | str, recipe: Recipe, *, fp32: bool = False, progress: Progress = silent
 ) -> tuple[str, list[str]]:
@@ -110,8 +135,12 @@ def export_policies(
     samples: Sequence[Sample],
     parity: Parity,
 ) -> dict[str, dict[str, Any]]:
-    """Write policy_<name>.pt of each policy into `folder`. Returns what quantize.json says of each."""
+    """Write policy_<name>.pt of each policy into `folder`, and remove those of other modes, which would be of an
+    earlier scheme. Returns what quantize.json says of each.
+    """
     described = {}
+    for mode in set(ARTIFACTS) - policies.keys():
+        (Path(folder) / f"policy_{mode}.pt").unlink(missing_ok=True)
     exporter = Exporter(checkpoint, samples, parity)
     for name, policy in policies.items():
         forget_graphs()
@@ -167,8 +196,16 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
 # --- what the stages of a run leave -----------------------------------------------------------------------------------
 
 
-def write_load(run_dir: Path | str, loaded: Opened, note: str = "", fit: Mapping[str, Any] | None = None) -> None:
-    """load.json: where a run starts from. note: what is special about its policy. fit: `plausible.Fit.summary`."""
+def write_load(
+    run_dir: Path | str,
+    loaded: Opened,
+    note: str = "",
+    fit: Mapping[str, Any] | None = None,
+    sides: Sides | None = None,
+) -> None:
+    """load.json: where a run starts from. note: what is special about its policy. fit: `plausible.Fit.summary`. sides:
+    which way the recordings' car steers.
+    """
     checkpoint, recordings = loaded.checkpoint, loaded.recordings
     model = ACT(checkpoint.config, checkpoint.weights)
     work = {"macs_by_block": multiply_accumulates(model), "parameters_by_block": parameters_by_block(model)}
@@ -181,6 +218,8 @@ def write_load(run_dir: Path | str, loaded: Opened, note: str = "", fit: Mapping
         metrics["note"] = note
     if fit:
         metrics["fit"] = fit
+    if sides and sides.turnings:
+        metrics["steering"] = {"side": sides.side, "mirrored": sides.mirrored, "words": sides.words()}
     source = recordings.source
     given = {
         "checkpoint": checkpoint.path.resolve(),
@@ -217,8 +256,17 @@ def write_calibrate(
     write_stage(Path(run_dir) / "calibrate.json", "calibrate", params=given, metrics=metrics, inputs=inputs)
 
 
-def write_quantize(run_dir: Path | str, checkpoint: Checkpoint, metrics: dict[str, Any]) -> None:
-    """quantize.json. metrics: `modes` from `export_policies`, and the tables of choosing."""
+def write_quantize(
+    run_dir: Path | str, checkpoint: Checkpoint, metrics: dict[str, Any], given: Mapping[str, Any] | None = None
+) -> None:
+    """quantize.json. metrics: `modes` from `export_policies`, and the tables of choosing. given: the parameters, None
+    for those of params.yml.
+    """
     inputs = {"calibration.pt": sha256_of(Path(run_dir) / "calibration.pt"), "checkpoint": checkpoint.sha256}
-    given = params()["quantization"]
-    write_stage(Path(run_dir) / "quantize.json", "quantize", params=given, metrics=metrics, inputs=inputs)
+    write_stage(
+        Path(run_dir) / "quantize.json",
+        "quantize",
+        params=dict(given or params()["quantization"]),
+        metrics=metrics,
+        inputs=inputs,
+    )

@@ -10,8 +10,8 @@ from onnx import TensorProto, helper
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact.archive import ONNX
-from rover_lib.onboard.artifact.manifest import check_artifact
-from rover_lib.onboard.artifact.onnx_file import FIELDS, NODES, OPERATORS
+from rover_lib.onboard.artifact.manifest import Artifact
+from rover_lib.onboard.artifact.onnx_file import NODES, OPERATORS
 from rover_lib.onboard.errors import ArtifactError
 
 Change = Callable[[onnx.ModelProto], object]
@@ -46,10 +46,6 @@ def larger(model: onnx.ModelProto) -> None:
     model.graph.initializer[0].dims[0] *= 1000
 
 
-def sizes_without_end(model: onnx.ModelProto) -> None:
-    model.graph.initializer[0].dims.extend([2**62] * 300_000)
-
-
 def far_away(model: onnx.ModelProto) -> None:
     model.graph.node[0].attribute.append(helper.make_attribute("axis", -(2**40)))
 
@@ -71,8 +67,6 @@ HOSTILE: dict[str, tuple[Change, str]] = {
     "a tensor without its bytes": (larger, "a tensor of"),
     "sparse weights": (lambda m: m.graph.sparse_initializer.add(), "a graph with field 15"),
     "many nodes": (lambda m: [m.graph.node.add(op_type="Relu") for _ in range(NODES)], "nodes"),
-    "sizes without end": (sizes_without_end, "a tensor of more than 8 dimensions"),
-    "names without end": (lambda m: m.graph.node[0].input.extend([""] * FIELDS), "more than 100000 fields"),
     "another opset": (lambda m: setattr(m.opset_import[0], "version", 21), "operator sets"),
     "no graph": (lambda m: m.ClearField("graph"), "0 graphs"),
 }
@@ -83,7 +77,7 @@ def test_hostile_model_is_refused(name, onnx_static, tmp_path):
     change, message = HOSTILE[name]
     path = changed(onnx_static, tmp_path / "hostile.zip", change)
     with pytest.raises(ArtifactError, match=message) as e:
-        check_artifact(path)
+        Artifact(path).prove()
     assert "do not load it" in str(e.value) and "\n" not in str(e.value)
 
 
@@ -97,7 +91,7 @@ def test_no_protobuf_is_refused(raw, onnx_static, tmp_path):
 def test_policy_for_two_engines_is_refused(artifacts, tmp_path):
     path = rewritten(artifacts["static"], tmp_path / "two.pt", {}, {ONNX: b"x"})
     with pytest.raises(ArtifactError, match="two engines"):
-        check_artifact(path)
+        Artifact(path).prove()
 
 
 def test_every_operator_of_the_list_has_a_use():

@@ -23,7 +23,7 @@ here = pytest.mark.skipif(platform.machine() not in confine.PROCESSORS, reason="
 
 PROGRAM = r"""
 import ctypes, json, os, resource, signal, socket, subprocess, sys, threading, time
-from rover_lib.onboard.policy.confine import confine, open_no_more
+from rover_lib.onboard.policy.confine import confine, forbid_opening
 
 port, folder, other = sys.argv[1], sys.argv[2], int(sys.argv[3])
 libc = ctypes.CDLL(None, use_errno=True)
@@ -77,7 +77,7 @@ asked("read a file", lambda: open(f"{folder}/there").read())
 asked("take some memory", lambda: bytearray(50 << 20))
 asked("take much memory", lambda: bytearray(400 << 20))
 in_a_thread("start a thread", lambda: None)
-open_no_more()
+forbid_opening()
 asked("read a file at the end", lambda: open(f"{folder}/there").read())
 asked("read what is open", lambda: os.read(opened, 1))
 print(json.dumps({"reason": reason, "found": found}))

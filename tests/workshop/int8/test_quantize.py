@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from policies import TINY, lerobot_policy, memory_samples, trainer_content
+from policies import TINY, lerobot_policy, memory_samples, saved, trainer_content
 
 from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE
 from rover_lib.onboard.errors import QuantizeError
@@ -47,8 +47,6 @@ def made(tiny, calibration):
     "variant", [{}, {"pre_norm": True, "n_encoder_layers": 2}, {"feedforward_activation": "gelu"}], ids=str
 )
 def test_channel_scales_are_exact_in_float(variant, tmp_path):
-    from test_act import saved
-
     saved(lerobot_policy(**(TINY | variant)), tmp_path)
     checkpoint = load_checkpoint(tmp_path)
     seen = inputs(checkpoint, 3)
@@ -328,11 +326,13 @@ def test_chooses_by_error(tiny, calibration):
     assert list(sensitivity) == act.blocks(tiny.config)
     assert all(max(e.values()) > 0 for e in sensitivity.values())  # each block alone does something
     graph = restore_observed(tiny, scheme, calibration)
-    for block, error in sensitivity.items():  # what is before a block is not run again: the same as running all of it
-        assert chooser.error(q.convert(graph, tiny.config, replace(scheme, float_blocks=()), only=[block])) == error
+    for block in list(sensitivity)[::4]:  # what is before a block is not run again: the same as running all of it
+        alone = q.convert(graph, tiny.config, replace(scheme, float_blocks=()), only=[block])
+        assert chooser.error(alone) == sensitivity[block]
     costs = float_costs_pct(tiny)
     assert 0 < sum(costs.values()) <= 100 * 3.2  # all in float, but for the head: 4.2 times the instructions
-    mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=1e-6, max_cost_pct=60)
+    few = dict(list(sensitivity.items())[::2])  # each block takes a conversion
+    mixed, steps = chooser.mixed(scheme, few, budget_pct=1e-6, max_cost_pct=60)
     errors = [max(s["steering_mae_pct"], s["throttle_mae_pct"]) for s in steps]
     assert errors == sorted(errors, reverse=True) and len(set(errors)) == len(errors) > 1
     assert mixed.mode == "mixed" and list(mixed.float_blocks) == steps[-1]["float_blocks"]
