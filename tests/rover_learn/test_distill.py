@@ -208,7 +208,12 @@ def test_what_loses_much_by_int8_is_told_of_qat(taught):
     (row,) = content["metrics"]["gates"]
     assert row["limit"] == 5 and "--qat" in row["gate"] and row["passed"] == (row["found"] <= 5)
     row |= {"found": 7.25, "passed": False}
-    assert "INT8 loses 7.2 % of the recorded range, more than 5 %: train with --qat" in summary(content)
+    said = "INT8 loses 7.2 % of the recorded range, more than 5 %: "
+    assert f"{said}train with --qat" in summary(content)
+    content["metrics"]["before_qat"] = content["metrics"]["students"][1]  # it was trained so already
+    assert f"{said}--qat was not enough, and `rover run` says where" in summary(content)
+    content["metrics"]["odd"] = {"share_pct": 4.0}
+    assert f"{said}4 % of the frames are odd, and `rover run` names them" in summary(content)
 
 
 @pytest.mark.slow
