@@ -172,7 +172,7 @@ def report(core, tiny_run, again, counts) -> dict:
         return counts
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(counting, "opened", lambda run_dir: again)
+        patch.setattr(counting, "open_run", lambda run_dir: again)
         patch.setattr(counting, "_count_all", keep)
         return count_run(tiny_run, frames=12)
 
@@ -216,7 +216,7 @@ def test_a_pi_4_has_no_dot_product(report, counts, tiny_run, again, monkeypatch)
         new = core.cpu == a76.A72 and artifact.stem == "policy_static"
         return count(core, artifact, *args, **options) if new else counts[artifact.stem]
 
-    monkeypatch.setattr(counting, "opened", lambda run_dir: again)
+    monkeypatch.setattr(counting, "open_run", lambda run_dir: again)
     monkeypatch.setattr(counting, "count_artifact", count_new)
     content = counting.count_other_core(tiny_run, a76.A72)
     assert read_stage(tiny_run / "arm-cortex-a72.json", "arm") == content
@@ -281,7 +281,7 @@ def test_a_slow_fp32_is_held_against_this_machines(report, tiny_run, again, coun
             for plan in [plans[stem]]
         }
 
-    monkeypatch.setattr(counting, "opened", lambda run_dir: again)
+    monkeypatch.setattr(counting, "open_run", lambda run_dir: again)
     monkeypatch.setattr(counting, "_count_all", fewer)
     monkeypatch.setattr(counting, "backbone_bits", lambda *args: report["metrics"]["backbone_bits"])
     monkeypatch.setattr(counting, "SLOW_GMAC", 0.0)
@@ -298,7 +298,7 @@ def test_a_slow_fp32_is_held_against_this_machines(report, tiny_run, again, coun
 
 
 def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again, monkeypatch):
-    monkeypatch.setattr(counting, "opened", lambda run_dir: again)
+    monkeypatch.setattr(counting, "open_run", lambda run_dir: again)
     monkeypatch.setattr(counting, "SLOW_GMAC", 0.0)
     fake = SimpleNamespace(chunks=np.full((STEADY, 32, 2), 0.5, np.float32))
     monkeypatch.setattr(counting, "_count_all", lambda _, artifacts, *args: dict.fromkeys(artifacts, fake))

@@ -228,7 +228,7 @@ def test_blocks_of_a_stripped_library_are_told_apart(tmp_path):
 def without_engines(tiny_run, monkeypatch):
     """count_peers with the engines' part left out: their chunks are our FP32's, steering off by a hundredth."""
     samples = tiny_run.opened.parts.held_out
-    monkeypatch.setattr(peers, "opened", lambda run_dir: tiny_run.opened)
+    monkeypatch.setattr(peers, "open_run", lambda run_dir: tiny_run.opened)
     monkeypatch.setattr(peers, "pick_evenly", lambda given, n: tuple(given[:n]))
     monkeypatch.setattr(peers, "prepare", lambda progress: None)
     monkeypatch.setattr(peers, "packages_here", lambda engine: None)
@@ -300,7 +300,7 @@ def test_a_peer_that_fails_leaves_arm_json_as_it_was(without_engines, tiny_run, 
 
 @needs_engines
 def test_the_engines_run_the_policy_in_int8(tiny, tiny_run, monkeypatch):
-    monkeypatch.setattr(peers, "opened", lambda run_dir: tiny_run.opened)
+    monkeypatch.setattr(peers, "open_run", lambda run_dir: tiny_run.opened)
     machine, samples = prepare(), tiny_run.opened.parts.held_out[:6]
     ours = count_artifact(machine, tiny_run.folder / "policy_static.pt", samples, counted=3)
     fp32 = count_artifact(machine, tiny_run.folder / "policy_fp32.pt", samples, counted=3)

@@ -54,7 +54,7 @@ def test_fp32_needs_no_calibration(loaded, tmp_path):
 
 def test_a_run_whose_files_do_not_fit_each_other_gets_no_onnx_at_all(loaded, calibration, tmp_path, monkeypatch):
     """Not even the FP32 one, which would lie there beside a static policy that is another."""
-    monkeypatch.setattr(pipeline, "opened", lambda *_: loaded)
+    monkeypatch.setattr(pipeline, "open_run", lambda *_: loaded)
     calibration.save(tmp_path / "calibration.pt")
     (tmp_path / "policy_static.pt").write_bytes(b"of another run")
     write_quantize(tmp_path, loaded.checkpoint, {"modes": {"static": {"content_hash": "of this run"}}})
