@@ -15,13 +15,14 @@ export ROVER_AS_ROOT := 1
 # Some container images forbid Python to store its bytecode; then every process compiles torch again, which takes 2 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo watch run test test-fast check-release coverage lint lab arm faults faults-cars random pi-fast pi firmware flash notebooks tables docs clean
+.PHONY: help demo demo-more watch run test test-fast check-release coverage lint notebooks-open lab count arm faults faults-cars random pi-fast pi firmware flash notebooks tables docs clean
 
 help:
-	@echo "make demo                                   record, train, quantize, compare, benchmark, drive and distill in the balloon world"
+	@echo "make demo                                   in the balloon world: record, train, quantize, drive, and judge"
 	@echo "make watch                                  the demo's policy drives through that world, live in the browser"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
-	@echo "make lab NAME=mine                          JupyterLab on the notebooks of a run, with its outputs"
+	@echo "make notebooks-open NAME=mine [AS=try1]     JupyterLab on a copy of a run's notebooks, with its outputs; the run stays"
+	@echo "make demo-more                              late plans, and a smaller policy that the demo's teaches: half an hour"
 	@echo "make firmware; make flash PORT=/dev/ttyUSB0 build the Arduino's firmware, and put it on the board"
 	@echo "make docs                                   these pages and the notebooks as a site: runs/site/index.html"
 	@echo
@@ -29,7 +30,7 @@ help:
 	@echo "make test-fast                              what a minute and a half can prove"
 	@echo "make test                                   lint, tests and notebooks, on the demo's run"
 	@echo "make check-release                          what takes two hours and a quiet machine"
-	@echo "make arm NAME=demo [PEERS=1]                count a run's instructions on an emulated Cortex-A76; NAME=full makes"
+	@echo "make count NAME=demo [PEERS=1]              count a run's instructions on an emulated Cortex-A76; NAME=full makes"
 	@echo "                                            a policy of the real car's size, LEARNED=1 one that has learned to"
 	@echo "                                            drive (an hour or more), PEERS=1 adds other runtimes"
 	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino"
@@ -51,16 +52,24 @@ $(READY): pyproject.toml lerobot_robot_rover/pyproject.toml
 	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,view,dev,docs]' -e ./lerobot_robot_rover
 	@touch $@
 
+# It ends with the verdict, and what to do next stands last on the screen.
 demo: $(READY)
 	@rm -f $(DEMO)
 	$(ROVER) world record runs/demo/episodes
-	$(ROVER) world train runs/demo/episodes runs/demo/best_model.pth
+	$(ROVER) train runs/demo/episodes runs/demo/best_model.pth
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
-	$(ROVER) world latency runs/demo
-	$(ROVER) distill runs/demo/best_model.pth runs/demo/episodes --name demo-small --size 96x54 --feedforward 256 --steps 20 --samples 200
-	$(ROVER) world students runs/demo runs/demo-small --worlds 20
-	$(ROVER) report runs/demo
 	@touch $(DEMO)
+	@echo
+	@echo 'the report, for your browser:   file://$(CURDIR)/runs/demo/report.html'
+	@echo 'its notebooks, in JupyterLab:   make notebooks-open NAME=demo'
+	@echo 'late plans, a smaller policy:   make demo-more'
+	@echo 'see it drive in your browser:   make watch'
+
+demo-more: $(DEMO)
+	$(ROVER) world latency runs/demo
+	$(ROVER) distill runs/demo/best_model.pth runs/demo/episodes --name demo-small --size 96x54 --feedforward 256
+	$(ROVER) world students runs/demo runs/demo-small --worlds 40
+	$(ROVER) report runs/demo
 
 watch: $(READY)
 	@test -f runs/demo/policy_static.pt || $(MAKE) demo
@@ -90,6 +99,7 @@ test-fast: $(READY)
 
 # Tests in real time, of whole fleets and of whole machines. Run them on a quiet machine before each release.
 check-release: lint $(DEMO)
+	$(MAKE) demo-more
 	$(VENV)/bin/pytest -m release tests
 	$(VENV)/bin/pytest notebooks
 	$(MAKE) faults faults-cars random pi-fast pi
@@ -98,7 +108,7 @@ coverage: $(DEMO)
 	$(VENV)/bin/pytest --cov=rover_lib --cov=rover_learn --cov=balloon_world --cov=lab --cov=lerobot_robot_rover --cov-report=term
 
 # NAME=full needs no checkpoint: it makes one. The last file that it makes is policy_static.onnx.zip.
-arm: $(READY)
+count: $(READY)
 	@test '$(NAME)' != full -o -f runs/full/policy_static.onnx.zip || $(LAB) full runs/full $(if $(LEARNED),--learned)
 	$(LAB) arm 'runs/$(NAME)' $(if $(PEERS),--peers)
 
@@ -128,12 +138,18 @@ firmware:
 flash:
 	$(MAKE) -C firmware flash PORT='$(PORT)'
 
-# This opens a run's executed notebooks; without NAME, and if there is no run of the default name, the repository's.
-lab: $(READY)
-	@test '$(origin NAME)' != 'command line' -o -f 'runs/$(NAME)/01_load.ipynb' || { echo 'there is no run runs/$(NAME): rover list' >&2; exit 2; }
-	$(VENV)/bin/jupyter lab $(if $(wildcard runs/$(NAME)/01_load.ipynb),'runs/$(NAME)',notebooks)
+# This opens a copy, so that cells that are run again there change no run; without NAME, of the repository's notebooks.
+notebooks-open: $(READY)
+	$(VENV)/bin/python -m rover_lib.workshop.run.copy_run '$(if $(filter file,$(origin NAME)),,$(NAME))' '$(if $(filter default,$(origin AS)),,$(AS))'
 
-notebooks: demo
+# Their old names say the new ones and do it, for one release.
+lab arm:
+	@echo '`make $@` is now `make $(NEW_$@)`' >&2
+	@$(MAKE) $(NEW_$@)
+NEW_lab := notebooks-open
+NEW_arm := count
+
+notebooks: demo demo-more
 	$(VENV)/bin/python -m lab.repository.publish
 	$(MAKE) tables
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import click
 
+from rover_learn.cli import train
 from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
-from rover_lib.onboard.kinds import Output, PathTo
+from rover_lib.onboard.kinds import PathTo
 from rover_lib.workshop.progress import terminal_bar
 
 
@@ -29,34 +30,7 @@ def record(out_dir: Path, count: int, seed: int) -> None:
     click.echo(f"recorded: {record_episodes(out_dir, count, seed, terminal_bar())}")
 
 
-@world.command(short_help="Train LeRobot's ACT on recordings.")
-@click.argument("episodes", type=PathTo("recordings"))
-@click.argument("output", type=Output("checkpoint"))
-@click.option(
-    "--size",
-    type=click.Choice(["small", "full"]),
-    default="small",
-    show_default=True,
-    help="full is the size of the real car's policy.",
-)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps [default: the recipe's].")
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
-def train(episodes: Path, output: Path, **options: Any) -> None:
-    """Train LeRobot's ACT on EPISODES and write the checkpoint OUTPUT, as a trainer's .pth.
-
-    `small` takes minutes on two cores, `full`, the policy of the real car, about an hour: it is trained at a
-    quarter of its pixels and then carried to 640x360. If it is ended at any moment (Ctrl-C, a power cut), the same
-    command continues where it was. For that it keeps 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover, until it is
-    done. A few --steps do not make a policy drive.
-    """
-    from balloon_world.train import train as train_policy
-
-    try:
-        click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), **options)}")
-    except KeyboardInterrupt:
-        click.echo("\nrover: stopped; the same command goes on where it was", err=True)
-        raise click.exceptions.Exit(130) from None
+world.add_command(train)
 
 
 @world.command(short_help="Drive an artifact through unseen worlds; count hits.")
@@ -125,7 +99,7 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
 
     Each folder has a policy_static.pt, and an arm.json if its instructions were counted. All policies drive through
     the same worlds: left alone, and pushed with plans that are as late as was computed for the policy. Leaves
-    distill.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its teacher's place. If
+    students.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its teacher's place. If
     it is ended at any moment, the same command continues where it was.
     """
     from balloon_world.frontier import sentences, table

@@ -1,4 +1,4 @@
-"""Which student may take its teacher's place? A rule decides: it holds distill.json's rows to limits from params.yml.
+"""Which student may take its teacher's place? A rule decides: it holds students.json's rows to limits from params.yml.
 
 verdict = recommendation(rows, params()["students"])
 """
@@ -72,7 +72,7 @@ def work_key(rows: Sequence[Mapping[str, Any]]) -> str:
 def recommendation(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any]) -> dict[str, Any]:
     """Choose the fastest student that passes every gate, or the teacher if none does.
 
-    rows: of distill.json, the teacher first. Returns {"name", "fastest_by", "gates": of all students}.
+    rows: of students.json, the teacher first. Returns {"name", "fastest_by", "gates": of all students}.
     """
     teacher, *students = rows
     gates = {row["name"]: gates_of(row, teacher, limits) for row in students}
@@ -92,7 +92,7 @@ def shape_of(row: Mapping[str, Any]) -> str:
 
 
 def table(metrics: Mapping[str, Any]) -> Table:
-    """Show a teacher and its students as a table, a row each. metrics: of distill.json."""
+    """Show a teacher and its students as a table, a row each. metrics: of students.json."""
     actions = _actions(metrics["students"][0])
     header = ("", "MB", "GMAC", "10^9 instructions", "ms, computed", "left alone", "pushed")
     rows = []
@@ -109,7 +109,7 @@ def table(metrics: Mapping[str, Any]) -> Table:
 
 
 def sentences(metrics: Mapping[str, Any]) -> list[str]:
-    """Say the recommendation in plain English, a sentence to a line. metrics: of distill.json."""
+    """Say the recommendation in plain English, a sentence to a line. metrics: of students.json."""
     teacher, *students = metrics["students"]
     verdict, limits = metrics["recommendation"], metrics["limits"]
     lines = [_rule(limits, bool(teacher["trials"]))]

@@ -20,7 +20,7 @@ from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.recording import episode as recording
-from rover_lib.onboard.recording.episode import About, EpisodeWriter
+from rover_lib.onboard.recording.episode import SIMULATED, About, EpisodeWriter
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.progress import Progress, silent
 
@@ -124,10 +124,11 @@ class WorldEpisode:
         self._periods = [_round_us(c.period_us) for c in (self._pwm.steering, self._pwm.throttle)]
         self.writer = EpisodeWriter(
             folder / episode_name(start),
-            About(LABEL, fps=RATE_HZ, start_time_s=self._start_s, arduino_port="playground", car=car),
+            About(LABEL, fps=RATE_HZ, start_time_s=self._start_s, arduino_port=SIMULATED, car=car),
             resolution=(FRAME_WIDTH, FRAME_HEIGHT),
             jpeg_quality=JPEG_QUALITY,
         )
+        self.writer.metadata["steering_positive"] = car.positive
 
     def __enter__(self) -> "WorldEpisode":
         self.writer.open()

@@ -56,7 +56,7 @@ _LINE_MAX = 96
 
 
 class StandIn:
-    """A stand-in for the Arduino, for machines without simavr. It speaks protocol 3 of firmware/README.md on a pty.
+    """A stand-in for the Arduino, for machines without simavr. It speaks protocol 4 of firmware/README.md on a pty.
 
     It is not the firmware and proves nothing about it. Like the firmware, it resets when its port is opened, unless DTR
     was left up; it starts in manual, with a transmitter at rest; it drives only when armed, within the ranges and the
@@ -213,7 +213,7 @@ class StandIn:
         armed = self._state == "A"
         if kind == "C":
             return "i" if armed else self._told(numbers)
-        if kind == "A" and numbers[1] != self._car_id:
+        if kind == "A" and numbers[2] != self._car_id:
             return "c"
         pulses = {"D": numbers[1:], "L": [self._neutral[0], *numbers]}.get(kind, self._neutral)
         if not all(low <= us <= high for us, (low, high) in zip(pulses, self._ranges, strict=True)):

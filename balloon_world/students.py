@@ -40,7 +40,6 @@ from rover_lib.workshop.judge.recorded_range import not_judged
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Recordings, Sample, Source, pick_evenly
-from rover_lib.workshop.run.run_folder import says_how_it_was_taught
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -62,7 +61,7 @@ ESTIMATED = (
 class _Run:
     """A run's static artifact.
 
-    shape: its row of distill.json. counts: its instructions from arm.json, None if they were not counted.
+    shape: its row of students.json. counts: its instructions from arm.json, None if they were not counted.
     """
 
     name: str
@@ -90,7 +89,7 @@ def judge_students(
     held_out_frames: int = HELD_OUT_FRAMES,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Compare a teacher's run with its students' runs; write and return distill.json in the teacher's folder.
+    """Compare a teacher's run with its students' runs; write and return students.json in the teacher's folder.
 
     students: folders that `rover distill` left, each with a policy_static.pt. episodes: the recordings to judge with,
     those of the teacher's run if None. worlds: how many each policy drives through twice, left alone as in
@@ -112,7 +111,7 @@ def judge_students(
         rows.append(_row(run) | errors | _drives(run, worlds, pushed_ms, progress))
     notes = [COUNTED if counted else ESTIMATED] if worlds else [NOBODY_DROVE]
     if missing := [run.name for run in runs if run.counts is None]:
-        notes.append(f"Not counted, or another artifact was: {', '.join(missing)}. `make arm` counts.")
+        notes.append(f"Not counted, or another artifact was: {', '.join(missing)}. `make count` counts.")
     metrics = {
         "students": rows,
         "recommendation": recommendation(rows, p["students"]),
@@ -131,7 +130,7 @@ def judge_students(
         "students": [r.name for r in runs[1:]],
     }
     inputs = {f"{run.name}/{ARTIFACT}": sha256_of(run.artifact) for run in runs}
-    return write_stage(folder / "distill.json", "distill", params=how, metrics=metrics, inputs=inputs)
+    return write_stage(folder / "students.json", "students", params=how, metrics=metrics, inputs=inputs)
 
 
 # --- which runs -------------------------------------------------------------------------------------------------------
@@ -143,10 +142,6 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
     if not names or len({*names, TEACHER}) <= len(names):
         raise DistillError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
     taught = [_read_distilled(student) for student in students]
-    if (own := folder / "distill.json").is_file() and says_how_it_was_taught(own):
-        raise DistillError(
-            f"{folder}: was distilled itself, and its distill.json would be lost", remedy="begin with its own teacher"
-        )
     manifest = read_manifest(_artifact_of(folder))
     runs = [_Run(TEACHER, folder / ARTIFACT, manifest, taught[0]["metrics"]["students"][0], _counts(folder))]
     for student, content in zip(students, taught, strict=True):
@@ -175,8 +170,6 @@ def _read_distilled(student: Path) -> dict[str, Any]:
     path = student / "distill.json"
     if not path.is_file():
         raise DistillError(f"{student}: no distill.json in it", remedy="'rover distill' makes a student")
-    if not says_how_it_was_taught(path):
-        raise DistillError(f"{student}: is a teacher's run, not a student's", remedy="give the teacher first")
     return read_stage(path, "distill")
 
 

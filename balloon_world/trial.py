@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from balloon_world.world import RATE_HZ, World
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import WorldError
 from rover_lib.workshop.progress import Progress, silent
 
@@ -109,8 +110,11 @@ def run_trials(
     seen: list[tuple[np.ndarray, np.ndarray]] = []
     stride = 1  # doubles whenever too many are kept, so that memory is bounded and the pairs come from all drives
     shown = 0
+    # A policy of recordings that were made when the default car turned left drives a car that does.
+    car = getattr(policy, "car", None)
+    left = car.left if isinstance(car, Car) else None
     for world_seed in progress(seeds, desc="driving", total=worlds):
-        result, pairs = _drive(policy, World(world_seed), replan_every)
+        result, pairs = _drive(policy, World(world_seed, left=left), replan_every)
         results.append(result)
         for pair in pairs:
             if shown % stride == 0 and keep_frames:

@@ -2,8 +2,9 @@
 
 A car stands on a floor, a red balloon floats some metres ahead, and the task is to drive into it. Floor,
 wall, light and the objects that are not red balloons differ from seed to seed. Lengths are in metres, angles in
-radians (positive to the left). Actions are the policy's: steering in [-1, 1] (positive to the left), throttle in
-[0, 1], or in [-1, 1] if the car has a reverse gear. Wheelbase and field of view come from car.yml.
+radians (positive to the left). Actions are the policy's: steering in [-1, 1], throttle in [0, 1], or in [-1, 1] if the
+car has a reverse gear. Positive steering turns to the car's positive side, the recorded car's right. That side, the
+wheelbase and the field of view come from car.yml.
 """
 
 import math
@@ -105,15 +106,17 @@ class World:
     """One drive to one balloon.
 
     seed: determines everything that is random. shoves: how many pushes the car gets on its way. decoys: how many
-    red things stand about that are no balloons; without them nothing but the balloon is red.
-    Frames and motion depend only on these three and on the actions given.
+    red things stand about that are no balloons; without them nothing but the balloon is red. left: 1 if positive
+    steering turns left, -1 if right; None: as this machine's car.
+    Frames and motion depend only on these and on the actions given.
     """
 
-    def __init__(self, seed: int, shoves: int = 0, decoys: int = 0):
+    def __init__(self, seed: int, shoves: int = 0, decoys: int = 0, left: int | None = None):
         if min(seed, shoves, decoys) < 0:
             found = f"{seed}, {shoves} and {decoys}"
             raise WorldError("a world's seed, shoves and decoys must not be negative", found=found)
         self.seed = seed
+        self.left = left or _CAR.left
         rng = np.random.default_rng([seed, 20_251])
         self.state = CarState()
         distance, bearing = rng.uniform(1.8, 4.0), rng.uniform(-0.5, 0.5)
@@ -158,7 +161,7 @@ class World:
         wheels = s.steering + (steering - s.steering) * (1 - math.exp(-dt / STEERING_LAG_S))
         wanted = throttle * SPEED_PER_THROTTLE_MPS
         speed = s.speed_mps + (wanted - s.speed_mps) * (1 - math.exp(-dt / SPEED_LAG_S))
-        yaw_rps = speed / WHEELBASE_M * math.tan(wheels * WHEEL_ANGLE_RAD)
+        yaw_rps = speed / WHEELBASE_M * math.tan(self.left * wheels * WHEEL_ANGLE_RAD)
         sideways_mps = 0.0
         for shove in self._shoves:
             if shove.start_s <= s.time_s < shove.end_s:
@@ -251,7 +254,7 @@ def expert(world: World) -> tuple[float, float]:
     The driver steers towards the balloon, starts gently, and slows down in a turn and near the balloon.
     """
     distance, bearing = world.balloon_seen()
-    steering = float(np.clip(1.1 * bearing, -STEERING_MOST, STEERING_MOST))
+    steering = world.left * float(np.clip(1.1 * bearing, -STEERING_MOST, STEERING_MOST))
     in_turn = 1 - 0.55 * min(1.0, abs(bearing) / 0.5)
     near = float(np.clip(0.35 + 0.65 * (distance - 0.5) / 1.2, 0.35, 1.0))
     wanted = THROTTLE_MOST * in_turn * near

@@ -92,7 +92,7 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as
 @click.argument("run_dir", type=FILE)
 @click.option("--samples", type=click.IntRange(min=1), default=64, show_default=True, help="Calibration samples.")
 @click.option("--steps", type=click.IntRange(min=1), default=24, show_default=True, help="Training steps.")
-@click.option("--learned", is_flag=True, help="Train it whole instead, as `rover world train --size full` does.")
+@click.option("--learned", is_flag=True, help="Train it whole instead, as `rover train --size full` does.")
 def full(run_dir: Path, steps: int, learned: bool, **options: Any) -> None:
     """Make a policy of the real car's size in RUN_DIR, and artifacts of it at several image sizes, for `arm`.
 

@@ -7,10 +7,18 @@ link = line.open()                  # the first user opens the port, and the las
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from typing import Any
 from weakref import WeakSet, WeakValueDictionary
 
 from rover_lib.onboard.car.servo_link import LinkError, ServoLink
+
+# lerobot-rollout leaves out each number whose name does not end in .pos or .vel, and moves those in .pos to where they
+# were at the start. Recording and replaying use the same names, so that datasets can be merged.
+ENDING = ".vel" if find_spec("lerobot.rollout") else ""
+ACTIONS = ("steering", "throttle")
+FEATURES = {name + ENDING: float for name in ACTIONS}
 
 _lines: WeakValueDictionary[str, Line] = WeakValueDictionary()
 
@@ -20,6 +28,7 @@ class Line:
 
     transmitters: the teleoperators on the port; if there is one, a human may drive without arming anything.
     humans_action: whether a teleoperator has returned the human's own action, and the robot has not been given it yet.
+    drives_ended: how many drives have ended; what was planned for one is not for the next.
     before_drive: waits until the car can be armed; None while no robot is connected.
     """
 
@@ -27,6 +36,7 @@ class Line:
         self.port = port
         self.transmitters: WeakSet[object] = WeakSet()
         self.humans_action = False
+        self.drives_ended = 0
         self.before_drive: Callable[[], None] | None = None
         self._link: ServoLink | None = None
         self._users = 0
@@ -73,8 +83,23 @@ def line_to(port: str) -> Line:
     return line
 
 
+def count_ended_drives() -> int:
+    """Return how many drives of this process's robots have ended."""
+    return sum(line.drives_ended for line in list(_lines.values()))
+
+
 def wait_for_humans() -> None:
     """Wait, before an episode, until the car of each connected robot can be armed. Raises as Rover.connect() does."""
     for line in list(_lines.values()):
         if line.before_drive:
             line.before_drive()
+
+
+def named(steering: float, throttle: float) -> dict[str, float]:
+    """Return an action, or a state, by LeRobot's names."""
+    return dict(zip(FEATURES, (steering, throttle), strict=True))
+
+
+def unnamed(action: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an action by our names, whichever of the two LeRobot recorded it with."""
+    return {name.removesuffix(".vel"): value for name, value in action.items()}

@@ -14,8 +14,10 @@ from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig, not_trained
-from lerobot_robot_rover.line import wait_for_humans
+from lerobot_robot_rover.line import count_ended_drives, wait_for_humans
+from lerobot_robot_rover.rollout import find_rollout
 from rover_lib.onboard.car.car import this_car
+from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.drive.drive import another_car
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.drive.plan import Plan, Settings
@@ -42,6 +44,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         self.config: RoverArtifactConfig = config
         self._limits = this_car().limits
         self._queue: deque[Tensor] = deque()
+        self._planned_s, self._planned_in = 0.0, 0  # when the queue was filled, and after how many drives
         self._plans = 0
         self._process = PolicyProcess(config.file, threads=config.threads)
         self._close = weakref.finalize(self, self._process.close)  # at the program's end too
@@ -71,8 +74,14 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         wait_for_humans()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps, that of a new chunk."""
+        """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps, that of a new chunk.
+
+        A chunk that is older than the stop_s of params.yml, or from before the car was disarmed, is dropped.
+        """
+        if boottime() - self._planned_s > _stop_s() or self._planned_in != count_ended_drives():
+            self._queue.clear()
         if not self._queue:
+            self._planned_s, self._planned_in = boottime(), count_ended_drives()
             chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
             self._queue.extend(chunk.transpose(0, 1))
         return self._queue.popleft()
@@ -98,6 +107,8 @@ class RoverArtifactPolicy(PreTrainedPolicy):
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, *, config: Any = None, **kwargs: Any):
         """Return the policy in a folder that pack() wrote. Raises ParamsError for anything else, such as a Hub name."""
+        if config is not None and pretrained_name_or_path is None:  # lerobot-rollout with --policy.artifact
+            return cls(config, **kwargs).eval()
         folder = Path(pretrained_name_or_path)
         if not folder.is_dir():
             raise ParamsError(f"{folder}: not a folder", remedy="`python -m lerobot_robot_rover` packs an artifact")
@@ -105,7 +116,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         config.pretrained_path = folder
         return cls(config, **kwargs).eval()
 
-    def _save_pretrained(self, save_directory: Path) -> None:
+    def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
         shutil.copyfile(self.config.file, save_directory / self.config.file.name)
         self.config._save_pretrained(save_directory)
 
@@ -127,6 +138,13 @@ class RoverArtifactPolicy(PreTrainedPolicy):
             )
         if sentence := another_car(manifest, this_car()):
             _log.warning(sentence)
+        rollout = find_rollout()
+        if rollout is not None and rollout.fps != rate_hz:
+            raise PolicyError(
+                f"this artifact's actions are {rate_hz:g} a second",
+                found=f"--fps={rollout.fps:g}",
+                remedy=f"--fps={rate_hz:g}",
+            )
         if dataset_meta is None:
             return
         if dataset_meta.fps != rate_hz:

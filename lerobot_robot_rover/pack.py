@@ -14,7 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_robot_rover.configuration_rover_artifact import N_ACTION_STEPS, RoverArtifactConfig
 from lerobot_robot_rover.processor_rover_artifact import make_rover_artifact_pre_post_processors
-from rover_lib.onboard.artifact.manifest import check_artifact, read_manifest
+from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.errors import ParamsError, RoverError
 
 
@@ -25,8 +25,9 @@ def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_AC
     folder that exists. The folder appears complete, or not at all.
     """
     artifact, folder = Path(artifact), Path(folder)
-    check_artifact(artifact)
-    manifest = read_manifest(artifact)
+    with Artifact(artifact) as opened:
+        opened.prove()
+        manifest = opened.manifest
     if folder.exists():
         raise ParamsError(f"{folder}: is there already", remedy="name a new folder")
     visual = {

@@ -362,17 +362,20 @@ class Given(nn.Module):
         return {"feature_map": features}
 
 
-def driving_error(policy: "ACTPolicy", data: Frames, rows: np.ndarray) -> float:
-    """Return the mean absolute error, in action units, of the policy's plans on these rows (no latent is sampled)."""
+def driving_error(
+    policy: "ACTPolicy", data: Frames, rows: np.ndarray, units: np.ndarray | float = 1.0, features: bool = False
+) -> float:
+    """Return the mean absolute error of the policy's plans on these rows (no latent is sampled), in action units.
+
+    units: what an error of 1 in each action counts. features: the images are the backbone's feature maps already.
+    """
     policy.eval()
     device = next(policy.parameters()).device
+    images = data.images[rows] if features else normalise(data.images[rows])
     chunks = policy.predict_action_chunk(
-        {
-            IMAGE: torch.from_numpy(normalise(data.images[rows])).to(device),
-            STATE: torch.from_numpy(data.states[rows]).to(device),
-        }
+        {IMAGE: torch.from_numpy(images).to(device), STATE: torch.from_numpy(data.states[rows]).to(device)}
     )
-    return float(np.abs(chunks.cpu().numpy() - data.chunks[rows])[~data.is_pad[rows]].mean())
+    return float((np.abs(chunks.cpu().numpy() - data.chunks[rows]) * units)[~data.is_pad[rows]].mean())
 
 
 def to_cpu(value: Any) -> Any:

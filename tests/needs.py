@@ -117,7 +117,7 @@ def in_turn():
 
 
 @contextlib.contextmanager
-def boosted_priority():
+def boost_priority():
     """While inside, this thread goes before ordinary ones, if this user is allowed to do so.
 
     Processes and threads that it starts have ordinary priority, unless they ask for more: a program that loads torch
@@ -144,7 +144,7 @@ def real_time(test: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(test)
     def repeated(*args: object, **fixtures: object) -> None:
         for attempt in range(1, ATTEMPTS + 1):
-            with in_turn(), boosted_priority(), Heartbeat() as heartbeat:
+            with in_turn(), boost_priority(), Heartbeat() as heartbeat:
                 try:
                     return test(*args, **fixtures)
                 except Exception as error:

@@ -55,7 +55,7 @@ def lerobot_policy(
         ACTConfig(
             input_features={
                 **{k: PolicyFeature(FeatureType.VISUAL, (3, *size)) for k, size in cameras.items()},
-                "observation.state": PolicyFeature(FeatureType.STATE, (states,)),
+                **({"observation.state": PolicyFeature(FeatureType.STATE, (states,))} if states else {}),
             },
             output_features={"action": PolicyFeature(FeatureType.ACTION, (actions,))},
             pretrained_backbone_weights=None,

@@ -11,15 +11,24 @@ from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
 
 REPO = Path(__file__).resolve().parents[1]
+BESIDE = (REPO, *REPO.parents[:2])  # where shared/ may be
 
 
 def real_episode() -> Path:
     """Return the folder of a real recording in shared/, in or beside the checkout. Skips the test if there is none."""
-    for base in (REPO, REPO.parent):
+    for base in BESIDE:
         found = sorted((base / "shared" / "sample_episode").glob("episode_*/episode_data.json"))
         if found:
             return found[0].parent
     pytest.skip("no real recording here: put one at shared/sample_episode/episode_*/ to run this test on it")
+
+
+def real_recordings() -> Path:
+    """Return the folder of several whole real recordings in shared/. Skips the test if there is none."""
+    for base in BESIDE:
+        if any((base / "shared" / "recordings").glob("episode_*/frames")):
+            return base / "shared" / "recordings"
+    pytest.skip("no real recordings here: put some at shared/recordings/episode_*/ to run this test on them")
 
 
 def record_drives(root: Path, drives: int = 4, frames: int = 24) -> Path:

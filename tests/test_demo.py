@@ -1,4 +1,4 @@
-"""The demo's run, made by `make demo`, must pass the gates of params.yml."""
+"""The demo's run, made by `make demo`, must pass the gates of params.yml; before a release, `make demo-more` too."""
 
 import nbformat
 import pytest
@@ -10,7 +10,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
 
-STAGES = ("load", "calibrate", "quantize", "compare", "drive", "distill")
+STAGES = ("load", "calibrate", "quantize", "compare")
 
 
 def stage_of(folder, name):
@@ -22,7 +22,7 @@ def test_left_everything_that_a_run_leaves(demo_run):
         assert stage_of(demo_run, stage)["inputs"]
     for mode in ("fp32", "dynamic", "static", "mixed"):
         assert load_policy(demo_run / f"policy_{mode}.pt").manifest["mode"] == mode
-    assert {p.stem for p in demo_run.glob("*.ipynb")} >= {*NAMES, "07_drive", "08_distill"}
+    assert {p.stem for p in demo_run.glob("*.ipynb")} >= {*NAMES}
     assert len(list((demo_run / "figures").glob("*.png"))) >= 5
     assert list(demo_run.glob("benchmark-*.json"))
 
@@ -48,6 +48,7 @@ def test_sizes_are_weights_with_weights(demo_run):
     assert 0.2 < metrics["modes"]["static"]["size_mb"] / metrics["fp32"]["size_mb"] < 0.35
 
 
+@pytest.mark.release
 def test_drives_by_plans_that_are_150_ms_late_as_by_fresh_ones(demo_run):
     metrics = stage_of(demo_run, "drive")["metrics"]
     rows = {r["latency_ms"]: r for r in metrics["rows"] if r["compensate"] and not r["pushes"] and not r["ensemble"]}
@@ -59,6 +60,7 @@ def test_drives_by_plans_that_are_150_ms_late_as_by_fresh_ones(demo_run):
     assert all(g["passed"] for g in metrics["gates"])
 
 
+@pytest.mark.release
 def test_late_plans_are_drawn(demo_run):
     text = shown(demo_run / "07_drive.ipynb")
     assert str(latency.table(stage_of(demo_run, "drive"))) in text and "ensembling, 0.01" in text
@@ -66,15 +68,15 @@ def test_late_plans_are_drawn(demo_run):
     assert figures == {f"07_{figure}" for figure in ("age", "hits", "path", "above")}
 
 
+@pytest.mark.release
 def test_a_student_of_its_own_is_judged_beside_it(demo_run):
-    """It is trained for a few steps only, so it need not be as good; but the report must say what was measured."""
-    metrics = stage_of(demo_run, "distill")["metrics"]
+    metrics = stage_of(demo_run, "students")["metrics"]
     teacher, student = metrics["students"]
     assert (student["name"], student["width"], student["feedforward"]) == ("demo-small", 96, 256)
     assert student["gmac"] < 0.6 * teacher["gmac"]
-    assert teacher["trials"] == teacher["pushed_trials"] == student["trials"] == student["pushed_trials"] == 20
-    assert teacher["hits"] >= 18 and student["hits"] >= 10  # both look where the balloon is
-    assert teacher["teacher_steering_pct"] < 0.5 < student["teacher_steering_pct"] < 10
+    assert teacher["trials"] == teacher["pushed_trials"] == student["trials"] == student["pushed_trials"] == 40
+    assert teacher["hits"] >= 36 and student["hits"] >= 36  # it has learned enough to be worth a look
+    assert teacher["teacher_steering_pct"] < 0.5 < student["teacher_steering_pct"] < 5
     gates = frontier.gates_of(student, teacher, params()["students"])
     assert metrics["recommendation"]["gates"] == gates
     assert metrics["recommendation"]["name"] == ("demo-small" if all(g["passed"] for g in gates) else "teacher")

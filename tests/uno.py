@@ -166,7 +166,7 @@ class Uno:
     def next_line(self, kind: str, *values: int, boot: int | None = None, sequence: int | None = None) -> bytes:
         """Return the line that command() would send now."""
         if kind == "A":
-            values = (self.car_id, *values)
+            values = (self.status.uptime_ms, self.car_id, *values)
         if kind in "AD":
             values = (self.status.uptime_ms if self.heard_ms is None else self.heard_ms, *values)
         numbers = (self.boot if boot is None else boot, self.sequence + 1 if sequence is None else sequence, *values)
@@ -184,7 +184,7 @@ class Uno:
     def wiggle(self) -> None:
         """Let the human move the steering stick to both sides and let go of it, and run until that has counted."""
         self._c.uno_wiggle(self._uno)
-        self.run_ms(450)
+        self.run_ms(1250)
 
     def reset(self) -> None:
         self._c.uno_reset(self._uno)

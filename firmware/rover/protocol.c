@@ -42,7 +42,7 @@ static bool parse(const char *line, uint8_t length, struct command *command) {
     uint32_t crc = crc32(line, (size_t)(end - line));
     for (uint8_t i = 8; i; i--, crc >>= 4)
         if (end[i] != hex(crc & 15)) return false;
-    struct command found = {line[1], 0, 0, 0, 0, 0, 0, {0}};
+    struct command found = {line[1], 0, 0, 0, 0, 0, 0, 0, {0}};
     uint32_t *numbers[5] = {&found.boot, &found.sequence};
     uint8_t count = 2, shorts = 0;
     switch (found.kind) {
@@ -53,6 +53,7 @@ static bool parse(const char *line, uint8_t length, struct command *command) {
             break;
         case COMMAND_ARM:
             numbers[count++] = &found.heard_ms;
+            numbers[count++] = &found.asked_ms;
             numbers[count++] = &found.car;
             break;
         case COMMAND_CAR:

@@ -10,8 +10,8 @@
 extern "C" {
 #endif
 
-#define PROTOCOL_VERSION 3
-#define FIRMWARE_VERSION "3.0.0" /* rover_lib/onboard/car/servo_link.py drives no other: change both */
+#define PROTOCOL_VERSION 4
+#define FIRMWARE_VERSION "4.0.0" /* rover_lib/onboard/car/servo_link.py drives no other: change both */
 
 enum {
     HOST_LINE_MAX = 87,     /* the longest line of the host without its end: two numbers of ten digits, nine of five */
@@ -34,6 +34,7 @@ struct command {
     uint32_t boot, sequence;           /* not in COMMAND_HELLO */
     uint32_t heard_ms;                 /* in COMMAND_ARM, COMMAND_DRIVE: time of the newest status that the host read */
     uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE, the throttle in COMMAND_LOWER; vehicle.c checks them */
+    uint32_t asked_ms;                 /* in COMMAND_ARM: heard_ms as it was when somebody asked to arm the car */
     uint32_t car;                      /* in COMMAND_ARM: which one the host means */
     uint16_t numbers[CAR_NUMBERS];     /* in COMMAND_CAR: the car, in the order of struct car */
 };

@@ -77,12 +77,16 @@ void vehicle_start(struct vehicle *vehicle, uint16_t boot, const struct car *car
     enter(vehicle, MANUAL, AFTER_RESET);
 }
 
+static void forget_wiggle(struct vehicle *vehicle) {
+    for (uint8_t i = 0; i < 3; i++) vehicle->wiggle[i].seen = false;
+}
+
 static void forget_signal(struct vehicle *vehicle, struct received *received) {
     received->present = false;
     received->seen = 0;
     vehicle->throttle_free = false;
     vehicle->throttle_off_rest = 0xFF;
-    vehicle->sides[0].seen = vehicle->sides[1].seen = false;
+    forget_wiggle(vehicle);
 }
 
 /* A signal that returns after a loss may come from a receiver that makes up pulses while its transmitter is off. */
@@ -100,8 +104,11 @@ static bool has_signal(const struct vehicle *vehicle) {
 
 /* Notes a steering pulse. Returns whether the stick has moved from where it was on arming, as see_throttle() does. */
 static bool see_steering(struct vehicle *vehicle, uint16_t pulse_us, uint32_t now_ms) {
-    if (pulse_us <= neutral_us(vehicle, STEERING) - WIGGLE_US) vehicle->sides[0] = (struct side){true, now_ms};
-    if (pulse_us >= neutral_us(vehicle, STEERING) + WIGGLE_US) vehicle->sides[1] = (struct side){true, now_ms};
+    struct moment now = {true, now_ms}, *wiggle = vehicle->wiggle;
+    if (distance(pulse_us, neutral_us(vehicle, STEERING)) >= WIGGLE_US) {
+        wiggle[pulse_us > neutral_us(vehicle, STEERING)] = now;
+        if (wiggle[0].seen && wiggle[1].seen) wiggle[2] = now;
+    }
     if (distance(pulse_us, vehicle->still_us) > STEERING_DEAD_BAND_US / 2) {
         vehicle->still_us = pulse_us;
         vehicle->still_ms = now_ms;
@@ -114,6 +121,7 @@ static bool see_throttle(struct vehicle *vehicle, uint16_t pulse_us) {
     bool moved = distance(pulse_us, vehicle->rest_us[THROTTLE]) > THROTTLE_DEAD_BAND_US;
     vehicle->throttle_off_rest = (uint8_t)(vehicle->throttle_off_rest << 1 | off_rest);
     vehicle->throttle_moved = (uint8_t)(vehicle->throttle_moved << 1 | moved);
+    if (vehicle->throttle_off_rest) forget_wiggle(vehicle);
     if (!vehicle->throttle_off_rest && has_signal(vehicle)) vehicle->throttle_free = true;
     uint8_t pulses = 0;
     for (uint8_t bits = vehicle->throttle_moved; bits; bits >>= 1) pulses += bits & 1;
@@ -143,18 +151,20 @@ void vehicle_received(struct vehicle *vehicle, enum channel channel, uint16_t pu
 enum missing vehicle_missing(const struct vehicle *vehicle, uint32_t now_ms) {
     if (!has_signal(vehicle)) return SIGNAL;
     if (vehicle->throttle_off_rest) return THROTTLE_AT_REST;
-    bool wiggled = vehicle->sides[0].seen && vehicle->sides[1].seen && now_ms - vehicle->still_ms >= LET_GO_MS;
-    return wiggled ? NOTHING : WIGGLE;
+    bool let_go = distance(vehicle->still_us, neutral_us(vehicle, STEERING)) <= LET_GO_US &&
+                  now_ms - vehicle->still_ms >= LET_GO_MS;
+    return vehicle->wiggle[2].seen && let_go ? NOTHING : WIGGLE;
 }
 
-static char arm(struct vehicle *vehicle, uint32_t car, uint32_t now_ms) {
+static char arm(struct vehicle *vehicle, const struct command *command, uint32_t now_ms) {
     if (vehicle->state == AUTONOMOUS) return DONE; /* the host repeats itself, which renews nothing */
-    if (!vehicle->car_told || car != vehicle->car_id) return OTHER_CAR;
+    if (now_ms - command->asked_ms > REQUEST_MS) return EXPIRED;
+    if (!vehicle->car_told || command->car != vehicle->car_id) return OTHER_CAR;
     enum missing missing = vehicle_missing(vehicle, now_ms);
     if (missing != NOTHING) return (char)missing;
     vehicle->rest_us[STEERING] = vehicle->received[STEERING].pulse_us;
     vehicle->rest_us[THROTTLE] = vehicle->received[THROTTLE].pulse_us;
-    vehicle->sides[0].seen = vehicle->sides[1].seen = false;
+    forget_wiggle(vehicle);
     vehicle->commanded_ms = vehicle->driven_ms = vehicle->slewed_ms = now_ms;
     enter(vehicle, AUTONOMOUS, ARMED);
     return DONE;
@@ -195,7 +205,7 @@ static enum result lower_cap(struct vehicle *vehicle, uint32_t throttle_us) {
 }
 
 /* With another car, nothing counts any more that was seen of the transmitter and of the human at it. */
-static enum result take_car(struct vehicle *vehicle, const uint16_t *numbers) {
+static char take_car(struct vehicle *vehicle, const uint16_t *numbers) {
     struct car car;
     memcpy(&car, numbers, sizeof car);
     if (!car_allowed(&car)) {
@@ -204,8 +214,10 @@ static enum result take_car(struct vehicle *vehicle, const uint16_t *numbers) {
     }
     if (vehicle->state == AUTONOMOUS) return IGNORED;
     uint32_t id = car_id(&car);
+    bool same = id == vehicle->car_id;
+    if (!same && vehicle->state == MANUAL && has_signal(vehicle) && vehicle->throttle_off_rest) return THROTTLE_AT_REST;
     vehicle->car_told = true;
-    if (id == vehicle->car_id) return DONE;
+    if (same) return DONE;
     vehicle->car = car;
     vehicle->car_id = id;
     vehicle->cap_us = car.cap_us < vehicle->lowered_us ? car.cap_us : vehicle->lowered_us;
@@ -238,7 +250,7 @@ void vehicle_command(struct vehicle *vehicle, const struct command *command, uin
     vehicle->sequence = command->sequence;
     switch (command->kind) {
         case COMMAND_ARM:
-            vehicle->result = arm(vehicle, command->car, now_ms);
+            vehicle->result = arm(vehicle, command, now_ms);
             break;
         case COMMAND_DRIVE:
             vehicle->result = (char)drive(vehicle, command, in_turn, now_ms);
@@ -247,7 +259,7 @@ void vehicle_command(struct vehicle *vehicle, const struct command *command, uin
             vehicle->result = (char)lower_cap(vehicle, command->throttle_us);
             break;
         case COMMAND_CAR:
-            vehicle->result = (char)take_car(vehicle, command->numbers);
+            vehicle->result = take_car(vehicle, command->numbers);
             break;
         default:
             vehicle->result = (char)neutral(vehicle);
@@ -256,8 +268,8 @@ void vehicle_command(struct vehicle *vehicle, const struct command *command, uin
 
 void vehicle_tick(struct vehicle *vehicle, uint32_t now_ms) {
     judge_signal(vehicle, now_ms);
-    for (struct side *side = vehicle->sides; side < vehicle->sides + 2; side++)
-        if (now_ms - side->at_ms > WIGGLE_LIFETIME_MS) side->seen = false;
+    for (uint8_t i = 0; i < 3; i++)
+        if (now_ms - vehicle->wiggle[i].at_ms > (i == 2 ? WIGGLE_LIFETIME_MS : WIGGLE_MS)) vehicle->wiggle[i].seen = false;
     if (vehicle->state == AUTONOMOUS) {
         if (!has_signal(vehicle))
             enter(vehicle, STOPPED, NO_SIGNAL);

@@ -49,10 +49,14 @@ enum {
     SIGNAL_TIMEOUT_MS = 100,
     SIGNAL_PULSES = 2,
     FAST_SIGNAL_PULSES = 8,
-    /* A wiggle of the steering stick: at least this far to both sides of neutral, then still for LET_GO_MS. */
+    /* The gesture, a wiggle of the steering stick: at least this far to both sides of neutral within WIGGLE_MS, then still
+     * near neutral for LET_GO_MS, and the throttle at rest all the while: nobody drives like that. */
     WIGGLE_US = 200,
+    WIGGLE_MS = 3000,
     WIGGLE_LIFETIME_MS = 30000,
-    LET_GO_MS = 250,
+    LET_GO_US = 100,           /* a trim's */
+    LET_GO_MS = 1000,
+    REQUEST_MS = 31000,        /* an arming that was asked for longer ago is refused; the hosts' own limits are shorter */
     COMMAND_TIMEOUT_MS = 150,
     LATE_MS = 150,             /* a drive or arm is late if its host has not heard from us for longer than this */
     FRESH_MS = 50,             /* a drive holds in full if its host has heard from us within this, otherwise for less */
@@ -87,7 +91,8 @@ enum result {
     OUT_OF_RANGE = 'r',    /* or a car that is not allowed */
     OTHER_CAR = 'c',       /* an arming for another car than the one that was told since the reset */
     OLD = 'o',             /* its sequence number is not a new one, or it is for another boot */
-    LATE = 'l'             /* it waited in the link for longer than LATE_MS */
+    LATE = 'l',            /* it waited in the link for longer than LATE_MS */
+    EXPIRED = 'e'          /* an arming that somebody asked for longer ago than REQUEST_MS */
 };
 /* What arming lacks; also the result of an arming that was refused. */
 enum missing { NOTHING = '-', SIGNAL = 's', THROTTLE_AT_REST = 't', WIGGLE = 'w' };
@@ -99,8 +104,8 @@ struct received {
     bool present;
 };
 
-struct side {
-    bool seen; /* the stick was there within WIGGLE_LIFETIME_MS, and arming has not used it up */
+struct moment {
+    bool seen; /* not too long ago; arming, throttle and a lost signal forget it */
     uint32_t at_ms;
 };
 
@@ -113,7 +118,7 @@ struct vehicle {
     uint32_t sequence;                  /* of the last command that was accepted as new */
     uint16_t steering_us, throttle_us;  /* for the pins, always safe */
     struct received received[2];
-    struct side sides[2];               /* the two sides of a wiggle */
+    struct moment wiggle[3];            /* the stick on either side, and both within WIGGLE_MS */
     uint16_t still_us;                  /* the steering stick has stayed near this */
     uint32_t still_ms;                  /* since this time */
     uint8_t throttle_off_rest;          /* the last eight pulses, a bit each: not at rest */

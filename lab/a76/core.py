@@ -168,7 +168,7 @@ def fetch_wheels(folder: Path, *what: object) -> None:
     beside = Path(sys.executable).parent / "uv"
     uv = str(beside) if beside.is_file() else shutil.which("uv")
     if not uv:
-        raise CountError("no uv to fetch Python packages with", remedy="pip install uv ('make arm' has it)")
+        raise CountError("no uv to fetch Python packages with", remedy="pip install uv ('make count' has it)")
     options = ["--quiet", "--only-binary", ":all:", "--no-deps", "--target", folder]
     remedy = f"is the index within reach that has {' '.join(map(str, what))}?"
     run(uv, "pip", "install", *options, *what, error=CountError, remedy=remedy)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from balloon_world.record import record_episodes
-from balloon_world.train import train
+from rover_learn.train import train
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
@@ -56,7 +56,7 @@ def full_run(
     """Record drives, train a policy for a few steps, and quantize it at several image sizes. Returns run_dir.
 
     size: 'full' (the user's policy, 360x640), or 'small' to try this out. steps: None for the whole recipe, as in
-    `rover world train`. drives: if None, 16, or the demo's 80 for the whole recipe. samples: how many frames calibrate
+    `rover train`. drives: if None, 16, or the demo's 80 for the whole recipe. samples: how many frames calibrate
     at most. sizes, curve: further image sizes (height, width) in pixels, with the same weights. progress: called like
     tqdm.tqdm(iterable, desc=, total=).
 

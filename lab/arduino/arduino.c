@@ -382,7 +382,7 @@ static struct {
     char line[128];     /* of the Arduino, so far */
     size_t length;
 } human;
-static const double WIGGLE_EVERY_US = 1e6;
+static const double WIGGLE_EVERY_US = 2.5e6;
 
 static double slow = 1; /* seconds of this world in a second of the Arduino's */
 

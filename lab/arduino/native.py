@@ -19,7 +19,7 @@ SOURCES = (FIRMWARE / "rover" / "protocol.c", FIRMWARE / "rover" / "vehicle.c")
 STEERING, THROTTLE = range(2)
 READ_COMMAND, READ_BAD = 1, 2
 WIGGLE_US = (1750, 1750, 1750, 1150, 1150, 1150)  # the stick's pulses, 21 ms apart
-LET_GO_MS = 300  # a little longer than the firmware wants the stick to rest after a wiggle
+LET_GO_MS = 1050  # a little longer than the firmware wants the stick to rest after a wiggle
 
 
 class Command(ctypes.Structure):
@@ -27,7 +27,10 @@ class Command(ctypes.Structure):
 
     _fields_ = (
         ("kind", ctypes.c_char),
-        *((name, ctypes.c_uint32) for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us", "car")),
+        *(
+            (name, ctypes.c_uint32)
+            for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us", "asked_ms", "car")
+        ),
         ("numbers", ctypes.c_uint16 * 9),
     )
 
@@ -68,7 +71,7 @@ class Received(ctypes.Structure):
     )
 
 
-class Side(ctypes.Structure):
+class Moment(ctypes.Structure):
     """As in vehicle.h."""
 
     _fields_ = (("seen", ctypes.c_bool), ("at_ms", ctypes.c_uint32))
@@ -87,7 +90,7 @@ class Vehicle(ctypes.Structure):
         ("steering_us", ctypes.c_uint16),
         ("throttle_us", ctypes.c_uint16),
         ("received", Received * 2),
-        ("sides", Side * 2),
+        ("wiggle", Moment * 3),
         ("still_us", ctypes.c_uint16),
         ("still_ms", ctypes.c_uint32),
         ("throttle_off_rest", ctypes.c_uint8),
@@ -160,6 +163,7 @@ class NativeArduino:
         self.sequence = sequence
         # The board's time that the host claims to have heard last; None stands for now_ms.
         self.heard_ms: int | None = None
+        self.asked_ms: int | None = None  # the same, of when somebody asked to arm it
         self._vehicle, self._reader = Vehicle(), Reader()
         self._native = library()
         self._due_us = [0.0, 0.0]
@@ -241,7 +245,7 @@ class NativeArduino:
         heard_ms = self.now_ms if self.heard_ms is None else self.heard_ms
         dated: tuple[int, ...] = (heard_ms % (1 << 32),) if kind in "AD" else ()
         if kind == "A":
-            dated += (self.car.id,)
+            dated += ((self.now_ms if self.asked_ms is None else self.asked_ms) % (1 << 32), self.car.id)
         return self.send(frame(" ".join(map(str, (f">{kind}", self._vehicle.boot, sequence, *dated, *pulses_us)))))
 
     def drive(self, steering_us: int, throttle_us: int, ms: int, every_ms: int = 33) -> list[tuple[int, int]]:

@@ -16,7 +16,7 @@ from lab.driving.virtual import HELD, LIVE, LOST, PRESET, STICKS_US, Killed, See
 from lab.driving.virtual_host import Process
 from rover_lib.onboard.car.servo_link import frame
 
-WIGGLE_MS, START_MS, ASK_MS, STOP_MS, END_MS = 100, 700, 1300, 4000, 4600
+WIGGLE_MS, START_MS, ASK_MS, STOP_MS, END_MS = 100, 1500, 2100, 4800, 5400
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def _replay(stage: Stage, h: Happening) -> None:
 
 @_may("another program writes to the port", (0, 5), (20, 1000))
 def _intrude(stage: Stage, h: Happening) -> None:
-    what = (b"AT+GCAP\r\n", b">D 1", frame(">D 0 7 2000 700"), frame(">A 0 8"), frame(">N 0 9"), frame(">Q"))
+    what = (b"AT+GCAP\r\n", b">D 1", frame(">D 0 7 2000 700"), frame(">A 0 8 0 0 0"), frame(">N 0 9"), frame(">Q"))
     stage.again_and_again(h, 10, lambda: stage.world.down.send(what[h.amount]))
 
 
@@ -281,6 +281,11 @@ def _pause(stage: Stage, h: Happening) -> None:
     stage.world.pause(h.for_ms)
 
 
+@_may("the machine is suspended", for_ms=(200, 40_000))
+def _suspend(stage: Stage, h: Happening) -> None:
+    stage.world.suspend(h.for_ms)
+
+
 @_may("the process stutters", (20, 140), A_WHILE)
 def _stutter(stage: Stage, h: Happening) -> None:
     stage.again_and_again(h, 150, lambda: stage.world.pause(h.amount))
@@ -313,45 +318,49 @@ def _start(stage: Stage, h: Happening) -> None:
 
 H = Happening
 KEPT: dict[str, tuple[Story, str]] = {  # stories that once broke an invariant, and how a drive ends in them
-    "frozen since before the start": (Story((H(0, "the camera freezes", for_ms=4000),)), "frozen"),
-    "pictures of 1.5 s ago": (Story((H(0, "frames come late", 1500, 4000),)), "before it began"),
-    "pictures of 2.5 s ago, from now on": (Story((H(1500, "frames come late", 2500, 2000),)), "too old"),
-    "presets after a loss": (Story((H(2000, "the receiver sends presets", 400, 1500),)), "signal was lost"),
+    "frozen since before the start": (Story((H(0, "the camera freezes", for_ms=4800),)), "frozen"),
+    "pictures of 1.5 s ago": (Story((H(0, "frames come late", 1500, 4800),)), "before it began"),
+    "pictures of 2.5 s ago, from now on": (Story((H(2300, "frames come late", 2500, 2000),)), "too old"),
+    "presets after a loss": (Story((H(2800, "the receiver sends presets", 400, 1500),)), "signal was lost"),
     "presets from the first moment": (
-        Story((H(0, "the receiver sends presets", 400, 4000),), wiggled=False),
+        Story((H(0, "the receiver sends presets", 400, 4800),), wiggled=False),
         "throttle stick is not at rest",
     ),
     "held since before the start": (
-        Story((H(0, "the receiver holds its last values", for_ms=4000),), wiggled=False),
+        Story((H(0, "the receiver holds its last values", for_ms=4800),), wiggled=False),
         "wiggled",
     ),
-    "a host that asks for full throttle": (Story((H(2000, "the host goes mad", 711, 500),)), "told to stop"),
+    "a host that asks for full throttle": (Story((H(2800, "the host goes mad", 711, 500),)), "told to stop"),
     "every third pulse misread": (
-        Story((H(1500, "throttle pulses are misread", 3, 2000), H(2000, "the human pulls the throttle", 500, 1500))),
+        Story((H(2300, "throttle pulses are misread", 3, 2000), H(2800, "the human pulls the throttle", 500, 1500))),
         "the human took over",
     ),
     "a throttle pulse every 99 ms": (
-        Story((H(1500, "few throttle pulses come", 99, 2000), H(2000, "the human pulls the throttle", 500, 1500))),
+        Story((H(2300, "few throttle pulses come", 99, 2000), H(2800, "the human pulls the throttle", 500, 1500))),
         "signal was lost",
     ),
     "a link further and further behind": (
-        Story((H(1100, "to the Arduino: further and further behind", 80, 4000),)),
+        Story((H(1900, "to the Arduino: further and further behind", 80, 4000),)),
         "no valid command|has not answered",  # a millisecond decides who stops it first
     ),
     "armed by a line that waited": (
-        Story((H(600, "to the Arduino: further and further behind", 50, 4000),)),
+        Story((H(1400, "to the Arduino: further and further behind", 50, 4000),)),
         "no answer to arming",
     ),
     "started again without a gesture": (
-        Story((H(1500, "the operator says stop"), H(2200, "the operator starts it"))),
+        Story((H(2300, "the operator says stop"), H(3000, "the operator starts it"))),
         "wiggled",
     ),
     "an exception while neutral is on its way": (
-        Story((H(2400, "from the Arduino: latency_ms", 617, 20), H(3000, "an exception in the loop"))),
+        Story((H(3200, "from the Arduino: latency_ms", 617, 20), H(3800, "an exception in the loop"))),
         "has not answered",
     ),
     "asked for, and then the process is stopped": (
-        Story((H(1200, "the process is stopped", for_ms=2300),), service=True),
+        Story((H(2000, "the process is stopped", for_ms=2300),), service=True),
+        "before a human armed",
+    ),
+    "asked for, and then the machine is suspended": (
+        Story((H(2110, "the machine is suspended", for_ms=2300),), service=True),
         "before a human armed",
     ),
 }

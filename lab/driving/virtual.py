@@ -213,6 +213,7 @@ class World:
         self.mad_us = 0
         self.alive = True  # whether the host's process is
         self.paused_until_ms = 0
+        self.suspended_ms = 0  # for how long the host's machine has been suspended in all
         self.failing: BaseException | None = None  # to be raised when the host waits next
         self.unplugged = self.stuck = False
         self.content_ms = 0  # content_ms (see Asked) of the newest order
@@ -228,7 +229,11 @@ class World:
     # ---- time
 
     def clock(self) -> float:
-        """Return the time in seconds, in place of time.monotonic()."""
+        """Return the time in seconds, in place of time.monotonic(): it stands still while the host is suspended."""
+        return (self.now_ms - self.suspended_ms) / 1e3
+
+    def boottime(self) -> float:
+        """Return the time in seconds, in place of host.boottime()."""
         return self.now_ms / 1e3
 
     def at(self, at_ms: int, what: Callable[[], None]) -> None:
@@ -263,6 +268,12 @@ class World:
     def phase(self, name: str) -> None:
         """Note what the host is doing from now on."""
         self.seen.phases.append((self.now_ms, name))
+
+    def suspend(self, ms: int) -> None:
+        """Suspend the host's machine for a while."""
+        before_ms = max(self.paused_until_ms, self.now_ms)
+        self.pause(ms)
+        self.suspended_ms += self.paused_until_ms - before_ms
 
     def pause(self, ms: int) -> None:
         """Stop the host's process for a while."""

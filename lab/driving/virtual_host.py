@@ -162,7 +162,7 @@ class Eyes:
         if lens.black:
             picture = (picture - picture.min()) // 64 + world.now_ms % 2
         # The driver of a frozen camera still gives each picture a new time stamp.
-        self._give((picture, seen_ms / 1e3))
+        self._give((picture, (seen_ms - world.suspended_ms) / 1e3))
         self.content.setdefault(self.camera.frames, content_ms)
         self.on_frame()
 
@@ -343,7 +343,7 @@ class Process:
                 self.planner.renew(_settings().fade_s)
                 pilot.check_sight()
                 if self._service:
-                    check_age((world.now_ms - self._asked_ms) / 1000)
+                    check_age(world.boottime() - self._asked_ms / 1e3)
                 telemetry = link.arm()
             except RoverError as error:
                 if not self._service:

@@ -17,7 +17,12 @@ from rover_lib.onboard.stage import atomic_path, read_stage
 from rover_lib.workshop.run.run import parameters_in
 
 ROOT = Path(__file__).parents[2]
-MODES = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed"}
+EXPLAINED = {  # the modes, in words that need no other page
+    "fp32": "FP32, as trained",
+    "dynamic": "*dynamic* INT8: linear layers only",
+    "static": "***static* INT8**: all layers",
+    "mixed": "*mixed*: static, the most sensitive parts in FP32",
+}
 BEST = "static"
 PLACE = re.compile(r"(<!-- table (\w+), by make tables -->\n)(.*?)(<!-- end -->)", re.S)
 
@@ -65,41 +70,24 @@ def _line(fields: Row) -> str:
 
 
 def _demo(root: Path) -> list[Row]:
-    """The demo's policy in each mode."""
+    """The demo's policy, a row for each mode."""
     compared = _metrics(root / "results" / "demo", "compare")
     timed = _metrics(root / "results" / "demo", "benchmark-*")["artifacts"]
-    counted = _metrics(root / "results" / "demo", "arm", {"artifacts": {}})["artifacts"]
-    fp32, modes = compared["fp32"], {"fp32": compared["fp32"]} | compared["modes"]
+    modes = {"fp32": compared["fp32"]} | compared["modes"]
 
-    def row(what: str, text: Callable[[str], str | None]) -> Row:
-        return what, *(_strong(text(mode) or "", mode == BEST) for mode in MODES)
+    def row(mode: str) -> Row:
+        found = modes[mode]
+        errors = [_of(found, f"{action}_mae_pct", ".2f") for action in ("steering", "throttle")]
+        hits = f"{found['hits']} of {found['trials']}"
+        fields = (
+            _of(found, "size_mb", ".1f"),
+            hits,
+            " / ".join(filter(None, errors)),
+            _of(timed[mode], "speedup", ".1f"),
+        )
+        return EXPLAINED[mode], *(_strong(field or "", mode == BEST) for field in fields)
 
-    def error(action: str) -> Callable[[str], str | None]:
-        return lambda mode: _of(modes[mode], f"{action}_mae_pct", ".2f")
-
-    def microseconds(mode: str) -> str | None:
-        steering, throttle = (_of(modes[mode], f"{a}_mae_us", d) for a, d in (("steering", ".1f"), ("throttle", ".2f")))
-        return f"{steering} / {throttle}" if steering and throttle else None
-
-    low, high = (f"{fp32['trials'] * fp32[f'hits_wilson_{end}']:.1f}".removesuffix(".0") for end in ("low", "high"))
-    worlds = f"in {fp32['trials']} worlds (95 % interval for FP32: {low} to {high})"
-    rows = [
-        row("artifact, MB", lambda mode: _of(modes[mode], "size_mb", ".1f")),
-        row(f"balloons hit {worlds}", lambda mode: _of(modes[mode], "hits", "d")),
-        row("steering error, % of the recorded range", error("steering")),
-        row("throttle error, % of the recorded range", error("throttle")),
-        row("both errors in microseconds of servo pulse (the Arduino resolves 4)", microseconds),
-        row("speed-up over LeRobot's eager FP32, by medians", lambda mode: _of(timed[mode], "speedup", ".1f")),
-        row(
-            "instructions per inference, 10^9, *counted on an emulated Cortex-A76* (`make arm NAME=demo`)",
-            lambda mode: _of(counted.get(f"policy_{mode}", {}), "instructions_g", ".3f"),
-        ),
-        row(
-            "lower bound for a plan on a Pi 5, ms, *computed*",
-            lambda mode: _of(timed[mode], "floor_ms", ".1f") if mode in ("fp32", BEST) else None,
-        ),
-    ]
-    return [("", *MODES.values()), *(fields for fields in rows if any(fields[1:]))]
+    return [("", "MB", "balloons hit", "error, %: steering / throttle", "times faster"), *map(row, EXPLAINED)]
 
 
 def _faults(root: Path) -> list[Row]:
@@ -170,7 +158,7 @@ def _drives(root: Path) -> list[Row]:
 
 def _students(run: str, root: Path) -> list[Row]:
     """The policy of that run, and what was distilled from it."""
-    rows = _metrics(root / "results" / run, "distill")["students"]
+    rows = _metrics(root / "results" / run, "students")["students"]
     actions = [key.removeprefix("recorded_").removesuffix("_pct") for key in rows[0] if key.startswith("recorded_")]
 
     def row(student: Mapping[str, Any]) -> Row:

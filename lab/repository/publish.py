@@ -21,7 +21,6 @@ from PIL import Image
 
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, NotebookError
-from rover_lib.workshop.run.run_folder import says_how_it_was_taught
 
 RESULTS_OF = {  # stages that a notebook leaves
     "01_load": "load",
@@ -31,7 +30,7 @@ RESULTS_OF = {  # stages that a notebook leaves
     "05_benchmark": "benchmark-*",
     "06_arm": "arm",
     "07_drive": "drive",
-    "08_distill": "distill",
+    "08_distill": "students",
     "09_learn": "learn",
 }
 OF_LABORATORY = (  # in runs/, where make leaves them
@@ -98,7 +97,7 @@ def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEB
 
 def students(runs_dir: Path) -> list[Path]:
     """What `rover distill` left of each student."""
-    return [path for path in sorted(runs_dir.glob("*/distill.json")) if says_how_it_was_taught(path)]
+    return sorted(runs_dir.glob("*/distill.json"))
 
 
 def _write(texts: dict[Path, str]) -> list[Path]:

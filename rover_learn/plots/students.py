@@ -27,8 +27,8 @@ DRIVES = (("", "left alone", SLATE, "o", -0.16), ("pushed_", "pushed", "white", 
 def frontier(students: Sequence[Mapping[str, Any]], chosen: str) -> Figure:
     """Draw the policies from most work to least: time of a plan, errors, and hits with Wilson's 95 % interval.
 
-    Without drives there is no panel of hits. students: rows of distill.json, the teacher first. chosen: the name of the
-    recommended one.
+    Without drives there is no panel of hits. students: rows of students.json, the teacher first. chosen: the
+    recommended one's name.
     """
     drove = any(row["trials"] for row in students)
     rows = sorted(students, key=lambda row: -row["gmac"])

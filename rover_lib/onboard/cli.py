@@ -17,7 +17,7 @@ from typing import Any, TextIO, cast
 import click
 
 from rover_lib.onboard.columns import align, benchmark_rows, number
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import RoverError, of_system, printable
 from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
 
 FILE = click.Path(path_type=Path)
@@ -83,7 +83,7 @@ class Rover(click.Group):
         except RoverError as e:
             if ctx.params.get("debug"):
                 raise
-            click.echo(f"rover: {e}", err=True)
+            click.echo(f"rover: {printable(str(e))}", err=True)
         except ModuleNotFoundError as e:
             if ctx.params.get("debug") or (e.name or "").startswith("rover_lib"):
                 raise
@@ -91,10 +91,14 @@ class Rover(click.Group):
             if e.name == "aiohttp":
                 sentence = "the view needs aiohttp: provision the rover with -e rover_view=true; on a laptop, make demo"
             click.echo(f"rover: {sentence}", err=True)
-        except (OSError, MemoryError) as e:
+        except OSError as e:
             if ctx.params.get("debug"):
                 raise
-            click.echo(f"rover: {type(e).__name__}: {e}", err=True)
+            click.echo(f"rover: {of_system(e)}", err=True)
+        except MemoryError:
+            if ctx.params.get("debug"):
+                raise
+            click.echo("rover: there is not enough memory; end other programs, or use fewer samples", err=True)
         ctx.exit(1)
 
 
@@ -127,11 +131,11 @@ def show(value: Any, as_json: bool) -> None:
             if isinstance(inner, list) and len(inner) > LONG_LIST:
                 click.echo(f"{indent}{key:<28} {len(inner)} values, see --json")
             elif isinstance(inner, (dict, list)) and inner:
-                click.echo(f"{indent}{key}")
+                click.echo(f"{indent}{printable(key)}")
                 lines(inner, indent + "  ")
             else:
-                text = f"{inner:.4g}" if isinstance(inner, float) else inner
-                click.echo(f"{indent}{key:<28} {text}")
+                text = f"{inner:.4g}" if isinstance(inner, float) else printable(inner)
+                click.echo(f"{indent}{printable(key):<28} {text}")
 
     lines(value, "")
 
@@ -376,13 +380,16 @@ def calibrate(
     the ground and unplug the motor first. Ctrl-C leaves everything as it was.
     """
     from rover_lib.onboard.car.calibrate import measure, refuse_existing, write_car
-    from rover_lib.onboard.car.car import Car, default_place, yaml_of
+    from rover_lib.onboard.car.car import Car, default_place, read_car, yaml_of
     from rover_lib.onboard.car.servo_link import ServoLink
+    from rover_lib.onboard.errors import CarError
 
     path = output or default_place()
     refuse_existing(path, force)
     check_output(path, None)
     more: dict[str, Any] = {"name": name}
+    with contextlib.suppress(CarError):  # measured again, its actions must mean what they meant
+        more["positive"] = read_car(path).positive
     if field_of_view_deg is not None:
         more["camera"] = {"field_of_view_deg": field_of_view_deg}
     if wheelbase_m is not None:
@@ -410,10 +417,11 @@ def inspect(file: Path, as_json: bool) -> None:
 
 def describe_artifact(file: Path) -> dict[str, Any]:
     """Return what `rover inspect` says of an intact artifact. Raises ArtifactError for any other file."""
-    from rover_lib.onboard.artifact.manifest import check_artifact, content_hash, read_manifest
+    from rover_lib.onboard.artifact.manifest import Artifact
 
-    check_artifact(file)
-    return {"artifact": {"content_hash": content_hash(file), **read_manifest(file)}}
+    with Artifact(file) as artifact:
+        artifact.prove()
+        return {"artifact": {"content_hash": artifact.content_hash, **artifact.manifest}}
 
 
 @main.command(short_help="Time artifacts on this machine.")
@@ -440,7 +448,7 @@ def benchmark(
     With --json or --output the first artifact's figures are at the top level. Needs nothing but the artifacts: this is
     what runs on the Pi.
     """
-    from rover_lib.onboard.artifact.manifest import content_hash, distinct_names, read_parity
+    from rover_lib.onboard.artifact.manifest import Artifact, distinct_names
     from rover_lib.onboard.care.benchmark import BenchmarkOptions
     from rover_lib.onboard.care.benchmark import benchmark as measure
     from rover_lib.onboard.care.limits import check_gates
@@ -449,8 +457,13 @@ def benchmark(
     from rover_lib.onboard.stage import write_stage
 
     files = distinct_names(artifacts)
-    policies = {name: load_policy(path) for name, path in files.items()}
-    vectors = read_parity(artifacts[0])
+    policies, contents, vectors = {}, {}, None
+    for name, path in files.items():
+        with Artifact(path) as artifact:
+            policies[name] = load_policy(artifact)
+            contents[f"{name}{path.suffix}"] = artifact.content_hash
+            vectors = artifact.parity if vectors is None else vectors
+    assert vectors is not None, "click asks for an artifact at least"
     first = next(iter(policies.values()))
     frames = [
         {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
@@ -461,8 +474,7 @@ def benchmark(
     if busy > BUSY:
         click.echo(f"rover: warning: this machine was busy before ({busy:.0%} of its cores): times are rough", err=True)
     if output:
-        inputs = {f"{name}{path.suffix}": content_hash(path) for name, path in files.items()}
-        write_stage(output, "benchmark", params=options, metrics=metrics, inputs=inputs)
+        write_stage(output, "benchmark", params=options, metrics=metrics, inputs=contents)
     if gates:
         metrics["gates"] = check_gates(metrics, params()["gates"]["original"])
     if as_json:
@@ -548,7 +560,7 @@ def release(
 ALLOW = click.option(
     "--allow",
     multiple=True,
-    type=click.Choice(["mode", "chunk", "camera"]),
+    type=click.Choice(["mode", "chunk", "camera", "aspect"]),
     help="Accept an artifact that differs in this.",
 )
 
@@ -566,10 +578,13 @@ def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, all
     show(pack_parts(artifact, folder, releases.expected, allow, sign_key), True)
 
 
+UNSIGNED = click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")
+
+
 @release.command(short_help="Make a release of an artifact without using it.")
 @click.argument("source", type=FILE)
 @click.option("--sha256", help="The SHA-256 that the artifact must have.")
-@click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")
+@UNSIGNED
 @ALLOW
 @click.pass_obj
 def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow: tuple[str, ...]) -> None:
@@ -586,10 +601,12 @@ def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow
 def verify(releases: Any, name: str, confined: bool) -> None:
     """Verify that a release is complete and computes here what it should, by checksums and parity vectors."""
     if confined and (path := releases.path_of(name)).exists():
+        from rover_lib.onboard.artifact.manifest import Artifact
         from rover_lib.onboard.policy.confine import confine, memory_mb
         from rover_lib.onboard.policy.load import import_engine
 
-        import_engine(path)
+        with Artifact(path) as artifact:
+            import_engine(artifact)
         if unconfined := confine(memory_mb(path, os.cpu_count() or 1)):
             click.echo(f"rover: not confined: {unconfined}", err=True)
     releases.check(name)
@@ -598,10 +615,11 @@ def verify(releases: Any, name: str, confined: bool) -> None:
 
 @release.command(short_help="Use a release from now on.")
 @click.argument("name")
+@UNSIGNED
 @click.pass_obj
-def switch(releases: Any, name: str) -> None:
+def switch(releases: Any, name: str, unsigned: bool) -> None:
     """Use the release NAME from now on. It is verified before and after; if that fails, the old one is used again."""
-    show({"name": name, "changed": releases.switch(name)}, True)
+    show({"name": name, "changed": releases.switch(name, unsigned=unsigned)}, True)
 
 
 @release.command(short_help="Go back to the release before the one in use.")
@@ -688,11 +706,12 @@ def open_view(
     feed: Path | None,
     drive_user: str | None,
     opened: Callable[[str], object] = lambda url: None,
-    replay: Any = None,
+    shown: Any = None,
 ) -> None:
     """Serve the view until SIGINT or SIGTERM.
 
-    opened: called with its URL. replay: a Replay of drive_log, shown instead of the drives that connect.
+    opened: called with its URL. shown: what is shown instead of the drives that connect, a Replay of drive_log, or
+    balloon_world's Simulation, whose `ask` gets what is asked for on the page.
     """
     import asyncio
 
@@ -700,14 +719,16 @@ def open_view(
     from rover_lib.onboard.view.server import Address, View, new_token, read_token
 
     token = read_token(token_file) if token_file else new_token()
-    place = None if replay else feed or default_view()
+    place = None if shown else feed or default_view()
+    ask = getattr(shown, "ask", None)
     view = View(
         Address(web_port, interface),
         token,
         place,
         drive_user=drive_user,
-        replay=replay is not None,
-        car=replay and replay.car,
+        replay=shown is not None and ask is None,
+        car=shown and shown.car,
+        ask=ask,
     )
 
     def tell(url: str) -> None:
@@ -716,7 +737,7 @@ def open_view(
         sys.stdout.flush()
         opened(url)
 
-    asyncio.run(view.run(tell, replay and replay.show))
+    asyncio.run(view.run(tell, shown and shown.show))
 
 
 @main.command(short_help="Summarize a flight log.")

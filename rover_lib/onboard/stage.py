@@ -17,8 +17,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 
@@ -30,19 +31,23 @@ PARTS = ("params", "metrics", "inputs", "env")
 def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path`. It is renamed to `path` if the block succeeds, and removed if it fails.
 
-    Raises RoverError if torch.save cannot write the whole file.
+    Raises RoverError if torch.save cannot write the whole file, and OSError that names `path` for all else.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{path.suffix}")
     # Not mkstemp, whose mode of 0600 would hide the file from the service's user. Here the kernel applies the umask;
     # a process can learn its umask only by setting it, which would affect all of its threads.
-    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         with temporary.open("rb") as f:
             os.fsync(f.fileno())  # a power cut after the rename must not leave an empty file
         temporary.replace(path)
+    except OSError as error:
+        if error.filename in (None, str(temporary)):  # of a full disk it says no name, else a name that nobody knows
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
     except RuntimeError as error:
         if "inline_container" not in str(error):  # torch's file writer, which hides the system's error
             raise
@@ -51,7 +56,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def open_plain(path: Path | str, refusal: RoverError) -> BinaryIO:
+def open_plain(path: Path | str, refusal: RoverError) -> BufferedReader:
     """Open a plain file for reading. Raises OSError, and `refusal` if it is no plain file.
 
     Path.open() would wait for a writer of a FIFO, and reading a device might never end.
@@ -64,8 +69,8 @@ def open_plain(path: Path | str, refusal: RoverError) -> BinaryIO:
 
 
 def sha256_of(path: Path | str) -> str:
-    """Return the hex SHA-256 of a file's bytes."""
-    with Path(path).open("rb") as f:
+    """Return the hex SHA-256 of a file's bytes. Raises RoverError for what is no plain file."""
+    with open_plain(path, RoverError(f"{path}: not a plain file")) as f:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
 

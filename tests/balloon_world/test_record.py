@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -6,7 +7,9 @@ import pytest
 
 from balloon_world import record
 from balloon_world.record import record_episodes
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.recording.episode import read_car_of
 from rover_lib.workshop.recordings.episodes import load_recordings
 
 pytestmark = pytest.mark.slow
@@ -121,3 +124,15 @@ def test_progress_is_told(tmp_path, monkeypatch):
 
     record_episodes(tmp_path / "episodes", count=3, progress=progress)
     assert told == [("recording", 3)]
+
+
+def test_recordings_of_before_are_of_a_car_that_turns_left(recorded, tmp_path):
+    """Their policies still hit: the side travels with the recordings, and all pulses stay as they are."""
+    folder = shutil.copytree(sorted(recorded.glob("episode_*"))[0], tmp_path / "episode_1")
+    assert read_car_of(folder) == Car()
+    path = folder / "episode_data.json"
+    content = json.loads(path.read_text())
+    assert content["metadata"].pop("steering_positive") == "right"
+    path.write_text(json.dumps(content))
+    car = read_car_of(folder)
+    assert car.positive == "left" and car.drives_like(Car()) and car.pwm == Car().pwm

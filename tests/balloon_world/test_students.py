@@ -112,7 +112,7 @@ def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
     counted(made.teacher, 56, 90)
     counted(made.student, 13, 20)
     content = judge_students(made.teacher, [made.student], worlds=3)
-    assert content == read_stage(made.teacher / "distill.json", "distill")
+    assert content == read_stage(made.teacher / "students.json", "students")
     teacher, student = content["metrics"]["students"]
     assert set(KEYS) <= set(teacher) and set(teacher) == set(student)
     assert (teacher["name"], teacher["decoder_layers"], teacher["computed_ms"]) == ("teacher", 7, [56, 90])
@@ -125,7 +125,7 @@ def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
     assert {late for *_, late in made.driven} == {None, 0.09, 0.02}
     assert content["metrics"]["latency"] == "counted" and content["metrics"]["recommendation"]["name"] == "teacher"
     assert {p.name for p in made.teacher.iterdir()} == {
-        "arm.json", "distill.json", "load.json", "policy_fp32.pt", "policy_static.pt",
+        "arm.json", "load.json", "policy_fp32.pt", "policy_static.pt", "students.json",
     }  # fmt: skip
 
 
@@ -151,7 +151,7 @@ def test_a_student_that_is_not_counted_is_not_pushed(made):
 def test_what_was_driven_once_is_kept(made):
     judge_students(made.teacher, [made.student], worlds=2)
     assert len(made.driven) == 8
-    first = read_stage(made.teacher / "distill.json", "distill")["metrics"]
+    first = read_stage(made.teacher / "students.json", "students")["metrics"]
     made.driven.clear()
     assert judge_students(made.teacher, [made.student], worlds=2)["metrics"] == first and not made.driven
     judge_students(made.teacher, [made.student], worlds=3)  # one more world for each
@@ -186,7 +186,7 @@ def test_a_kill_costs_the_drives_that_had_not_ended(made, monkeypatch):
     monkeypatch.setattr(students, "_append", dies)
     with pytest.raises(KeyboardInterrupt):
         judge_students(made.teacher, [made.student], worlds=3)
-    assert not (made.teacher / "distill.json").exists()
+    assert not (made.teacher / "students.json").exists()
     monkeypatch.setattr(students, "_append", append)
     made.driven.clear()
     rows = judge_students(made.teacher, [made.student], worlds=3)["metrics"]["students"]
@@ -237,7 +237,6 @@ def moved(made, name):
         (lambda made: (made.teacher / "load.json").unlink() or made.student, "give --episodes"),
         (lambda made: distilled(made.student, teacher="another") or made.student, "a student of another checkpoint"),
         (lambda made: distilled(made.student, own="another") or made.student, "not made of the student"),
-        (lambda made: distilled(made.teacher) or made.student, "was distilled itself"),
     ],
 )
 def test_what_does_not_belong_together_is_refused(made, breaks, says):
@@ -248,13 +247,6 @@ def test_what_does_not_belong_together_is_refused(made, breaks, says):
     assert {p: p.read_bytes() for p in made.teacher.iterdir()} == before
     with pytest.raises(DistillError, match="names of their own"):
         judge_students(made.teacher, [student, student], worlds=1)
-
-
-def test_the_teachers_report_is_replaced_and_is_no_students(made):
-    judge_students(made.teacher, [made.student], worlds=1)
-    judge_students(made.teacher, [made.student], worlds=2)
-    with pytest.raises(DistillError, match="is a teacher's run, not a student's"):
-        judge_students(made.student, [made.teacher], worlds=1)
 
 
 def test_the_command_drives_and_executes_the_notebook(made, monkeypatch):

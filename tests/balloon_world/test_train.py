@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from balloon_world import train as train_module
-from balloon_world.train import FULL, RECIPES, SIZES, train
 from balloon_world.trial import run_trials
 from balloon_world.world import World
+from rover_learn import train as train_module
 from rover_learn import training as training_module
+from rover_learn.train import FULL, RECIPES, SIZES, train
 from rover_learn.training import descend
-from rover_lib.onboard.errors import RoverError, TrainingError, WorldError
+from rover_lib.onboard.errors import RoverError, TrainingError
 from rover_lib.workshop.act import lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.judge.compare import LerobotEager
@@ -250,7 +250,7 @@ def test_a_recipe_of_few_steps_keeps_all_phases(recipe, steps):
     ],
 )
 def test_what_cannot_be_trained_is_refused(recorded, tmp_path, wrong, match):
-    with pytest.raises(WorldError, match=match):
+    with pytest.raises(TrainingError, match=match):
         train(recorded, tmp_path / "best_model.pth", **wrong)
     assert not list(tmp_path.iterdir())
 

@@ -176,3 +176,16 @@ def test_rendering_is_quick():
         times.append(time.process_time() - start)
         world.step(*expert(world))
     assert np.median(times) < 0.012, "aim 4 ms; the rest is for slow machines"
+
+
+@pytest.mark.parametrize(("left", "side"), [(None, -1), (1, 1), (-1, -1)])
+def test_positive_steering_turns_to_the_cars_side(left, side):
+    """The recorded car's is right; a policy of older recordings of this world drives a car that turns left."""
+    world = World(3, left=left)
+    for _ in range(30):
+        world.step(0.5, 0.09)
+    assert world.state.heading_rad * side > 0.1
+    world = World(3, left=left)
+    while not world.done:
+        world.step(*expert(world))
+    assert world.hit

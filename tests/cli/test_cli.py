@@ -166,7 +166,7 @@ def test_a_training_that_is_stopped_says_that_it_goes_on(tmp_path, monkeypatch):
     def interrupted(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("balloon_world.train.train", interrupted)
+    monkeypatch.setattr("rover_learn.train.train", interrupted)
     result = rover("world", "train", tmp_path, tmp_path / "out.pth")
     assert result.exit_code == 130 and "the same command goes on where it was" in result.output
 

@@ -4,7 +4,7 @@
  * armed and driven any more. What is allowed is known here, not taken from the code under test: the pins may do neutral,
  * the transmitter's last pulses (its throttle only after it was at rest), or go towards the pulses of the last valid
  * drive as fast and as far as the limits let them, and the latter two only in their state and while there is a signal; a
- * moved stick ends autonomy; and nothing arms without a wiggle. The board starts anew now and then, often shortly before
+ * moved stick ends autonomy; and nothing arms without a wiggle, nor long after it was asked for. The board starts anew now and then, often shortly before
  * its clock or the host's sequence wraps, and as another car; other cars are told too, some of which may not be.
  * Use: fuzz LINES SEED
  */
@@ -55,8 +55,9 @@ static uint32_t seen_ms[2];
 static uint16_t rest_us[2]; /* the sticks on arming */
 static bool signal_on = true;
 static bool misreading;           /* some throttle pulses are measured wrongly */
-static bool sides[2];             /* the steering stick was there since the last arming or loss */
-static uint32_t sides_ms[2];
+static bool sides[2], wiggled;    /* the steering stick was there, with the throttle at rest since, and no arming or loss */
+static uint32_t sides_ms[2], wiggled_ms;
+static void forget_wiggle(void) { sides[0] = sides[1] = wiggled = false; }
 static unsigned at_rest, away;    /* throttle pulses in a row: at rest; not where they were on arming */
 static bool throttle_may_pass, was_lost;
 static uint32_t wanted_us[2];     /* of the last drive that must count */
@@ -86,7 +87,8 @@ static void check(void) {
     bool neutral = vehicle.steering_us == car[2] && vehicle.throttle_us == car[6];
     bool lost = now_ms - seen_ms[0] > 100 || now_ms - seen_ms[1] > 100;
     if (!neutral && lost) fail("no signal, and not neutral");
-    if (lost) sides[0] = sides[1] = throttle_may_pass = false;
+    if (lost) forget_wiggle();
+    if (lost) throttle_may_pass = false;
     if (lost && !was_lost) at_rest = 0; /* pulses of the one signal count while the other is awaited */
     was_lost = lost;
     if (vehicle.state == MANUAL && before_state != MANUAL) throttle_may_pass = at_rest >= 8;
@@ -120,6 +122,7 @@ static void see_throttle(uint16_t us) {
         seen_us[1] = us;
         seen_ms[1] = now_ms;
         at_rest = abs(us - car[6]) <= 32 ? at_rest + 1 : 0;
+        if (!at_rest) forget_wiggle();
         away = abs(us - rest_us[1]) > 32 ? away + 1 : 0;
         if (at_rest >= 8) throttle_may_pass = true;
     }
@@ -133,7 +136,10 @@ static void pass(uint32_t ms) { /* as the sketch's loop does */
             seen_us[0] = stick_us[0];
             seen_ms[0] = now_ms;
             for (int side = 0; side < 2; side++)
-                if (side ? seen_us[0] >= car[2] + 200 : seen_us[0] <= car[2] - 200) sides[side] = true, sides_ms[side] = now_ms;
+                if (side ? seen_us[0] >= car[2] + 200 : seen_us[0] <= car[2] - 200) {
+                    sides[side] = true, sides_ms[side] = now_ms;
+                    if (sides[!side] && now_ms - sides_ms[!side] <= 3000) wiggled = true, wiggled_ms = now_ms;
+                }
             vehicle_received(&vehicle, STEERING, seen_us[0], car[0], now_ms);
         }
         if (signal_on && (fast() || now_ms % 20 == 0))
@@ -147,7 +153,7 @@ static int print_command(char *text, const struct command *command) {
     int n = sprintf(text, ">%c %u %u", command->kind, command->boot, command->sequence);
     bool drive = command->kind == COMMAND_DRIVE;
     if (drive || command->kind == COMMAND_ARM) n += sprintf(text + n, " %u", command->heard_ms);
-    if (command->kind == COMMAND_ARM) n += sprintf(text + n, " %u", command->car);
+    if (command->kind == COMMAND_ARM) n += sprintf(text + n, " %u %u", command->asked_ms, command->car);
     for (int i = 0; command->kind == COMMAND_CAR && i < 9; i++) n += sprintf(text + n, " %u", command->numbers[i]);
     if (drive) n += sprintf(text + n, " %u", command->steering_us);
     if (drive || command->kind == COMMAND_LOWER) n += sprintf(text + n, " %u", command->throttle_us);
@@ -164,7 +170,8 @@ static void drives(const uint16_t *other) {
     if (other == car) return;
     car = other;
     seen_ms[0] = seen_ms[1] = now_ms - 1000;
-    sides[0] = sides[1] = throttle_may_pass = false;
+    forget_wiggle();
+    throttle_may_pass = false;
     at_rest = 0, was_lost = true;
     let_go();
 }
@@ -197,16 +204,17 @@ static void feed(const uint8_t *bytes, int length, const struct command *genuine
                 lowered_us = lowered;
             vehicle_command(&vehicle, &command, now_ms);
             if (!genuine && vehicle.sequence != sequence) fail("a line that nobody sent was taken");
-            if (genuine && command.kind == COMMAND_CAR && before != AUTONOMOUS)
+            if (genuine && command.kind == COMMAND_CAR && before != AUTONOMOUS && vehicle.result != 't')
                 for (int i = 0; i < 4; i++)
                     if (!memcmp(command.numbers, CARS[i], 18)) told = true, drives(CARS[i]), cars++;
             sequence_wraps += vehicle.sequence < sequence;
             if (vehicle.state == AUTONOMOUS && before != AUTONOMOUS) {
                 if (!genuine || command.kind != COMMAND_ARM) fail("armed without being told");
                 if (!told || command.car != id_of(car)) fail("armed for another car");
-                for (int side = 0; side < 2; side++)
-                    if (!sides[side] || now_ms - sides_ms[side] > 30000) fail("armed without a wiggle");
-                sides[0] = sides[1] = wanted = false;
+                if (!wiggled || now_ms - wiggled_ms > 30000 || now_ms - wiggled_ms < 1000) fail("armed without a wiggle");
+                if (now_ms - command.asked_ms > 31000) fail("armed long after it was asked for");
+                forget_wiggle();
+                wanted = false;
                 rest_us[0] = seen_us[0], rest_us[1] = seen_us[1];
                 away = 0;
             }
@@ -224,7 +232,7 @@ static void wiggle(void) {
     stick_us[0] = 1750;
     pass(60);
     let_go();
-    pass(300);
+    pass(rnd(4) ? 1050 : 300);
 }
 
 static void still_works(void) { /* from any state at all */
@@ -232,13 +240,16 @@ static void still_works(void) { /* from any state at all */
     reader_take(&reader, '\n', now_ms, &(struct command){0});
     signal_on = true;
     misreading = false;
-    struct command tell = {COMMAND_CAR, vehicle.boot, vehicle.sequence + 1, 0, 0, 0, 0, {0}};
+    struct command tell = {COMMAND_CAR, vehicle.boot, vehicle.sequence + 1, 0, 0, 0, 0, 0, {0}};
     memcpy(tell.numbers, car, sizeof tell.numbers);
+    let_go();
+    pass(200);
     feed((uint8_t *)text, print_command(text, &tell), &tell);
     wiggle();
-    struct command arm = {COMMAND_ARM, vehicle.boot, vehicle.sequence + 1, now_ms, 0, 0, id_of(car), {0}};
+    pass(1050);
+    struct command arm = {COMMAND_ARM, vehicle.boot, vehicle.sequence + 1, now_ms, 0, 0, now_ms, id_of(car), {0}};
     feed((uint8_t *)text, print_command(text, &arm), &arm);
-    struct command drive = {COMMAND_DRIVE, vehicle.boot, vehicle.sequence + 1, now_ms, car[2] + 144u, car[6] + 80u, 0, {0}};
+    struct command drive = {COMMAND_DRIVE, vehicle.boot, vehicle.sequence + 1, now_ms, car[2] + 144u, car[6] + 80u, 0, 0, {0}};
     feed((uint8_t *)text, print_command(text, &drive), &drive);
     pass(60);
     uint32_t throttle_us = car[6] + (cap_us() < 80 ? cap_us() : 80);
@@ -255,7 +266,8 @@ static void start(void) { /* a reset: of the board alone */
     now_ms = rnd(2) ? UINT32_MAX - rnd(10000) : rnd(1u << 31) * 2;
     vehicle.sequence = rnd(2) ? UINT32_MAX - rnd(300000) : rnd(1u << 31) * 2;
     seen_ms[0] = seen_ms[1] = now_ms - 1000;
-    sides[0] = sides[1] = throttle_may_pass = wanted = false;
+    forget_wiggle();
+    throttle_may_pass = wanted = false;
     at_rest = 0, was_lost = true;
     lowered_us = UINT32_MAX;
     before_state = 0;
@@ -272,7 +284,7 @@ int main(int argc, char **argv) {
         char text[512];
         struct command genuine = {COMMAND_DRIVE, vehicle.boot, vehicle.sequence + 1 + (rnd(20) ? 0 : rnd(65535)),
                                   now_ms - rnd(100), car[1] + rnd(car[3] - car[1] + 1u),
-                                  car[5] + rnd(car[7] - car[5] + 1u), id_of(car), {0}};
+                                  car[5] + rnd(car[7] - car[5] + 1u), now_ms - rnd(32000), id_of(car), {0}};
         if (!rnd(12)) genuine.kind = COMMAND_ARM;
         if (!rnd(60)) genuine.kind = COMMAND_NEUTRAL;
         if (!rnd(600)) genuine.kind = COMMAND_LOWER;
@@ -339,7 +351,7 @@ int main(int argc, char **argv) {
         if (!rnd(300)) signal_on = !signal_on;
         if (!rnd(1000)) misreading = !misreading;
         if (!rnd(5000)) start();
-        if (!rnd(40) && vehicle.state != AUTONOMOUS) wiggle();
+        if (!rnd(20) && vehicle.state != AUTONOMOUS) wiggle();
         if (!rnd(200)) {
             bool moved = rnd(2);
             let_go();

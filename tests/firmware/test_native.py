@@ -56,7 +56,7 @@ def test_random_and_mutated_lines(count):
         ("car's period", "vehicle.c", "within(servo->period_us, PERIOD_MIN_US, PERIOD_MAX_US) &&", ""),
         ("armed", "vehicle.c", "AUTONOMOUS) return IGNORED;\n    uint32_t id", "0) return IGNORED;\n    uint32_t id"),
         ("told", "vehicle.c", "!vehicle->car_told ||", ""),
-        ("other car", "vehicle.c", "|| car != vehicle->car_id) return OTHER_CAR", ") return OTHER_CAR"),
+        ("other car", "vehicle.c", "|| command->car != vehicle->car_id) return OTHER_CAR", ") return OTHER_CAR"),
         ("raised cap", "vehicle.c", "car.cap_us < vehicle->lowered_us ?", "true ?"),
         ("old signal", "vehicle.c", "forget_signal(vehicle, &vehicle->received[channel]);\n    }\n    e", ";}\n    e"),
         ("slew", "vehicle.c", "ms * STEERING_SLEW_US_PER_MS", "ms * 5"),
@@ -64,8 +64,11 @@ def test_random_and_mutated_lines(count):
         ("rest", "vehicle.c", "vehicle->throttle_free ?", "true ?"),
         ("takeover", "vehicle.c", "    vehicle->throttle_free = false;\n}\n\nvoid", "}\n\nvoid"),
         ("majority", "vehicle.c", "FAST_MOVED_PULSES : 1)", "FAST_MOVED_PULSES + 1 : 1)"),
-        ("wiggle", "vehicle.c", "vehicle->sides[0].seen && vehicle->sides[1].seen && now_ms", "now_ms"),
-        ("used up", "vehicle.c", "vehicle->sides[1].seen = false;\n    vehicle->comm", "true;\n    vehicle->comm"),
+        ("wiggle", "vehicle.c", "vehicle->wiggle[2].seen && let_go", "let_go"),
+        ("let go", "vehicle.c", ".seen && let_go", ".seen"),
+        ("by hand", "vehicle.c", "if (vehicle->throttle_off_rest) forget", "if (false) forget"),
+        ("request", "vehicle.c", "now_ms - command->asked_ms > REQUEST_MS", "false"),
+        ("used up", "vehicle.c", "forget_wiggle(vehicle);\n    vehicle->comm", "vehicle->comm"),
         ("sparse", "vehicle.c", "[received->oldest] <= SIGNAL_TIMEOUT_MS) cont", "[received->oldest] < 1u << 31) cont"),
         ("replay", "vehicle.c", "!within(ahead, 1, SEQUENCE_WINDOW)", "ahead == 0"),
         ("boot", "vehicle.c", "command->boot != vehicle->boot ||", ""),
@@ -104,7 +107,7 @@ def read(data: bytes) -> list[Command]:
 NUMBER = st.integers(0, 2**32 - 1)
 LINES = st.one_of(
     st.builds(lambda *v: servo_link.frame(">D " + " ".join(map(str, v))), NUMBER, NUMBER, NUMBER, NUMBER, NUMBER),
-    st.builds(lambda *v: servo_link.frame(">A " + " ".join(map(str, v))), NUMBER, NUMBER, NUMBER, NUMBER),
+    st.builds(lambda *v: servo_link.frame(">A " + " ".join(map(str, v))), *[NUMBER] * 5),
     st.builds(
         lambda boot, sequence, car: servo_link.frame(f">C {boot} {sequence} " + " ".join(map(str, car))),
         NUMBER,
@@ -119,7 +122,12 @@ def test_crc_is_zlibs(data):
     assert library().crc32(data, len(data)) == zlib.crc32(data)
 
 
-FIELDS = {"A": ["heard_ms", "car"], "N": [], "L": ["throttle_us"], "D": ["heard_ms", "steering_us", "throttle_us"]}
+FIELDS = {
+    "A": ["heard_ms", "asked_ms", "car"],
+    "N": [],
+    "L": ["throttle_us"],
+    "D": ["heard_ms", "steering_us", "throttle_us"],
+}
 
 
 @given(st.sampled_from("ANDL"), st.lists(NUMBER, min_size=5, max_size=5))
@@ -127,7 +135,7 @@ def test_what_the_host_sends_is_what_the_firmware_reads(kind, numbers):
     sent = dict(zip(["boot", "sequence", *FIELDS[kind]], numbers, strict=False))
     (command,) = read(servo_link.frame(f">{kind} " + " ".join(map(str, sent.values()))))
     assert command.kind.decode() == kind
-    for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us", "car"):
+    for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us", "asked_ms", "car"):
         assert getattr(command, name) == sent.get(name, 0)
 
 
@@ -168,7 +176,7 @@ U16 = st.integers(0, 65535)
         {
             "state": st.sampled_from("MAS"),
             "reason": st.sampled_from("rhatpsn"),
-            "result": st.sampled_from("-kirolstwc"),
+            "result": st.sampled_from("-kirolestwc"),
             "sequence": NUMBER,
             **dict.fromkeys(["boot", "steering_us", "throttle_us", "cap_us", "bad_lines", "old_commands"], U16),
             **dict.fromkeys(["out_of_range", "lost_bytes"], U16),

@@ -138,15 +138,79 @@ def test_a_stick_that_is_still_moving_is_not_let_go(board):
         board.run(60)
         assert board.status.missing == "w"
     board.sticks[STEERING] = 1490  # where it rests is its trim's affair
-    board.run(300)
+    board.run(1050)
     assert board.command("A") == "k"
     board.drive(1456, 150, 300)
     assert board.status.state is State.AUTONOMOUS
 
 
+def drive_by_hand(board, steering_us, throttle_us, ms):
+    board.sticks = [steering_us, throttle_us]
+    board.run(ms)
+
+
+@pytest.mark.parametrize("between_ms", [100, 1400, 9000])
+def test_driving_by_hand_is_no_gesture(board, between_ms):
+    """It was: each side could be 30 s old, with throttle in between, and 9 ms at rest sufficed."""
+    for turn in range(20):
+        drive_by_hand(board, (1750, 1150)[turn % 2], 200, 400)
+        drive_by_hand(board, 1456, 120 if turn % 3 else 180, between_ms)
+        assert board.command("A") in ("t", "w")
+    drive_by_hand(board, 1456, 120, 1500)
+    assert board.command("A") == "w"
+
+
+def test_the_two_sides_of_a_gesture_belong_together(board):
+    for steering_us in (1750, 1150):
+        drive_by_hand(board, steering_us, 120, 100)
+        drive_by_hand(board, 1456, 120, 3200)
+        assert board.command("A") == "w"
+
+
+@pytest.mark.parametrize("held_us", [1948, 1600])
+def test_a_stick_held_to_a_side_is_not_let_go(board, held_us):
+    board.wiggle()
+    drive_by_hand(board, held_us, 120, 2000)
+    assert board.command("A") == "w"
+
+
+def test_throttle_after_the_gesture_forgets_it(board):
+    board.wiggle()
+    drive_by_hand(board, 1456, 170, 20)
+    drive_by_hand(board, 1456, 120, 2000)
+    assert board.command("A") == "w"
+
+
+def test_arming_waits_for_a_second_of_rest(board):
+    for steering_us in (1750, 1150):
+        drive_by_hand(board, steering_us, 120, 60)
+    drive_by_hand(board, 1456, 120, 950)
+    assert board.command("A") == "w"
+    drive_by_hand(board, 1456, 120, 100)
+    assert board.command("A") == "k"
+
+
+@pytest.mark.parametrize(("age_ms", "result"), [(30_900, "k"), (31_100, "e"), (3_600_000, "e"), (-5000, "e")])
+def test_a_request_has_an_age(board, age_ms, result):
+    """A drive that had waited in a terminal for an hour armed the car."""
+    board.run(32_000)
+    board.wiggle()
+    board.asked_ms = board.now_ms - age_ms
+    assert board.command("A") == result
+
+
+@pytest.mark.parametrize(("throttle_us", "result"), [(300, "t"), (124, "k")])
+def test_a_human_who_drives_keeps_the_car_when_another_is_told(board, throttle_us, result):
+    """Throttle and steering went to neutral until there were signals again."""
+    drive_by_hand(board, 1600, throttle_us, 300)
+    assert board.command("C", 20000, 1000, 1500, 2000, 20000, 1000, 1500, 2000, 100) == result
+    if result == "t":
+        assert set(board.run(300)) == {(1600, 300)}
+
+
 def test_a_wiggle_is_good_for_one_arming_within_30_seconds(board):
     board.wiggle()
-    board.run(29_000)
+    board.run(28_500)
     assert board.status.missing == "-"
     board.run(1_500)
     assert board.command("A") == "w"
@@ -363,7 +427,7 @@ def test_lines_that_were_lost_are_no_pause(armed):
 # ---- near the wraps of clock and sequence
 
 
-@pytest.mark.parametrize("before_ms", [1, 50, 400, 700, 1000])
+@pytest.mark.parametrize("before_ms", [1, 50, 400, 700, 1000, 1500])
 def test_nothing_happens_when_the_clock_wraps(before_ms):
     board = NativeArduino(now_ms=(1 << 32) - before_ms)
     board.sequence = 0
@@ -371,7 +435,7 @@ def test_nothing_happens_when_the_clock_wraps(before_ms):
     board.wiggle()
     assert board.command("A") == "k"
     assert set(throttles(board.drive(1456, 150, 1200)[20:])) == {150}
-    assert board.status.uptime_ms < 2000
+    assert board.status.uptime_ms < 3000
     assert board.status.state is State.AUTONOMOUS
     assert moved_after_ms(board.run(400)) <= 150
     assert board.status.reason == "t"

@@ -21,6 +21,7 @@ from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import CONTINUES, HUMAN, STOPPED, Command, Gates, Observation, judge
 from lab.driving.policy import PLAIN, make_artifact, pictures
+from lerobot_robot_rover.line import ENDING, FEATURES
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.drive.flight_log import read_log
 
@@ -131,8 +132,20 @@ def dataset(folder, name, **more):
 
 
 def recording(folder, name, **more):
-    given = {"single_task": "drive", "push_to_hub": False, "vcodec": "h264", "fps": 30} | more
+    codec = "rgb_encoder__vcodec" if ENDING else "vcodec"
+    given = {"single_task": "drive", "push_to_hub": False, codec: "h264", "fps": 30} | more
     return dataset(folder, name, **given) | {"play_sounds": False, "display_data": False}
+
+
+def driving(folder, artifact, seconds):
+    """The command by which this LeRobot lets a policy drive for one episode, and its options."""
+    policy = {"policy__type": "rover_artifact", "policy__artifact": artifact}
+    if not ENDING:
+        options = recording(folder, "eval_a", num_episodes=1, episode_time_s=seconds, reset_time_s=0)
+        return "lerobot-record", policy | options
+    options = recording(folder, "rollout_a", num_episodes=1, episode_time_s=seconds, reset_time_s=0)
+    strategy = {"strategy__type": "episodic", "strategy__reset_to_initial_position": False}
+    return "lerobot-rollout", policy | options | strategy
 
 
 def rows(root):
@@ -205,9 +218,7 @@ class TestHuman:
         monkeypatch.setenv("HF_HUB_OFFLINE", "1")
         data = LeRobotDataset("local/drives", root=drives, video_backend="pyav")
         assert (data.num_episodes, data.fps, data.meta.robot_type) == (3, 30, "rover")
-        assert (
-            data.features["action"]["names"] == data.features["observation.state"]["names"] == ["steering", "throttle"]
-        )
+        assert data.features["action"]["names"] == data.features["observation.state"]["names"] == list(FEATURES)
         picture = data[5]["observation.images.cam_front"]
         ours = load_recordings(drives, 8)
         assert len(ours.episodes) == 3 and not ours.faults
@@ -292,9 +303,8 @@ def take_over(process, board):
 def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifact, plugin, tmp_path):
     folder = Path(tempfile.mkdtemp(dir=tmp_path))  # of this attempt
     with EmulatedArduino(transmitter=REST_US, ready=True, nice=NICE) as board:
-        given = robot(board.port, eyes) | {"policy__type": "rover_artifact", "policy__artifact": artifact}
-        given |= recording(folder, "eval_a", num_episodes=1, episode_time_s=60, reset_time_s=0)
-        with LeRobot("lerobot-record", plugin, eyes, **given) as record:
+        command, given = driving(folder, artifact, 60)
+        with LeRobot(command, plugin, eyes, **robot(board.port, eyes), **given) as record:
             record.wait_for("Recording episode 0")
             moving_s, events = None, []
             end = time.monotonic() + 20
@@ -344,13 +354,17 @@ def test_the_demos_policy_hits_balloons(demo_run, plugin, tmp_path):
     subprocess.run(packing, check=True, env={**os.environ, "PYTHONPATH": f"{plugin}{os.pathsep}{ROOT}"})
     with VirtualCar() as car:
         given = robot(car.port, folder, camera=car.camera, width=128, height=72)
-        given |= recording(folder, "eval_world", num_episodes=2, episode_time_s=5, reset_time_s=0)
-        with LeRobot("lerobot-record", plugin, folder, policy__path=folder / "packed", **given) as record:
+        name = "rollout_world" if ENDING else "eval_world"
+        given |= recording(folder, name, num_episodes=2, episode_time_s=5, reset_time_s=0)
+        if ENDING:
+            given |= {"strategy__type": "episodic", "strategy__reset_to_initial_position": False}
+        command = "lerobot-rollout" if ENDING else "lerobot-record"
+        with LeRobot(command, plugin, folder, policy__path=folder / "packed", **given) as record:
             end_s = time.monotonic() + START_S
             needs.until(lambda: record.over(end_s), START_S + 1)
             assert record.ended() == 0, record.text[-3000:]
         report = car.report()
     assert report.hits >= 1, report.outcomes
-    table = rows(folder / "eval_world")
+    table = rows(folder / name)
     assert sorted(set(table["episode_index"])) == [0, 1]
     assert read_log(folder / "flight.log").drives == 2

@@ -1,5 +1,6 @@
 """An artifact as a policy of LeRobot: the same actions as by our own loader, from LeRobot's own factories."""
 
+import importlib
 from types import SimpleNamespace
 
 import cv2
@@ -9,14 +10,16 @@ import torch
 from click.testing import CliRunner
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_policy, make_pre_post_processors
-from lerobot.utils.control_utils import predict_action
 
 from lab.driving.policy import make_artifact
-from lerobot_robot_rover import RoverArtifactConfig
+from lerobot_robot_rover import RoverArtifactConfig, modeling_rover_artifact
+from lerobot_robot_rover.line import ENDING, line_to
 from lerobot_robot_rover.pack import pack
 from rover_lib.onboard.errors import ArtifactError, ParamsError, PolicyError
 from rover_lib.onboard.policy.load import load_policy
 
+moved = "common" if ENDING else "utils"
+predict_action = importlib.import_module(f"lerobot.{moved}.control_utils").predict_action
 NUMBERS = {"dtype": "float32", "shape": (2,), "names": ["steering", "throttle"]}
 
 
@@ -111,6 +114,23 @@ def test_a_batch_is_a_plan_for_each(artifact):
         policy.forward(batch)
     with pytest.raises(PolicyError, match="is not trained"):
         policy.get_optim_params()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("paused", ["for two seconds", "until the car was disarmed", "not at all"])
+def test_actions_of_a_chunk_have_an_age(artifact, monkeypatch, paused):
+    """After a pause inside a chunk, LeRobot's loop went on with 29 actions of before."""
+    now = [1000.0]
+    monkeypatch.setattr(modeling_rover_artifact, "boottime", lambda: now[0])
+    policy = make_policy(RoverArtifactConfig(artifact=str(artifact), n_action_steps=30), ds_meta=dataset())
+    batch = {"observation.images.cam_front": torch.rand(1, 3, 36, 64), "observation.state": torch.zeros(1, 2)}
+    line = line_to("/dev/no-rover")
+    for _ in range(3):
+        policy.select_action(batch)
+    now[0] += 2.0 if paused == "for two seconds" else 0.1
+    line.drives_ended += paused == "until the car was disarmed"
+    policy.select_action(batch)
+    assert policy._plans == (1 if paused == "not at all" else 2)
 
 
 @pytest.mark.slow

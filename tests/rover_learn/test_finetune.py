@@ -343,7 +343,7 @@ def test_a_recipe_that_cannot_be_is_refused(recipe, values, says):
 
 def test_phases_that_another_process_has_removed_are_no_error(checkpoint, old, new, tmp_path, monkeypatch):
     """A process that learns the same under another name uses the same folder, and may finish first."""
-    monkeypatch.setattr(finetune_module, "_train", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
+    monkeypatch.setattr(finetune_module, "_train_phases", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
     monkeypatch.setattr(finetune_module, "_leave", lambda new, *_: (new / "finetune.json").touch())
     assert finetune(checkpoint, [old, new], "better", runs_dir=tmp_path, device="cpu").is_dir()
 
@@ -368,7 +368,7 @@ def test_a_run_that_another_process_made_meanwhile_is_not_overwritten(checkpoint
 def test_ended_while_the_run_takes_its_place_it_goes_on(checkpoint, old, new, tmp_path, monkeypatch):
     """A run's folder with only some of its files would keep the same command from going on."""
     taught = SimpleNamespace(folder=tmp_path / "phases")
-    monkeypatch.setattr(finetune_module, "_train", lambda work: taught)
+    monkeypatch.setattr(finetune_module, "_train_phases", lambda work: taught)
 
     def leave(folder, *_):
         for name in ("best_model.pth", "finetune.json"):

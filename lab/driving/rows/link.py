@@ -128,7 +128,7 @@ def _cut(bench: DrivingBench) -> None:
     limits="none by what it writes; what it reads is lost to rover drive: 0.5 s without a status stop the car",
 )
 def _intrude(bench: DrivingBench) -> float:
-    whole = [frame(f">D 0 {n} 0 2000 200") for n in range(1, 20)] + [frame(">A 0 1 0"), frame(">N 0 2")]
+    whole = [frame(f">D 0 {n} 0 2000 200") for n in range(1, 20)] + [frame(">A 0 1 0 0 0"), frame(">N 0 2")]
     bench.cable.not_ours |= {line[:-1] for line in whole}
     at_s = time.monotonic()
     with open(bench.cable.port, "wb", buffering=0) as port:  # noqa: PTH123  # a device

@@ -10,6 +10,7 @@ from lab.driving.bench import DrivingBench
 from lab.driving.pins import CONTINUES, REFUSED, STOPPED
 from lab.driving.policy import PLAIN, SIZE, pictures
 from lab.driving.row import FaultKind
+from rover_lib.onboard.car.picture import decode_jpeg
 
 FAULTS = FaultKind("perception")
 
@@ -61,6 +62,15 @@ def _flicker(bench: DrivingBench) -> None:
     bench.feed.show(*shown)
 
 
+@FAULTS.add("all but a strip is frozen", STOPPED, "the camera is frozen", "a strip of 5 % still changes")
+def _freeze_but_a_strip(bench: DrivingBench) -> None:
+    shown = [decode_jpeg(jpeg).copy() for jpeg in pictures(PLAIN)]
+    rows = SIZE[0] // 20
+    for picture in shown[1:]:
+        picture[:-rows] = shown[0][:-rows]
+    bench.feed.show(*shown)
+
+
 @FAULTS.add("camera sees grey", STOPPED, "nothing is on the camera's picture", "grey pictures, with a sensor's noise")
 def _grey(bench: DrivingBench) -> None:
     bench.feed.show(*np.random.default_rng(0).integers(120, 137, (40, *SIZE, 3), np.uint8))
@@ -74,6 +84,11 @@ def _blacken(bench: DrivingBench) -> None:
 @FAULTS.add("camera changes its picture's size", STOPPED, "the picture changed from", "pictures of 160x80")
 def _resize(bench: DrivingBench) -> None:
     bench.feed.show(*pictures(PLAIN, size=(80, 160)))
+
+
+@FAULTS.add("camera of another shape", REFUSED, "they would be squeezed", "pictures of 160x120 since before the drive")
+def _another_shape(bench: DrivingBench) -> None:
+    bench.feed.show(*pictures(PLAIN, size=(120, 160)))
 
 
 @FAULTS.add(

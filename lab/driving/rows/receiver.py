@@ -65,6 +65,23 @@ def _no_gesture(bench: DrivingBench) -> None:
     bench.arduino.reset()  # forgets earlier gestures, which count for 30 s
 
 
+def _by_steering(name: str, *moves: tuple[float, float], message: str = "nobody has just wiggled") -> None:
+    """A row in which a human has steered before the drive: by how much, and then for how many seconds."""
+
+    @FAULTS.add(name, REFUSED, message, f"steering by {moves} (us, s), the throttle at rest")
+    def _steer(bench: DrivingBench) -> None:
+        bench.arduino.ready(False)
+        bench.arduino.reset()  # forgets earlier gestures
+        bench.wait(1.0)
+        for steering_us, seconds in moves:
+            bench.arduino.transmitter(*_moved(steering_us, 0))
+            bench.wait(seconds)
+
+
+_by_steering("a gesture that takes too long", (290, 0.2), (0, 3.5), (-290, 0.2), (0, 1.2))
+_by_steering("a gesture whose stick is held at a side", (290, 0.2), (-290, 0.2), (290, 1.2))
+
+
 def _by_human(name: str, sent_us: tuple[float, float], human_us: tuple[float, float]) -> None:
     FAULTS.add(name, HUMAN, "the human took over", f"the transmitter sends {sent_us}", human_us=human_us)(
         lambda bench: bench.arduino.transmitter(*sent_us)

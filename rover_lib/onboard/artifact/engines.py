@@ -2,9 +2,9 @@
 
 An engine is a module with
 
-    load(path, manifest, threads) -> Engine
+    load(artifact, threads) -> Engine
 
-that raises ArtifactError if it cannot run the artifact here. threads: None lets the engine choose.
+that raises ArtifactError if it cannot run the open Artifact here. threads: None lets the engine choose.
 """
 
 import importlib

@@ -12,7 +12,8 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +37,7 @@ MANIFEST_KEYS: dict[str, type | tuple[type, ...]] = {
     "mode": str,  # one of MODES
     "scheme": str,  # one of SCHEMES
     "engine": str,  # see engines.py
-    "cameras": list,  # [{name, height, width}], in the graph's order
+    "cameras": list,  # [{name, height, width}], in the graph's order, and recorded, see seen_size
     "state_names": list,
     "action_names": list,
     "chunk": int,  # actions per inference
@@ -111,86 +112,103 @@ def car_of(manifest: dict[str, Any]) -> Car:
         raise ArtifactError(str(error), remedy="export it again") from None
 
 
-def content_hash(path: Path | str) -> str:
-    """Return the hex SHA-256 of everything in the artifact that has an effect: the same inputs give the same hash.
+class Artifact:
+    """An artifact that is opened once, and carries on what was read of it and checked.
 
-    The bytes of the file may differ, because TorchScript also writes debug tables (source positions), a serial number,
-    and class names with a counter of all classes that the process ever made. Raises ArtifactError like open_archive().
+        with Artifact("policy_static.pt") as artifact:
+            artifact.prove()
+
+    path: of the file. All its methods raise ArtifactError.
     """
-    digest = hashlib.sha256()
-    with open_archive(path) as z:
-        for name in sorted(z.namelist()):
+
+    def __init__(self, path: Path | str):
+        """Open the file and check its directory, as open_archive() does."""
+        self.path = Path(path)
+        self._z = open_archive(path)
+        self._proven = False
+
+    def __enter__(self) -> "Artifact":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._z.close()
+
+    @cached_property
+    def manifest(self) -> dict[str, Any]:
+        """What the artifact is, checked (see MANIFEST_KEYS). Nothing is run or even loaded for it."""
+        return _manifest_in(self._z, self.path)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """The hex SHA-256 of everything in the artifact that has an effect: the same inputs give the same hash.
+
+        The bytes of the file may differ, because TorchScript also writes debug tables (source positions), a serial
+        number, and in the class's name a counter of all classes that the process ever made. Reading each record for it
+        also checks the record's checksum.
+        """
+        digest = hashlib.sha256()
+        code = (r for r in self._z.infolist() if r.filename.startswith("archive/code/") and r.filename.endswith(".py"))
+        programs = [r.filename for r in code if r.file_size]
+        module = programs[0][13:-3].replace("/", ".").encode() if len(programs) == 1 else b""
+        for name in sorted(self.names):
+            record = self.record(name)
             if name.endswith((".debug_pkl", "/.data/serialization_id")):
                 continue
-            record = read_record(z, name)
-            if not name.startswith(("archive/constants/", ONNX)):
-                record = MANGLED.sub(b"", record)
-            digest.update(MANGLED.sub(b"", name.encode()) + b"\0")
+            if name in ("archive/data.pkl", *programs):  # each names the class once; all other names there are kept
+                record = record.replace(module, MANGLED.sub(b"", module), 1)
+            digest.update((MANGLED.sub(b"", name.encode()) if name in programs else name.encode()) + b"\0")
             digest.update(hashlib.sha256(record).digest())
-    return digest.hexdigest()
+        return digest.hexdigest()
+
+    @cached_property
+    def parity(self) -> "dict[str, np.ndarray]":
+        """The parity vectors, as save_artifact() takes them, of the shapes that the manifest says."""
+        return _parity_in(self._z, self.path, self.manifest)
+
+    @property
+    def names(self) -> list[str]:
+        """The names of its records."""
+        return self._z.namelist()
+
+    @property
+    def kind(self) -> str:
+        """The engine that its policy is for, by the records: torch, onnxruntime or hailo."""
+        return kind_of(self._z.infolist())
+
+    def record(self, name: str) -> bytes:
+        """Read one record, whose checksum must match."""
+        try:
+            return read_record(self._z, name)
+        # RuntimeError, its subclasses too: a damaged header may ask for a password, or for an unknown compression
+        except (zipfile.BadZipFile, OSError, RuntimeError, zlib.error) as e:
+            what = f"the checksum of '{name}' does not match" if "Bad CRC-32" in str(e) else str(e)
+            raise ArtifactError(f"{self.path}: damaged, {what}", remedy="copy the file again") from None
+
+    def prove(self) -> None:
+        """Prove that no byte changed since the artifact was written, and that it has nothing that no artifact has.
+
+        TorchScript itself checks neither. Nothing in the artifact is run. A second call does nothing.
+        """
+        if self._proven:
+            return
+        _ = self.content_hash  # which reads every byte
+        if self.kind == "onnxruntime":
+            check_model(self._z, self.path)
+        elif self.kind == "torch":  # only HailoRT and the chip can read a HEF
+            check_program(self._z, self.path)
+        self._proven = True
+
+
+def content_hash(path: Path | str) -> str:
+    """Return Artifact.content_hash of a file. Raises ArtifactError."""
+    with Artifact(path) as artifact:
+        return artifact.content_hash
 
 
 def read_manifest(path: Path | str) -> dict[str, Any]:
-    """Read and check an artifact's manifest, without running or even loading the policy. Raises ArtifactError."""
-    with open_archive(path) as z:
-        return _manifest_in(z, path)
-
-
-def read_parity(path: Path | str) -> "dict[str, np.ndarray]":
-    """Read an artifact's parity vectors. Raises ArtifactError unless they have the shapes that its manifest says."""
-    import numpy as np
-
-    with open_archive(path) as z:
-        manifest = _manifest_in(z, path)
-        wanted: dict[str, tuple[str, tuple[int, ...]]] = {
-            "state": ("float32", (len(manifest["state_names"]),)),
-            "chunk": ("float32", (manifest["chunk"], len(manifest["action_names"]))),
-        } | {f"frame_{c['name']}": ("uint8", (c["height"], c["width"], 3)) for c in manifest["cameras"]}
-        vectors = {}
-        try:
-            with zipfile.ZipFile(io.BytesIO(read_record(z, PARITY))) as packed:
-                for name, (dtype, shape) in wanted.items():
-                    size = packed.getinfo(f"{name}.npy").file_size
-                    if size > MOST_VECTORS * math.prod(shape) * np.dtype(dtype).itemsize + 200:
-                        raise ArtifactError(f"{path}: its parity vectors are too large", remedy="quantize again")
-                    raw = io.BytesIO(read_record(packed, f"{name}.npy"))
-                    if np.lib.format.read_magic(raw) != (1, 0):
-                        raise ValueError("another version of numpy's format")
-                    found, _, kind = np.lib.format.read_array_header_1_0(raw)
-                    if found[1:] != shape or not 1 <= found[0] <= MOST_VECTORS or kind != dtype:
-                        raise ArtifactError(
-                            f"{path}: its parity vectors have another shape than its manifest says",
-                            found=f"{name} of {kind} {found}",
-                            remedy="quantize again",
-                        )
-                    raw.seek(0)
-                    vectors[name] = np.load(raw, allow_pickle=False)
-        except (KeyError, ValueError, OSError, zipfile.BadZipFile, zlib.error, RuntimeError) as e:
-            raise ArtifactError(f"{path}: its parity vectors are not readable ({e})", remedy="quantize again") from None
-    if len({len(v) for v in vectors.values()}) != 1 or not all(np.isfinite(v).all() for v in vectors.values()):
-        raise ArtifactError(f"{path}: its parity vectors do not belong together", remedy="quantize again")
-    return vectors
-
-
-def check_artifact(path: Path | str) -> None:
-    """Raise ArtifactError if any byte changed since the artifact was written, or if it contains what no artifact has.
-
-    TorchScript itself checks neither. Nothing in the artifact is run.
-    """
-    with open_archive(path) as z:
-        try:
-            damaged = z.testzip()
-        # RuntimeError, its subclasses too: a damaged header may ask for a password, or for an unknown compression
-        except (zipfile.BadZipFile, OSError, RuntimeError, zlib.error) as e:
-            raise ArtifactError(f"{path}: damaged ({e})", remedy="copy the file again") from None
-        if damaged:
-            raise ArtifactError(
-                f"{path}: damaged, the checksum of '{damaged}' does not match", remedy="copy the file again"
-            )
-        if ONNX in z.namelist():
-            check_model(z, path)
-        elif kind_of(z.infolist()) == "torch":  # only HailoRT and the chip can read a HEF
-            check_program(z, path)
+    """Return Artifact.manifest of a file. Raises ArtifactError."""
+    with Artifact(path) as artifact:
+        return artifact.manifest
 
 
 def check_manifest(manifest: Any, where: str) -> None:
@@ -222,11 +240,13 @@ def check_manifest(manifest: Any, where: str) -> None:
     if not manifest["cameras"]:
         raise ArtifactError(f"{where}: manifest has no cameras", remedy="quantize again")
     for camera in manifest["cameras"]:
-        if not isinstance(camera, dict) or not {"name", "height", "width"} <= camera.keys():
+        recorded = camera.get("recorded", [1, 1]) if isinstance(camera, dict) else None
+        pair = isinstance(recorded, list) and len(recorded) == 2
+        if not isinstance(camera, dict) or not pair or not {"name", "height", "width"} <= camera.keys():
             raise ArtifactError(
                 f"{where}: manifest camera {str(camera)[:80]!r} lacks name, height or width", remedy="quantize again"
             )
-        sides = [camera["height"], camera["width"]]
+        sides = [camera["height"], camera["width"], *camera.get("recorded", ())]
         if not is_name(camera["name"]) or not all(isinstance(s, int) and _is_within(s, SIDE_PX) for s in sides):
             raise ArtifactError(
                 f"{where}: manifest camera {str(camera)[:80]!r} is not a name and a size", remedy="quantize again"
@@ -256,6 +276,17 @@ def check_manifest(manifest: Any, where: str) -> None:
                 found=repr(value)[:60],
                 remedy="quantize again",
             )
+
+
+def seen_size(manifest: Mapping[str, Any]) -> tuple[int, int]:
+    """Return (width, height) of the pictures that a policy's first camera gave.
+
+    That is the policy's own size unless its recordings have another shape, which then is the camera's `recorded`:
+    [height, width].
+    """
+    camera = manifest["cameras"][0]
+    height, width = camera.get("recorded", (camera["height"], camera["width"]))
+    return width, height
 
 
 def largest_tolerance(mode: str, action: str) -> float:
@@ -337,3 +368,36 @@ def _manifest_in(z: zipfile.ZipFile, path: Path | str) -> dict[str, Any]:
             remedy="quantize again",
         )
     return manifest
+
+
+def _parity_in(z: zipfile.ZipFile, path: Path, manifest: dict[str, Any]) -> "dict[str, np.ndarray]":
+    import numpy as np
+
+    wanted: dict[str, tuple[str, tuple[int, ...]]] = {
+        "state": ("float32", (len(manifest["state_names"]),)),
+        "chunk": ("float32", (manifest["chunk"], len(manifest["action_names"]))),
+    } | {f"frame_{c['name']}": ("uint8", (c["height"], c["width"], 3)) for c in manifest["cameras"]}
+    vectors = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(read_record(z, PARITY))) as packed:
+            for name, (dtype, shape) in wanted.items():
+                size = packed.getinfo(f"{name}.npy").file_size
+                if size > MOST_VECTORS * math.prod(shape) * np.dtype(dtype).itemsize + 200:
+                    raise ArtifactError(f"{path}: its parity vectors are too large", remedy="quantize again")
+                raw = io.BytesIO(read_record(packed, f"{name}.npy"))
+                if np.lib.format.read_magic(raw) != (1, 0):
+                    raise ValueError("another version of numpy's format")
+                found, _, kind = np.lib.format.read_array_header_1_0(raw)
+                if found[1:] != shape or not 1 <= found[0] <= MOST_VECTORS or kind != dtype:
+                    raise ArtifactError(
+                        f"{path}: its parity vectors have another shape than its manifest says",
+                        found=f"{name} of {kind} {found}",
+                        remedy="quantize again",
+                    )
+                raw.seek(0)
+                vectors[name] = np.load(raw, allow_pickle=False)
+    except (KeyError, ValueError, OSError, zipfile.BadZipFile, zlib.error, RuntimeError) as e:
+        raise ArtifactError(f"{path}: its parity vectors are not readable ({e})", remedy="quantize again") from None
+    if len({len(v) for v in vectors.values()}) != 1 or not all(np.isfinite(v).all() for v in vectors.values()):
+        raise ArtifactError(f"{path}: its parity vectors do not belong together", remedy="quantize again")
+    return vectors

@@ -75,12 +75,14 @@ def measure(
     *,
     notify: Callable[[str], None] = lambda text: None,
     sleep: Callable[[float], None] = time.sleep,
+    positive: str | None = None,
     **more: Any,
 ) -> Car:
     """Lead a human through the ends and centres of both sticks; return the measured car.
 
-    ask: tells the human what to do, and returns when it is done. notify: is told what was measured. more: entries of
-    car.yml that cannot be measured, `name`, `camera` and `wheelbase_m`.
+    ask: tells the human what to do, and returns when it is done. notify: is told what was measured. positive: the side
+    that positive steering turns to; None: that of the longer pulse, as on the recorded car. more: entries of car.yml
+    that cannot be measured, `name`, `camera` and `wheelbase_m`.
     Raises CarError, with what was measured and what to do, if the values do not make a car; LinkError like the link.
     """
     Car.of({**DEFAULT, **more}, "what was given")  # so that mistakes in it are reported before the human does anything
@@ -111,6 +113,7 @@ def measure(
         "left_us": ends["left"],
         "neutral_us": rest.steering_us,
         "right_us": ends["right"],
+        "positive": positive or ("right" if ends["right"] > ends["left"] else "left"),
     }
     throttle = {
         "period_us": rest.throttle_period_us,

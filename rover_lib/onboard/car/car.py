@@ -47,7 +47,8 @@ class Car:
     """One car. Only a car that the Arduino accepts can be made: otherwise CarError says what is wrong.
 
     pwm: its two channels. cap_us: the farthest that a host may move the throttle's pulse from neutral, either way.
-    field_of_view_deg: of the camera, from the left edge to the right one. wheelbase_m: from axle to axle.
+    field_of_view_deg: of the camera, from the left edge to the right one. wheelbase_m: from axle to axle. positive: the
+    side that positive steering turns to, "left" or "right".
     """
 
     name: str = "the recordings' car"
@@ -55,6 +56,7 @@ class Car:
     cap_us: int = CAP_MAX_US
     field_of_view_deg: float = 77.3196  # a focal length of 400 pixels of 640
     wheelbase_m: float = 0.26
+    positive: str = "right"  # as the pictures of the recordings show
 
     def __post_init__(self):
         steering, throttle = self.pwm.steering, self.pwm.throttle
@@ -86,6 +88,11 @@ class Car:
     def reverses(self) -> bool:
         """Whether it can drive backwards."""
         return self.pwm.throttle.low < 0
+
+    @property
+    def left(self) -> int:
+        """1 if positive steering turns left, else -1."""
+        return 1 if self.positive == "left" else -1
 
     @property
     def limits(self) -> np.ndarray:
@@ -127,11 +134,19 @@ class Car:
         return round(WIDTH_PX / 2 / math.tan(math.radians(self.field_of_view_deg) / 2), 2)
 
     def drives_like(self, other: "Car") -> bool:
-        """Whether actions and pictures mean the same on both cars: all is equal but the name and the cap."""
-        mine, others = ({**c.description(), "name": ""} for c in (self, other))
+        """Whether actions and pictures mean the same on both cars: all is equal but the name, the cap, and which side
+        is called left.
+        """
+        mine, others = ({**c.description(), "name": "", "steering": c.steering_us} for c in (self, other))
         for description in (mine, others):
             description["throttle"] = {**description["throttle"], "cap_us": 0}
         return mine == others
+
+    @property
+    def steering_us(self) -> tuple[int, ...]:
+        """Steering's period, and its pulses at -1, 0 and 1, in microseconds."""
+        c = self.pwm.steering
+        return round(c.period_us), c.pulse_us(c.low), c.neutral_us, c.pulse_us(c.high)
 
     def description(self) -> dict[str, Any]:
         """The content of its car.yml, from which Car.of() makes the same car."""
@@ -141,9 +156,10 @@ class Car:
             "name": self.name,
             "steering": {
                 "period_us": round(steering.period_us),
-                "left_us": steering.pulse_us(steering.high),
+                "left_us": steering.pulse_us(float(self.left)),
                 "neutral_us": steering.neutral_us,
-                "right_us": steering.pulse_us(steering.low),
+                "right_us": steering.pulse_us(-float(self.left)),
+                "positive": self.positive,
             },
             "throttle": {
                 "period_us": round(throttle.period_us),
@@ -161,8 +177,15 @@ class Car:
         """The car that the content of a car.yml describes. CarError names what is missing, unknown or impossible."""
         content = _section(content, where, {"steering", "throttle"}, {"name", "camera", "wheelbase_m"})
         steering = _section(
-            content["steering"], f"{where}: steering", {"period_us", "left_us", "neutral_us", "right_us"}, set()
+            content["steering"],
+            f"{where}: steering",
+            {"period_us", "left_us", "neutral_us", "right_us"},
+            {"positive"},
         )
+        # In files that do not say it, +1 is what they call left; of the recorded car they did not know it (below).
+        positive = steering.get("positive", "left")
+        if positive not in ("left", "right"):
+            raise CarError(f"{where}: steering: positive must be left or right", found=repr(positive)[:80])
         throttle = _section(
             content["throttle"],
             f"{where}: throttle",
@@ -177,7 +200,9 @@ class Car:
             f"{channel}.{key}": _whole(value, f"{where}: {channel}: {key}")
             for channel, section in (("steering", steering), ("throttle", throttle))
             for key, value in section.items()
+            if key != "positive"
         }
+        ends_us = us["steering.right_us"], us["steering.neutral_us"], us["steering.left_us"]
         forward_us = abs(us["throttle.forward_us"] - us["throttle.neutral_us"])
         cap_us = us.get("throttle.cap_us", min(round(CAP * forward_us), CAP_MAX_US))
         measures = {
@@ -192,7 +217,7 @@ class Car:
                     steering=_channel(
                         "steering",
                         us["steering.period_us"],
-                        (us["steering.right_us"], us["steering.neutral_us"], us["steering.left_us"]),
+                        ends_us if positive == "left" else ends_us[::-1],
                     ),
                     throttle=_channel(
                         "throttle",
@@ -201,15 +226,17 @@ class Car:
                     ),
                 ),
                 cap_us=cap_us,
+                positive=positive,
                 **measures,
             )
         except (CarError, PwmError) as error:
             raise CarError(f"{where}: {error.what}", found=error.found, remedy=error.remedy) from None
-        if car.description()["steering"] == DEFAULT["steering"] and (
+        if car.steering_us == _DEFAULT_CAR.steering_us and (
             {**car.description()["throttle"], "cap_us": 0} == {**DEFAULT["throttle"], "cap_us": 0}
         ):
             # The checked constants themselves, because whole microseconds are slightly less precise.
-            car = cls(car.name, PwmCalibration(), cap_us, **measures)
+            positive = steering.get("positive", _DEFAULT_CAR.positive)
+            car = cls(car.name, PwmCalibration(), cap_us, positive=positive, **measures)
         return car
 
 

@@ -8,9 +8,11 @@ import errno
 import os
 import re
 import resource
+import shutil
 import socket
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,11 @@ from typing import Any
 # Bits of vcgencmd get_throttled: true now, and 16 bits higher: has been true since the start
 THROTTLED_BITS = {0: "under-voltage", 1: "frequency capped", 2: "throttled", 3: "soft temperature limit"}
 THROTTLED_VALUE = re.compile(r"0x[0-9a-fA-F]{1,8}")  # as get_throttled prints the bits
+
+
+def boottime() -> float:
+    """Return the seconds since this machine started, with those in which it was suspended."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 @dataclass(frozen=True)
@@ -49,8 +56,28 @@ class Host:
             found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
         except (OSError, subprocess.SubprocessError):
             return None
+        return self._value_in(found)
+
+    @staticmethod
+    def _value_in(found: "subprocess.CompletedProcess[str]") -> str | None:
         name, _, value = found.stdout.strip().partition("=")
         return value if found.returncode == 0 and name == "throttled" and THROTTLED_VALUE.fullmatch(value) else None
+
+    def vcgencmd_trouble(self) -> str | None:
+        """Return why `vcgencmd get_throttled` gives no value although it is there; None if it is not there, or works.
+
+        Its own words, such as "VCHI initialization failed", are cut to one line.
+        """
+        if shutil.which(self.vcgencmd) is None:
+            return None
+        try:
+            found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
+        except (OSError, subprocess.SubprocessError) as error:
+            return f"{self.vcgencmd}: {type(error).__name__}"
+        if self._value_in(found):
+            return None
+        said = ascii(" ".join((found.stderr + found.stdout).split()))[1:-1][:160]
+        return f"{self.vcgencmd} says {said!r}" if said else f"{self.vcgencmd} ended with {found.returncode}, silently"
 
     def process_peak_memory_mb(self) -> float | None:
         """Return the largest resident memory that this process has ever had, in MB of 10**6 bytes."""

@@ -27,8 +27,8 @@ from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.pwm import Channel, Pulses
 from rover_lib.onboard.errors import RoverError
 
-PROTOCOL_VERSION = 3
-FIRMWARE_VERSION = "3.0.0"  # open() accepts no other; firmware/rover/protocol.h has the same
+PROTOCOL_VERSION = 4
+FIRMWARE_VERSION = "4.0.0"  # open() accepts no other; firmware/rover/protocol.h has the same
 BAUD = 115200
 LINE_MAX = 128  # bytes of a line from the Arduino
 SEQUENCES = 1 << 32
@@ -77,6 +77,7 @@ RESULTS = {
     "r": "out of range",
     "o": "an old command, or one for another start of the Arduino",
     "l": "late: it had waited in the link",
+    "e": "refused: too long ago since somebody asked for it",
     "c": "refused: the Arduino was not told of this car since its reset",
     "s": "refused: the transmitter gives no signal",
     "t": "refused: the throttle stick is not at rest",
@@ -85,7 +86,7 @@ RESULTS = {
 MISSING = {  # what the Arduino still needs before it can be armed, and what the human does about it
     "s": "switch the transmitter on",
     "t": "let go of the throttle stick",
-    "w": "move the steering stick far to both sides and let go of it",
+    "w": "move the steering stick far to both sides within 3 s and let go of it for a second, without any throttle",
     "-": "nothing is missing",
 }
 RESETS = {"p": "power-on", "e": "reset pin", "b": "brown-out", "w": "watchdog", "-": "unknown"}
@@ -234,11 +235,12 @@ class ServoLink:
         self._serial: serial.Serial | None = None
         self._reader: threading.Thread | None = None
         self._closing = threading.Event()
-        self._heard = threading.Condition()  # guards the six below
+        self._heard = threading.Condition()  # guards the seven below
         self._hello: Hello | None = None
         self._hellos = 0
         self._telemetry: Telemetry | None = None
         self._turned: Telemetry | None = None
+        self._requested: Telemetry | None = None  # the newest status when somebody asked to arm the car
         self._failure: LinkError | None = None
         self._unanswered: deque[tuple[int, float]] = deque(maxlen=256)  # number of a command, and when it was sent
         self._sending = threading.RLock()  # guards the two below, and keeps lines whole; never taken inside _heard
@@ -278,7 +280,7 @@ class ServoLink:
             ) from error
         self._closing.clear()
         with self._heard:
-            self._hello = self._telemetry = self._turned = self._failure = None
+            self._hello = self._telemetry = self._turned = self._requested = self._failure = None
             self._unanswered.clear()
         self._reader = threading.Thread(
             target=self._read, args=(self._serial,), name=f"servo link {self.port}", daemon=True
@@ -346,6 +348,10 @@ class ServoLink:
                     f"{self.port}: the Arduino refuses {self.car.name!r} of car.yml, its firmware allows no such car",
                     remedy="measure it with `rover calibrate`",
                 )
+            if telemetry.result == "t":
+                raise LinkError(
+                    f"{self.port}: a human drives, and the Arduino does not change its car", remedy=MISSING["t"]
+                )
         raise LinkError(f"{self.port}: the Arduino was not told of the car; {self._last_words()}")
 
     def close(self) -> None:
@@ -375,21 +381,34 @@ class ServoLink:
                 port.close()
         self._reader = None
 
+    def request(self, *, keep: bool = False) -> None:
+        """Note that somebody asks for the car now; the next arm() tells the Arduino, which counts the request's age.
+
+        keep: an earlier request that was not tried yet stays as old as it is.
+        """
+        with self._heard:
+            self._requested = (keep and self._requested) or self._telemetry
+
     def arm(self) -> Telemetry:
         """Hand the car to the host, which must send commands from then on. Return the status that confirms it.
 
-        Raises LinkError if the Arduino refuses, with what is missing as its remedy, or does not answer within 0.5 s.
+        It is asked for now, or when request() was called. Raises LinkError if the Arduino refuses, with what is missing
+        as its remedy, or does not answer within 0.5 s.
         """
         hello = self.hello
+        with self._heard:
+            asked, self._requested = self._requested or self._telemetry, None
+        if hello and asked and asked.boot != hello.boot:
+            raise LinkError(f"{self.port}: the Arduino was reset since the car was asked for", remedy="ask again")
         if hello and self._told_boot != hello.boot:
             self._tell_car(hello)
-        for telemetry in self._ask(">A", self.car.id):
+        for telemetry in self._ask(">A", asked.uptime_ms if asked else 0, self.car.id):
             if telemetry.state is State.AUTONOMOUS:
                 return telemetry
             if telemetry.result == "s" and telemetry.uptime_ms < SIGNALS_MS:
                 continue  # it has just started, and cannot have seen the signals yet
-            if telemetry.result == "c":
-                raise LinkError(f"{self.port}: arming was {RESULTS['c']}", remedy="start again, which tells it")
+            if telemetry.result in "ce":
+                raise LinkError(f"{self.port}: arming was {RESULTS[telemetry.result]}", remedy="start again")
             if telemetry.result in MISSING and telemetry.result != "-":
                 raise LinkError(
                     f"{self.port}: arming was {RESULTS[telemetry.result]}",

@@ -31,9 +31,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rover_lib.onboard.artifact.archive import ARCHIVE_BYTES, ONNX, kind_of, open_archive, read_record
+from rover_lib.onboard.artifact.archive import ARCHIVE_BYTES, ONNX
 from rover_lib.onboard.artifact.engines import PACKAGES, TORCH
-from rover_lib.onboard.artifact.manifest import check_artifact, content_hash, read_manifest, read_parity
+from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.policy.confine import less_memory
 from rover_lib.onboard.stage import open_plain, sha256_of, version_of
@@ -55,7 +55,7 @@ SANDBOX = "rover-check@{}.service"
 
 STAGE_MB = 400  # memory that staging may take: until an artifact is staged, it is not trusted
 # What can be allowed to differ. Torch, engine and actions cannot: this rover could not drive with others.
-MAY_DIFFER = ("mode", "chunk", "camera")
+MAY_DIFFER = ("mode", "chunk", "camera", "aspect")
 CODE_OF_MODE = {"static": b"ops.quantized.conv2d", "mixed": b"ops.quantized.conv2d", "dynamic": b"linear_dynamic"}
 ONNX_OF_MODE = {"static": b"QuantizeLinear", "mixed": b"QuantizeLinear"}
 OF_MODE: dict[str, dict[str, bytes]] = {"torch": CODE_OF_MODE, "onnxruntime": ONNX_OF_MODE, "hailo": {}}
@@ -77,16 +77,20 @@ class Expected:
     modes: tuple[str, ...] = ("static", "mixed")
 
     def refusals(self, manifest: dict[str, Any]) -> dict[str, str]:
-        """Return reasons to refuse an artifact, by kind: "mode", "chunk", "camera", "torch", "engine", "actions"."""
+        """Return reasons to refuse an artifact, by kind.
+
+        The kinds are those of MAY_DIFFER, and "torch", "engine", "actions" and "state".
+        """
         refusals = {}
         if manifest["mode"] not in self.modes:
             refusals["mode"] = f"its mode is {manifest['mode']}, which is several times slower than {self.modes[0]}"
         if manifest["chunk"] != self.chunk:
             refusals["chunk"] = f"it plans {manifest['chunk']} actions, this rover takes {self.chunk}"
         cameras = ", ".join(f"{c['name']} {c['width']}x{c['height']}" for c in manifest["cameras"])
-        shapes = [(c["name"], round(c["width"] / c["height"], 1)) for c in manifest["cameras"]]
-        if shapes != [(self.camera, round(self.aspect, 1))]:
-            refusals["camera"] = f"it looks through {cameras}, this rover has {self.camera} at {self.aspect:.2f} to 1"
+        if [c["name"] for c in manifest["cameras"]] != [self.camera]:
+            refusals["camera"] = f"it looks through {cameras}, this rover has {self.camera}"
+        if any(round(c["width"] / c["height"], 1) != round(self.aspect, 1) for c in manifest["cameras"]):
+            refusals["aspect"] = f"it looks through {cameras}, this rover's pictures are {self.aspect:.2f} to 1"
         engine, made_with = manifest["engine"], str(manifest["versions"].get("torch", "?"))
         package = PACKAGES.get(engine)
         here = version_of(package) if package else None
@@ -96,16 +100,17 @@ class Expected:
             refusals["engine"] = f"it needs {package}, which is not installed here"
         elif engine == TORCH and made_with.split(".")[:2] != here.split(".")[:2]:
             refusals["torch"] = f"it was made with torch {made_with}, rovers have {here}"
-        if manifest["action_names"] != ["steering", "throttle"] or manifest["state_names"] != ["steering", "throttle"]:
-            refusals["actions"] = f"it gives {manifest['action_names']}, this car has steering and throttle"
+        for kind, key, does in (("actions", "action_names", "gives"), ("state", "state_names", "is told")):
+            if manifest[key] != ["steering", "throttle"]:
+                refusals[kind] = f"it {does} {', '.join(manifest[key])}, this car has steering and throttle"
         return refusals
 
 
 THIS_CAR = Expected()
 
 
-def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Iterable[str] = ()) -> dict[str, Any]:
-    """Check that an artifact may be deployed, without running it; return its manifest.
+def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Iterable[str] = ()) -> Artifact:
+    """Check that an artifact may be deployed, without running it; return it, closed.
 
     allow: kinds of refusal to ignore, of those in MAY_DIFFER. Raises ArtifactError for a damaged file or a manifest
     that does not fit the code beside it, ReleaseError for an artifact that this rover does not accept.
@@ -113,19 +118,19 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
     allow = set(allow)
     if unknown := allow - set(MAY_DIFFER):
         raise ReleaseError(f"only {', '.join(MAY_DIFFER)} can be allowed", found=", ".join(sorted(unknown)))
-    check_artifact(path)
-    manifest = read_manifest(path)
-    with open_archive(path) as z:
-        code = b"".join(read_record(z, n) for n in z.namelist() if n.endswith(".py") or n == ONNX)
-        of_mode = OF_MODE[kind_of(z.infolist())]
+    with Artifact(path) as artifact:
+        artifact.prove()
+        manifest = artifact.manifest
+        code = b"".join(artifact.record(n) for n in artifact.names if n.endswith(".py") or n == ONNX)
+        of_mode = OF_MODE[artifact.kind]
+        _ = artifact.parity  # has the shapes that the manifest says
     if (wanted := of_mode.get(manifest["mode"])) and wanted not in code:
         raise ArtifactError(f"{path}: its manifest says {manifest['mode']}, its code is not", remedy="quantize again")
     for kind, why in expected.refusals(manifest).items():
         if kind not in allow:
             remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
             raise ReleaseError(f"{path}: {why}", remedy=remedy)
-    read_parity(path)
-    return manifest
+    return artifact
 
 
 def pack(
@@ -144,12 +149,12 @@ def pack(
     other files.
     """
     artifact, folder = Path(artifact), Path(folder)
-    manifest = inspect_artifact(artifact, expected, allow)
+    inspected = inspect_artifact(artifact, expected, allow)
     signature = sign(artifact, key) if key else None
     for old in _read_earlier_pack(artifact, folder):
         old.unlink()
     folder.mkdir(parents=True, exist_ok=True)
-    about = {**_about(artifact, manifest), "parts": 0}
+    about = {**_about(inspected), "parts": 0}
     try:
         with artifact.open("rb") as f:
             while part := f.read(PART_BYTES):
@@ -220,15 +225,16 @@ def _ssh_keygen(call: list[Any], content: BinaryIO, what: str, remedy: str) -> b
     return done.stdout
 
 
-def _about(artifact: Path, manifest: dict[str, Any]) -> dict[str, Any]:
+def _about(artifact: Artifact) -> dict[str, Any]:
+    manifest = artifact.manifest
     return {
         "schema": 1,
-        "name": content_hash(artifact),
-        "sha256": sha256_of(artifact),
-        "bytes": artifact.stat().st_size,
+        "name": artifact.content_hash,
+        "sha256": sha256_of(artifact.path),
+        "bytes": artifact.path.stat().st_size,
         "mode": manifest["mode"],
         # No time: to Ansible, the same artifact from the same place must look unchanged.
-        "origin": {"file": _file(artifact), "host": socket.gethostname()},
+        "origin": {"file": _file(artifact.path), "host": socket.gethostname()},
         "checkpoint": manifest["checkpoint"].get("sha256", ""),
     }
 
@@ -249,7 +255,7 @@ class Staged:
 
 @dataclass(frozen=True)
 class Release:
-    """One release on the disk. wrong: what is wrong with it, empty if nothing."""
+    """One release on the disk. signed: by a laptop that the rover knows now. wrong: with its bytes, "" if nothing."""
 
     name: str
     current: bool
@@ -309,21 +315,29 @@ class Releases:
             )
         return self.releases / name / POLICY
 
-    def wrong_with(self, name: str) -> str:
-        """Return what is wrong with the bytes of a release, "" if nothing. Needs no torch."""
+    def wrong_with(self, name: str, then: Callable[[Artifact], object] = lambda artifact: None) -> str:
+        """Return what is wrong with the bytes of a release, "" if nothing. Needs no torch.
+
+        then: called with the intact artifact while it is open; what it raises is passed on.
+        """
         folder, named = self.releases / name, NAME.fullmatch(name)
         if not named:
             return f"'{name}' is no content hash"
-        try:
-            _read_json(folder / ORIGIN)
-            if (folder / DIGEST).read_text().split()[:1] != [sha256_of(folder / POLICY)]:
-                return f"{POLICY} is not what {DIGEST} says"
-            content = content_hash(folder / POLICY)
-        except Exception as e:  # whatever prevents reading it is the answer
-            return f"not readable ({type(e).__name__}: {e})"
-        if content != named[1]:
-            return f"tampered with: its content is {content[:12]}, not what its folder is named after"
-        return ""
+        with contextlib.ExitStack() as stack:
+            try:
+                _read_json(folder / ORIGIN)
+                with _open_file(folder / DIGEST) as file:
+                    digest = file.read(JSON_BYTES).decode()
+                if digest.split()[:1] != [sha256_of(folder / POLICY)]:
+                    return f"{POLICY} is not what {DIGEST} says"
+                artifact = stack.enter_context(Artifact(folder / POLICY))
+                content = artifact.content_hash
+            except Exception as e:  # whatever prevents reading it is the answer
+                return f"not readable ({type(e).__name__}: {e})"
+            if content != named[1]:
+                return f"tampered with: its content is {content[:12]}, not what its folder is named after"
+            then(artifact)
+            return ""
 
     def all(self) -> list[Release]:
         """Return all releases: the one in use, then those used before, the latest first, then those never used."""
@@ -335,8 +349,8 @@ class Releases:
                 megabytes = (self.releases / name / POLICY).stat().st_size / 1e6
             except (OSError, ValueError, KeyError, TypeError, ReleaseError):
                 mode, origin, megabytes = "?", "?", 0.0
-            signed = (self.releases / name / SIGNATURE).is_file()
             wrong = self.wrong_with(name)
+            signed = not wrong and self.is_signed(name)
             releases.append(Release(name, name == current, mode, origin, round(megabytes, 1), signed, wrong))
         return releases
 
@@ -375,12 +389,11 @@ class Releases:
         path = self.path_of(name)
         if not path.exists():
             raise ReleaseError(f"{path}: not there", remedy="deploy one" if name == "current" else "stage it again")
-        real = path.parent.resolve().name
-        if wrong := self.wrong_with(real):
-            raise ReleaseError(f"{path}: {wrong}", remedy="deploy it again")
         from rover_lib.onboard.policy.load import load_policy
 
-        load_policy(path)
+        real = path.parent.resolve().name
+        if wrong := self.wrong_with(real, load_policy):
+            raise ReleaseError(f"{path}: {wrong}", remedy="deploy it again")
 
     # Changes
 
@@ -391,7 +404,8 @@ class Releases:
 
         The signature is policy.pt.sig in that folder, or lies beside the artifact with .sig added to its name. sha256:
         what the artifact's must be, if it is known. unsigned: accept it without a signature. A release that exists
-        and is intact is left as it is. A damaged one is replaced; if it is in use, a second copy is made beside it.
+        and is intact only gets the signature that it may lack. A damaged one is replaced; if it is in use, a second
+        copy is made beside it.
         Raises ReleaseError, ArtifactError.
         """
         source = Path(source)
@@ -402,7 +416,7 @@ class Releases:
                 )
             about = self._packed(source) if source.is_dir() else None
             if about and (existing := self._intact(about["name"])):
-                return Staged(existing, False)
+                return self._accept(existing, source / SIGNATURE, unsigned)
             self._check_free_space(about["bytes"] if about else source.stat().st_size)
             new = self.releases / ".new"
             new.mkdir()
@@ -419,7 +433,7 @@ class Releases:
                     signature = source / SIGNATURE if about else Path(f"{source}.sig")
                     check_signature(new / POLICY, signature, self.signers)
                     _join([signature], new / SIGNATURE, JSON_BYTES)
-                here = _about(new / POLICY, inspect_artifact(new / POLICY, self.expected, allow))
+                here = _about(inspect_artifact(new / POLICY, self.expected, allow))
             except RoverError as e:
                 what = e.what.replace(str(new / POLICY), str(source))
                 raise type(e)(what, found=e.found, remedy=e.remedy) from None
@@ -429,7 +443,7 @@ class Releases:
                 )
             here["origin"] = about["origin"] if about else {**here["origin"], "file": _file(source)}
             if existing := self._intact(here["name"]):
-                return Staged(existing, False)
+                return self._accept(existing, new / SIGNATURE, unsigned)
             _write(new / DIGEST, f"{arrived}  {POLICY}\n")
             _write(new / ORIGIN, json.dumps(here, indent=1, sort_keys=True) + "\n")
             _sync(new)
@@ -438,10 +452,32 @@ class Releases:
             _sync(self.releases)
             return Staged(name, True)
 
-    def switch(self, name: str) -> bool:
+    def _accept(self, name: str, signature: Path, unsigned: bool) -> Staged:
+        """Take an intact release as staged again. One that came in unsigned needs a signature, unless `unsigned`."""
+        if unsigned or self.is_signed(name):
+            return Staged(name, False)
+        policy = self.path_of(name)
+        check_signature(policy, signature, self.signers)
+        new = policy.with_name(f".{SIGNATURE}")
+        new.unlink(missing_ok=True)
+        _join([signature], new, JSON_BYTES)
+        new.replace(policy.with_name(SIGNATURE))
+        _sync(policy.parent)
+        return Staged(name, True)
+
+    def is_signed(self, name: str) -> bool:
+        """Whether a laptop that this rover knows now has signed the release."""
+        try:
+            check_signature(self.releases / name / POLICY, self.releases / name / SIGNATURE, self.signers)
+        except ReleaseError:
+            return False
+        return True
+
+    def switch(self, name: str, *, unsigned: bool = False) -> bool:
         """Check a release, switch to it, and check it again through `current`; switch back if that fails.
 
-        Returns whether anything changed. Raises ReleaseError, whose text says which release is in use now.
+        unsigned: use it also if no laptop that this rover knows now has signed it. Returns whether anything changed.
+        Raises ReleaseError, whose text says which release is in use now.
         """
         with _disk_errors_explained(), self._exclusively():
             before = self.current
@@ -449,6 +485,12 @@ class Releases:
                 raise ReleaseError("'current' is in use already", remedy="name the release to switch to")
             self.path_of(name)
             self.check(name)
+            if not unsigned:
+                policy = self.path_of(name)
+                try:
+                    check_signature(policy, policy.with_name(SIGNATURE), self.signers)
+                except ReleaseError as error:
+                    raise ReleaseError(f"{error.what}; {self._in_use()}", remedy=error.remedy) from None
             if before == name:
                 return False
             self._point_current_at(name)
@@ -464,11 +506,16 @@ class Releases:
             return True
 
     def rollback(self) -> str:
-        """Switch to the newest earlier release that passes its checks. Returns its name."""
+        """Switch to the newest earlier release that passes its checks. Returns its name.
+
+        One that was accepted unsigned may come back. One whose key this rover no longer knows may not.
+        """
         with _disk_errors_explained(), self._exclusively():
             refused = []
             for name in self._used_before():
                 try:
+                    if (self.releases / name / SIGNATURE).exists() and not self.is_signed(name):
+                        raise ReleaseError("the laptop that signed it is not known any more")
                     self.check(name)
                 except RoverError as error:
                     refused.append(f"{name[:12]}: {error}")

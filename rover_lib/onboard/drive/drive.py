@@ -18,10 +18,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from rover_lib.onboard.artifact.manifest import car_of, content_hash
-from rover_lib.onboard.car.camera import Camera, CameraError, path_of
+from rover_lib.onboard.artifact.manifest import Artifact, car_of, seen_size
+from rover_lib.onboard.car.camera import Camera, CameraError, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import Car, this_car
-from rover_lib.onboard.car.host import default_log, default_view
+from rover_lib.onboard.car.host import boottime, default_log, default_view
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink, Telemetry
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
@@ -29,7 +29,7 @@ from rover_lib.onboard.drive.inference import Planner, PolicyProcess, delay
 from rover_lib.onboard.drive.loop import Arm, Hooks, Report, Until, Warnings, drive
 from rover_lib.onboard.drive.pilot import Pilot, PolicyPilot, ReplayPilot
 from rover_lib.onboard.drive.plan import Commanded, Settings
-from rover_lib.onboard.drive.service import CHECK_S, NotArmed, Service
+from rover_lib.onboard.drive.service import CHECK_S, NotArmed, Service, check_age
 from rover_lib.onboard.drive.takeover import TakeoverRecorder
 from rover_lib.onboard.drive.watch import (
     HealthWatch,
@@ -47,6 +47,7 @@ from rover_lib.onboard.recording.recorder import Recorder, room_for
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.status_line import StatusLine
 
+WAIT_S = 30.0  # for a human, from the command that asks for the car; the Arduino refuses an arming after 31
 REST_S = 1.0  # between plans while the car is not driving
 TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"
 
@@ -128,11 +129,16 @@ def drive_car(
             found=f"{recorded.name!r} there, and this car is {this.name!r}",
             remedy="replay one of this car's",
         )
-    artifact = options.artifact.resolve() if options.artifact else None  # `current` may point to another one later
-    if not (controls or car or options.dry_run or options.film):
-        check_no_film(options.camera)
+    path = options.artifact.resolve() if options.artifact else None  # `current` may point to another one later
     with ExitStack() as stack:
+        artifact = stack.enter_context(Artifact(path)) if path else None
+        seen = seen_size(artifact.manifest) if artifact else (0, 0)  # read first: it may be missing, or no artifact
+        if not (controls or car or options.dry_run or options.film):
+            check_no_film(options.camera)
         log = stack.enter_context(_open_flight_log(options, settings, report))
+        if path:
+            most_m = settings.throttle_limit * params()["view"]["speed_mps"] * settings.blind_s
+            log.event(f"one picture drives the car for {most_m:.1f} m at most, at throttle {settings.throttle_limit:g}")
         stop = SignalEvent()
         stack.enter_context(stop_on_signals(stop, log))
         stack.enter_context(exit_if_hung(report, log))
@@ -142,7 +148,7 @@ def drive_car(
             stack.callback(lambda: report.world.update(other.summary()))
         service = None
         if options.service and artifact:
-            service = stack.enter_context(Service(report, stop, log.event, model=content_hash(artifact)))
+            service = stack.enter_context(Service(report, stop, log.event, model=artifact.content_hash))
         title = (options.artifact or options.replay or Path()).name
         feed = stack.enter_context(contextlib.closing(Feed(options.view or default_view(), log, title)))
         over = _first_of(*([service.over] if service else []), feed.over)
@@ -152,7 +158,7 @@ def drive_car(
         if controls:
             _replay(opened, controls)
         elif artifact:
-            _drive_by(artifact, opened, service)
+            _drive_by(artifact, seen, opened, service)
         else:
             raise ParamsError("a drive needs an artifact or a replay")
 
@@ -193,12 +199,17 @@ def _replay(opened: _Opened, controls: Controls) -> None:
         opened.feed.ended(report, None, link)
 
 
-def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
-    """Drive by an artifact's plans: once, or as a service each time that a human arms the car."""
+def _drive_by(artifact: Artifact, seen: tuple[int, int], opened: _Opened, service: Service | None) -> None:
+    """Drive by an artifact's plans: once, or as a service each time that a human arms the car.
+
+    seen: (width, height) of the pictures that the policy was made with.
+    """
     options, report, log, link, feed = opened.options, opened.report, opened.log, opened.link, opened.feed
     this, stop = this_car(), opened.until.stop
     with ExitStack() as stack:
-        camera = stack.enter_context(Camera(options.camera, held=options.film))
+        camera = stack.enter_context(Camera(options.camera, size=size_like(*seen), held=options.film))
+        if (frame := camera.latest()) and not path_of(options.camera).is_dir():  # a folder is of an episode, for a look
+            check_shape(options.camera, frame.image, seen)
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:
             log.event(f"the policy's process is not confined: {policy.unconfined}", level=logging.WARNING)
@@ -228,7 +239,7 @@ def _drive_by(artifact: Path, opened: _Opened, service: Service | None) -> None:
         while True:
             pilot = PolicyPilot(camera, planner, commanded, opened.settings, policy.rate_hz, calibration=this.pwm)
             warnings = _all_of(
-                artifact_changes(artifact),
+                artifact_changes(artifact.path),
                 pilot.warnings,
                 HealthWatch(report, link),
                 MemoryWatch(report, [os.getpid(), *policy.pids]),
@@ -324,14 +335,17 @@ def arm_when_ready(
     stop: threading.Event,
     notify: Callable[[str], None],
     checks: Sequence[Callable[[], object]] = (),
+    clock: Callable[[], float] = boottime,
 ) -> Telemetry | None:
-    """Arm for a human in a terminal, for the loop's hooks: say what is missing, wait for it, and then arm.
+    """Arm for a human who has just asked for it: say what is missing, wait for it for WAIT_S at most, and then arm.
 
-    checks: called while waiting; each raises if its device fails. Raises NotArmed when told to stop, what a check
-    raises, and what arm() raises.
+    checks: called while waiting; each raises if its device fails. Raises NotArmed when told to stop or if something is
+    missing for too long, what a check raises, and what arm() raises.
     """
-    told = ""
+    link.request()
+    told, asked_s = "", clock()
     while missing := what_is_missing(link):
+        check_age(clock() - asked_s, WAIT_S)
         if missing != told:
             notify(f"before the car can drive: {missing}")
             told = missing
@@ -339,6 +353,7 @@ def arm_when_ready(
             check()
         if stop.wait(CHECK_S):
             raise NotArmed("told to stop before a human armed the car")
+    check_age(clock() - asked_s, WAIT_S)
     return arm()
 
 
@@ -379,6 +394,8 @@ class _Arming:
 
     def arm(self) -> Telemetry | None:
         """Arm the car, for the loop's hooks. Raises RoverError if that is refused; it may then be called again."""
+        if self._link:
+            self._link.request(keep=True)
         with ExitStack() as recording, ExitStack() as driving:
             driving.enter_context(self._planner.without_rest())
             if self._options.record:

@@ -18,6 +18,7 @@ stream may be a terminal that somebody stopped.
 import binascii
 import contextlib
 import errno
+import fcntl
 import glob
 import json
 import logging
@@ -151,9 +152,9 @@ class FlightLog:
     path: the file, to which the drive is appended; None only passes events on to logging. header: what the drive was
     started with; the figure of a log looks for hz, fade_s and stop_s in it. max_bytes: before the file grows beyond
     this, it is renamed to path.1, path.1 to path.2 and so on, and only `keep` older files stay. flush_s: pause between
-    two syncs to the disk. Raises ParamsError for limits that make no sense, and nothing later: if the disk is full or
-    gone, this is logged once, counted in `failures`, and tried again every second. Ticks must come from one thread;
-    events may come from any.
+    two syncs to the disk. Raises ParamsError for limits that make no sense, LogError on entering if another drive
+    writes the file, and nothing later: if the disk is full or gone, this is logged once, counted in `failures`, and
+    tried again every second. Ticks must come from one thread; events may come from any.
     """
 
     def __init__(
@@ -209,6 +210,7 @@ class FlightLog:
         self._threads = [threading.Thread(target=self._run_messages, name="flight log events", daemon=True)]
         if self.path:
             file = _LogFile(self.path, self._header, self._max_bytes, self._keep)
+            file.refuse_another()
             self._threads.append(
                 threading.Thread(target=self._run_writer, args=(file,), name="flight log", daemon=True)
             )
@@ -358,6 +360,16 @@ class _LogFile:
             self.unwritten = lines[lines.rfind(b"\n", 0, done + 1) + 1 :]
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    def refuse_another(self) -> None:
+        """Raise LogError if another drive writes the file: a reader could not tell their lines apart."""
+        if not self._path.is_file():
+            return
+        with contextlib.suppress(PermissionError), self._path.open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise LogError(f"{self._path}: another drive writes this log", remedy="name another by --log") from None
+
     def open(self) -> int:
         """Return the open file. Opening it writes a header and starts a new part of the log."""
         if self._fd is not None:
@@ -368,6 +380,7 @@ class _LogFile:
         if path.is_file() and path.stat().st_size + len(header) > self._max_bytes:
             self._shift()
         fd = self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._size = os.fstat(fd).st_size
         if self._size and os.pread(fd, 1, self._size - 1) != b"\n":
             header = b"\n" + header  # ends a line that a power cut or a full disk has cut

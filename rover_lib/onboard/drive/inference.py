@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.artifact.engines import UNCONFINED
-from rover_lib.onboard.artifact.manifest import read_manifest
+from rover_lib.onboard.artifact.manifest import Artifact, read_manifest
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.drive.plan import LIMITS, Commanded, Plan
 from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
@@ -157,7 +157,8 @@ class PolicyProcess:
     With a process, the loop's commands were 1.4 to 3.5 ms late at p99, and with a thread instead of it 5.4 to 6.3 ms
     (measured on a workstation at commit 7343b87, which could do both).
 
-    threads: of the engine; None: all cores but one, which is left for the loop. Raises PolicyError, with the sentence
+    artifact: a file, or an open Artifact whose manifest need not be read again. threads: of the engine; None: all cores
+    but one, which is left for the loop. Raises PolicyError, with the sentence
     of the ArtifactError, if the artifact cannot be used here.
 
     The artifact is not trusted. So the process is confined (see confine.py), and its answers are accepted only if they
@@ -167,8 +168,9 @@ class PolicyProcess:
 
     program = __name__  # the module that the process runs
 
-    def __init__(self, artifact: Path | str, *, threads: int | None = None):
-        self.artifact = Path(artifact)
+    def __init__(self, artifact: Path | str | Artifact, *, threads: int | None = None):
+        self._source = artifact
+        self.artifact = artifact.path if isinstance(artifact, Artifact) else Path(artifact)
         self.threads = threads or max(1, (os.cpu_count() or 1) - 1)
         self.manifest: dict[str, Any] = {}
         self.unconfined = ""
@@ -178,7 +180,8 @@ class PolicyProcess:
 
     def __enter__(self) -> "PolicyProcess":
         try:
-            self.manifest = read_manifest(self.artifact)
+            given = self._source
+            self.manifest = given.manifest if isinstance(given, Artifact) else read_manifest(given)
         except ArtifactError as error:
             raise PolicyError(error.what, found=error.found, remedy=error.remedy) from None
         ours, theirs = Pipe()
@@ -303,8 +306,9 @@ def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any],
             # Here, because the process that drives must load no engine; and before the limits, which an engine exceeds.
             from rover_lib.onboard.policy.load import import_engine, load_policy
 
-            unconfined = UNCONFINED.get(import_engine(artifact)) or confine(memory_mb(artifact, threads))
-            policy = load_policy(artifact, threads=threads)
+            with Artifact(artifact) as opened:
+                unconfined = UNCONFINED.get(import_engine(opened)) or confine(memory_mb(artifact, threads))
+                policy = load_policy(opened, threads=threads)
             names = list(policy.state_names), list(policy.action_names)
             if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
                 raise PolicyError(

@@ -22,6 +22,8 @@ STEERING, THROTTLE = 0, 1
 ROUNDING = 1e-6  # error of a time, in steps
 LIMITS = np.array([[-1.0, 0.0], [1.0, 1.0]])  # lowest and highest [steering, throttle]
 IN_FORCE_S = 0.15  # how long a command holds: after that, the Arduino stops a car that gets no other
+BLIND_M = 1.0  # how far the car may go by one picture, at RECORDED_MPS
+RECORDED_MPS = 1.1  # throttle 0.09, the most of the recordings, of 12 m/s
 ENSEMBLE_MOST = 10.0  # times 64 plans; exp(709) is the largest that a float holds
 OVERSHOOT = 0.25  # a learned action may be this far beyond an end, as a transmitter's may: it is clipped
 
@@ -62,6 +64,11 @@ class Settings:
             value = getattr(self, name)
             must(type(value) is int and value >= 0, f"{name} must be a whole number from 0, found {value!r}")
         must(0 < self.fade_s <= self.stop_s, f"0 < fade_s <= stop_s must hold, found {self.fade_s} and {self.stop_s}")
+        must(
+            self.blind_s * RECORDED_MPS <= BLIND_M,
+            f"by one picture the car would go {self.blind_s * RECORDED_MPS:.1f} m at {RECORDED_MPS:g} m/s, and it may "
+            f"{BLIND_M:g}: choose a smaller fade_s and stop_s, found {self.fade_s:g} and {self.stop_s:g}",
+        )
         must(0 <= self.throttle_limit <= 1, f"throttle_limit must be in [0, 1], found {self.throttle_limit}")
         must(self.frozen_frames != 1 and self.black_frames != 1, "one frame alone is no fault: 0 (off) or from 2")
         must(type(self.compensate) is bool, f"compensate must be true or false, found {self.compensate!r}")
@@ -69,6 +76,11 @@ class Settings:
             # Beyond it, the weights of a few dozen plans overflow, and their average is not a number.
             holds = is_finite(self.ensemble) and abs(self.ensemble) <= ENSEMBLE_MOST
             must(holds, f"ensemble must be a number within {ENSEMBLE_MOST:g} of 0, found {self.ensemble!r}")
+
+    @property
+    def blind_s(self) -> float:
+        """For how long one picture drives the car, in seconds of a throttle that does not fade."""
+        return (self.fade_s + self.stop_s) / 2
 
     @classmethod
     def of(cls, section: Mapping[str, Any], **overrides: Any) -> "Settings":

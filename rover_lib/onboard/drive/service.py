@@ -45,7 +45,7 @@ from typing import TYPE_CHECKING, Any
 
 from systemd_watchdog import WatchDog
 
-from rover_lib.onboard.car.host import is_listened_at
+from rover_lib.onboard.car.host import boottime, is_listened_at
 from rover_lib.onboard.errors import RoverError
 
 if TYPE_CHECKING:  # asking for the service's state, as every playbook does, must not import numpy or OpenCV
@@ -89,11 +89,12 @@ class Request:
             raise ValueError(f"seconds above 0, not {self}")
 
 
-def check_age(age_s: float) -> None:
+def check_age(age_s: float, most_s: float | None = None) -> None:
     """Raise NotArmed for a request to arm that is too old: whoever sent it may no longer be watching the car."""
-    if not age_s <= REQUEST_S:  # also refuses NaN
+    most_s = REQUEST_S if most_s is None else most_s
+    if not age_s <= most_s:  # also refuses NaN
         raise NotArmed(
-            f"{age_s:.1f} s have passed since the car was asked for, at most {REQUEST_S:g} may", remedy="ask again"
+            f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may", remedy="ask again"
         )
 
 
@@ -112,7 +113,7 @@ class Service:
         notify: Callable[[str], None] = lambda text: None,
         *,
         model: str = "",
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = boottime,
     ):
         self._report, self._stop, self._notify, self._model, self._clock = report, stop, notify, model, clock
         # Non-blocking: systemd may be busy, and the loop must not wait for it.
@@ -260,7 +261,7 @@ class Service:
     ) -> dict[str, Any]:
         """Return the answer to an operator's question.
 
-        asked_s: when the operator sent it, by time.monotonic(): this process may have been suspended since then.
+        asked_s: when the operator sent it, by boottime(): this process or machine may have been suspended since then.
         """
         if ask == "heartbeat":
             self._heard_s = self._clock()
@@ -384,7 +385,7 @@ def arm_car(
     transmitter; each such sentence is passed to `notify`.
     """
     state = ask_service(unit, ask="state")
-    if model and state["model"] != model:
+    if model and state["model"] != model.partition("-")[0]:  # a release's name may end in -2
         raise ServiceError(
             f"{unit} has loaded another model than {model[:12]}",
             found=state["model"][:12],
@@ -397,7 +398,7 @@ def arm_car(
             notify(told := now["missing"])
         time.sleep(CHECK_S)
         now = ask_service(unit, ask="state")
-    asked = {"model": state["model"], "ticket": state["ticket"], "asked_s": time.monotonic()}
+    asked = {"model": state["model"], "ticket": state["ticket"], "asked_s": boottime()}
     answer = ask_service(unit, ask="arm", **asked, **vars(request))
     if not answer["armed"]:
         raise ServiceError(f"{unit} did not arm: {answer['text']}", remedy="'rover doctor' says what it needs")

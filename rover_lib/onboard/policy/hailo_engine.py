@@ -13,8 +13,9 @@ from typing import Any
 import hailo_platform
 import numpy as np
 
-from rover_lib.onboard.artifact.archive import HEF, ONNX, open_archive, read_record
+from rover_lib.onboard.artifact.archive import HEF, ONNX
 from rover_lib.onboard.artifact.engines import SessionEngine
+from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.car.host import usable_cores
 from rover_lib.onboard.errors import ArtifactError
 
@@ -25,19 +26,19 @@ LARGEST_SIDE = 8192  # of an output's shape
 class HailoEngine(SessionEngine):
     """A network on the chip, and the rest of the policy on the processor. Make it with `load`.
 
-    _runs: the manifest's "hailo", see `_checked`.
+    _runs: the manifest's "hailo", see `_check_manifest`.
     """
 
-    def __init__(self, path: Path, manifest: dict[str, Any], threads: int | None):
+    def __init__(self, artifact: Artifact, threads: int | None):
+        path, manifest = artifact.path, artifact.manifest
         self._path, self._runs = path, _check_manifest(manifest, path)
         cameras = manifest["cameras"]
         self._frames = [f"frame_{c['name']}" for c in cameras]
         shapes = {f"frame_{c['name']}": [c["height"], c["width"], 3] for c in cameras}
         if self._runs["network"] == "whole":
             shapes["state"] = [1, 1, len(manifest["state_names"])]
-        with open_archive(path) as z:
-            hef = read_record(z, HEF)
-            self._rest_model = read_record(z, ONNX) if ONNX in z.namelist() else None
+        hef = artifact.record(HEF)
+        self._rest_model = artifact.record(ONNX) if ONNX in artifact.names else None
         if (self._rest_model is None) != (self._runs["network"] == "whole"):
             raise ArtifactError(f"{path}: its parts are not those of its network", remedy="pack it again")
         formats = hailo_platform.FormatType
@@ -108,16 +109,16 @@ class HailoEngine(SessionEngine):
         return matched
 
 
-def load(path: Path, manifest: dict[str, Any], threads: int | None) -> HailoEngine:
+def load(artifact: Artifact, threads: int | None) -> HailoEngine:
     """Load an artifact for the chip. Raises ArtifactError if there is no chip, or HailoRT refuses the network."""
     try:
-        return HailoEngine(path, manifest, threads)
+        return HailoEngine(artifact, threads)
     except ArtifactError:
         raise
     except Exception as e:
         why = " ".join(f"{type(e).__name__}: {e}".split())[:200]
         raise ArtifactError(
-            f"{path}: the Hailo chip does not run it here ({why})",
+            f"{artifact.path}: the Hailo chip does not run it here ({why})",
             remedy="is the card in, its driver loaded, and the HEF for this chip? ('hailortcli fw-control identify')",
         ) from None
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.artifact.engines import PACKAGES, Engine, module_of
-from rover_lib.onboard.artifact.manifest import car_of, check_artifact, read_manifest, read_parity
+from rover_lib.onboard.artifact.manifest import Artifact, car_of
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import ArtifactError, PolicyError
 from rover_lib.onboard.policy.confine import refuse_root
@@ -99,12 +99,12 @@ class Policy:
         self._engine.set_threads(threads)
 
 
-def import_engine(path: Path | str) -> str:
+def import_engine(artifact: Artifact) -> str:
     """Import the engine that an artifact needs, which takes seconds and memory, and return the engine's name.
 
     Raises ArtifactError if the engine is unknown or not installed.
     """
-    name = read_manifest(path)["engine"]
+    path, name = artifact.path, artifact.manifest["engine"]
     try:
         module_of(name)
     except KeyError:
@@ -119,21 +119,23 @@ def import_engine(path: Path | str) -> str:
     return name
 
 
-def load_policy(path: Path | str, *, threads: int | None = None) -> Policy:
-    """Load an artifact, and prove that it computes the same here as where it was made.
+def load_policy(source: Path | str | Artifact, *, threads: int | None = None) -> Policy:
+    """Load an artifact, a file or an open one, and prove that it computes the same here as where it was made.
 
     threads: for the engine's kernels (with torch, of the whole process); None leaves their number unchanged.
     The file's checksums are checked, the form and the operators of its program, the manifest, the engine, and the
     parity vectors (which also warm the kernels). Raises ArtifactError with one sentence if any of these fails, and
     if root calls it, who has too much to lose.
     """
-    path = Path(path)
+    if not isinstance(source, Artifact):
+        refuse_root()
+        with Artifact(source) as artifact:
+            return load_policy(artifact, threads=threads)
     refuse_root()
-    check_artifact(path)
-    manifest = read_manifest(path)
-    engine = module_of(import_engine(path)).load(path, manifest, threads)
-    policy = Policy(path, engine, manifest)
-    vectors = read_parity(path)
+    source.prove()
+    engine = module_of(import_engine(source)).load(source, threads)
+    path, vectors = source.path, source.parity
+    policy = Policy(path, engine, source.manifest)
     chunks = _predict(policy, vectors)
     _check_differences(policy, chunks, vectors)
     if engine.give_back() and not np.array_equal(_predict(policy, vectors), chunks):

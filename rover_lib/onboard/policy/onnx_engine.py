@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnxruntime
 
-from rover_lib.onboard.artifact.archive import ONNX, nothing_unknown, open_archive, read_record
+from rover_lib.onboard.artifact.archive import ONNX
 from rover_lib.onboard.artifact.engines import SessionEngine
+from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.car.host import usable_cores
 from rover_lib.onboard.errors import ArtifactError
 
@@ -39,9 +39,10 @@ def session_of(model: bytes, threads: int, path: Path | str = "the model") -> on
 class OnnxEngine(SessionEngine):
     """The model of an ONNX artifact. Make it with `load`."""
 
-    def __init__(self, path: Path, threads: int):
+    def __init__(self, path: Path, model: bytes, threads: int):
         self._path = path
-        self.set_threads(threads)
+        self._start(model, threads)
+        self._threads = threads
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
         """As Engine.run()."""
@@ -53,14 +54,19 @@ class OnnxEngine(SessionEngine):
         return y
 
     def _make_session(self, threads: int) -> None:
-        with open_archive(self._path) as z, nothing_unknown(self._path, "model"):
-            self._session = session_of(read_record(z, ONNX), threads, self._path)
+        with Artifact(self._path) as artifact:  # again, because keeping the model would cost its size in memory
+            artifact.prove()
+            self._start(artifact.record(ONNX), threads)
+
+    def _start(self, model: bytes, threads: int) -> None:
+        self._session = session_of(model, threads, self._path)
         self._names = [i.name for i in self._session.get_inputs()]
 
 
-def load(path: Path, manifest: dict[str, Any], threads: int | None) -> OnnxEngine:
+def load(artifact: Artifact, threads: int | None) -> OnnxEngine:
     """Load an artifact. Raises ArtifactError if ONNX Runtime refuses it, or its inputs are not the manifest's."""
-    engine = OnnxEngine(path, threads or usable_cores())
+    path, manifest = artifact.path, artifact.manifest
+    engine = OnnxEngine(path, artifact.record(ONNX), threads or usable_cores())
     wanted = ["state", *(f"frame_{c['name']}" for c in manifest["cameras"])]
     if engine._names != wanted:
         raise ArtifactError(

@@ -1,12 +1,11 @@
 """Run artifacts in torch: TorchScript, whose INT8 operators run in the engine that the manifest names."""
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
+from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.artifact.torchscript import unknown_operators
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.memory import give_back_packed_weights
@@ -39,16 +38,18 @@ class TorchEngine:
         torch.set_num_threads(threads)
 
 
-def load(path: Path, manifest: dict[str, Any], threads: int | None) -> TorchEngine:
+def load(artifact: Artifact, threads: int | None) -> TorchEngine:
     """Load an artifact.
 
     Raises ArtifactError if it was made with another torch, needs a quantization engine that this torch lacks, cannot be
     loaded, or has an operator that no artifact has.
     """
+    path, manifest = artifact.path, artifact.manifest
     made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
     if made_with.split(".")[:2] != here.split(".")[:2]:
         raise ArtifactError(
-            f"{path}: made with torch {made_with}, here is {here}", remedy=f"install torch {made_with.split('+')[0]}"
+            f"{path}: made with torch {made_with}, here is {here}",
+            remedy="make it again where this torch is: rover run CHECKPOINT EPISODES",
         )
     engine = manifest["engine"]
     if engine not in torch.backends.quantized.supported_engines:

@@ -20,7 +20,7 @@ import os
 import shutil
 import stat
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import FileIO
 from itertools import pairwise
 from pathlib import Path
@@ -56,6 +56,7 @@ LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers st
 ARDUINO_WRAP_MS = 1 << 32  # its clock starts at 0 again after 49.7 days
 BURST_SHARE = 0.3  # two controls that arrive within this share of the usual interval had waited in a buffer
 BURST_MIN = 3  # fewer than this in a row are the USB line's jitter, shorter than a frame, and left as they are
+SIMULATED = "playground"  # the port of the balloon world's Arduino
 CLOCKS_APART_S = 0.5  # if the clocks differ by more between two controls, the system's clock was set
 
 
@@ -442,11 +443,14 @@ def read_car_of(folder: Path | str) -> Car:
     description is not that of a car.
     """
     try:
-        content = json.loads(_data_of(Path(folder) / "episode_data.json"))
-        described = content["metadata"]["car"]
-    except (ValueError, RecursionError, TypeError, KeyError):
+        metadata = json.loads(_data_of(Path(folder) / "episode_data.json"))["metadata"]
+        described, said = metadata.get("car"), metadata.get("steering_positive")
+        before = metadata.get("arduino_port") == SIMULATED and said is None
+    except (ValueError, RecursionError, TypeError, KeyError, AttributeError):
         return Car()
-    return Car.of(described, f"{folder}: its car")
+    car = Car() if described is None else Car.of(described, f"{folder}: its car")
+    # In the balloon world the default car turned left until recordings said which side is positive.
+    return replace(car, positive="left") if before and car.drives_like(Car()) else car
 
 
 def read_controls(folder: Path | str) -> Controls:
@@ -454,7 +458,7 @@ def read_controls(folder: Path | str) -> Controls:
 
     They are read from control_data.csv, or from episode_data.json if that gives none. Times are the system's, unless
     its clock was set meanwhile or controls arrived in a burst; then they are the Arduino's. Raises EpisodeError if no
-    control is usable, CarError as recorded_car() does.
+    control is usable, CarError as read_car_of() does.
     """
     folder = Path(folder)
     pwm = read_car_of(folder).pwm

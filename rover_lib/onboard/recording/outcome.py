@@ -27,7 +27,7 @@ _WHOLE = "copy the episode again, or label the one that it was copied from"
 
 
 def label(episodes: Sequence[Path], outcome: str) -> None:
-    """Note an outcome, one of CHOICES, in each of these episode folders. Raises EpisodeError as labelled() does.
+    """Note an outcome, one of CHOICES, in each of these episode folders. Raises EpisodeError as relabel() does.
 
     All episodes are read before the first is written.
     """

@@ -34,10 +34,11 @@ class CarShape:
     camera_height_m: float
     focal: float
     horizon: float
+    left: int = 1
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not is_finite(value) or value <= 0:
+            if name != "left" and (not is_finite(value) or value <= 0):
                 raise ParamsError(f"view: {name} must be a number above 0", found=repr(value), remedy="see params.yml")
 
     @classmethod
@@ -48,7 +49,7 @@ class CarShape:
         """
         car = car or this_car()
         section: dict[str, Any] = params()["view"]
-        measured = {"wheelbase_m": car.wheelbase_m, "focal": car.focal_px / WIDTH_PX}
+        measured: dict[str, Any] = {"wheelbase_m": car.wheelbase_m, "focal": car.focal_px / WIDTH_PX, "left": car.left}
         if (names := {f.name for f in fields(cls)} - measured.keys()) != set(section):
             odd = sorted(names ^ set(section))
             raise ParamsError(f"view: {odd} must be there once", found=sorted(section), remedy="see params.yml")
@@ -59,13 +60,13 @@ class CarShape:
 
         It has one point before each action and one at the end.
 
-        actions: [steering, throttle] each, for step_s seconds; steering is positive to the left.
+        actions: [steering, throttle] each, for step_s seconds.
         """
         x = y = heading = 0.0
         points = [(x, y, heading)]
         for steering, throttle in actions:
             way_m = throttle * self.speed_mps * step_s
-            turn = way_m / self.wheelbase_m * math.tan(steering * self.wheel_angle_rad)
+            turn = way_m / self.wheelbase_m * math.tan(self.left * steering * self.wheel_angle_rad)
             x += way_m * math.cos(heading + turn / 2)
             y += way_m * math.sin(heading + turn / 2)
             heading += turn

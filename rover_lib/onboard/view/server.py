@@ -5,7 +5,8 @@
 It listens in two places. Drives connect to a Unix socket and send the messages that feed.py describes. Browsers get the
 page over HTTP, and each page opens a WebSocket. Through it the page receives the newest message, and the next one only
 after the page has confirmed that it shows the previous one: so no messages queue up, and a slow page gets fewer. A page
-may send only "shown N" and "stop", and the view never sends a drive anything but a stop.
+may send only "shown N" and "stop", and the view never sends a drive anything but a stop. In a simulation, a page may
+also ask for the next world or another policy.
 
 Whoever has the token may watch the drive and stop it. A request must name this machine as its host, and a WebSocket
 must come from our own page, so that no other page in the same browser can use the view.
@@ -19,6 +20,7 @@ import hashlib
 import hmac
 import ipaddress
 import json
+import logging
 import os
 import pwd
 import re
@@ -43,11 +45,14 @@ from rover_lib.onboard.view.path_overlay import CarShape, from_now
 PORT = 8470
 MESSAGE_BYTES = 1 << 20  # no message of a drive is larger (MOST_BYTES in feed.py)
 PAGES = 32
+CONNECTIONS = 2 * PAGES  # at a time, of all browsers; a peer may have three quarters of them
+REQUEST_S = 5.0  # a connection that is no page's by then is closed
 ACCEPT_AGAIN_S = 0.5
 BEAT_S = 5.0  # between two pings; a page that does not answer one is gone
 GONE = "gone"
 PAGE = Path(__file__).with_name("view.html")
 HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]{1,253})(:\d{1,5})?", re.ASCII)
+ASKED = re.compile(r"ask ([\w. ]{1,60})", re.ASCII)  # by the page of a simulation
 SHOWN = re.compile(r"shown (\d{1,12})", re.ASCII)
 
 
@@ -121,10 +126,11 @@ def read_token(path: Path) -> str:
 class View:
     """The web server of the view.
 
-    address: where browsers reach it. place: the socket to which drives connect; None if a replay is shown instead.
+    address: where browsers reach it. place: the socket to which drives connect; None if something else is shown.
     drive_user: another user whose drives are accepted, besides this user's and root's. replay: whether a past drive is
-    shown. car: the car whose drives are shown; None means this machine's. Raises ViewError for an unknown user, and
-    CarError and ParamsError like this_car() and CarShape.of().
+    shown. car: the car whose drives are shown; None means this machine's. ask: takes what a simulation's page asks for;
+    None for a car, whose page can only stop it. Raises ViewError for an unknown user, and CarError and ParamsError like
+    this_car() and CarShape.of().
     """
 
     def __init__(
@@ -135,8 +141,9 @@ class View:
         drive_user: str | None = None,
         replay: bool = False,
         car: Car | None = None,
+        ask: Callable[[str], object] | None = None,
     ):
-        self._address, self._token, self._place, self._replay = address, token, place, replay
+        self._address, self._token, self._place, self._replay, self._ask = address, token, place, replay, ask
         self._users = {0, os.geteuid()}
         if drive_user:
             try:
@@ -152,6 +159,8 @@ class View:
         self._picture = b""
         self._news = asyncio.Event()
         self._pages = 0
+        self._browsers: dict[asyncio.BaseTransport, str] = {}  # open connections and their peers, the oldest first
+        self._talking: set[asyncio.BaseTransport] = set()  # those of pages
         self._html = PAGE.read_bytes()
 
     async def run(
@@ -180,7 +189,10 @@ class View:
         app = web.Application(middlewares=[self._guard], client_max_size=1024)
         app.router.add_get("/", self._give_page)
         app.router.add_get("/ws", self._talk)
-        runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=0.5, keepalive_timeout=10)
+        silent = logging.getLogger(f"{__name__}.library")
+        silent.disabled = True  # it would write whole requests into the log, with the token and as often as they come
+        asyncio.get_running_loop().set_exception_handler(lambda *_: None)
+        runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=0.5, logger=silent)
         wire = self._address.open()
         stack.callback(wire.close)
         if self._place:
@@ -190,7 +202,7 @@ class View:
             stack.push_async_callback(_end, asyncio.create_task(self._accept(drives)))
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
-        await web.SockSite(runner, wire).start()
+        stack.push_async_callback(_end, asyncio.create_task(self._admit(wire, runner.server)))
         name = f"{socket.gethostname()}.local" if self._address.interface else "127.0.0.1"
         return f"http://{name}:{wire.getsockname()[1]}/?token={self._token}"
 
@@ -209,6 +221,7 @@ class View:
         head |= {
             "n": self._number,
             "ribbon": ribbon,
+            "left": self._shape.left,
             "replay": self._replay,
             "pins": pins,
             "pins_actions": self._actions(pins),
@@ -222,6 +235,9 @@ class View:
     def stop(self, who: str) -> int:
         """Ask each drive to stop, and return how many were asked. who: the IP address that asks."""
         asked = 0
+        if self._ask:
+            self._ask("stop")
+            return 1
         for drive in tuple(self._drives):
             with contextlib.suppress(OSError):  # this drive no longer reads
                 drive.send(f"stop {who}".encode())
@@ -298,6 +314,38 @@ class View:
 
     # ---- browsers
 
+    async def _admit(self, wire: socket.socket, server: Any) -> None:
+        """Accept browsers, but from nobody so many that others find no place. Runs until it is cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                browser, (peer, _) = await loop.sock_accept(wire)
+                if self._make_room(peer):
+                    transport, _ = await loop.connect_accepted_socket(server, browser)
+                    self._browsers[transport] = peer
+                    loop.call_later(REQUEST_S, self._drop, transport)
+                else:
+                    browser.close()
+            except OSError:  # no file descriptor is free, or the browser has gone again
+                await asyncio.sleep(ACCEPT_AGAIN_S)
+
+    def _make_room(self, peer: str) -> bool:
+        """Close connections that are no page's, the oldest first, until another of that peer may come."""
+        self._browsers = {t: p for t, p in self._browsers.items() if not t.is_closing()}
+        for limit, who in ((CONNECTIONS * 3 // 4, {peer}), (CONNECTIONS, {*self._browsers.values()})):
+            theirs = [t for t, p in self._browsers.items() if p in who]
+            if len(theirs) < limit:
+                continue
+            if not (idle := [t for t in theirs if t not in self._talking]):
+                return False
+            self._drop(idle[0])
+        return True
+
+    def _drop(self, transport: Any) -> None:
+        if transport not in self._talking:
+            transport.abort()
+            self._browsers.pop(transport, None)
+
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
         if not self._address.is_ours(request.headers.get("Host", "")):
@@ -325,7 +373,9 @@ class View:
         page = _Page()
         wire = web.WebSocketResponse(heartbeat=BEAT_S, max_msg_size=64, compress=False)
         self._pages += 1
+        transport: Any = request.transport
         try:
+            self._talking.add(transport)
             await wire.prepare(request)
             sending = asyncio.create_task(self._send(wire, page))
             try:
@@ -337,10 +387,13 @@ class View:
                         await wire.send_str("asked for a stop" if count else "no drive is there to be stopped")
                     elif shown := SHOWN.fullmatch(message.data):
                         page.was_shown(int(shown[1]))
+                    elif self._ask and (asked := ASKED.fullmatch(message.data)):
+                        self._ask(asked[1])
             finally:
                 await _end(sending)
         finally:
             self._pages -= 1
+            self._talking.discard(transport)
         return wire
 
     async def _send(self, wire: web.WebSocketResponse, page: "_Page") -> None:

@@ -133,7 +133,8 @@ def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
 def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
     """Return the config of the user's trainer as a plain dict, key for key.
 
-    known: learning_rate, batch_size, data_dir, output_dir, device and seed. Give folders by their name only, because a
+    known: learning_rate, batch_size, data_dir, output_dir, device and seed, and rate_hz, the steps per second of its
+    plans, which is written if it is not the trainer's 30. Give folders by their name only, because a
     checkpoint is shown to others.
     """
     ((height, width),) = size.image_sizes
@@ -166,4 +167,4 @@ def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
         "log_freq": 1,
         "save_freq": 1,
         "num_workers": 0,
-    }
+    } | ({} if (rate_hz := known.get("rate_hz", 30)) == 30 else {"rate_hz": rate_hz})

@@ -116,7 +116,7 @@ def draw_moment(head: dict[str, Any], frame_bgr: np.ndarray, shape: CarShape, pw
     canvas = np.full((height + PANEL, WIDTH, 3), (20, 23, 26), np.uint8)
     canvas[:height] = picture[:, :, ::-1]
     image = Image.fromarray(canvas)
-    _draw_panel(ImageDraw.Draw(image), head, height, pwm)
+    _draw_panel(ImageDraw.Draw(image), head, height, pwm, shape.left)
     return np.asarray(image)
 
 
@@ -137,13 +137,13 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), size)
 
 
-def _draw_panel(draw: ImageDraw.ImageDraw, head: dict[str, Any], top: int, pwm: PwmCalibration) -> None:
+def _draw_panel(draw: ImageDraw.ImageDraw, head: dict[str, Any], top: int, pwm: PwmCalibration, left: int) -> None:
     tick, pins = head["tick"], head.get("pins") or [None, None]
     for row, (name, us) in enumerate(zip(("steering", "throttle"), pins, strict=True)):
         y = top + 10 + 30 * row
         pin = None if us is None else pwm.channel(name).action(us)
         draw.text((10, y), name, INK, _font(14))
-        _draw_bar(draw, (84, y, 264, y + 18), name, tick[name], pin)
+        _draw_bar(draw, (84, y, 264, y + 18), name, tick[name], pin, left)
         value = "" if tick[name] is None else f"{tick[name]:+.2f}" if name == "steering" else f"{tick[name]:.3f}"
         draw.text((272, y), value if us is None else f"{value} | {us:.0f} us", INK, _font(14))
     who = WHO.get(head["who"], "")
@@ -160,15 +160,17 @@ def _draw_panel(draw: ImageDraw.ImageDraw, head: dict[str, Any], top: int, pwm: 
     draw.text((10, top + 95), AHEAD, FAINT, _font(12))
 
 
-def _draw_bar(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], name: str, value: Any, pin: Any) -> None:
+def _draw_bar(
+    draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], name: str, value: Any, pin: Any, positive_left: int
+) -> None:
     """Draw what was commanded as a bar, and what the pin did as a line.
 
-    Steering starts in the middle of the bar, and positive steering goes to the left.
+    Steering starts in the middle of the bar. positive_left: 1 if positive steering goes to the left, else -1.
     """
     left, top, right, bottom = box
 
     def column(action: float) -> float:
-        share = 0.5 - 0.5 * action if name == "steering" else action / FULL_THROTTLE
+        share = 0.5 - 0.5 * positive_left * action if name == "steering" else action / FULL_THROTTLE
         return left + (right - left) * min(1.0, max(0.0, share))
 
     draw.rectangle(box, BAR)

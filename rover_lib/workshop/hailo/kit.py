@@ -10,7 +10,7 @@ from typing import Any
 
 import onnx
 
-from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE, read_manifest, read_parity
+from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE, Artifact
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.act import ACT, Affine
@@ -138,8 +138,9 @@ def _manifest(judged: Exporter, samples: int, folder: Path) -> dict[str, Any]:
     with TemporaryDirectory() as temporary:
         path = Path(temporary) / "policy_fp32.pt"
         judged.export(judged.float_policy, path)
-        save_arrays(folder / "parity.npz", read_parity(path))
-        manifest = read_manifest(path)
+        with Artifact(path) as artifact:
+            save_arrays(folder / "parity.npz", artifact.parity)
+            manifest = artifact.manifest
     return manifest | {
         "mode": "static",
         "scheme": "affine",

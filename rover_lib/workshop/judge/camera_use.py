@@ -16,7 +16,7 @@ import numpy as np
 
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.workshop.judge.compare import Fidelity
-from rover_lib.workshop.judge.recorded_range import follows, format_pct
+from rover_lib.workshop.judge.recorded_range import FLOOR_PCT, follows, format_pct
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import pick_evenly
@@ -58,10 +58,11 @@ class Looking:
 
     def warnings(self) -> list[str]:
         """Return what to know before anybody drives with this policy, if an action does not follow the camera."""
-        judged = [(i, a) for i, a in enumerate(self.report.action_names) if self.report.pct(a) is not None]
-        if judged and all(self.apart[i] == 0 for i, _ in judged):
-            return ["this policy plans the same whatever it is shown"]
-        blind = [(i, a) for i, a in judged if not follows(float(self.by_picture[i]), float(self.apart[i]))]
+        units = [(i, a, self.report.pct(a)) for i, a in enumerate(self.report.action_names)]
+        judged = [(i, a, pct) for i, a, pct in units if pct is not None]
+        if judged and all(self.apart[i] * pct < FLOOR_PCT for i, _, pct in judged):
+            return ["this policy plans the same whatever it is shown, do not drive it"]
+        blind = [(i, a) for i, a, pct in judged if not follows(self.by_picture[i] * pct, self.apart[i] * pct)]
         if judged and len(blind) == len(judged):
             return [f"this policy ignores its camera: {self._moves(blind)}; it copies its state, do not drive it"]
         return [f"{action} hardly follows the camera: {self._moves([(i, action)])}" for i, action in blind]

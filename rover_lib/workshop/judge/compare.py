@@ -87,6 +87,14 @@ class Fidelity:
         """(n, C, A) float64 absolute difference to FP32, in units of the action."""
         return np.abs(self.chunks[mode].astype(np.float64) - self.reference)
 
+    def spread(self) -> np.ndarray:
+        """(A,) float64: how far FP32's plans lie from their mean plan, as a mean over frames and steps.
+
+        It is the unit in which an error cannot be small only because all plans are nearly the same.
+        """
+        reference = self.reference.astype(np.float64)
+        return np.abs(reference - reference.mean(0)).mean((0, 1))
+
     def relative(self, mode: str) -> float:
         """The largest difference to FP32, as a share of the largest that is planned of that action, or of 1."""
         largest = np.abs(self.reference).max((0, 1)).clip(1)
@@ -115,10 +123,15 @@ class Fidelity:
     def summary(self, mode: str) -> dict[str, Any]:
         """Everything about one mode, keys by action name and unit; percentages of an action not judged are None."""
         summary: dict[str, Any] = {}
-        errors = self.errors(mode)
+        errors, spread = self.errors(mode), self.spread()
         for i, action in enumerate(self.action_names):
             e, us = errors[..., i], self.us(action)
             summary[f"{action}_mae_pct"] = self.in_pct(e.mean(), action)
+            # Of plans that are all the same, no error is a share.
+            judged = self.pct(action) is not None and spread[i] > 0
+            summary[f"{action}_of_spread_pct"] = 100 * e.mean() / spread[i] if judged else None
+            tenth = np.sort(e.mean(1))[-math.ceil(len(e) / 10) :]
+            summary[f"{action}_worst_tenth_pct"] = self.in_pct(tenth.mean(), action)
             summary[f"{action}_p95_pct"] = self.in_pct(np.quantile(e, 0.95), action)
             summary[f"{action}_max_pct"] = self.in_pct(e.max(), action)
             summary[f"{action}_mae_recorded_steps_pct"] = self.in_pct(e[~self.is_pad].mean(), action)
@@ -378,6 +391,11 @@ def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GA
         gate(f"{mode} {key}", judged[key], "<=", limits[key])
         for key in judged
         if key.endswith("_mae_pct") and key in limits
+    ]
+    rows += [
+        gate(f"{mode} {key}", judged[key], "<=", limits["of_spread_pct"])
+        for key in judged
+        if key.endswith("_of_spread_pct") and judged[key] is not None
     ]
     lost = None if fp32["hits"] is None or judged["hits"] is None else fp32["hits"] - judged["hits"]
     rows += [

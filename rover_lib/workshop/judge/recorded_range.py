@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 
 Range = tuple[float, float]  # (least, most) recorded value of an action
 FOLLOWS = 0.1  # of how far plans lie apart: what moves a plan by less than that is hardly followed
+FLOOR_PCT = 1.0  # of the recorded range: nor is what moves it by less, however little the plans lie apart
 
 
 def pct_of_range(error: float, recorded: Range) -> float | None:
@@ -29,12 +30,15 @@ def constant_actions(action_range: Mapping[str, Range]) -> list[str]:
 
 def not_judged(action_range: Mapping[str, Range]) -> list[str]:
     """A warning for each action that never changes in the recordings."""
-    return [f"{name} never changes in these recordings: not judged" for name in constant_actions(action_range)]
+    return [
+        f"{name} never changes in these recordings, so its error has no range to be a share of and is not judged"
+        for name in constant_actions(action_range)
+    ]
 
 
-def follows(moved: float, apart: float) -> bool:
-    """Whether a plan follows what moved it by `moved`, where the plans for both lie `apart`; in one unit."""
-    return moved > FOLLOWS * apart
+def follows(moved_pct: float, apart_pct: float) -> bool:
+    """Whether a plan follows what moved it by `moved_pct`, where the plans for both lie `apart_pct`."""
+    return moved_pct > max(FOLLOWS * apart_pct, FLOOR_PCT)
 
 
 def format_pct(value: float | None) -> str:

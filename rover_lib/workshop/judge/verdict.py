@@ -9,11 +9,13 @@ small as the smallest; and if several are left, it takes the first of PREFERRED.
 there is an artifact to deploy whenever the policy itself drives.
 """
 
+import json
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rover_lib.onboard.care.release import MAY_DIFFER
 from rover_lib.onboard.columns import ratio
 from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.compare import GATED, MODES, gate, gates
@@ -35,6 +37,7 @@ PREFERRED = ("fp32", "static", "mixed", "dynamic")  # between equals: the policy
 COUNTED = "counted on an emulated Cortex-A76"
 NEXT_COMMANDS = 3
 MOST_EPISODES = 3  # a remedy names at most this many
+EARLY_FRAMES = 30  # odd frames below this number all belong to the beginning of a drive
 
 Stages = Mapping[str, Mapping[str, Any]]
 
@@ -55,23 +58,29 @@ class Names:
         return f"{self.run.rstrip('/')}/policy_{mode}.pt"
 
 
-def verdict(stages: Stages, params: Mapping[str, Any], names: Names) -> dict[str, Any]:
+def verdict(
+    stages: Stages, params: Mapping[str, Any], names: Names, refusals: Mapping[str, Mapping[str, str]] | None = None
+) -> dict[str, Any]:
     """Return the verdict on a run, as run.json stores it.
 
     stages: the metrics of the stages load, quantize, compare and benchmark, and of arm and distill if they were made.
-    params: the content of params.yml. "deploy" in the result is None if no artifact of this policy should drive a car.
+    params: the content of params.yml. refusals: by mode, what a rover would refuse its artifact for, as
+    `release.Expected.refusals`. "deploy" in the result is None if no artifact of this policy should drive a car.
     """
     rows = _rows(stages, params)
     failed = _list_failures(stages, params, names, rows)
-    unfit = _does_not_drive(stages, failed)
+    unfit = _not_ready(stages, failed)
     best = _best(list(rows.values()), params["verdict"])
     deploy = None if unfit else best["mode"]
+    slow = {} if best["mode"] in ("static", "mixed") else {"mode": "it is slow"}
+    refused = (refusals or {}).get(best["mode"], slow)
     for row in rows.values():
         row["because"] = _because(row, best, params["verdict"])
     judged = {
         "deploy": deploy,
         "artifact": None if deploy is None else f"policy_{deploy}.pt",
-        "why": unfit or _why(best, rows["fp32"]),
+        "why": (unfit or _why(best, rows["fp32"])) + _for_another_robot(refused),
+        "refused": dict(refused),
         "timing": _timing(rows),
         "modes": list(rows.values()),
         "failed": failed,
@@ -107,8 +116,14 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
             "hits": found["hits"],
             "trials": found["trials"],
             "float_blocks": stages["quantize"]["modes"].get(mode, {}).get("float_blocks", []),
+            "not_timed": "",
             "missed_gates": [] if mode == "fp32" else _list_missed(compared, params["gates"], mode),
         }
+    static, mixed = rows.get("static"), rows.get("mixed")
+    if static and mixed and static["time_ms"] and mixed["time_ms"] and mixed["time_ms"] < static["time_ms"]:
+        # It does the same work and some of it in float, so that its shorter time is chance.
+        mixed["not_timed"] = f"its {mixed['time_ms']:.1f} ms are chance, as it does what static INT8 does and more"
+        mixed |= {"time_ms": static["time_ms"], "times_faster": static["times_faster"]}
     return rows
 
 
@@ -199,6 +214,8 @@ def in_words(mode: str, key: str) -> str:
     of = CALLED.get(mode, mode)
     if key.endswith("_mae_pct"):
         return f"{key.removesuffix('_mae_pct')} error of {of}, % of the recorded range"
+    if key.endswith("_of_spread_pct"):
+        return f"{key.removesuffix('_of_spread_pct')} error of {of}, % of how much the plans vary"
     return {
         "instructions_g": f"instructions of a plan of {of}, 10^9",
         "simd_g": f"SIMD instructions of a plan of {of}, 10^9",
@@ -275,11 +292,15 @@ def _remedies(
     """Say what to do about a gate that static INT8 misses, the cheapest remedy first."""
     if key in ("size_mb", "model_size_mb"):
         return [f"INT8 cannot make it smaller; a smaller policy can: `{_smaller(stages, names)}`."]
-    action = key.removesuffix("_mae_pct") if key.endswith("_mae_pct") else None
-    remedies = [
-        _of_mixed(params, rows),
-        f"Train it for INT8: `{_qat(names)}`, then `rover run` on what it leaves.",
-    ]
+    action = key.removesuffix("_mae_pct").removesuffix("_of_spread_pct") if key.endswith("_pct") else None
+    remedies = [_of_mixed(params, rows)]
+    if stages["quantize"].get("odd"):  # then training with INT8's rounding was tried, and repaired nothing
+        remedies.append(
+            "The frames that the cautions name take the steps of INT8 from all others: leave out drives that should "
+            "not be there, or train on more frames like them, so that the policy answers them as it does the others."
+        )
+    else:
+        remedies.append(f"Train it for INT8: `{_qat(names)}`, then `rover run` on what it leaves.")
     if action and (block := _worst_block(stages["quantize"].get("sensitivity", {}), action)):
         remedies.append(f"Most of it comes from {block[0]}: {block[1]:.2f} % with that alone in INT8 (notebook 03).")
     if clipped := _clipped(stages["quantize"], params):
@@ -355,26 +376,42 @@ def _shell(*words: str) -> str:
 # --- in sentences -----------------------------------------------------------------------------------------------------
 
 
-def _does_not_drive(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say why no artifact of this policy should drive a car; empty if nothing is known to speak against it."""
-    looking = stages["compare"].get("looking", {})
+def _not_ready(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say why no artifact of this policy should drive a car, and what helps; empty if nothing speaks against it."""
+    compared, lines = stages["compare"], []
+    unbeaten = compared.get("guesses", {}).get("warnings", [])
+    lines += [f"{warning[0].upper()}{warning[1:]}." for warning in unbeaten]
+    lines += [f"{warning[0].upper()}{warning[1:]}." for warning in stages["load"].get("fit", {}).get("warnings", [])]
+    looking = compared.get("looking", {})
     actions = [k.removesuffix("_apart_pct") for k, v in looking.items() if k.endswith("_apart_pct") and v is not None]
     if actions and not any(judge.follows(looking[f"{a}_by_picture_pct"], looking[f"{a}_apart_pct"]) for a in actions):
-        return ["The policy ignores its camera and copies its state: it would leave the track. Train it again."]
+        lines.append("The policy ignores its camera, and copies its state or always plans the same.")
     if any(row["gate"] == "fp32 hits" for row in failed):
-        fp32 = stages["compare"]["fp32"]
-        return [
-            f"As it was trained, in FP32, it hits {fp32['hits']} of {fp32['trials']} balloons: it does not drive yet."
-        ]
-    return []
+        fp32 = compared["fp32"]
+        lines.append(f"As it was trained, in FP32, it hits {fp32['hits']} of {fp32['trials']} balloons.")
+    if lines:
+        count_of = len({name for part in stages["load"]["split"].values() for name in part})
+        lines.append(
+            "What helps: the dataset that it was trained on, if this is another; more training steps; more recordings "
+            f"than these {count_of}, with standing starts, other places and light (docs: which recordings help)."
+        )
+    return lines
+
+
+def _for_another_robot(refused: Mapping[str, str]) -> list[str]:
+    """Say what a rover would refuse the artifact for and cannot be allowed; empty if there is nothing."""
+    whys = "; ".join(why for kind, why in refused.items() if kind not in MAY_DIFFER)
+    robot = "A policy for another robot" if "actions" in refused else "A rover refuses it"
+    return [f"{robot}, to benchmark only: {whys}."] if whys else []
 
 
 def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
     """Say why this mode was chosen, each reason in a sentence."""
     if best is fp32:
         return ["No INT8 mode keeps every gate and is worth its cost, so this is FP32, the policy as it was trained."]
-    errors = [f"{action} {judge.format_pct(e).strip()}" for action, e in best["errors_pct"].items()]
-    lines = [f"It keeps every gate: it differs from FP32 by {', '.join(errors)} of the recorded range."]
+    errors = [f"{action} {e:.2f} %" for action, e in best["errors_pct"].items() if e is not None]
+    differs = f": it differs from FP32 by {', '.join(errors)} of the recorded range" if errors else ""
+    lines = [f"It keeps every gate{differs}."]
     if best["trials"]:
         lines.append(f"It hits {best['hits']} of {best['trials']} balloons; FP32 hits {fp32['hits']}.")
     size = f"It has {best['size_mb']:.1f} MB, {best['times_smaller']:.1f} times smaller than FP32"
@@ -400,6 +437,8 @@ def _because(
         return "the one to deploy"
     if row["missed_gates"]:
         return "misses " + "; ".join(against(missed) for missed in row["missed_gates"])
+    if row["not_timed"] and best["mode"] == "static":
+        return f"is no faster than static INT8: {row['not_timed']}"
     if row["mode"] == "mixed" and not row["float_blocks"]:
         return "is the same as static INT8: no block had to stay in float"
     key = _work_key([row, best])
@@ -432,8 +471,21 @@ def _cautions(
     were not measured on a Pi.
     """
     compared, split = stages["compare"], stages["load"]["split"]
-    unfit = stages["load"].get("fit", {}).get("warnings", [])
-    lines = [f"Do not drive before this is clear: {warning.removesuffix('?')}." for warning in unfit]
+    lines: list[str] = []
+    if recomputed := stages["load"].get("recordings", {}).get("recomputed"):
+        lines.append(f"{recomputed[0].upper()}{recomputed[1:]}.")
+    if units := (stages["load"]["checkpoint"].get("normalisation") or {}).get("units"):
+        lines.append(f"The policy was {units} once, in its artifacts: its 0.1687 meant stopped.")
+    if mirrored := stages["load"].get("steering", {}).get("mirrored", []):
+        lines.append(
+            f"The pictures of {_some(mirrored)} are mirrored beside the others': leave them out, or turn them."
+        )
+    most, limit = compared.get("action_range", {}).get("throttle", (0, 0))[1], params["drive"]["throttle_limit"]
+    if most > limit:
+        lines.append(
+            f"The recordings have throttle up to {most:.2f}, and a rover cuts it at {limit:g}: throttle_limit in "
+            "rover_lib/onboard/params.yml."
+        )
     shared = set(split["held_out"]) & set(split["calibration"])
     if shared or len(split["held_out"]) < params["verdict"]["held_out_episodes"]:
         alone = ", which were also used to calibrate" if shared else ""
@@ -445,7 +497,11 @@ def _cautions(
         lines.append(
             "Nobody drove: only errors on recordings were judged. The first metres are the test, so hold the stick."
         )
-    lines += [f"{warning}." for warning in (*compared.get("warnings", []), *stages["quantize"].get("warnings", []))]
+    notes = stages["load"]["checkpoint"].get("notes", [])
+    told = (*notes, *compared.get("warnings", []), *stages["quantize"].get("warnings", []))
+    if odd := stages["quantize"].get("odd"):
+        lines.append(_of_odd_frames(odd))
+    lines += [f"{warning}." for warning in dict.fromkeys(told)]  # two stages may say the same
     if _timing(rows) == "measured here":
         lines.append(
             "The times are this machine's; on a Pi another mode may be fastest: `ansible/benchmark.yml` measures it."
@@ -458,10 +514,28 @@ def _cautions(
         )
     if best["mode"] == "fp32" and best["floor_ms"]:
         lines.append(f"A plan in FP32 takes a Pi 5 at least {best['floor_ms']:.0f} ms (computed).")
-    student = stages.get("distill", {}).get("recommendation", {}).get("name", "teacher")
+    student = stages.get("students", {}).get("recommendation", {}).get("name", "teacher")
     if student != "teacher":
         lines.append(f"A smaller policy may replace this one: {student}, as `rover world students` found.")
     return lines
+
+
+def _of_odd_frames(odd: Mapping[str, Any]) -> str:
+    """Name the frames that the policy answers far more strongly than the others, and how far INT8 is off there.
+
+    odd: `frames.describe_odd`, and errors: {usual, odd: {<action>_mae_pct}} of static INT8.
+    """
+    off = {
+        kind: ", ".join(f"{k.removesuffix('_mae_pct')} {v:.2f}" for k, v in errors.items() if v is not None)
+        for kind, errors in odd["errors"].items()
+    }
+    episodes, rows = list(odd["episodes"]), odd["rows"]
+    at_start = f", frame {max(rows)} or earlier" if max(rows) < EARLY_FRAMES else ""
+    return (
+        f"In {odd['share_pct']:.1f} % of the frames ({_some(episodes)}{at_start}) {odd['block']} answers "
+        f"{odd['times']:.0f} times more than usual: what is special there? Static INT8 is off by {off['odd']} % on "
+        f"them, by {off['usual']} % on the others."
+    )
 
 
 def count(number: int, what: str) -> str:
@@ -477,25 +551,33 @@ def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[
     run = _shell("rover", "run", f"runs/{student}/{left}", names.episodes, "--name", student)
     if deploy is None:
         commands = [
-            (f"make lab NAME={_shell(names.name)}", "look at notebook 01, what the car saw, and 04, what it plans"),
+            (
+                f"make notebooks-open NAME={_shell(names.name)}",
+                "look at notebook 01, what the car saw, and 04, what it plans",
+            ),
             ("rover record --max-seconds 30 episodes", "more drives, with corrections; on the car"),
             (_shell("rover", "inspect", names.episodes), "what is in the recordings, and what is wrong with them"),
         ]
         return [{"command": command, "why": why} for command, why in commands]
     artifact = names.artifact(deploy)
-    allow = "" if deploy in ("static", "mixed") else """ -e '{"rover_allow": ["mode"]}'"""
+    if set(judged["refused"]) - set(MAY_DIFFER):
+        return [{"command": _shell("rover", "benchmark", artifact), "why": "how long a plan takes, on any machine"}]
+    allow = json.dumps({"rover_allow": sorted(judged["refused"])}) if judged["refused"] else ""
+    deploying = f"ansible-playbook -i inventory.ini ansible/deploy.yml -e {_shell(f'rover_artifact={artifact}')}"
+    deploying += f" -e '{allow}'" if allow else ""
     play = "ansible-playbook -i inventory.ini ansible/"
     commands = []
     if drove:
         commands.append((_shell("rover", "drive", artifact, "--world", "--max-seconds", "60"), "watch it drive"))
     if not any(row["gate"].startswith(GATED) and not row["gate"].endswith("floor_ms") for row in judged["failed"]):
-        commands.append((f"{play}deploy.yml -e {_shell(f'rover_artifact={artifact}')}{allow}", "put it on the rover"))
+        commands.append((deploying, "put it on the rover"))
         commands.append((f"{play}benchmark.yml", "measure its time there"))
         commands.append((f"{play}drive.yml --limit rover1", "drive, transmitter in hand"))
     else:
         if deploy == "mixed":
-            commands.append((f"{play}deploy.yml -e {_shell(f'rover_artifact={artifact}')}", "put it on the rover"))
-        commands.append((_qat(names), "train static INT8 to keep its gates"))
-        commands.append((run, "and judge that"))
-        commands.append((f"make lab NAME={_shell(names.name)}", "notebook 03 has the blocks, 04 the frames"))
+            commands.append((deploying, "put it on the rover"))
+        if not stages["quantize"].get("odd"):
+            commands.append((_qat(names), "train static INT8 to keep its gates"))
+            commands.append((run, "and judge that"))
+        commands.append((f"make notebooks-open NAME={_shell(names.name)}", "notebook 03 has the blocks, 04 the frames"))
     return [{"command": command, "why": why} for command, why in commands[:NEXT_COMMANDS]]

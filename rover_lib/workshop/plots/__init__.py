@@ -25,6 +25,7 @@ from rover_lib.workshop.plots.recordings import (
     faults,
     frame,
     observer_ranges,
+    odd_frames,
     work_per_block,
 )
 from rover_lib.workshop.plots.style import save

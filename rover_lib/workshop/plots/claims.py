@@ -51,6 +51,13 @@ def error(report: Fidelity, mode: str = GATED) -> str:
     return f"{_upper(_called(mode))} is off by {how}, most in {action}"
 
 
+def odd_frames(odd: Mapping[str, Any], most: float) -> str:
+    """odd: `frames.describe_odd`. most: how many times the median frame's largest value any frame's is."""
+    if not odd:
+        return f"No frame is odd: none has values above {most:.1f} times the median frame's"
+    return f"On {odd['share_pct']:.1f} % of the frames {odd['block']} answers {odd['times']:.0f} times more than usual"
+
+
 def worst_frame(frame: WorstFrame) -> str:
     return f"On its worst frame {_called(frame.mode)} is {frame.error_pct:.2f} % off, in {frame.action}"
 
@@ -198,7 +205,7 @@ def _and(numbers: Sequence[float]) -> str:
 
 
 def student(students: Sequence[Mapping[str, Any]], chosen: str) -> str:
-    """students: rows of distill.json, the teacher first. chosen: the name of the recommended one."""
+    """students: rows of students.json, the teacher first. chosen: the name of the recommended one."""
     teacher = students[0]
     row = next((r for r in students[1:] if r["name"] == chosen), None)
     if row is None:

@@ -28,8 +28,8 @@ from rover_lib.workshop.plots.style import (
 )
 
 # Instructions of one inference of the full policy (15 GMAC, 360x640), in 1e9: label, all instructions, and the SIMD
-# instructions among them. Notebook 03 shows them for a run that `make arm` has not counted. Source: `make arm NAME=full
-# PEERS=1`, as in notebook 06.
+# instructions among them. Notebook 03 shows them for a run that `make count` has not counted. Source: `make count
+# NAME=full PEERS=1`, as in notebook 06.
 COUNTED = (
     ("FP32, TorchScript", 6.08, 3.81),
     ("INT8 affine (quint8): QNNPACK's kernels", 5.03, 4.34),

@@ -23,6 +23,8 @@ How a recording becomes samples:
   the frame after it is no sample, because its state would be invented. Only an episode's first frame starts neutral.
 - If nobody drove, the pulses are those of a human whose car did something else, because it was held. Such frames are
   samples with that driver, but no chunk and no state reaches from them to frames at which somebody drove, or back.
+- Actions that follow another formula of the pulses than this car's, as older firmware wrote them, are recomputed from
+  the pulses (see `formula`). If they follow none, the recording is left out.
 - A drive that failed is as good a recording as any other: its outcome is noted, and nothing is left out because of it.
 """
 
@@ -39,14 +41,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.pwm import NEUTRAL, PwmCalibration
+from rover_lib.onboard.car.pwm import NEUTRAL, Channel, PwmCalibration
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.recording.episode import (
     BURST_MIN,
     CONTROL_FIELDS,
     DATA_BYTES,
     FRAME_FIELDS,
-    HUMAN,
     NOBODY,
     OUTCOMES,
     arduino_step_s,
@@ -59,6 +60,7 @@ from rover_lib.onboard.recording.episode import (
 from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
+from rover_lib.workshop.recordings.formula import EXACT, FOLLOWS, LEAST_READINGS, Formula, formula_of
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source, relative
 from rover_lib.workshop.untrusted import quote, quote_all
 
@@ -67,7 +69,6 @@ HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 Item = TypeVar("Item")
-DISAGREES = 1e-3  # largest difference of an action from what its pulse says; recorded actions are within 5e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,7 @@ class Split:
 
 
 @dataclass
-class _Faults:
+class Faults:
     """Counts faults by file and kind, and keeps the note of the first."""
 
     root: Path
@@ -103,12 +104,15 @@ class _Faults:
 
 @dataclass(frozen=True)
 class _Control:
-    """One reading. arduino_s is NaN if that clock was no number; an action is None if nothing was measured."""
+    """One reading. arduino_s is NaN if that clock was no number; an action is None if nothing was measured, and its
+    pulse, in microseconds, then is NaN.
+    """
 
     system_s: float
     arduino_s: float
     actions: tuple[float | None, float | None]
-    driver: str = HUMAN
+    driver: str
+    pulses_us: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -161,7 +165,7 @@ def load_recordings(
         raise EpisodeError(
             f"{root}: no episode folders in it", remedy="give the folder that holds episode_YYYYMMDD_HHMMSS"
         )
-    faults = _Faults(root)
+    faults = Faults(root)
     read = (
         _load_episode(folder, chunk, sync_s, faults)
         for folder in progress(folders, desc="reading episodes", total=len(folders))
@@ -179,7 +183,7 @@ def load_recordings(
     return Recordings(root, episodes, faults.listed(), source)
 
 
-def _load_episode(folder: Path, chunk: int, sync_s: float, faults: _Faults) -> Episode | None:
+def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
     """Read one folder's episode. None if it has no usable sample; a fault then says why."""
     try:
         present = any((folder / name).exists() for name in DATA_FILES)
@@ -195,7 +199,11 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: _Faults) -> E
         faults.add(folder, "no_car", str(e))
         return None
     (label, outcome), tables = _read_tables(folder, faults)
-    controls = _read_controls(*tables["control_samples"], car.pwm, faults)
+    try:
+        controls, formulas = _read_controls(*tables["control_samples"], car.pwm, faults)
+    except EpisodeError as e:
+        faults.add(folder, "no_formula", str(e))
+        return None
     frames = _read_frames(folder, *tables["frame_samples"], faults)
     if not controls or not frames:
         faults.add(
@@ -220,10 +228,11 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: _Faults) -> E
         samples=samples,
         files=tuple(p for name in DATA_FILES if (p := folder / name).is_file()),
         outcome=outcome,
+        formulas=formulas,
     )
 
 
-def _read_tables(folder: Path, faults: _Faults) -> tuple[tuple[str, str | None], dict[str, tuple[Path, list]]]:
+def _read_tables(folder: Path, faults: Faults) -> tuple[tuple[str, str | None], dict[str, tuple[Path, list]]]:
     """Return (label, outcome), and for controls and frames the file that they came from and its rows.
 
     The rows are those of the JSON file if it has any, else those of the CSV file.
@@ -251,7 +260,7 @@ def _read_tables(folder: Path, faults: _Faults) -> tuple[tuple[str, str | None],
     return (label if isinstance(label, str) else "", outcome), tables
 
 
-def _read_bytes(path: Path, faults: _Faults) -> bytes | None:
+def _read_bytes(path: Path, faults: Faults) -> bytes | None:
     """Return a data file's bytes.
 
     None, with a fault, if it is absent, empty, unreadable, too large, or a link that leaves its folder.
@@ -280,7 +289,7 @@ def _read_bytes(path: Path, faults: _Faults) -> bytes | None:
     return data
 
 
-def _read_json(path: Path, faults: _Faults) -> dict[str, Any]:
+def _read_json(path: Path, faults: Faults) -> dict[str, Any]:
     data = _read_bytes(path, faults)
     if data is None:
         return {}
@@ -295,7 +304,7 @@ def _read_json(path: Path, faults: _Faults) -> dict[str, Any]:
     return content
 
 
-def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict[str, Any]]:
+def _read_csv(path: Path, fields: tuple[str, ...], faults: Faults) -> list[dict[str, Any]]:
     data = _read_bytes(path, faults)
     if data is None:
         return []
@@ -312,17 +321,21 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict
     return rows
 
 
-def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults) -> list[_Control]:
-    """Return the usable readings, ordered by system time."""
-    controls = []
+def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -> tuple[list[_Control], dict]:
+    """Return the usable readings, ordered by system time, and by channel the formula that its actions followed, if it
+    was another than the car's, and they were recomputed.
+
+    Raises EpisodeError if a channel's actions follow no formula of its pulses.
+    """
+    read: list[tuple[int, dict[str, float], list[str], str]] = []
     for i, row in enumerate(rows):
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"control {i} is a {type(row).__name__}, not an object")
             continue
         lost = [name for name in ACTION_NAMES if no_pulse(row, name)]
         wanted = [name for name in CONTROL_FIELDS if name.split("_")[0] not in lost]
-        read = {name: number_of(row.get(name)) for name in wanted}
-        values = {name: value for name, value in read.items() if value is not None}
+        numbers = {name: number_of(row.get(name)) for name in wanted}
+        values = {name: value for name, value in numbers.items() if value is not None}
         bad = [name for name in wanted if name not in values]
         nan = [name for name, value in values.items() if math.isnan(value)]
         if bad:
@@ -334,43 +347,76 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
             continue  # without a time it cannot be the action of a frame
         for name in lost:
             faults.add(path, f"{name}_no_pulse", f"control {i}: not measured; such values are missing, not 0")
-        steering, throttle = (
-            None if name in lost else _read_action(name, values, i, path, pwm, faults) for name in ACTION_NAMES
-        )
         if (driver := driver_of(row)) is None:
             faults.add(path, "unknown_driver", f"control {i}: {quote(row.get('driver'))} drove; left out")
             continue
+        read.append((i, values, lost, driver))
+    actions: dict[str, dict[int, float]] = {}
+    formulas = {}
+    for name in ACTION_NAMES:
+        rows_of = {i: values for i, values, lost, _ in read if name not in lost}
+        actions[name], formula = _read_actions(pwm.channel(name), rows_of, path, faults)
+        if formula:
+            formulas[name] = formula
+    controls = []
+    for i, values, _, driver in read:
+        pair = actions["steering"].get(i), actions["throttle"].get(i)
+        pulses = tuple(values.get(f"{n}_raw_us", math.nan) if i in actions[n] else math.nan for n in ACTION_NAMES)
         times_s = values["system_timestamp"], values["arduino_timestamp"] / 1000
-        controls.append(_Control(*times_s, (steering, throttle), driver))
+        controls.append(_Control(*times_s, pair, driver, pulses))
     went_on = [arduino_step_s(a.arduino_s, b.arduino_s) > 0 for a, b in pairwise(controls)]
-    return _in_order([(c.system_s, c) for c in controls], went_on, path, "control", faults)
+    return _in_order([(c.system_s, c) for c in controls], went_on, path, "control", faults), formulas
 
 
-def _read_action(
-    name: str, values: dict[str, float], i: int, path: Path, pwm: PwmCalibration, faults: _Faults
-) -> float | None:
-    """Return one channel's recorded action, or None, with a fault, if it was not measured."""
-    action, pulse_us, period_us = (values[f"{name}_{part}"] for part in ("normalized", "raw_us", "period_us"))
-    if any(math.isnan(v) for v in (action, pulse_us, period_us)):
-        return None  # the caller has counted it, with the field's name
-    channel = pwm.channel(name)
-    expected = channel.action(pulse_us, period_us)
-    if expected is None:
-        kind = "zero_period" if period_us == 0 or pulse_us == 0 else "odd_period"
-        note = f"control {i}: pulse {pulse_us:g} us of {period_us:g} us; such values are missing, not 0"
-        faults.add(path, f"{name}_{kind}", note)
-        return None
-    if not channel.low <= action <= channel.high:
-        faults.add(path, f"{name}_out_of_range", f"control {i}: {action:g}")
-        return None
-    if abs(action - expected) > DISAGREES:
-        note = f"control {i}: {action:g} recorded, its pulse says {expected:.4f}; taken as recorded"
-        faults.add(path, f"{name}_disagrees_with_pulse", note)
-    return action
+def _read_actions(
+    channel: Channel, rows: dict[int, dict[str, float]], path: Path, faults: Faults
+) -> tuple[dict[int, float], Formula | None]:
+    """Return one channel's action by the number of its control, without those that were not measured.
+
+    If they follow another formula than the car's, they are recomputed from their pulses, and that formula is returned.
+    Raises EpisodeError if they follow none.
+    """
+    name = channel.name
+    recorded, meant = {}, {}
+    duties_pct = {}
+    for i, values in rows.items():
+        action, pulse_us, period_us = (values[f"{name}_{part}"] for part in ("normalized", "raw_us", "period_us"))
+        if any(math.isnan(v) for v in (action, pulse_us, period_us)):
+            continue  # the caller has counted it, with the field's name
+        expected = channel.action(pulse_us, period_us)
+        if expected is None:
+            kind = "zero_period" if period_us == 0 or pulse_us == 0 else "odd_period"
+            note = f"control {i}: pulse {pulse_us:g} us of {period_us:g} us; such values are missing, not 0"
+            faults.add(path, f"{name}_{kind}", note)
+            continue
+        recorded[i], meant[i] = action, expected
+        duties_pct[i] = 100 * pulse_us / (channel.period_us if channel.by_pulse else period_us)
+    found, duties = np.array(list(recorded.values())), np.array(list(duties_pct.values()))
+    agrees = np.abs(found - np.array(list(meant.values()))) <= EXACT
+    if len(found) >= LEAST_READINGS and agrees.mean() < FOLLOWS:
+        formula = formula_of(channel, found, duties)
+        first = next(i for i, ok in zip(recorded, agrees, strict=True) if not ok)
+        seen = f"control {first}: {recorded[first]:g} recorded, its pulse says {meant[first]:.4f}"
+        if formula is None:
+            raise EpisodeError(
+                f"{name} follows no formula of its pulses: {100 * agrees.mean():.0f} % the car's, the rest no line",
+                found=seen,
+            )
+        note = f"recorded as {formula} instead of {Formula.of(channel)}; {seen}; recomputed from the pulses"
+        faults.add(path, f"{name}_recomputed", note, int((~agrees).sum()))
+        return meant, formula
+    for i, action in list(recorded.items()):
+        if not channel.low <= action <= channel.high:
+            faults.add(path, f"{name}_out_of_range", f"control {i}: {action:g}")
+            del recorded[i]
+        elif abs(action - meant[i]) > EXACT:
+            note = f"control {i}: {action:g} recorded, its pulse says {meant[i]:.4f}; taken as recorded"
+            faults.add(path, f"{name}_disagrees_with_pulse", note)
+    return recorded, None
 
 
 def _in_order(
-    timed: list[tuple[float, Item]], went_on: list[bool], path: Path, what: str, faults: _Faults
+    timed: list[tuple[float, Item]], went_on: list[bool], path: Path, what: str, faults: Faults
 ) -> list[Item]:
     """Sort the items by time, keeping the order of equal times, and count the steps back in time.
 
@@ -394,7 +440,7 @@ def _was_set_back(times_s: list[float], i: int) -> bool:
     return min(times_s[i - 2 : i]) > max(times_s[i : i + 2])
 
 
-def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list[_Control]:
+def _place_bursts(controls: list[_Control], path: Path, faults: Faults) -> list[_Control]:
     """Give the controls of a serial burst the times at which they were measured, or drop them."""
     late = find_backlog([c.system_s for c in controls], [c.arduino_s for c in controls])
     placed: list[_Control] = []
@@ -435,7 +481,7 @@ def _inside(path: Path, folder: Path) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
-def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[_Frame]:
+def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_Frame]:
     """Return the listed frames that have a time, ordered by it. `usable` says whether the picture is whole."""
     frames: list[_Frame] = []
     numbers: set[float] = set()
@@ -459,7 +505,7 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
             continue
         numbers.add(number)
         picture = folder / name.replace("\\", "/")
-        usable = _check_picture(folder, picture, name, path, faults)
+        usable = check_picture(folder, picture, name, path, faults)
         frames.append(_Frame(int(number), time_s, picture, usable))
     went_on = [b.number > a.number for a, b in pairwise(frames)]
     frames = _in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
@@ -472,7 +518,7 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
     return kept
 
 
-def _check_picture(folder: Path, picture: Path, name: str, path: Path, faults: _Faults) -> bool:
+def check_picture(folder: Path, picture: Path, name: str, path: Path, faults: Faults) -> bool:
     """Whether a listed picture is there, inside the episode's folder, and whole. Only its two ends are read."""
     try:
         if Path(name).is_absolute() or not _inside(picture, folder):
@@ -508,21 +554,23 @@ def _jpeg_problem(head: bytes, tail: bytes) -> str | None:
 
 def _actions_of(
     frames: list[_Frame], controls: list[_Control], sync_s: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, list[str]]:
     """Return for each frame its action, (n, 2) float32, whether it has one, (n,), whether any control is near, (n,),
-    and who drove.
+    and the pulses of each action in microseconds, (n, 2), and who drove.
     """
     times_s = np.array([f.time_s for f in frames])
     actions = np.zeros((len(frames), len(ACTION_NAMES)), np.float32)
+    pulses_us = np.zeros((len(frames), len(ACTION_NAMES)))
     known = np.ones(len(frames), bool)
     for i in range(len(ACTION_NAMES)):
-        near, index = _nearest(times_s, np.array([c.system_s for c in controls if c.actions[i] is not None]), sync_s)
-        values = np.array([c.actions[i] for c in controls if c.actions[i] is not None], np.float32)
+        measured = [c for c in controls if c.actions[i] is not None]
+        near, index = _nearest(times_s, np.array([c.system_s for c in measured]), sync_s)
         known &= near
-        if len(values):
-            actions[:, i] = np.where(near, values[index], 0)
+        if measured:
+            actions[:, i] = np.where(near, np.array([c.actions[i] for c in measured], np.float32)[index], 0)
+            pulses_us[:, i] = np.array([c.pulses_us[i] for c in measured])[index]
     near, index = _nearest(times_s, np.array([c.system_s for c in controls]), sync_s)
-    return actions, known, near, [controls[i].driver for i in index]
+    return actions, known, near, pulses_us, [controls[i].driver for i in index]
 
 
 def _nearest(times_s: np.ndarray, sorted_s: np.ndarray, within_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -536,9 +584,9 @@ def _nearest(times_s: np.ndarray, sorted_s: np.ndarray, within_s: float) -> tupl
 
 
 def _make_samples(
-    folder: Path, car: Car, frames: list[_Frame], controls: list[_Control], chunk: int, sync_s: float, faults: _Faults
+    folder: Path, car: Car, frames: list[_Frame], controls: list[_Control], chunk: int, sync_s: float, faults: Faults
 ) -> tuple[Sample, ...]:
-    actions, known, near, drivers = _actions_of(frames, controls, sync_s)
+    actions, known, near, pulses_us, drivers = _actions_of(frames, controls, sync_s)
     if not near.any():
         gap_s = min(abs(frames[0].time_s - controls[-1].system_s), abs(controls[0].system_s - frames[-1].time_s))
         faults.add(folder, "no_overlap", f"frames and controls are {gap_s:.1f} s apart")
@@ -580,6 +628,7 @@ def _make_samples(
                     row=i,
                     driver=drivers[i],
                     car=car,
+                    pulses_us=(float(pulses_us[i, 0]), float(pulses_us[i, 1])),
                 )
             )
     faults.add(folder, "frame_without_state", "the previous frame's action is not known", unknown_state)

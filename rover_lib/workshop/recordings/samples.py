@@ -18,10 +18,13 @@ from rover_lib.onboard.car.picture import PictureError, read_jpeg
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
+from rover_lib.workshop.recordings.formula import Formula
 
 OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has another rate
 
 ACTION_NAMES = CHANNELS
+HANDLED = ("repaired", "recomputed from the pulses", "taken as recorded", "left out")  # what is done about a fault
+REPAIRED = ("serial_burst", "unsorted_control_times", "unsorted_frame_times")
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 
@@ -61,7 +64,8 @@ class Source:
 class Layout:
     """Which cameras and which numbers the samples have.
 
-    rate_hz: frames a second; None if the recordings do not state it. state_order, action_order: for each name, its
+    rate_hz: frames a second; None if the recordings do not state it. image_sizes: (height, width) of each camera's
+    pictures, where the recordings state them. state_order, action_order: for each name, its
     column in the file. A car's names are always [steering, throttle] here, in whatever order they were recorded.
     """
 
@@ -71,6 +75,7 @@ class Layout:
     rate_hz: float | None = None
     state_order: tuple[int, ...] = (0, 1)
     action_order: tuple[int, ...] = (0, 1)
+    image_sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict, compare=False)
 
     def words(self) -> str:
         """Describe the layout in one line, in which users should recognise their own car."""
@@ -97,6 +102,15 @@ class Fault:
     count: int
     note: str
 
+    @property
+    def handled(self) -> str:
+        """What was done about it, one of HANDLED."""
+        if self.kind in REPAIRED:
+            return "repaired"
+        if self.kind.endswith("_recomputed"):
+            return "recomputed from the pulses"
+        return "taken as recorded" if self.kind.endswith("_disagrees_with_pulse") else "left out"
+
 
 @dataclass(frozen=True, eq=False)
 class Sample:
@@ -104,8 +118,8 @@ class Sample:
 
     time_s: seconds since the episode's first frame. state: (S,) float32, in our recordings the previous frame's
     [steering, throttle]. chunk: (chunk, A) float32, this frame's action and the following ones. is_pad: (chunk,)
-    bool, True past the end. driver: who drove at this frame, one of `episode.DRIVERS` of the rover.
-    car: the car that was driven.
+    bool, True past the end. driver: who drove at this frame, one of onboard.recording.DRIVERS. car: the car that was
+    driven. pulses_us: the recorded pulses of this frame's action; None if the recording has only actions.
     """
 
     episode: str
@@ -117,11 +131,17 @@ class Sample:
     row: int  # the frame's number in its episode, or in the whole of a LeRobotDataset
     driver: str = HUMAN
     car: Car = field(default_factory=Car)
+    pulses_us: tuple[float, float] | None = None
+    mirrored: bool = False  # turn the picture over, as it is mirrored beside the other recordings'
 
     @property
     def frame_name(self) -> str:
         """The picture's name within its episode."""
         return self.frame_path.name
+
+    def turned(self, frame: np.ndarray) -> np.ndarray:
+        """The picture as it is, or turned over if it is mirrored."""
+        return np.ascontiguousarray(frame[:, ::-1]) if self.mirrored else frame
 
     def frame_bgr(self) -> np.ndarray:
         """Read the picture: (h, w, 3) uint8 BGR.
@@ -129,7 +149,7 @@ class Sample:
         Raises EpisodeError if the file is gone, or is not a whole JPEG of a size that a camera gives.
         """
         try:
-            return read_jpeg(self.frame_path)
+            return self.turned(read_jpeg(self.frame_path))
         except OSError as e:
             raise EpisodeError(
                 f"{self.frame_path}: cannot be read ({e.strerror})", remedy="restore it or load again"
@@ -180,7 +200,8 @@ class Episode:
     """One drive.
 
     duration_s: from the first to the last frame. frames, controls: how many the recording lists. outcome: one of
-    onboard.recording.episode.OUTCOMES, None if none was noted.
+    onboard.recording.OUTCOMES, None if none was noted. formulas: by channel, the formula that its actions followed
+    before they were recomputed from the pulses.
     """
 
     id: str
@@ -192,11 +213,13 @@ class Episode:
     samples: tuple[Sample, ...]
     files: tuple[Path, ...]  # those that the numbers came from
     outcome: str | None = None
+    formulas: Mapping[str, Formula] = field(default_factory=dict)
+    corrects: bool = False  # whether a human intervened in it: lerobot-rollout can leave out what the policy drove
 
     @cached_property
     def by_policy(self) -> bool:
         """Whether a policy drove in it, so that what a human did in it was a correction."""
-        return any(sample.driver == POLICY for sample in self.samples)
+        return self.corrects or any(sample.driver == POLICY for sample in self.samples)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +243,24 @@ class Recordings:
         return {
             n: (float(actions[:, i].min()), float(actions[:, i].max())) for i, n in enumerate(self.layout.action_names)
         }
+
+    def recomputed(self) -> str:
+        """Say which actions were recomputed from their pulses, in one sentence; empty if none were."""
+        changed = [e for e in self.episodes if e.formulas]
+        if not changed:
+            return ""
+        found = sorted({f"{name} = {formula}" for e in changed for name, formula in e.formulas.items()})
+        return (
+            f"the actions of {len(changed)} of {len(self.episodes)} episodes were recomputed from their pulses, "
+            f"as they follow an older formula: {', '.join(found)}"
+        )
+
+    def faults_by_kind(self) -> dict[str, dict[str, int]]:
+        """How often each kind of fault was found, by what was done about it, one of HANDLED."""
+        counted: dict[str, Counter[str]] = {handled: Counter() for handled in HANDLED}
+        for fault in self.faults:
+            counted[fault.handled][fault.kind] += fault.count
+        return {handled: dict(kinds.most_common()) for handled, kinds in counted.items() if kinds}
 
     def driven_by_pct(self) -> dict[str, float]:
         """The percentage of samples at which each of `episode.DRIVERS` drove, without those who never did."""
@@ -257,6 +298,8 @@ class Recordings:
             "outcomes": self._counted(e.outcome or "not labelled" for e in self.episodes),
             "driven_by_pct": self.driven_by_pct(),
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
+            "recomputed": self.recomputed(),
+            "faults_by_kind": self.faults_by_kind(),
             "faults": [{"file": f.file, "kind": f.kind, "count": f.count, "note": f.note} for f in self.faults],
         }
 

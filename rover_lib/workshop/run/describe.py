@@ -1,18 +1,19 @@
 """Describe a file or a folder of this project, for `rover inspect`, and list the runs, for `rover list`."""
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import kinds_of
-from rover_lib.onboard.stage import read_stage
+from rover_lib.onboard.kinds import check_kind, kinds_of
+from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Source
 
 BULK = 200  # characters; of a longer value in a report only the number of its items is shown
-STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "distill", "finetune", "learn")
+STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "students", "distill", "finetune", "learn")
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
@@ -36,10 +37,18 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         return {"calibration": _calibration(path)}
     if kind == "stage":
         return {"report": _report(path)}
+    if kind == "tub":
+        check_kind(path, "recordings")  # says what to do with it
     if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
         from rover_lib.workshop.recordings.episodes import load_recordings
+        from rover_lib.workshop.recordings.turning import measure_sides
 
-        return {"recordings": load_recordings(source, progress=progress).summary()}
+        recordings = load_recordings(source, progress=progress)
+        sides = measure_sides(recordings, progress)
+        steers = (
+            {"steering": sides.words(), "by_episode": [t.words() for t in sides.turnings]} if sides.turnings else {}
+        )
+        return {"recordings": recordings.summary() | steers}
     from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
     checkpoint = load_checkpoint(path)
@@ -87,15 +96,23 @@ def runs(folder: Path | str) -> list[dict[str, str]]:
     return [{"name": p.name, "verdict": verdict_of(p)} for p in paths if set(kinds_of(p)) & {"run", "pretrained"}]
 
 
+def _changed(path: Path, sha256: str) -> bool:
+    return path.is_file() and sha256_of(path) != sha256
+
+
 def verdict_of(run_dir: Path) -> str:
     """A run's verdict in one line; if it has none yet, the command that makes one."""
     if (run_dir / "run.json").is_file():
         try:
-            return str(read_stage(run_dir / "run.json", "run")["metrics"]["headline"])
+            judged = read_stage(run_dir / "run.json", "run")
+            if changed := [name for name, sha256 in judged["inputs"].items() if _changed(run_dir / name, sha256)]:
+                return f"{', '.join(changed)} made again since its verdict: rover report {run_dir}"
+            return str(judged["metrics"]["headline"])
         except (RoverError, KeyError):
             return f"its run.json cannot be used: rover report {run_dir}"
     if (run_dir / "compare.json").is_file():
         return f"no verdict yet: rover report {run_dir}"
-    if (run_dir / "best_model.pth").is_file():
-        return f"a checkpoint: rover run {run_dir / 'best_model.pth'} EPISODES --name {run_dir.name}"
+    made = run_dir / "best_model.pth" if (run_dir / "best_model.pth").is_file() else run_dir
+    if made != run_dir or "pretrained" in kinds_of(run_dir):
+        return f"a checkpoint: rover run {shlex.quote(str(made))} EPISODES --name {shlex.quote(run_dir.name)}"
     return "not whole: rover run makes it again"

@@ -1,10 +1,9 @@
-"""Where a run lies: in a folder of its own, below the folder of runs; and whose policy its distill.json is about."""
+"""Where a run lies: in a folder of its own, below the folder of runs."""
 
 import re
 from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.stage import read_stage
 
 
 def run_folder(runs_dir: Path | str, name: str, error: type[RoverError]) -> Path:
@@ -20,10 +19,3 @@ def run_folder(runs_dir: Path | str, name: str, error: type[RoverError]) -> Path
     if folder.exists() and not folder.is_dir():
         raise error(f"{folder}: is a file, and not a run's folder", remedy="give another --name")
     return folder
-
-
-def says_how_it_was_taught(path: Path) -> bool:
-    """Whether a distill.json is `rover distill`'s, of the run's own policy; `rover world students` leaves one in a
-    teacher's run, which judges that run's students. Raises RoverError for a damaged one.
-    """
-    return "losses" in read_stage(path, "distill")["metrics"]

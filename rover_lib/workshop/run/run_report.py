@@ -6,24 +6,27 @@ print(text(content["metrics"]))
 
 import os
 import re
+import shutil
+import sys
 from base64 import b64encode
 from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.artifact.manifest import content_hash
+from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
+from rover_lib.onboard.care.release import THIS_CAR
 from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.judge.hosts import benchmark_of, is_of
 from rover_lib.workshop.judge.verdict import CALLED, Names, against, count, error_pct, verdict
-from rover_lib.workshop.run.run_folder import says_how_it_was_taught
 
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
-LATER = ("arm", "distill")  # that `make arm` and `rover world students` add to a run
+LATER = ("arm", "students")  # that `make count` and `rover world students` add to a run
 PAGE = "report.html"
+CARD = "rover-policy"  # this project's name, by which a card that we wrote is known
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
     "04_worst_frames": "The frames on which static INT8 differs most from FP32",
@@ -47,7 +50,7 @@ code{font-size:.9rem;overflow-wrap:anywhere}li{margin:.3rem 0}
 def write(run_dir: Path | str) -> dict[str, Any]:
     """Judge a run and leave run.json and report.html in its folder. Returns run.json's content.
 
-    Made anew of what is there, so that `make arm` and `rover world students` count once they were made. Raises
+    Made anew of what is there, so that `make count` and `rover world students` count once they were made. Raises
     RoverError where a stage is missing, is of other artifacts or lacks what is to be judged, and where an artifact is
     another one than was compared.
     """
@@ -61,7 +64,9 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         contents["benchmark"] = read_stage(files["benchmark"], "benchmark")
         given = contents["load"]["params"]
         names = Names(*(_relative(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
-        judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names)
+        there = {mode: path for mode in made if (path := folder / f"policy_{mode}.pt").is_file()}
+        refusals = {mode: THIS_CAR.refusals(read_manifest(path)) for mode, path in there.items()}
+        judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names, refusals)
         judged = {"headline": headline(judged), "host": contents["benchmark"]["env"]["host"], **judged}
     except KeyError as missing:
         raise RoverError(
@@ -90,10 +95,7 @@ def _files(folder: Path) -> dict[str, Path]:
         raise RoverError(
             f"{folder}: no verdict without {', '.join(missing)}", remedy="rover run makes them, of a checkpoint"
         )
-    files = {stage: path for stage, path in files.items() if path.is_file()}
-    if "distill" in files and says_how_it_was_taught(files["distill"]):
-        del files["distill"]
-    return files
+    return {stage: path for stage, path in files.items() if path.is_file()}
 
 
 def _benchmark(folder: Path, modes: Mapping[str, Any]) -> Path:
@@ -131,6 +133,13 @@ def _relative(path: Path | str) -> str:
     return os.path.relpath(path) if path.is_absolute() and path.is_relative_to(Path.cwd()) else str(path)
 
 
+def typed(command: str) -> str:
+    """A command as it works in this shell: a program of this environment that is not on PATH gets its folder."""
+    program, space, rest = command.partition(" ")
+    beside = Path(sys.executable).with_name(program)
+    return command if shutil.which(program) or not beside.is_file() else f"{_relative(beside)}{space}{rest}"
+
+
 # --- in words ---------------------------------------------------------------------------------------------------------
 
 
@@ -139,7 +148,7 @@ def headline(judged: Mapping[str, Any]) -> str:
     failed = judged["failed"]
     misses = f"; {count(len(failed), 'gate')} failed" if failed else ""
     if judged["deploy"] is None:
-        return f"deploy nothing{misses}"
+        return f"not ready to drive{misses}"
     row = next(row for row in judged["modes"] if row["mode"] == judged["deploy"])
     return f"deploy {judged['artifact']}, {row['size_mb']:.1f} MB, {error_pct(row):.2f} % off{misses}"
 
@@ -153,7 +162,7 @@ def text(judged: Mapping[str, Any]) -> str:
             lines += [f"  {against(row)}", *(f"    - {remedy}" for remedy in row["remedies"])]
     if judged["cautions"]:
         lines += ["", "Keep in mind:", *(f"  {line}" for line in judged["cautions"])]
-    lines += ["", "Next:", *(f"  {step['command']}\n      {step['why']}" for step in judged["next"])]
+    lines += ["", "Next:", *(f"  {typed(step['command'])}\n      {step['why']}" for step in judged["next"])]
     return "\n".join(lines)
 
 
@@ -188,6 +197,32 @@ def table(judged: Mapping[str, Any]) -> list[str]:
 # --- as a page --------------------------------------------------------------------------------------------------------
 
 
+def write_card(run_dir: Path | str) -> Path:
+    """Write README.md into a run's folder, a model card for the Hub, from its run.json and load.json; return its path.
+
+    Raises RoverError if the run has no verdict, and if there is a README.md that this has not written.
+    """
+    folder = Path(run_dir)
+    judged, load = (read_stage(folder / f"{name}.json", name)["metrics"] for name in ("run", "load"))
+    path, recordings = folder / "README.md", load["recordings"]
+    if path.exists() and CARD not in path.read_text(errors="replace"):
+        raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
+    header, *rows = columns(judged)
+    recorded = f"{count(recordings['episodes'], 'episode')}, {recordings['samples']} frames"
+    use = f"rover drive {judged['artifact']}" if judged["artifact"] else "none of them: no artifact should drive a car"
+    text = [
+        "---", "library_name: lerobot", "pipeline_tag: robotics", "tags: [lerobot, robotics, act, int8]", "---", "",
+        f"# {folder.resolve().name}: {judged['headline']}", "", *judged["why"], "",
+        f"| {' | '.join(header)} |", f"|{'---|' * len(header)}", *(f"| {' | '.join(row)} |" for row in rows), "",
+        f"Errors are mean differences from FP32, in percent of the recorded range. Speed: {judged['timing']}.", "",
+        f"Calibrated and judged on {recorded}: {recordings['layout'].replace('|', '/')}.", "",
+        f"To drive, in a checkout of {CARD}: `{use}`. In LeRobot: `python -m lerobot_robot_rover ARTIFACT FOLDER`.",
+        "", "## Keep in mind", "", *(f"- {line}" for line in judged["cautions"] or ["Nothing speaks against it."]), "",
+    ]  # fmt: skip
+    path.write_text("\n".join(text))
+    return path
+
+
 def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) -> str:
     """run.json as one HTML page that needs no other file. name: the run's. figures: PNGs by their names in FIGURES."""
     judged, env = content["metrics"], content["env"]
@@ -208,7 +243,9 @@ def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) ->
         parts += [f"<p><b>{escape(against(row))}</b></p>", _list(row["remedies"])]
     if judged["cautions"]:
         parts += ["<h2>Keep in mind</h2>", _list(judged["cautions"])]
-    steps = "".join(f"<li><code>{escape(s['command'])}</code><br>{escape(s['why'])}</li>" for s in judged["next"])
+    steps = "".join(
+        f"<li><code>{escape(typed(s['command']))}</code><br>{escape(s['why'])}</li>" for s in judged["next"]
+    )
     parts += ["<h2>Next</h2>", f"<ol>{steps}</ol>"]
     for figure, caption in FIGURES.items():
         if figure in figures:

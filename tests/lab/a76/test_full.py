@@ -68,7 +68,7 @@ def test_what_was_made_before_is_taken_from_the_cache(run_dir, tmp_path):
 
 
 def test_the_whole_recipe_is_that_of_the_balloon_world(cache, tmp_path, monkeypatch):
-    """So that a checkpoint that `rover world train` left in the cache is used."""
+    """So that a checkpoint that `rover train` left in the cache is used."""
     short = train_module.RECIPES["small", "cpu"].of_steps(4)
     monkeypatch.setitem(train_module.RECIPES, ("small", "cpu"), short)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)

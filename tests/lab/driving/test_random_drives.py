@@ -52,9 +52,9 @@ def test_the_same_seed_is_the_same_drive():
 
 # ---- each invariant can find something
 
-KILLED = Story((Happening(2200, "the process is killed"),))
-OFF = Story((Happening(1500, "the transmitter is off", for_ms=2500),))
-STEERED = Story((Happening(1500, "the human steers", 300, 2000),))
+KILLED = Story((Happening(3000, "the process is killed"),))
+OFF = Story((Happening(2300, "the transmitter is off", for_ms=2500),))
+STEERED = Story((Happening(2300, "the human steers", 300, 2000),))
 
 
 HEARD_NOW = "ahead == 1; *(uint32_t *)&command->heard_ms = now_ms;"  # all that comes is taken for fresh
@@ -73,7 +73,7 @@ HEARD_NOW = "ahead == 1; *(uint32_t *)&command->heard_ms = now_ms;"  # all that 
         ("human_wins", "if (moved && vehicle->state != MANUAL)", "if (moved && channel == THROTTLE)", STEERED),
         ("human_wins", "if (!has_signal(vehicle))\n            enter", "if (false)\n            enter", OFF),
         ("human_keeps", "vehicle->steering_us = vehicle->received[STEERING].pulse_us", "(void)0", STEERED),
-        ("armed_by_people", "return wiggled ? ", "return wiggled || true ? ", "held since before the start"),
+        ("armed_by_people", ".seen && let_go ? NOTHING", ".seen | let_go ? NOTHING", "held since before the start"),
     ],
 )  # fmt: skip
 @pytest.mark.slow

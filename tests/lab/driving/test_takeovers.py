@@ -78,11 +78,11 @@ def mixed(*happenings, make=Recorded):
         world.hand.sticks[0] = STICKS_US[0] + throw_us
         world.handle()
 
-    for at_ms, throw_us in ((400, 300), (500, -300), (600, 0)):
+    for at_ms, throw_us in ((1400, 300), (1500, -300), (1600, 0)):
         world.at(at_ms, lambda us=throw_us: wiggle(us))
     for at_ms, change in happenings:
-        world.at(at_ms, lambda change=change: (change(world.hand), world.handle()))
-    world.sleep(1.0)
+        world.at(at_ms + 1800, lambda change=change: (change(world.hand), world.handle()))
+    world.sleep(2.8)
     process.run()
     world.close()
     return world, process

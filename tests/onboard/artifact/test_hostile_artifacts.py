@@ -514,6 +514,17 @@ def test_no_parts_of_another_form_are_joined(artifacts, tmp_path, monkeypatch, r
     refused(tmp_path / "packed", message)
 
 
+def test_names_that_look_like_torchs_counter_are_kept_in_the_content_hash(artifacts, tmp_path):
+    """They were dropped from it, so that two programs could have one hash."""
+    hashes = {artifact.content_hash(artifacts["static"])}
+    for name in (b"x___torch_mangle_1", b"x___torch_mangle_2", b"x"):
+        with zipfile.ZipFile(artifacts["static"]) as z:
+            program = next(r.filename for r in z.infolist() if r.filename.endswith(".py") and r.file_size)
+        changes = {program.removeprefix("archive/"): lambda raw, name=name: raw.replace(b"input", name, 1)}
+        hashes.add(artifact.content_hash(rewritten(artifacts["static"], tmp_path / "other.pt", changes)))
+    assert len(hashes) == 4
+
+
 # Signatures
 
 
@@ -567,6 +578,54 @@ def test_a_rover_without_signers_takes_nothing_unless_it_is_told_to(artifacts, t
         releases.stage(path)
     releases.stage(path, unsigned=True)
     assert [r.signed for r in releases.all()] == [False]
+
+
+def test_what_was_once_taken_unsigned_needs_a_signature_later(artifacts, tmp_path, keys):
+    """It was taken without one, even from a folder with nothing but release.json in it, and switched to."""
+    path = Path(shutil.copy(artifacts["static"], tmp_path / "x.pt"))
+    releases = Releases(tmp_path / "models", signers=keys / "signers", check=lambda name: None)
+    name = releases.stage(path, unsigned=True).name
+    pack(path, tmp_path / "packed")
+    for source in (path, tmp_path / "packed"):
+        with pytest.raises(ReleaseError, match=r"not signed.*--unsigned"):
+            releases.stage(source)
+    with pytest.raises(ReleaseError, match=r"not signed; no model is in use"):
+        releases.switch(name)
+    assert releases.switch(name, unsigned=True)
+    pack(path, tmp_path / "packed", key=keys / "ours")
+    assert vars(releases.stage(tmp_path / "packed")) == {"name": name, "changed": True}
+    assert [r.signed for r in releases.all()] == [True]
+    assert not releases.stage(tmp_path / "packed").changed and not releases.switch(name)
+
+
+def test_a_key_that_is_revoked_is_good_for_no_switch(artifacts, tmp_path, keys):
+    """Its releases stayed usable for ever."""
+    signers = Path(shutil.copy(keys / "signers", tmp_path / "signers"))
+    releases = Releases(tmp_path / "models", signers=signers, check=lambda name: None)
+    names = []
+    for mode in ("static", "fp32"):
+        path = Path(shutil.copy(artifacts[mode], tmp_path / f"{mode}.pt"))
+        Path(f"{path}.sig").write_bytes(sign(path, keys / "ours"))
+        names.append(releases.stage(path, allow=["mode"]).name)
+        releases.switch(names[-1])
+    signers.write_text("")
+    for name in names:
+        with pytest.raises(ReleaseError, match=rf"not signed by a laptop.*{names[1][:12]} stays in use"):
+            releases.switch(name)
+    with pytest.raises(ReleaseError, match="the laptop that signed it is not known any more"):
+        releases.rollback()
+    assert [r.signed for r in releases.all()] == [False, False]
+
+
+@pytest.mark.parametrize("name", ["policy.pt", "policy.pt.sha256", "policy.pt.sig", "release.json"])
+def test_a_pipe_in_a_release_is_not_waited_for(artifacts, tmp_path, name):
+    releases = Releases(tmp_path / "models", check=lambda name: None)
+    release = releases.path_of(releases.stage(artifacts["static"], unsigned=True).name).parent
+    (release / name).unlink(missing_ok=True)
+    os.mkfifo(release / name)
+    with pytest.raises(ReleaseError):
+        releases.switch(release.name)
+    assert bool(releases.all()[0].wrong) is (name != "policy.pt.sig")
 
 
 def test_a_key_that_is_none_signs_nothing(artifacts, tmp_path):

@@ -10,7 +10,7 @@ from onnx import TensorProto, helper
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact.archive import ONNX
-from rover_lib.onboard.artifact.manifest import check_artifact
+from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.artifact.onnx_file import NODES, OPERATORS
 from rover_lib.onboard.errors import ArtifactError
 
@@ -77,7 +77,7 @@ def test_hostile_model_is_refused(name, onnx_static, tmp_path):
     change, message = HOSTILE[name]
     path = changed(onnx_static, tmp_path / "hostile.zip", change)
     with pytest.raises(ArtifactError, match=message) as e:
-        check_artifact(path)
+        Artifact(path).prove()
     assert "do not load it" in str(e.value) and "\n" not in str(e.value)
 
 
@@ -91,7 +91,7 @@ def test_no_protobuf_is_refused(raw, onnx_static, tmp_path):
 def test_policy_for_two_engines_is_refused(artifacts, tmp_path):
     path = rewritten(artifacts["static"], tmp_path / "two.pt", {}, {ONNX: b"x"})
     with pytest.raises(ArtifactError, match="two engines"):
-        check_artifact(path)
+        Artifact(path).prove()
 
 
 def test_every_operator_of_the_list_has_a_use():

@@ -66,12 +66,17 @@ def test_a_crawler():
 
 
 def test_an_inverted_transmitter():
-    """Left is where the human's stick was when asked for left, whichever pulse that gives."""
-    car = Desk(CRAWLER | {"left": 1012, "right": 1996, "forward": 1004, "back": 1990}).measure()
-    assert car.pwm.pulses(1, 1).steering_us == 1012
-    assert car.pwm.pulses(1, 1).throttle_us == 1004
-    assert car.pwm.pulses(-1, -1).steering_us == 1996
-    assert car.pwm.pulses(-1, -1).throttle_us == 1990
+    """Left is where the human's stick was when asked for left, whichever pulse that gives.
+
+    Positive steering is the longer pulse's side, as on the recorded car, or what an earlier car.yml said.
+    """
+    desk = Desk(CRAWLER | {"left": 1012, "right": 1996, "forward": 1004, "back": 1990})
+    for positive, found in ((None, "right"), ("left", "left")):
+        car = desk.measure(positive=positive)
+        assert (car.positive, car.pwm.pulses(car.left, 1).steering_us) == (found, 1012)
+        assert car.pwm.pulses(1, 1).throttle_us == 1004
+        assert car.pwm.pulses(-car.left, -1).steering_us == 1996
+        assert car.pwm.pulses(-1, -1).throttle_us == 1990
 
 
 @pytest.mark.parametrize("periods_us", [(3100, 3300), (24900, 24000), (20000, 9000), (21316, 1016)])

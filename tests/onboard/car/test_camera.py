@@ -8,11 +8,13 @@ import cv2
 import hostile
 import numpy as np
 import pytest
+import recorded
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rover_lib.onboard.car import camera as c
 from rover_lib.onboard.car.camera import Camera, CameraError
+from rover_lib.onboard.car.picture import decode_jpeg
 
 
 def jpeg(value: int, size=(64, 36)) -> bytes:
@@ -150,6 +152,30 @@ def test_a_film_begins_when_it_is_told_to():
     begun.set()
     assert [picture for picture, _ in reader] == pictures
     assert list(c._pace(lambda: iter(()), 1000, threading.Event(), threading.Event())) == []
+
+
+@pytest.mark.parametrize("at", [0, 0.5, 0.95])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_camera_that_is_frozen_but_for_a_strip_is_frozen(at, axis):
+    """A strip of 5 % lies in one or two rows or columns of the blocks that are compared; it drove on."""
+    rng, camera = np.random.default_rng(0), Camera("frozen")
+    picture = rng.integers(0, 255, (360, 640, 3), np.uint8)
+    size = picture.shape[axis]
+    strip = slice(int(at * size), int(at * size) + size // 20)
+    for _ in range(4):
+        part = picture[strip] if axis == 0 else picture[:, strip]
+        part[:] = rng.integers(0, 255, part.shape, np.uint8)
+        camera._add(picture.copy(), 0.0, None)
+    assert camera.latest().repeats == 3
+
+
+def test_no_picture_of_a_real_drive_counts_as_frozen():
+    """The most equal ones share a fiftieth of their blocks."""
+    for episode in sorted(recorded.real_recordings().glob("episode_*")):
+        camera = Camera("recorded")
+        for jpeg in sorted((episode / "frames").glob("*.jpg")):
+            camera._add(decode_jpeg(jpeg.read_bytes()), 0.0, None)
+            assert camera.latest().repeats == 0
 
 
 def test_a_film_that_begins_again_is_no_frozen_camera():

@@ -170,3 +170,19 @@ def test_what_is_written_is_read_again():
     for content in (CRAWLER, changed("throttle.reverse_us", None)):
         car = Car.of(content)
         assert Car.of(yaml.safe_load(yaml_of(car))) == car
+
+
+def test_which_side_is_positive_is_said_and_changes_no_pulse():
+    """The recorded car's files once called 2012 us left; its pictures show that it is right."""
+    ours = Car()
+    assert ours.description()["steering"] | {"period_us": 0} == {
+        "period_us": 0, "left_us": 900, "neutral_us": 1456, "right_us": 2012, "positive": "right",
+    }  # fmt: skip
+    before = ours.description()
+    before["steering"] = {"period_us": 21316, "left_us": 2012, "neutral_us": 1456, "right_us": 900}
+    for content in (ours.description(), before):
+        assert Car.of(content) == ours and Car.of(content).pwm.pulses(1, 0).steering_us == 2012
+    left = Car.of(before | {"steering": before["steering"] | {"positive": "left"}})
+    assert (left.positive, left.left, ours.left) == ("left", 1, -1) and left.drives_like(ours)
+    with pytest.raises(CarError, match="positive must be left or right"):
+        Car.of(before | {"steering": before["steering"] | {"positive": "up"}})

@@ -106,6 +106,16 @@ def test_events_have_their_time_and_go_to_logging_too(path, caplog):
     ]
 
 
+def test_a_second_drive_into_one_log_is_refused(path):
+    """The reader gave 127 of 900 ticks: it cannot tell two drives' lines apart."""
+    with FlightLog(path, header=HEADER, **LIMITS, flush_s=0.01) as log:
+        until(lambda: path.exists() and path.stat().st_size)
+        with pytest.raises(LogError, match="another drive writes this log"), FlightLog(path, header=HEADER, **LIMITS):
+            pytest.fail("it was let in")
+        log.tick(tick(0))
+    write(path, [tick(0)])  # and then it is free
+
+
 def test_without_a_file_events_are_still_said(caplog):
     with FlightLog(None, header=HEADER, **LIMITS) as log:
         for k in range(10):

@@ -24,6 +24,13 @@ def follower(**settings):
     return Follower(Settings(**{"blend_ticks": 0, "throttle_limit": 1.0, **settings}), RATE)
 
 
+@pytest.mark.parametrize(("fade_s", "stop_s"), [(60.0, 60.0), (0.5, 60.0), (1.0, 1.0)])
+def test_one_picture_drives_for_a_metre_at_most(fade_s, stop_s):
+    """With a minute each, a policy of 5 Hz and 256 actions, one picture drove for 51 s."""
+    with pytest.raises(ParamsError, match=r"by one picture the car would go [\d.]+ m at 1.1 m/s, and it may 1"):
+        Settings(fade_s=fade_s, stop_s=stop_s)
+
+
 def test_a_plan_is_used_by_time():
     f = follower()
     f.add(Plan(1, captured_s=10.0, ready_s=10.15, actions=ramp()), 10.15)
@@ -72,9 +79,9 @@ def test_the_throttle_fades_with_the_plans_age():
 
 
 def test_fade_can_be_switched_off():
-    f = follower(fade_s=1.0, stop_s=1.0)
+    f = follower(fade_s=0.9, stop_s=0.9)
     f.add(Plan(1, 0.0, 0.1, ramp()), 0.1)
-    assert f.command(0.99).throttle == pytest.approx(0.05)
+    assert f.command(0.89).throttle == pytest.approx(0.05)
 
 
 def test_the_throttles_limit():
@@ -138,7 +145,7 @@ def test_ensembling_is_lerobots(coefficient):
 
     rng = np.random.default_rng(0)
     chunk, oracle = 8, ACTTemporalEnsembler(coefficient, 8)
-    f = Follower(Settings(blend_ticks=0, ensemble=coefficient, throttle_limit=1.0, fade_s=1.0), RATE)
+    f = Follower(Settings(blend_ticks=0, ensemble=coefficient, throttle_limit=1.0, fade_s=0.8), RATE)
     for i in range(20):
         actions = rng.uniform([-1, 0], [1, 1], (chunk, 2))
         wanted = oracle.update(torch.tensor(actions, dtype=torch.float64)[None])[0].numpy()

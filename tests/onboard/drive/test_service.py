@@ -1,6 +1,7 @@
 """The drive as a service: what systemd hears, and who arms."""
 
 import contextlib
+import inspect
 import json
 import math
 import os
@@ -23,6 +24,7 @@ from needs import until
 
 from lab.driving.policy import pictures
 from rover_lib.cli import main
+from rover_lib.onboard.car import host
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
@@ -237,6 +239,8 @@ def test_a_request_names_the_model_that_it_arms(systemd):
     def operator() -> None:
         with pytest.raises(s.ServiceError, match=r"has loaded another model than cd34, found ab12; did somebody"):
             s.arm_car(s.Request(), model="cd34")
+        with pytest.raises(ZeroDivisionError):  # the second copy of a release that was damaged is that model too
+            s.arm_car(s.Request(), model="ab12-2", confirm=lambda state: 1 / 0)
         state = s.ask_service(ask="state")
         for wrong in ({"model": "cd34"}, {"ticket": "of the start before"}, {"ticket": ""}):
             answers.append(s.ask_service(**{"ask": "arm", "model": "ab12", "ticket": state["ticket"], **wrong}))
@@ -497,6 +501,9 @@ class Link:
     def unacknowledged_s(self, now_s):
         return 0.0
 
+    def request(self, keep=False):
+        pass
+
     def __enter__(self):
         type(self).opened += 1
         return self
@@ -685,7 +692,7 @@ def test_a_takeover_is_recorded_and_then_the_service_waits_disarmed(systemd, tmp
 def test_a_human_in_a_terminal_is_told_what_is_missing():
     """In the order in which a human does it; said once each."""
     steps = iter(["s", "s", "t", "w", "w", "w", "-"])
-    link = SimpleNamespace(latest=lambda: replace(STATUS, missing=next(steps)))
+    link = SimpleNamespace(latest=lambda: replace(STATUS, missing=next(steps)), request=lambda: None)
     said, checked = [], []
     assert arm_when_ready(armed, link, threading.Event(), said.append, [lambda: checked.append(1)]) == "telemetry"
     assert [text.partition(": ")[2] for text in said] == [MISSING[step] for step in "stw"]
@@ -695,9 +702,33 @@ def test_a_human_in_a_terminal_is_told_what_is_missing():
 def test_a_human_in_a_terminal_may_go_away():
     stop = threading.Event()
     stop.set()
-    link = SimpleNamespace(latest=lambda: replace(STATUS, missing="s"))
+    link = SimpleNamespace(latest=lambda: replace(STATUS, missing="s"), request=lambda: None)
     with pytest.raises(s.NotArmed):
         arm_when_ready(lambda: pytest.fail("armed"), link, stop, print)
+
+
+@pytest.mark.parametrize("missing", ["ww-", "-"])
+def test_a_drive_that_waits_in_a_terminal_does_not_arm_later(missing):
+    """It armed 3,628 s after the command, as the human let go of the throttle; or when a suspended machine woke up."""
+    steps, now = iter(missing), iter([0.0, 20.0, 31.0])
+    link = SimpleNamespace(latest=lambda: replace(STATUS, missing=next(steps)), request=lambda: None)
+    if missing == "-":
+        next(now), next(now)
+        now = iter([0.0, 3600.0])
+    with pytest.raises(s.NotArmed, match="have passed since the car was asked for, at most 30 may"):
+        arm_when_ready(lambda: pytest.fail("armed"), link, threading.Event(), print, clock=lambda: next(now))
+
+
+def test_ages_of_consent_go_on_while_the_machine_is_suspended(monkeypatch):
+    """CLOCK_MONOTONIC stands still then: a request of before armed the car."""
+    asked = []
+    monkeypatch.setattr(s, "ask_service", lambda unit, ask, **more: asked.append(more) or {
+        "model": "", "ticket": "", "armed": True, "text": ""})  # fmt: skip
+    monkeypatch.setattr(host.time, "clock_gettime", {time.CLOCK_BOOTTIME: 5000.0}.__getitem__)
+    s.arm_car(s.Request())
+    assert asked[-1]["asked_s"] == 5000.0
+    for function in (s.Service.__init__, arm_when_ready):
+        assert inspect.signature(function).parameters["clock"].default() == 5000.0
 
 
 def started(systemd: Systemd, tmp_path: Path, artifact: Path) -> subprocess.Popen:

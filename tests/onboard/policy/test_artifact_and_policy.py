@@ -233,7 +233,8 @@ def test_refuses_files_without_manifest_or_vectors(artifacts, tmp_path):
 
 def test_nothing_is_left_when_writing_fails(artifacts, tmp_path, monkeypatch):
     module = torch.jit.load(str(artifacts["fp32"]))
-    manifest, parity = artifact.read_manifest(artifacts["fp32"]), artifact.read_parity(artifacts["fp32"])
+    with artifact.Artifact(artifacts["fp32"]) as opened:
+        manifest, parity = opened.manifest, opened.parity
     path = tmp_path / "x.pt"
     with pytest.raises(ArtifactError, match="'gmac'"):
         artifact.save_artifact(path, module, {k: v for k, v in manifest.items() if k != "gmac"}, parity)
@@ -292,7 +293,7 @@ def test_a_parser_that_fails_by_itself_is_asked_again(artifacts, monkeypatch):
 
     with monkeypatch.context() as patched:  # only here, because pytest parses too
         patched.setattr(ast, "parse", failing)
-        artifact.check_artifact(artifacts["static"])
+        artifact.Artifact(artifacts["static"]).prove()
 
 
 def test_a_parser_that_always_fails_is_no_traceback(artifacts, monkeypatch):
@@ -301,4 +302,4 @@ def test_a_parser_that_always_fails_is_no_traceback(artifacts, monkeypatch):
 
     with monkeypatch.context() as patched, pytest.raises(ArtifactError, match=r"cannot be read \(SystemError\)"):
         patched.setattr(ast, "parse", failing)
-        artifact.check_artifact(artifacts["static"])
+        artifact.Artifact(artifacts["static"]).prove()

@@ -263,6 +263,51 @@ async def test_more_pages_than_anybody_opens_are_refused(bench, monkeypatch):
     raise AssertionError("a closed page still counts")
 
 
+def test_idle_connections_keep_no_page_waiting(tmp_path, monkeypatch, caplog):
+    """330 of them kept a new page waiting for 9.7 s, and wrote 12 MB of log."""
+    monkeypatch.setattr(v, "REQUEST_S", 0.5)
+
+    async def scene():
+        async with Bench(tmp_path) as bench, contextlib.AsyncExitStack() as stack:
+            port = int(bench.base.rpartition(":")[2])
+            page = await bench.page()
+            idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(330)]
+            stack.callback(lambda: [writer.close() for _, writer in idle])
+            assert len(bench.view._browsers) <= v.CONNECTIONS
+            another = await asyncio.wait_for(bench.page(), 2)
+            await asyncio.sleep(0.6)
+            assert (
+                len(bench.view._browsers) == 2 and not another.closed
+            )  # what asks for nothing is closed, and pages stay
+            bench.drive().send(HEAD)
+            await driving(page)
+
+    asyncio.run(scene())
+    assert not caplog.records
+
+
+def test_no_token_is_in_the_log(tmp_path, caplog, capsys):
+    """A request that is broken was logged whole, three times."""
+    caplog.set_level("DEBUG", "aiohttp")
+
+    async def scene():
+        async with Bench(tmp_path) as bench:
+            port = int(bench.base.rpartition(":")[2])
+            for broken in (
+                b"GET /?token=%s HTTP/9.x\r\n\r\n",
+                b"GET /\0?token=%s\r\n",
+                b"%s" * 9000,
+                b"POST /?token=%s",
+            ):
+                reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.write(broken.replace(b"%s", TOKEN.encode()) + b"\r\nContent-Length: x\r\n\r\n")
+                await asyncio.wait_for(reader.read(), 5)
+                writer.close()
+
+    asyncio.run(scene())
+    assert TOKEN not in caplog.text + "".join(capsys.readouterr())
+
+
 @on_a_bench
 async def test_a_second_click_hides_no_end(bench):
     """A drive that has ended closes its socket with the second stop unread."""

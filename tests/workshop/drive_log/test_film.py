@@ -85,7 +85,7 @@ def test_each_picture_has_what_the_log_says_of_its_moment(tmp_path):
 def test_the_ribbon_and_the_bars_are_of_the_moment():
     frame = np.full((360, 640, 3), 90, np.uint8)
     plan = {"captured_s": 0.0, "rate_hz": 30.0, "actions": [[0.0, 0.09]] * 30}
-    head = {"tick": {"steering": 0.5, "throttle": 0.1, "plan_age_ms": 150, "latency_ms": 90, "late_ms": 0.4},
+    head = {"tick": {"steering": -0.5, "throttle": 0.1, "plan_age_ms": 150, "latency_ms": 90, "late_ms": 0.4},
             "pins": [1456, 120], "who": "A", "missed": 0,
             "events": [[1.0, "armed"]], "sent_s": 0.0, "plan": plan}  # fmt: skip
     shape, pwm = CarShape.of(), PwmCalibration()
@@ -93,7 +93,7 @@ def test_the_ribbon_and_the_bars_are_of_the_moment():
     assert picture.shape == (360 + f.PANEL, 640, 3)
     way = np.argwhere(picture[:360, :, 1].astype(int) > picture[:360, :, 0] + 15)
     assert way[:, 0].min() > 125 and abs(way[:, 1].mean() - 320) < 2  # below the horizon, straight ahead
-    to_the_left = f.draw_moment(head | {"plan": plan | {"actions": [[0.6, 0.09]] * 30}}, frame, shape, pwm)
+    to_the_left = f.draw_moment(head | {"plan": plan | {"actions": [[-0.6, 0.09]] * 30}}, frame, shape, pwm)
     way = np.argwhere(to_the_left[:360, :, 1].astype(int) > to_the_left[:360, :, 0] + 15)
     assert way[:, 1].mean() < 310
     assert (f.draw_moment(head | {"plan": plan | {"actions": [[0.6, 0.0]] * 30}}, frame, shape, pwm)[:360] == 90).all()

@@ -81,6 +81,8 @@ def test_it_is_cheap():
         ),
         (Known(looks=1, copies=0), None),  # of one that does not need its state nothing bad can be said
         (Known(looks=0, copies=0), "plans the same whatever it is shown"),
+        (Known(looks=0.004, copies=0), "plans the same whatever it is shown"),  # it follows by 0.02 % of the range
+        (Known(looks=0.1, copies=0.5), "steering hardly follows the camera: another picture moves steering by 0.50 %"),
     ],
 )
 def test_what_must_be_known_before_it_drives(policy, says):

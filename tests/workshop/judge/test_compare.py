@@ -24,6 +24,7 @@ RANGE = {"steering": (-0.2, 0.6), "throttle": (0.0, 0.1)}
 LIMITS = {
     "steering_mae_pct": 1.0,
     "throttle_mae_pct": 1.0,
+    "of_spread_pct": 5.0,
     "hits_lost": 2,
     "fp32_hits": 36,
     "size_full_mb": 70,
@@ -88,6 +89,23 @@ def test_padded_steps_count_in_the_plan_but_not_against_the_recording(report):
     )
 
 
+def test_an_error_is_also_a_share_of_how_much_the_plans_vary():
+    """A policy that always plans nearly the same was once 0.01 % off, and so passed every gate."""
+    base, off = np.full((CHUNK, 2), 0.05), [np.float64([[0.001, 0.0001]] * CHUNK), np.full((CHUNK, 2), 0.0)]
+
+    class Varies(Fixed):
+        def predict_chunk(self, frame_bgr, state):
+            return super().predict_chunk(frame_bgr, state) + np.float32([0.01, 0.001]) * (-1) ** self.calls
+
+    report = compare.fidelity(Varies(base), {"static": Varies(base, off)}, [sample(), sample()], RANGE)
+    assert report.spread() == pytest.approx([0.01, 0.001], rel=1e-4)
+    found = report.summary("static")
+    assert found["steering_mae_pct"] < 0.1 and found["steering_of_spread_pct"] == pytest.approx(5, rel=1e-3)
+    metrics = {"fp32": {"hits": None}, "modes": {"static": found | {"hits": None, "size_mb": 1.0}}}
+    rows = {r["gate"]: r for r in compare.gates(metrics, LIMITS | {"of_spread_pct": 4.9})}
+    assert rows["static steering_mae_pct"]["passed"] and rows["static steering_of_spread_pct"]["passed"] is False
+
+
 def test_worst_frame_comes_first_and_keeps_both_plans(report):
     first, second = report.worst("static", 5)
     assert (first.index, second.index) == (0, 1)  # their throttle errors are equal, so they are in recorded order
@@ -100,7 +118,7 @@ def test_worst_frame_comes_first_and_keeps_both_plans(report):
 def test_a_policy_does_not_differ_from_itself(values, frames, pads):
     base = np.reshape(values, (3, 2))
     found = compare.fidelity(Fixed(base), {"static": Fixed(base)}, [sample(pads)] * frames, RANGE).summary("static")
-    numbers = {k: np.max(v) for k, v in found.items() if "vs_recorded" not in k}
+    numbers = {k: np.max(v) for k, v in found.items() if "vs_recorded" not in k and v is not None}
     assert numbers and all(v == 0 for v in numbers.values())
 
 
@@ -117,7 +135,7 @@ def test_an_action_that_never_changed_is_not_judged(still):
     metrics, report = still
     static = metrics["modes"]["static"]
     shares = {k: v for k, v in static.items() if k.startswith("throttle") and k.endswith("_pct")}
-    assert len(shares) == 6 and set(shares.values()) == {None}
+    assert len(shares) == 7 and set(shares.values()) == {None}
     assert static["throttle_mae_us"] == pytest.approx(0.001 * 0.5819 * 1016, rel=1e-4)
     assert static["steering_mae_pct"] == pytest.approx(1.0, rel=1e-4)
     assert static["driven"]["throttle_mae_pct"] is None and metrics["fp32"]["throttle_vs_recorded_pct"] is None

@@ -126,10 +126,48 @@ def test_what_ignores_its_camera_is_not_deployed(demo):
     assert judge(demo)["deploy"] == "static"
 
 
-def test_numbers_that_do_not_fit_the_recordings_are_said_first(demo):
-    demo["load"]["fit"] = {"warnings": ["throttle: far outside; are these the statistics that it was trained with?"]}
-    first = judge(demo)["cautions"][0]
-    assert first.startswith("Do not drive before this is clear: throttle: far outside") and first.endswith("with.")
+DRIVES = ("ansible", "rover drive", "deploy.yml")
+
+
+@pytest.mark.parametrize(
+    ("stage", "change", "says"),
+    [
+        ("load", {"fit": {"warnings": ["throttle: far outside; are these the recordings?"]}}, "Throttle: far outside"),
+        ("compare", {"guesses": {"warnings": ["this policy is no better than a guess without eyes: x"]}}, "no better"),
+        ("compare", {"looking": {"steering_by_picture_pct": 0.05, "steering_apart_pct": 0.05}}, "ignores its camera"),
+    ],
+)
+def test_a_policy_that_is_not_ready_gets_no_command_that_drives(demo, stage, change, says):
+    demo[stage] |= change
+    judged = judge(demo)
+    assert judged["deploy"] is None and says in judged["why"][0] and judged["why"][-1].startswith("What helps")
+    assert not any(word in command for command in commands(judged) for word in DRIVES)
+
+
+@pytest.mark.parametrize(
+    ("refused", "says"),
+    [
+        ({}, None),
+        ({"camera": "c", "chunk": "p", "mode": "m"}, """ -e '{"rover_allow": ["camera", "chunk", "mode"]}'"""),
+        ({"actions": "it gives x", "camera": "c"}, "A policy for another robot, to benchmark only: it gives x."),
+    ],
+)
+def test_what_a_rover_refuses_is_asked_before_a_command_is_printed(demo, refused, says):
+    judged = v.verdict(demo, PARAMS, NAMES, dict.fromkeys(("fp32", "static", "mixed", "dynamic"), refused))
+    deploying = [command for command in commands(judged) if "deploy.yml" in command]
+    if "actions" in refused:
+        assert says in judged["why"] and commands(judged) == ["rover benchmark runs/mine/policy_static.pt"]
+    else:
+        assert deploying[0].endswith(says or "policy_static.pt")
+
+
+def test_recomputed_actions_and_throttle_beyond_the_limit_are_said(demo):
+    demo["load"]["recordings"]["recomputed"] = "the actions of 5 of 6 episodes were recomputed"
+    demo["compare"]["action_range"]["throttle"] = [0.0, 0.27]
+    said = "\n".join(judge(demo)["cautions"])
+    assert (
+        "The actions of 5 of 6 episodes were recomputed." in said and "throttle up to 0.27" in said and "0.2:" in said
+    )
 
 
 def test_a_size_that_misses_its_gate_wants_a_smaller_policy(demo):
@@ -187,7 +225,7 @@ def test_nobody_who_drove_and_an_action_that_is_not_judged_are_said(demo):
         if "throttle_mae_pct" in found:
             found["throttle_mae_pct"] = None
     judged = judge(demo)
-    assert judged["deploy"] == "static" and "not judged" in judged["why"][0]
+    assert judged["deploy"] == "static" and "throttle" not in judged["why"][0]
     assert any("Nobody drove" in line for line in judged["cautions"])
     assert "deploy.yml" in commands(judged)[0] and "drive.yml" in commands(judged)[2]
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from recorded import real_episode
+from recorded import real_episode, real_recordings
 
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
@@ -450,7 +450,79 @@ def test_a_value_that_its_pulse_denies_is_counted(tmp_path):
         content["control_samples"][20]["steering_normalized"] = 0.99
 
     edit(record(tmp_path), change)
-    assert kinds(load(tmp_path)) == {"steering_disagrees_with_pulse": 1}
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"steering_disagrees_with_pulse": 1}
+    assert recordings.faults_by_kind() == {"taken as recorded": {"steering_disagrees_with_pulse": 1}}
+
+
+def rewritten(formulas, wrong=0):
+    """Return a change of a recording: its actions as other formulas of the duty give them, `wrong` of them random."""
+
+    def change(content):
+        rng = np.random.default_rng(0)
+        for i, row in enumerate(content["control_samples"]):
+            for name, (neutral, span) in formulas.items():
+                duty = 100 * row[f"{name}_raw_us"] / row[f"{name}_period_us"]
+                low = -1 if name == "steering" else 0
+                said = min(max((duty - neutral) / span, low), 1)
+                row[f"{name}_normalized"] = round(float(rng.uniform(low, 1)) if i < wrong else said, 4)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("formulas", "said"),
+    [
+        ({"steering": (7, 2.42), "throttle": (0, 70)}, "steering = (duty % - 7) / 2.42, throttle = duty % / 70"),
+        ({"steering": (7, 2.42)}, "steering = (duty % - 7) / 2.42"),
+        ({"steering": (6.9, -2.1)}, "steering = (duty % - 6.9) / -2.1"),
+        ({"throttle": (5, 95)}, "throttle = (duty % - 5) / 95"),
+    ],
+)
+@pytest.mark.parametrize("wrong", [0, 3])
+def test_actions_of_another_formula_are_recomputed_from_their_pulses(tmp_path, formulas, said, wrong):
+    """A stopped car, 120 us, stood as 0.1687 in most real recordings, and was taken as recorded."""
+    whole = [s.chunk.tolist() for s in load(record(tmp_path)).samples]
+    edit(tmp_path / "episode_20260101_120000", rewritten(formulas, wrong))
+    recordings = load(tmp_path)
+    assert np.abs(np.array([s.chunk.tolist() for s in recordings.samples]) - whole).max() <= 1e-4
+    assert recordings.recomputed().endswith(f"an older formula: {said}")
+    assert recordings.faults_by_kind().keys() == {"recomputed from the pulses"}
+    assert recordings.summary()["recomputed"] == recordings.recomputed()
+
+
+@pytest.mark.parametrize("name", ["steering", "throttle"])
+def test_actions_that_follow_no_formula_are_refused(tmp_path, name):
+    record(tmp_path)
+    odd = record(tmp_path, "episode_20260102_120000")
+    edit(odd, rewritten({name: (7, 2.4)}, wrong=20))
+    recordings = load(tmp_path)
+    assert [e.id for e in recordings.episodes] == ["episode_20260101_120000"]
+    (fault,) = recordings.faults
+    assert fault.kind == "no_formula" and fault.handled == "left out"
+    assert name in fault.note and "its pulse says" in fault.note
+    shutil.rmtree(tmp_path / "episode_20260101_120000")
+    with pytest.raises(EpisodeError, match="no_formula 1 times"):
+        load(tmp_path)
+
+
+def test_the_real_recordings_have_the_actions_of_their_pulses():
+    recordings = load(real_recordings())
+    assert len(recordings.episodes) == 6 and "5 of 6" in recordings.recomputed()
+    for episode in recordings.episodes:
+        rows = json.loads((episode.path / "episode_data.json").read_text())["control_samples"]
+        said = set()  # every action that a measured pulse stands for
+        for row in rows:
+            values = (row[f"{n}_{p}"] for n in ("steering", "throttle") for p in ("raw_us", "period_us"))
+            pulses = dict(zip(("s", "sp", "t", "tp"), values, strict=True))
+            found = PWM.actions_from_pulses(pulses["s"], pulses["t"], pulses["sp"], pulses["tp"])
+            said |= {("steering", found.steering), ("throttle", found.throttle)}
+        for i, name in enumerate(("steering", "throttle")):
+            pulses = np.array([action for channel, action in said if channel == name and action is not None])
+            actions = np.array([s.chunk[0, i] for s in episode.samples])
+            assert np.abs(actions[:, None] - pulses).min(1).max() <= 1e-3
+    assert recordings.action_range()["throttle"] == pytest.approx((0, 0.0812), abs=1e-3)
+    assert sum(s.chunk[0, 1] > 0.1 for s in recordings.samples) == 0
 
 
 def test_unsorted_times(tmp_path):

@@ -99,7 +99,7 @@ def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
     whole = (first / "frames/frame_000015.jpg").read_bytes()
     (first / "frames/frame_000015.jpg").write_bytes(whole[:200] + bytes(60) + whole[260:])  # seen in decoding
     report = export_dataset(recorded, tmp_path / "out")
-    kinds = {f["kind"]: f["count"] for f in report["repaired_or_left_out_while_reading"]}
+    kinds = {f["kind"]: f["count"] for f in report["faults_while_reading"]}
     assert kinds == {"serial_burst": 10, "throttle_zero_period": 1, "frame_missing": 1}
     assert (report["episodes"], report["frames"], report["left_out_pictures_not_whole"]) == (5, 58, 1)
     assert report["episodes_are"][:3] == [f"episode_20260101_120000 from frame {n}" for n in (0, 8, 15)]

@@ -57,6 +57,8 @@ def test_runs_are_listed_with_their_verdicts(runs_dir):
     assert found["demo"] == content["metrics"]["headline"] and found["demo"].startswith("deploy policy_static.pt")
     assert f"rover report {runs_dir / 'new'}" in found["new"] and "rover report" in found["broken"]
     assert "rover run" in found["fast"] and "best_model.pth" in found["fast"]
+    (runs_dir / "demo" / "compare.json").write_text("{}")  # as a notebook that is executed again leaves another
+    assert "compare.json made again since its verdict: rover report" in runs(runs_dir)[1]["verdict"]
     with pytest.raises(RoverError, match="no such folder"):
         runs(runs_dir / "nothing")
 

@@ -110,6 +110,30 @@ def test_leaves_the_same_verdict_as_json_page_and_words(run_dir):
         assert f"{mode['size_mb']:.1f}" in page.text and f"{mode['size_mb']:.1f}" in words
 
 
+def test_commands_work_as_they_are_printed(run_dir, monkeypatch):
+    """`make demo` activates no environment, so `rover` alone would be another program, or none."""
+    programs = run_dir.parents[1] / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    (programs / "rover").touch(0o755)
+    monkeypatch.setattr(report.sys, "executable", str(programs / "python"))
+    monkeypatch.setenv("PATH", "/usr/bin")
+    assert report.typed("rover list") == ".venv/bin/rover list" and report.typed("make watch") == "make watch"
+    assert "\n  .venv/bin/rover drive runs/mine" in report.text(report.write(run_dir)["metrics"])
+    monkeypatch.setenv("PATH", str(programs))
+    assert report.typed("rover list") == "rover list"
+
+
+def test_a_card_says_what_the_verdict_says_and_replaces_only_cards(run_dir):
+    content = report.write(run_dir)["metrics"]
+    for _ in range(2):
+        text = report.write_card(run_dir).read_text()
+    assert text.startswith("---\nlibrary_name: lerobot\n") and content["headline"] in text
+    assert f"`rover drive {content['artifact']}`" in text and all(line in text for line in content["cautions"])
+    (run_dir / "README.md").write_text("mine")
+    with pytest.raises(RoverError, match="is not a card that this has written; move it away"):
+        report.write_card(run_dir)
+
+
 def test_the_page_needs_no_other_file_and_fits_a_phone(run_dir):
     report.write(run_dir)
     html = (run_dir / report.PAGE).read_text()
@@ -133,13 +157,6 @@ def test_what_others_wrote_is_no_markup(run_dir):
     report.write(renamed)
     html = (renamed / report.PAGE).read_text()
     assert "<script" not in html and "<b>mine" not in html and "&lt;script&gt;" in html
-
-
-def test_a_students_own_distill_json_is_no_comparison(run_dir):
-    content = json.loads((run_dir / "distill.json").read_text())
-    content["metrics"] = {"losses": {}}
-    (run_dir / "distill.json").write_text(json.dumps(content))
-    assert "distill.json" not in report.write(run_dir)["inputs"]
 
 
 def test_a_run_that_is_not_whole_has_no_verdict(run_dir, tmp_path):

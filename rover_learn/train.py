@@ -1,5 +1,7 @@
 """Train LeRobot's own ACTPolicy on recordings, and write a checkpoint in the format of the user's trainer.
 
+    train("episodes", "best_model.pth")
+
 Nothing is downloaded, so the ResNet starts from random weights, and with frozen batch norm it would learn nothing. So
 there are three phases: the backbone alone, with live batch norm, learns to predict the chunk; then the transformer
 learns on the frozen backbone's features, which are computed once; then both learn together at a tenth of the rate.
@@ -7,13 +9,17 @@ learns on the frozen backbone's features, which are computed once; then both lea
 ACT's position codes are relative to the picture, and no weight depends on the picture's size. So the real car's policy
 goes through these phases at a quarter of its pixels, which takes a quarter of the time, and a few more steps at its own
 size carry it there.
+
+Few recordings are soon learned by heart. So while the transformer learns, episodes that it does not learn from are held
+against it again and again, and the best weights are kept. Recordings whose pictures are mirrored beside the others' are
+turned over.
 """
 
 import math
 import shutil
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,11 +52,11 @@ from rover_learn.training import (
     threads,
     to_cpu,
 )
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.policy.preprocess import normalise
-from rover_lib.onboard.stage import atomic_path, sha256_of
+from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop import act as act_module
 from rover_lib.workshop.act import ActConfig, lerobot_act
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
@@ -58,7 +64,17 @@ from rover_lib.workshop.checkpoint.files import trainer_config
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
+from rover_lib.workshop.recordings.samples import (
+    ACTION_NAMES,
+    Recordings,
+    Source,
+    car_of,
+    frame_rate_hz,
+    is_another_rate,
+    pick_evenly,
+)
+from rover_lib.workshop.recordings.turning import measure_sides
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
@@ -66,6 +82,8 @@ if TYPE_CHECKING:
 # Below this width, two threads wait for each other longer than they compute: 40 times slower on a busy machine.
 SMALL_DIM = 256
 RESNET18_MACS = 37e3  # multiply-accumulates per pixel of the picture
+PLANNED_HZ = 30.0  # of the user's trainer
+JUDGE_EVERY, PATIENCE = 50, 8  # steps of the transformer; judgements without a better one, after which it stops
 
 
 @dataclass(frozen=True)
@@ -148,7 +166,7 @@ FULL_VERSION = 1
 
 
 def train(
-    episodes_dir: Path | str,
+    episodes: Path | str | Source,
     out_path: Path | str,
     size: str = "small",
     seed: int = 0,
@@ -166,28 +184,36 @@ def train(
     Returns out_path, which appears complete or not at all. On one machine the same input gives the same weights, even
     if training was ended at any moment and started again, as it goes on where it was. A checkpoint that was made before
     is taken from the cache.
-    Raises WorldError for a size, device, steps or seed that it cannot use, EpisodeError for recordings that cannot be
-    used, and TrainingError if another process trains the same.
+    episodes: our recordings of one car, or a LeRobotDataset of steering, throttle and one camera. The plans have their
+    rate: 30 steps a second if that is within a fifth of it.
+    Raises TrainingError for a size, device, steps or seed that it cannot use, and if another process trains the same,
+    and EpisodeError for recordings that cannot be used.
     """
-    out_path, episodes_dir = Path(out_path), Path(episodes_dir)
+    out_path, source = Path(out_path), Source.of(episodes)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     if size not in SIZES:
-        raise WorldError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))
+        raise TrainingError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))
     if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
-        raise WorldError("device must be cpu, or cuda where torch finds one", found=repr(device), remedy="leave it out")
+        raise TrainingError(
+            "device must be cpu, or cuda where torch finds one", found=repr(device), remedy="leave it out"
+        )
     if (steps is not None and steps < 1) or seed < 0:
-        raise WorldError("training needs at least 1 step and a seed from 0", found=f"{steps} and {seed}")
+        raise TrainingError("training needs at least 1 step and a seed from 0", found=f"{steps} and {seed}")
     recipe = RECIPES[size, device]
     if steps is not None:
         recipe = recipe.of_steps(steps)
+    p = params()["calibration"]
+    recordings = load_recordings(source, SIZES[size].chunk, p["sync_s"], progress)
+    rate_hz = _rate_hz(recordings)
     made_of = {
         "size": asdict(SIZES[size]),
         "recipe": asdict(recipe),
         "seed": seed,
         "device": device,
         "versions": [version(name) for name in ("torch", "lerobot", "torchvision", "numpy")],
-        "episodes": {p.relative_to(episodes_dir).as_posix(): sha256_of(p) for p in _files(episodes_dir)},
-        "split": params()["calibration"],
+        "episodes": recordings.hashes(),
+        "rate_hz": rate_hz,
+        "split": p,
         "version": FULL_VERSION,
     }
     sources = sys.modules[__name__], training_module, preprocess, act_module, episodes_module
@@ -196,7 +222,7 @@ def train(
 
     def make(folder: Path) -> None:
         with Resumable(unfinished, progress) as saved:
-            trained = _train(episodes_dir, SIZES[size], recipe, seed, torch.device(device), saved)
+            trained = _train(_turned(recordings, progress), SIZES[size], recipe, seed, torch.device(device), saved)
             config = trainer_config(
                 SIZES[size],
                 learning_rate=recipe.transformer_rate,
@@ -205,6 +231,7 @@ def train(
                 output_dir="checkpoints",
                 device=device,
                 seed=seed,
+                rate_hz=int(rate_hz),
             )
             # It must be on the disk before the unfinished training, which it comes from, is removed.
             with atomic_path(folder / "best_model.pth") as temporary:
@@ -217,9 +244,55 @@ def train(
     return out_path
 
 
-def _files(episodes_dir: Path) -> list[Path]:
-    """Return all files of the recordings except hidden ones."""
-    return sorted(p for p in episodes_dir.rglob("*") if p.is_file() and not p.name.startswith("."))
+def _rate_hz(recordings: Recordings) -> float:
+    """Return the steps per second of plans. Raises EpisodeError for recordings that this training is not for."""
+    layout = recordings.layout
+    car_of(recordings.samples)
+    if layout.action_names != ACTION_NAMES or layout.state_names != ACTION_NAMES or len(layout.cameras) != 1:
+        raise EpisodeError(
+            f"{recordings.root}: rover train is for cars of steering and throttle with one camera",
+            found=layout.words(),
+            remedy=f"name them, as in --action-names steering,throttle, or: {lerobot_train(recordings.root)}",
+        )
+    rates = [found for e in recordings.episodes if (found := frame_rate_hz(e.samples)) is not None]
+    found_hz = layout.rate_hz or (float(np.median(rates)) if rates else PLANNED_HZ)
+    return float(round(found_hz)) if layout.rate_hz or is_another_rate(found_hz, PLANNED_HZ) else PLANNED_HZ
+
+
+def _turned(recordings: Recordings, progress: Progress) -> Recordings:
+    """Return the recordings with the pictures of those that are mirrored beside most others turned over."""
+    mirrored = measure_sides(recordings, progress).mirrored
+    return replace(
+        recordings,
+        episodes=tuple(
+            replace(e, samples=tuple(replace(s, mirrored=True) for s in e.samples)) if e.id in mirrored else e
+            for e in recordings.episodes
+        ),
+    )
+
+
+@dataclass
+class _Best:
+    """The best weights so far, by their error on other episodes. A part of a training's saved state.
+
+    stale: how often they were not beaten since.
+    """
+
+    error: float = math.inf
+    stale: int = 0
+    weights: dict[str, Tensor] = field(default_factory=dict)
+
+    def see(self, error: float, module: nn.Module) -> None:
+        self.stale += 1
+        if error < self.error:
+            weights = {k: v.detach().clone() for k, v in module.state_dict().items()}
+            self.error, self.stale, self.weights = error, 0, weights
+
+    def state_dict(self) -> dict[str, Any]:
+        return dict(vars(self))
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
 
 
 @dataclass(frozen=True)
@@ -229,6 +302,7 @@ class _Training:
     size: ActConfig  # with the pictures' size in the three phases; the policy's own may be larger
     policy: "ACTPolicy"
     data: Frames
+    judges: Frames  # of other episodes
     recipe: TrainingRecipe
     loss_weights: Tensor  # (2,), on the device where training takes place
     rng: np.random.Generator
@@ -251,16 +325,26 @@ class _Training:
         count, cost = self.plan[phase]
         return self.saved.steps(phase, count, self.rng, cost, **parts)
 
+    def judge(self, policy: "ACTPolicy", maps: Any = None) -> float:
+        """Return the policy's mean error on the judges, in units of the spreads.
+
+        maps: a RowFile of their features, for a policy that takes those.
+        """
+        judges = self.judges if maps is None else replace(self.judges, images=maps)
+        units = self.loss_weights.cpu().numpy()
+        every = [np.arange(a, min(a + 64, len(judges))) for a in range(0, len(judges), 64)]
+        errors = [driving_error(policy, judges, rows, units, maps is not None) for rows in every]
+        return float(np.average(errors, weights=[len(rows) for rows in every]))
+
     def descend(self, phase: str, loss: Tensor, module: nn.Module, optimizer: Any, scheduler: Any) -> None:
         self.saved.losses[phase].append(descend(loss, module, optimizer, scheduler))
 
 
 def _train(
-    episodes_dir: Path, size: ActConfig, recipe: TrainingRecipe, seed: int, device: torch.device, saved: Resumable
+    recordings: Recordings, size: ActConfig, recipe: TrainingRecipe, seed: int, device: torch.device, saved: Resumable
 ) -> dict[str, Any]:
     """Train, and return everything in the checkpoint except its config."""
     p = params()["calibration"]
-    recordings = load_recordings(episodes_dir, size.chunk, p["sync_s"], saved.progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
     rng = np.random.default_rng([seed, 77])
     first = replace(size, image_sizes=(recipe.at,)) if recipe.at else size
@@ -268,7 +352,8 @@ def _train(
     data = frames_of(samples, *first.image_sizes[0])
     if not recipe.at:  # a small policy's step is so short that reading its frames from the disk would take longer
         data = in_memory(data, "reading frames", saved.progress)
-    judges = frames_of(pick_evenly(parts.choosing, recipe.judged), *size.image_sizes[0])
+    judging = pick_evenly(parts.choosing, recipe.judged)
+    judges = frames_of(judging, *size.image_sizes[0])
     spread = recorded_spread(data)
     loss_weights = torch.from_numpy(1 / spread).to(device)
     plan = _plan(size, first, recipe, len(data), len(judges))
@@ -281,15 +366,23 @@ def _train(
             policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
             policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
         policy.to(device)
-        training = _Training(first, policy, data, recipe, loss_weights, rng, saved, plan)
+        judges_first = frames_of(judging, *first.image_sizes[0])
+        training = _Training(first, policy, data, judges_first, recipe, loss_weights, rng, saved, plan)
         _train_backbone(training)
         _train_transformer(training)
         last = "all together"
+        apart = to_cpu({k: v.clone() for k, v in policy.state_dict().items()})
         if recipe.at:
             _train_together(training, last)  # do not keep its optimiser, which is twice as large as the policy
             training = replace(training, data=frames_of(samples, *size.image_sizes[0]))
             last = "at full size"
         optimizer, scheduler = _train_together(training, last)
+        if not recipe.at:  # at another size, what was before is no alternative
+            together = training.judge(policy)
+            after = {k: v.clone() for k, v in policy.state_dict().items()}
+            policy.load_state_dict(apart)
+            if together <= training.judge(policy):
+                policy.load_state_dict(after)
         for step in training.steps("judging"):
             rows = np.arange(len(judges))[step * recipe.batch : (step + 1) * recipe.batch]
             saved.losses["judging"].append(driving_error(policy, judges, rows))
@@ -328,6 +421,7 @@ def _plan(
         "statistics": (16 if frames >= 16 * batch else 4, forward),
         "features, plain": (features, forward),
         "features, mirrored": (features, forward),
+        "features, judges": (-(-judges // batch), forward),
         "transformer": (recipe.transformer_steps, g(first, train, recipe.transformer_batch, backbone=False)),
         "all together": (recipe.together_steps, g(first, train, recipe.together_batch)),
         "at full size": (recipe.carry_steps, g(size, train, recipe.together_batch)),
@@ -382,17 +476,17 @@ def _train_transformer(training: _Training) -> None:
     policy, backbone = training.policy, training.policy.model.backbone.eval()
     chosen = np.asarray(pick_evenly(range(len(training.data)), training.recipe.feature_samples))
     views = {view: _features(training, view, chosen, backbone) for view in ("plain", "mirrored")}
+    judged = _features(replace(training, data=training.judges), "judges", np.arange(len(training.judges)), backbone)
     policy.model.backbone = Given()
-    policy.train()
     with threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
-        _transformer_steps(training, chosen, views)
+        _transformer_steps(training, chosen, views, judged)
     policy.model.backbone = backbone
 
 
 def _features(training: _Training, view: str, chosen: np.ndarray, backbone: nn.Module) -> RowFile:
     """Compute the frozen backbone's feature maps of the chosen rows' frames, into a file.
 
-    view: 'plain' or 'mirrored'. chosen: (n,) row numbers.
+    view: 'plain', 'mirrored', or 'judges', which are plain too. chosen: (n,) row numbers.
     """
     batch, (size,) = training.recipe.batch, training.size.image_sizes
     channels = training.policy.model.encoder_img_feat_input_proj.in_channels
@@ -405,13 +499,17 @@ def _features(training: _Training, view: str, chosen: np.ndarray, backbone: nn.M
     return maps
 
 
-def _transformer_steps(training: _Training, chosen: np.ndarray, views: dict[str, RowFile]) -> None:
+def _transformer_steps(training: _Training, chosen: np.ndarray, views: dict[str, RowFile], judged: RowFile) -> None:
     policy, data, recipe = training.policy, training.data, training.recipe
     parameters = [p for p in policy.parameters() if p.requires_grad]
     optimizer, scheduler = optimiser(
         parameters, recipe.transformer_rate, recipe.transformer_steps, recipe.transformer_warmup
     )
-    for step in training.steps("transformer", policy=policy, optimizer=optimizer, scheduler=scheduler):
+    best = _Best()
+    for step in training.steps("transformer", policy=policy, optimizer=optimizer, scheduler=scheduler, best=best):
+        if best.stale >= PATIENCE:
+            continue  # it learns by heart
+        policy.train()
         kept = training.rows(recipe.transformer_batch, len(chosen))
         rows = chosen[kept]
         states, chunks = swap_states(data, rows, training.rng), data.chunks[rows].copy()
@@ -426,6 +524,10 @@ def _transformer_steps(training: _Training, chosen: np.ndarray, views: dict[str,
         }
         loss = policy_loss(policy, batch, training.loss_weights)
         training.descend("transformer", loss, policy, optimizer, scheduler)
+        if (step + 1) % JUDGE_EVERY == 0:
+            best.see(training.judge(policy, judged), policy)
+    if best.weights:
+        policy.load_state_dict(best.weights)
 
 
 def _train_together(training: _Training, phase: str) -> tuple[torch.optim.Optimizer, Any]:

@@ -1,0 +1,142 @@
+"""Hold a policy against its driver, beside guesses that need no eyes: a policy that is no better does not drive.
+
+    judged = against_guesses(report, parts.calibration)
+    for warning in judged.warnings(): ...
+
+The guesses are a constant action (the better of mean and median), the last action again and again, and the mean plan,
+step by step, of the recordings that the policy could learn from. An error is the mean over the judged actions, each in
+percent of its recorded range. Whether a guess is beaten is asked of many draws of the held-out episodes (a bootstrap),
+as few episodes say little.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from rover_lib.workshop.judge.compare import Fidelity
+from rover_lib.workshop.notebook_table import Table
+from rover_lib.workshop.recordings.samples import Sample
+
+DRAWS = 2000
+LEAST_EPISODES = 4  # of fewer, pieces are drawn instead, each as long as a plan
+SURE_PCT = 95
+
+
+@dataclass(frozen=True)
+class Guess:
+    """One guess: its error by action, and by how much the policy is better: the mean, and the ends of the interval.
+
+    All in percent of the recorded range. The interval has SURE_PCT % of the draws.
+    """
+
+    name: str
+    errors_pct: dict[str, float]
+    better: float
+    low: float
+    high: float
+
+    @property
+    def beaten(self) -> bool:
+        return self.low > 0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The result of `against_guesses`. drawn: how many episodes or pieces of them were drawn from, in words."""
+
+    errors_pct: dict[str, float]
+    guesses: tuple[Guess, ...]
+    drawn: str
+
+    def table(self) -> Table:
+        """The policy and the guesses beside each other, for people."""
+        rows = [("the policy", *(f"{e:.2f} %" for e in self.errors_pct.values()), "")]
+        for g in self.guesses:
+            rows.append((g.name, *(f"{e:.2f} %" for e in g.errors_pct.values()), _interval(g)))
+        return Table(("", *self.errors_pct, "the policy is better by"), rows)
+
+    def warnings(self) -> list[str]:
+        """A sentence for each guess that is not beaten."""
+        return [
+            f"this policy is no better than a guess without eyes: {g.name} ({_words(g.errors_pct)} off the driver, "
+            f"the policy {_words(self.errors_pct)}; better by {_interval(g)} over {self.drawn})"
+            for g in self.guesses
+            if not g.beaten
+        ]
+
+    def summary(self) -> dict[str, Any]:
+        """The same as plain JSON types, for compare.json."""
+        guesses = {g.name: {k: v for k, v in vars(g).items() if k != "name"} for g in self.guesses}
+        return {"errors_pct": self.errors_pct, "guesses": guesses, "drawn": self.drawn, "warnings": self.warnings()}
+
+
+def _words(errors_pct: dict[str, float]) -> str:
+    return " / ".join(f"{e:.1f}" for e in errors_pct.values()) + " %"
+
+
+def _interval(guess: Guess) -> str:
+    return f"{guess.better:.1f} points ({guess.low:.1f} to {guess.high:.1f})"
+
+
+def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) -> Judged | None:
+    """Hold the FP32 plans of a comparison and the guesses against the driver.
+
+    learned: samples of other episodes, which the policy could learn from; the guesses know no others. None if nobody
+    drove on the frames of the comparison, or no action is judged.
+    """
+    units = {a: pct for a in report.action_names if (pct := report.pct(a)) is not None}
+    if report.recorded is None or not units or not learned:
+        return None
+    recorded, known = report.recorded, ~report.is_pad
+    acted = np.stack([s.chunk for s in learned])
+    pads = np.stack([s.is_pad for s in learned])
+    every = acted[~pads]
+    # At a step that no plan reaches, the last one that was reached stands.
+    steps = np.ma.masked_array(acted, np.broadcast_to(pads[..., None], acted.shape)).mean(0).filled(every.mean(0))
+
+    def errors_of(plans: np.ndarray) -> np.ndarray:
+        """(n, judged actions): each frame's mean error over its recorded steps, in percent of the recorded range."""
+        e = np.abs(plans.astype(np.float64) - recorded) * known[..., None]
+        judged = [i for i, a in enumerate(report.action_names) if a in units]
+        return (e.sum(1) / known.sum(1)[:, None])[:, judged] * list(units.values())
+
+    own = errors_of(report.reference)
+    constants = [errors_of(np.broadcast_to(value, acted.shape[1:])) for value in (every.mean(0), np.median(every, 0))]
+    found = {"a constant action": min(constants, key=lambda e: e.mean())}
+    states = np.stack([s.state for s in report.samples])
+    if states.shape[1] == len(report.action_names):
+        found["the last action again"] = errors_of(states[:, None])
+    found["the mean plan"] = errors_of(steps)
+    drawn, pieces = _pieces(report)
+    draws = np.random.default_rng(seed).integers(0, len(pieces), (DRAWS, len(pieces)))
+    counts = np.array([len(p) for p in pieces])
+    guesses = []
+    for name, errors in found.items():
+        gain = (errors - own).mean(1)
+        sums = np.array([gain[p].sum() for p in pieces])
+        low, high = np.percentile(
+            sums[draws].sum(1) / counts[draws].sum(1), [(100 - SURE_PCT) / 2, (100 + SURE_PCT) / 2]
+        )
+        means = dict(zip(units, errors.mean(0).tolist(), strict=True))
+        guesses.append(Guess(name, means, float(gain.mean()), float(low), float(high)))
+    return Judged(dict(zip(units, own.mean(0).tolist(), strict=True)), tuple(guesses), drawn)
+
+
+def _pieces(report: Fidelity) -> tuple[str, list[np.ndarray]]:
+    """Return what is drawn from, in words, and for each piece the numbers of its frames."""
+    episodes = [np.array(list(rows)) for _, rows in groupby(range(len(report.samples)), _episode_of(report.samples))]
+    if len(episodes) >= LEAST_EPISODES:
+        return f"{len(episodes)} episodes", episodes
+    chunk = report.reference.shape[1]
+    pieces = []
+    for rows in episodes:
+        numbers = [report.samples[row].row // chunk for row in rows]
+        pieces += [rows[np.array(numbers) == n] for n in dict.fromkeys(numbers)]
+    return f"{len(pieces)} pieces of {len(episodes)} episode{'s' if len(episodes) > 1 else ''}", pieces
+
+
+def _episode_of(samples: Sequence[Sample]):
+    return lambda row: samples[row].episode

@@ -1,0 +1,57 @@
+"""Open a run's notebooks in JupyterLab, on a copy of the run: cells that are executed again there change no run.
+
+    python -m rover_lib.workshop.run.copy_run demo try1     # what `make notebooks-open NAME=demo AS=try1` does
+
+The copy is a run like any other: `rover report runs/try1` judges it again, and `rover list` says whether it must.
+"""
+
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+
+from rover_lib.onboard.errors import RoverError
+from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, NotebookError, files_of_a_run
+from rover_lib.workshop.run.run_folder import run_folder
+from rover_lib.workshop.swap_folder import build_beside
+
+
+def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
+    """Copy what a run left to the run `copy` (<name>-copy if empty) and return that folder; a copy that is there stays.
+
+    Its notebooks then work in it; checkpoint and recordings stay where they are. Raises NotebookError if there is no
+    such run, or if the copy would be the run itself or is a folder of something else.
+    """
+    source, folder = (run_folder(runs_dir, n, NotebookError) for n in (name, copy or f"{name}-copy"))
+    if not (source / f"{NAMES[0]}.ipynb").is_file():
+        raise NotebookError(f"there is no run {source}", remedy="rover list shows the runs that there are")
+    if folder == source:
+        raise NotebookError(f"{folder}: is the run itself", remedy="give the copy another name: AS=try1")
+    if (folder / f"{NAMES[0]}.ipynb").is_file():
+        return folder
+    if folder.exists():
+        raise NotebookError(f"{folder}: is there, and no copy of a run", remedy="give the copy another name: AS=try1")
+    with build_beside(folder) as new:
+        for path in {*files_of_a_run(source), *source.glob("benchmark-*.json")}:
+            (shutil.copytree if path.is_dir() else shutil.copy2)(path, new / path.name)
+        for path in new.glob("*.ipynb"):  # only the folder itself, as a whole text: run_dir
+            old, own = (json.dumps(json.dumps(str(each)))[1:-1] for each in (source, folder))
+            path.write_text(path.read_text().replace(old, own))
+    return folder
+
+
+def main() -> None:
+    """Replace this process by JupyterLab on the copy of a run, or on the repository's notebooks if no run is named."""
+    name, copy = (*sys.argv[1:], "", "")[:2]
+    try:
+        folder = copy_run(name, copy) if name else NOTEBOOKS
+    except RoverError as error:
+        sys.exit(f"rover: {error}")
+    root = ["--allow-root"] if os.geteuid() == 0 else []  # a container may have no other user
+    print(f"opening {folder}", file=sys.stderr)
+    os.execv(sys.executable, [sys.executable, "-m", "jupyterlab", *root, str(folder)])
+
+
+if __name__ == "__main__":
+    main()
