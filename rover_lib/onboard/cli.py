@@ -30,7 +30,7 @@ CAMERA = click.option(
     "--camera", default="0", show_default=True, help="A number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
 )
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's serial port.")
+PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")
 LOG_DRIVE = click.option(
     "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
 )
