@@ -89,6 +89,25 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as
 
 
 @main.command()
+@click.argument("output", type=FILE, required=False)
+@click.option("--ncnn", "graphs", type=FILE, help="benchmark/models of a copy of ncnn, for what is not counted yet.")
+@click.pass_context
+def clock(ctx: click.Context, output: Path | None, graphs: Path | None) -> None:
+    """Predict what networks and our policies take on a Raspberry Pi 5, and hold it against published times.
+
+    OUTPUT [default: results/clock/clock.json] keeps the counts, so that only what it lacks is counted, in the emulated
+    Cortex-A76: everything takes half an hour on two quiet cores. The exit code is 1 if a gate of lab/params.yml does
+    not hold.
+    """
+    from lab.a76.clock import OUTPUT, table, tell_time
+    from lab.params import lab_params
+
+    content = tell_time(output or OUTPUT, graphs=graphs, limits=lab_params()["clock"], progress=terminal_bar())
+    click.echo(table(content))
+    ctx.exit(0 if all(row["passed"] for row in content["metrics"]["gates"]) else 1)
+
+
+@main.command()
 @click.argument("run_dir", type=FILE)
 @click.option("--samples", type=click.IntRange(min=1), default=64, show_default=True, help="Calibration samples.")
 @click.option("--steps", type=click.IntRange(min=1), default=24, show_default=True, help="Training steps.")

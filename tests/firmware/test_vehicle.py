@@ -103,9 +103,10 @@ def test_a_receiver_that_holds_its_last_pulses_arms_nothing(armed):
 
 def test_arming_asks_for_one_thing_after_the_other():
     board = NativeArduino()
-    board.sticks = [0, 0]
-    board.run(200)
-    assert (board.command("A"), board.status.missing) == ("s", "s")
+    for present in ([0, 0], [0, 124], [1460, 0]):
+        board.sticks = present
+        board.run(200)
+        assert (board.command("A"), board.status.missing) == ("s", "s")
     board.sticks = [1460, 300]
     board.run(200)
     assert (board.command("A"), board.status.missing) == ("t", "t")
@@ -114,7 +115,13 @@ def test_arming_asks_for_one_thing_after_the_other():
     assert (board.command("A"), board.status.missing) == ("w", "w")
     board.wiggle()
     assert board.status.missing == "-"
+    assert board.command("N") == "i"  # a human drives, and goes on
+    assert set(board.drive(1700, 232, 100)) == {(1460, 124)}  # not armed
     assert (board.command("A"), board.status.state) == ("k", State.AUTONOMOUS)
+    assert board.status.missing == "w"  # used up
+    board.command("N")
+    assert set(board.drive(1700, 232, 200)) == {NEUTRAL}
+    assert (board.status.state, board.status.reason, board.status.result) == (State.STOPPED, "n", "i")
 
 
 @pytest.mark.parametrize("sides", [(1750,), (1150,), (1300, 1600), (1750, 1750)])

@@ -23,6 +23,7 @@ from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
 from rover_lib.workshop import hub
+from rover_lib.workshop.lerobot_moved import conversion
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 
 INFO = Path("meta/info.json")
 INFO_BYTES = 5_000_000  # LeRobot's: some kB
-CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 STATE, ACTION = "observation.state", "action"
 NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index")
@@ -222,11 +222,12 @@ def fetch_dataset(source: Source) -> Source:
     The version is checked first, before gigabytes are fetched.
     """
     given = source.path, "dataset", EpisodeError
-    _read_info(hub.fetch(*given, files=("meta/*",)))
+    _read_info(hub.fetch(*given, files=("meta/*",)), hub_id=str(source.path).partition("@")[0])
     return replace(source, path=hub.fetch(*given))
 
 
-def _read_info(root: Path) -> dict[str, Any]:
+def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
+    """Read meta/info.json. hub_id: user/name if the dataset is on the Hub. Raises EpisodeError."""
     path = root / INFO
     try:
         if path.stat().st_size > INFO_BYTES:
@@ -239,13 +240,23 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise EpisodeError(
             f"{path}: does not name a version of LeRobot's format", found=quote(version), remedy=COPY_AGAIN
         )
+    if version.startswith("v2.1"):
+        where = " and give the folder below ~/.cache/huggingface/lerobot that it names" if hub_id else ""
+        raise EpisodeError(
+            f"{root}: a LeRobotDataset v2.1, only v3 is read",
+            remedy=f"convert it once by LeRobot's own `{conversion(root, hub_id)}`{where}",
+        )
     if version.startswith(("v1", "v2")):
         raise EpisodeError(
-            f"{root}: a LeRobotDataset {version}, only v3 is read",
-            remedy=f"convert it once by LeRobot's own '{CONVERTER} --repo-id=... --root={root}'",
+            f"{root}: a LeRobotDataset {quote(version)}, only v3 is read",
+            remedy="convert it to v2.1 by a LeRobot of that time, and then as its documentation says",
         )
     if not version.startswith("v3"):
-        raise EpisodeError(f"{root}: a LeRobotDataset {quote(version)}, only v3 is known here")
+        raise EpisodeError(
+            f"{root}: a LeRobotDataset {quote(version)}, only v3 is known here", remedy="use a newer version of this"
+        )
+    if not isinstance(info.get("data_path"), str):
+        raise EpisodeError(f"{path}: has no 'data_path'", found=quote_all(info), remedy=COPY_AGAIN)
     features, fps = info.get("features"), info.get("fps")
     if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
         raise EpisodeError(f"{path}: does not give a number of frames per second", found=quote(fps), remedy=COPY_AGAIN)
@@ -283,7 +294,8 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
             raise EpisodeError(what, found=found, remedy="record one")
     actions, action_order = _name_numbers(root, features, ACTION, source.action_names)
     states, state_order = _name_numbers(root, features, STATE, _state_names(features, source.action_names))
-    return Layout(names, states, actions, float(info["fps"]), state_order, action_order), cameras
+    sizes = {camera.name: camera.size for camera in cameras}
+    return Layout(names, states, actions, float(info["fps"]), state_order, action_order, sizes), cameras
 
 
 def _state_names(features: Mapping[str, Any], said: tuple[str, ...]) -> tuple[str, ...]:
@@ -332,7 +344,8 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     elif isinstance(names, dict) and len(names) == 1:
         (names,) = names.values()  # {"motors": [...]}
     if isinstance(names, list) and names and all(isinstance(n, str) for n in names):
-        return tuple(names)
+        bare = tuple(name.removesuffix(".vel") for name in names)  # as our plugin's are in LeRobot 0.6
+        return bare if set(bare) == set(ACTION_NAMES) else tuple(names)
     return ()
 
 
@@ -431,7 +444,46 @@ def _open_local(root: Path) -> "LeRobotDataset":
             for number in range(meta.total_episodes):
                 if not (video := root / meta.get_video_file_path(number, key)).is_file():
                     raise EpisodeError(f"{video}: not there", remedy=COPY_AGAIN)
+            _check_video_times(root, meta, key)
         return Local(**given, video_backend=BACKEND)
+
+
+def _check_video_times(root: Path, meta: Any, key: str) -> None:
+    """Raise EpisodeError unless each episode has a part of a video of its own, as long as the episode.
+
+    The merge of LeRobot 0.4.0 wrote times by which an episode is shown another one's pictures.
+    """
+    import av  # here, because our own recordings do not need it
+
+    names = ("length", *(f"videos/{key}/{name}" for name in ("from_timestamp", "to_timestamp")))
+    length, first_s, last_s = (np.asarray(meta.episodes[name], np.float64) for name in names)
+    frame_s = 1 / meta.fps
+    files: dict[Path, list[int]] = {}
+    for number in range(meta.total_episodes):
+        files.setdefault(root / meta.get_video_file_path(number, key), []).append(number)
+    wrong = {
+        int(n): "is not as long as it" for n in np.flatnonzero(~(abs(last_s - first_s - length * frame_s) < frame_s))
+    }
+    for video, numbers in files.items():
+        with av.open(video) as opened:
+            stream = opened.streams.video[0]
+            end_s = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else np.inf
+        numbers.sort(key=first_s.__getitem__)
+        for number, after in zip(numbers, [*numbers[1:], None], strict=True):
+            if after is not None and last_s[number] > first_s[after] + frame_s / 2:
+                wrong[after] = f"overlaps that of episode {number}"
+            if last_s[number] > end_s + frame_s or first_s[number] < 0:
+                wrong[number] = f"ends after the video, which has {end_s:.2f} s"
+    unused = sorted(set((root / "videos" / key).rglob("*.mp4")) - set(files))
+    if wrong or unused:
+        number, what = min(wrong.items(), default=(-1, ""))
+        raise EpisodeError(
+            f"{root}: meta/episodes does not fit the videos of {quote(key)}",
+            found=f"{unused[0].relative_to(root)}, which no episode uses"
+            if number < 0
+            else f"{len(wrong)} of {len(length)} episodes; the part of episode {number} {what}",
+            remedy="merge the original datasets again with a newer LeRobot (lerobot-edit-dataset), or copy it again",
+        )
 
 
 @contextmanager
@@ -475,10 +527,13 @@ def _check_numbers(root: Path, columns: Mapping[str, np.ndarray], layout: Layout
                     remedy="leave those episodes out (lerobot-edit-dataset can), or record them again",
                 )
             if wrong := np.flatnonzero((values < low) | (values > high)).tolist():
+                reverse = name == "throttle" and low == 0 and values.min() >= -1 and values.max() <= high
                 raise EpisodeError(
                     f"{root}: {name} of '{key}' is {values[wrong[0]]:g} in frame {wrong[0]} and {len(wrong) - 1} more, "
                     f"a rover's lies from {low:g} to {high:g}",
-                    remedy="are the names in the right order (--action-names), and the numbers in our units?",
+                    remedy="if that car reverses, say so in a car.yml (reverse_us, docs/build.md) and put it here"
+                    if reverse
+                    else "are the names in the right order (--action-names), and the numbers in our units?",
                 )
 
 
@@ -536,6 +591,8 @@ def _episode(
         data = root / meta.get_data_file_path(number)
         files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
         task = meta.tasks.index[meta.tasks["task_index"] == columns["task_index"][first]]
+    if not data.is_file():
+        raise EpisodeError(f"{data}: not there, and episode {number} is in it", remedy=COPY_AGAIN)
     index = np.arange(n)[:, None] + np.arange(chunk)
     actions, pads = columns[ACTION][rows], index >= n
     chunks = actions[np.minimum(index, n - 1)]
@@ -566,5 +623,14 @@ def _episode(
         controls=n,
         samples=samples,
         files=(root / INFO, data, *files[1:]),
+        corrects=bool(taken_over.any()),
         outcome=outcome,
+    )
+
+
+def lerobot_train(dataset: Path | str) -> str:
+    """Return the command of LeRobot's own that trains an ACT on a LeRobotDataset."""
+    return (
+        f"lerobot-train --dataset.repo_id=local/drives --dataset.root={dataset} --policy.type=act "
+        "--policy.push_to_hub=false --policy.chunk_size=32 --policy.n_action_steps=32 --output_dir=trained"
     )
