@@ -198,7 +198,8 @@ def _armed_by_people(run: Run) -> str | None:
     The gesture: the steering stick at both sides within three seconds, then let go for one, without any throttle.
     """
     lost = _for_ms(run.signals == 0, 130)[130:] & _for_ms(run.signals == 1, 130)[:-130]  # gone after it was there
-    off = run.receiver["steering"] - NEUTRAL_US["steering"]
+    steering = run.receiver["steering"]
+    off = np.where(steering > 0, steering - NEUTRAL_US["steering"], 0)
     throttle = run.receiver["throttle"]
     off_rest = _for_ms((throttle > 0) & (np.abs(throttle - NEUTRAL_US["throttle"]) > 32), GLIMPSE_MS)
     used = 0
