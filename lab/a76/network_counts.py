@@ -189,6 +189,8 @@ POLICIES = (
 class _Noise:
     state: np.ndarray
     picture: np.ndarray
+    episode: str = "noise"
+    row: int = 0
 
     def frame_bgr(self) -> np.ndarray:
         return self.picture

@@ -84,7 +84,7 @@ def _clock(root: Path) -> dict[str, str]:
     """What each policy takes on the cores that drive, as "low to high"; on others as "POLICY, 4 threads"."""
     times = {}
     for row in _metrics(root / "results" / "clock", "clock")["policies"]:
-        span = f"{row['predicted_low_ms']:.2g} to {row['predicted_high_ms']:.2g}"
+        span = span_of(row)
         times[f"{row['name']}, {row['threads']} threads"] = span
         if row["threads"] == DRIVING:
             times[row["name"]] = span
@@ -141,6 +141,11 @@ def _networks(root: Path) -> list[Row]:
         any_row = next(iter(by_threads.values()))
         table.append((f"{runtime} {name}, {precision}", f"{any_row['instructions_g']:.3g}", *cells))
     return table
+
+
+def span_of(row: Mapping[str, Any]) -> str:
+    """Return the ends of a computed time with two digits each."""
+    return " to ".join(f"{float(f'{row[key]:.2g}'):g}" for key in ("predicted_low_ms", "predicted_high_ms"))
 
 
 def _against(row: Mapping[str, Any]) -> str:
