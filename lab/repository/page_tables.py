@@ -66,6 +66,7 @@ def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
         lines = [header, ("---",) * len(header), *rows]
         return match[1] + "".join(map(_line, lines)) + match[4]
 
+    placed = {path: PLACE.sub(place, text) for path, text in texts.items()}
     times = _clock(root)
 
     def tell(match: re.Match[str]) -> str:
@@ -77,7 +78,7 @@ def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
             )
         return match[1] + times[match[2]] + match[4]
 
-    return {path: TIME.sub(tell, PLACE.sub(place, text)) for path, text in texts.items()}
+    return {path: TIME.sub(tell, text) for path, text in placed.items()}
 
 
 def _clock(root: Path) -> dict[str, str]:

@@ -21,7 +21,7 @@ from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.act import ACT
 
 ROOT = Path(__file__).parents[3]
-PROMISED = '20 to 40 ms a plan, "expected 30"'  # by the guide with which this project began
+PROMISED = re.compile('20 to 40 ms a plan, "expected 30"|"20 to 30 ms"')  # by the guide that this project began with
 NS = (0.16, 1.8, 7.5)
 
 
@@ -133,7 +133,7 @@ def test_random_weights_have_the_channels_that_were_asked_for():
 @pytest.mark.parametrize("page", sorted(page_tables.pages()), ids=lambda p: p.name)
 def test_no_computed_time_is_typed(page):
     """A range of ms on a Pi stands between the marks of `make tables`, or in a table of theirs."""
-    text = page_tables.TIME.sub("", page_tables.PLACE.sub("", page.read_text())).replace(PROMISED, "")
+    text = PROMISED.sub("", page_tables.TIME.sub("", page_tables.PLACE.sub("", page.read_text())))
     typed = [line for line in text.splitlines() if re.search(r"\d to \d[\d.]* ms|\d to \d[\d.]* \|", line)]
     assert not [line for line in typed if "Pi 5" in line or "computed" in line]
 
