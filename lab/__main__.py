@@ -176,6 +176,32 @@ def view(ctx: click.Context, output: Path, artifact: Path, pairs: int, stops: in
     ctx.exit(1 if wrong else 0)
 
 
+@main.command("mutants")
+@click.argument("output", type=FILE, required=False)
+@click.option("--only", multiple=True, metavar="NAME", help="Only this mutant; several times for more.")
+@click.option("--drives", is_flag=True, help="Random drives, too, must notice those that an invariant is about.")
+@click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True)
+@click.pass_context
+def plant_mutants(ctx: click.Context, output: Path | None, only: tuple[str, ...], drives: bool, jobs: int) -> None:
+    """Break single lines of the safety path, each in a copy, and see that a named test fails.
+
+    The exit code is 1 if one survives.
+    """
+    from lab.repository.mutants import read_mutants, try_mutants
+    from rover_lib.onboard.stage import write_stage
+
+    outcomes = try_mutants([m for m in read_mutants() if not only or m.name in only], jobs, drives)
+    for outcome in outcomes:
+        click.echo(str(outcome))
+    survived = [outcome.mutant.name for outcome in outcomes if outcome.survived]
+    noticed = sum(outcome.noticed is True for outcome in outcomes)
+    metrics = {"mutants": len(outcomes), "survived": survived, "noticed_by_random_drives": noticed}
+    if output:
+        write_stage(output, "mutants", params={"drives": drives}, metrics=metrics)
+    show(metrics, False)
+    ctx.exit(1 if survived else 0)
+
+
 @main.command("random")
 @click.argument("output", type=FILE, required=False)
 @click.option("--drives", type=click.IntRange(min=1), default=10_000, show_default=True, help="How many.")

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from rover_learn.train import SIZES
 from lab.a76 import peers
 from lab.a76.core import FOR_GUEST, GUEST, Core, CountError, Emulation, emulate_script, fetch_wheels
 from lab.a76.count import STEADY, count_artifact
 from lab.a76.report import work_of
 from rover_learn.channels import kept_of
+from rover_learn.train import SIZES
 from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, ActConfig

@@ -183,7 +183,7 @@ def _demo(root: Path) -> list[Row]:
         )
         return EXPLAINED[mode], *(_strong(field or "", mode == BEST) for field in fields)
 
-    return [("", "MB", "balloons hit", "error, %: steering / throttle", "times faster"), *map(row, EXPLAINED)]
+    return [("", "MB", "balloons hit", "error, %", "times faster"), *map(row, EXPLAINED)]
 
 
 def _faults(root: Path) -> list[Row]:

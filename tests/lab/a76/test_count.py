@@ -335,6 +335,7 @@ def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again,
         count_run(tiny_run, frames=4)
 
 
+@pytest.mark.release  # half a minute to import torch again on the emulated core; the budgets below hold to 2 %
 def test_a_count_is_repeatable(report, core, tiny_run):
     again = count_artifact(core, tiny_run / "policy_static.pt", memory_samples(12, seed=1)[:3], counted=3)
     assert again.steady / 1e9 == pytest.approx(

@@ -173,7 +173,14 @@ def test_the_command_counts_then_draws_then_says_what_it_found(tmp_path, monkeyp
 
     def count_run(run_dir, **options):
         called.append(("count", options["frames"]))
-        counted = artifact(computed_pi5_ms={"low": 50, "ms": 60, "high": 70}, x_floor=1.5, first_g=1.4, load_instructions_g=9.0, instructions_g=1.47, tenth_g=1.47)
+        counted = artifact(
+            computed_pi5_ms={"low": 50, "ms": 60, "high": 70},
+            x_floor=1.5,
+            first_g=1.4,
+            load_instructions_g=9.0,
+            instructions_g=1.47,
+            tenth_g=1.47,
+        )
         metrics = {"artifacts": {"policy_static": counted}, "note": "this policy does not drive"}
         metrics["gates"] = report.gates(metrics, lab_params()["arm"]["gates"])
         write_stage(path, "arm", params={}, metrics=metrics)
