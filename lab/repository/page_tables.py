@@ -97,7 +97,7 @@ def _policies(root: Path) -> list[Row]:
     """What our policies take by threads."""
     rows = _metrics(root / "results" / "clock", "clock")["policies"]
     times = _clock(root)
-    table = [
+    table: list[Row] = [
         ("a plan, ms, *computed*: policy", "10^9 instructions", *(f"{n} thread{'s' * (n > 1)}" for n in range(1, 5)))
     ]
     for row in rows[::CORES]:
@@ -121,7 +121,7 @@ def _fit(root: Path) -> list[Row]:
 def _judged(root: Path) -> list[Row]:
     """How far off the computed times were."""
     metrics = _metrics(root / "results" / "clock", "clock")
-    rows = [("", "times", "median error, %", "worst error, %", "in the interval, %")]
+    rows: list[Row] = [("", "times", "median error, %", "worst error, %", "in the interval, %")]
     for n, found in metrics["judged"].items():
         shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct", "held_pct"))
         rows.append((f"{n} thread{'s' * (n != '1')}, architecture left out", *shown))
@@ -136,7 +136,9 @@ def _networks(root: Path) -> list[Row]:
     rows: dict[tuple[str, ...], dict[int, Mapping[str, Any]]] = {}
     for row in _metrics(root / "results" / "clock", "clock")["networks"]:
         rows.setdefault((row["runtime"], row["name"], row["precision"]), {})[row["threads"]] = row
-    table = [("network", "10^9 instructions", *(f"{n}: published, computed" for n in ("1 thread", "4 threads")))]
+    table: list[Row] = [
+        ("network", "10^9 instructions", *(f"{n}: published, computed" for n in ("1 thread", "4 threads")))
+    ]
     for (runtime, name, precision), by_threads in rows.items():
         cells = (_against(by_threads[n]) if n in by_threads else "" for n in (1, CORES))
         any_row = next(iter(by_threads.values()))

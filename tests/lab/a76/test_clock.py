@@ -50,7 +50,7 @@ def test_the_fit_finds_what_made_the_times_in_spite_of_odd_ones():
 def test_an_interval_holds_nine_in_ten_that_the_fit_did_not_know():
     rows = rows_of(np.random.default_rng(1).normal(0, 0.15, 60))
     predicted, off = clock.leave_out(rows)
-    judged = clock.judge(rows, predicted, off)
+    judged = clock.judge(list(zip(rows, predicted, off, strict=True)))
     assert 85 <= judged["held_pct"] <= 97 and judged["n"] == 120
     far = rows_of([0.0] * 29 + [1.0])[-1]
     assert clock.off_of(far, NS) == pytest.approx(1.0)
