@@ -261,18 +261,20 @@ def test_a_damaged_checkpoint_leaves_no_artifact(tiny_file, tmp_path, monkeypatc
     assert result.exit_code == 1 and "NaN" in result.output and not (tmp_path / "out.pt").exists()
 
 
-@pytest.fixture
-def drives(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
     """Four drives of the expert, through the command line."""
-    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
-    result = rover("world", "record", tmp_path / "episodes", "--count", 4, "--seed", 5)
+    folder = tmp_path_factory.mktemp("drives")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROVER_CACHE", str(folder / "cache"))
+        result = rover("world", "record", folder / "episodes", "--count", 4, "--seed", 5)
     assert result.exit_code == 0, result.output
-    return tmp_path / "episodes"
+    return folder / "episodes"
 
 
 @pytest.mark.slow
 def test_quantizes_and_compares_on_recordings(tiny_file, drives, tmp_path):
-    for mode in ("fp32", "static", "dynamic"):
+    for mode in ("fp32", "static"):
         result = rover("quantize", tiny_file, drives, "-o", tmp_path / f"{mode}.pt", "--mode", mode, "--samples", 8)
         assert result.exit_code == 0, result.output
         assert f"{mode}.pt: {mode}, " in result.output
@@ -287,11 +289,14 @@ def test_quantizes_and_compares_on_recordings(tiny_file, drives, tmp_path):
     assert len(content["static"]["steering_mae_per_step_pct"]) == 32
     (tmp_path / "other").mkdir()
     same_name = shutil.copy(tmp_path / "static.pt", tmp_path / "other" / "static.pt")
-    result = rover("compare", *files[:2], same_name, "--episodes", drives, "--json")
-    assert set(json.loads(result.stdout)) == {f"{tmp_path.name}/static", "other/static"}
-    plain = rover("compare", *files, "--episodes", drives)
+    plain = rover("compare", *files, same_name, "--episodes", drives)
     assert "steering mean %" in plain.output and "times smaller" in plain.output and "held-out frames" in plain.output
-    assert {line.split()[0] for line in plain.output.splitlines()} >= {"reference", "static", "mixed"}
+    assert {line.split()[0] for line in plain.output.splitlines()} >= {
+        "reference",
+        f"{tmp_path.name}/static",
+        "other/static",
+        "mixed",
+    }
 
 
 @pytest.mark.slow
