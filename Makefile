@@ -23,7 +23,7 @@ help:
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make notebooks-open NAME=mine [AS=try1]     JupyterLab on a copy of a run's notebooks, with its outputs; the run stays"
 	@echo "make demo-more                              late plans, and a smaller policy that the demo's teaches: half an hour"
-	@echo "make firmware; make flash PORT=/dev/ttyUSB0 build the Arduino's firmware, and put it on the board"
+	@echo "make firmware; make flash                   build the Arduino's firmware, and put it on the board"
 	@echo "make docs                                   these pages and the notebooks as a site: runs/site/index.html"
 	@echo
 	@echo "For who changes something; CONTRIBUTING.md says what each proves and how long it takes:"
@@ -90,8 +90,9 @@ lint: $(READY)
 $(DEMO): $(READY) $(shell find rover_lib rover_learn balloon_world notebooks -name '*.py' -o -name '*.ipynb' -o -name '*.html') $(wildcard params.yml car.yml)
 	$(MAKE) demo
 
+# Some tests call make, for which it does not matter how this one was called.
 test: lint $(DEMO)
-	$(PYTEST)
+	MAKEFLAGS= $(PYTEST)
 
 # No notebook is among these tests, so they do without nbval, whose import takes three seconds in each process.
 test-fast: $(READY)

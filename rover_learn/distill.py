@@ -44,6 +44,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.files import find_written, write_both
 from rover_lib.workshop.checkpoint.lerobot import read_origin
 from rover_lib.workshop.int8.export import export
+from rover_lib.workshop.int8.frames import describe_odd
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, quantize
 from rover_lib.workshop.int8.scheme import Scheme
@@ -561,8 +562,11 @@ def summary(content: dict[str, Any]) -> str:
             lines.append(f"in INT8{f', {title}' if title else ''}: to its own FP32 {own}; to the teacher {teachers}")
     for row in metrics["gates"]:
         if row["passed"] is False:
-            remedy = "and --qat was not enough: `rover run` says where it comes from" if metrics["before_qat"] else ""
-            remedy = remedy or "`rover run` says where it comes from, and what may help"
+            remedy = "train with --qat"
+            if odd := metrics.get("odd"):  # training with INT8's rounding does not mend those
+                remedy = f"{odd['share_pct']:.0f} % of the frames are odd, and `rover run` names them"
+            elif metrics["before_qat"]:
+                remedy = "--qat was not enough, and `rover run` says where it comes from"
             lines.append(f"INT8 loses {row['found']:.1f} % of the recorded range, more than {row['limit']} %: {remedy}")
     return "\n".join([*lines, metrics["note"]])
 
@@ -615,6 +619,7 @@ def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
             "losses": taught.losses,
             **taught.notes,
             "before_qat": unrounded,
+            "odd": describe_odd(calibration.frames, calibration.seen),
             "gates": [_quantization_gate(students[1])],
             "judged_frames": len(held_out),
             "held_out_episodes": parts.episodes["held_out"],

@@ -193,6 +193,8 @@ class MemorySample:
 
     state: np.ndarray
     picture: np.ndarray
+    row: int = 0
+    episode: str = "memory"
 
     def frame_bgr(self) -> np.ndarray:
         return self.picture
@@ -201,6 +203,6 @@ class MemorySample:
 def memory_samples(count: int, height: int = 72, width: int = 128, seed: int = 0) -> list[MemorySample]:
     rng = np.random.default_rng(seed)
     return [
-        MemorySample(rng.uniform(-0.5, 0.5, 2).astype(np.float32), smooth_frame(rng, height, width))
-        for _ in range(count)
+        MemorySample(rng.uniform(-0.5, 0.5, 2).astype(np.float32), smooth_frame(rng, height, width), row)
+        for row in range(count)
     ]

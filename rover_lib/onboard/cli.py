@@ -30,7 +30,7 @@ CAMERA = click.option(
     "--camera", default="0", show_default=True, help="A number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
 )
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's serial port.")
+PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")
 LOG_DRIVE = click.option(
     "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
 )
@@ -288,15 +288,20 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
     show_default=True,
     help="Episodes to record, one after another.",
 )
+@click.option("--finish", is_flag=True, help="Only make episodes of what killed recordings have left in OUT_DIR.")
 @click.pass_context
-def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -> None:
+def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **options: Any) -> None:
     """Record a human who drives with the transmitter: episode folders in OUT_DIR, to train and calibrate with.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGQUIT end an episode, and it is kept. Exit code 1 if a fault ended it; what was
     recorded until then is kept too.
     """
+    from rover_lib.onboard.recording.episode import find_killed, finish_killed
     from rover_lib.onboard.recording.recorder import record_episodes
 
+    if finish:
+        finished = [finish_killed(part) for part in find_killed(out_dir)]
+        return click.echo("\n".join(f"finished: {path}" for path in finished) or f"{out_dir}: nothing to finish")
     fault = None
     for report in record_episodes(
         folder=out_dir, rate_hz=hz, status=sys.stderr, notify=lambda text: click.echo(text, err=True), **options

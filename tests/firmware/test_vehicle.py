@@ -208,6 +208,25 @@ def test_a_human_who_drives_keeps_the_car_when_another_is_told(board, throttle_u
         assert set(board.run(300)) == {(1600, 300)}
 
 
+@pytest.mark.parametrize(("channel", "off", "missing"), [(0, 1.2, "w"), (0, 1.3, "s"), (1, 1.2, "w"), (1, 1.3, "s")])
+def test_the_period_of_a_signal_may_be_off_by_a_quarter(channel, off, missing):
+    board = NativeArduino()
+    periods = list(board.periods_us)
+    periods[channel] = round(off * periods[channel])
+    board.periods_us = tuple(periods)
+    board.run(400)
+    assert board.status.missing == missing
+
+
+def test_a_throttle_at_rest_frees_nothing_while_the_steering_is_lost(board):
+    board.sticks = [0, 0]
+    board.run(200)
+    board.sticks = [0, 120]
+    board.run(300)
+    board.sticks = [1500, 300]
+    assert set(throttles(board.run(400))) == {120}
+
+
 def test_a_wiggle_is_good_for_one_arming_within_30_seconds(board):
     board.wiggle()
     board.run(28_500)

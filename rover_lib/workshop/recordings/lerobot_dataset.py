@@ -6,7 +6,9 @@ The meaning of its numbers is read from the names of its features, or given by t
 never guessed: if throttle and steering were swapped, training, calibration and comparison would not notice.
 """
 
+import io
 import json
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager
@@ -51,6 +53,12 @@ DRIVEN_BY, OUTCOMES = (
     "outcomes",
 )  # who drove where nobody intervened; what the drive came to, or null
 CAR = "car"  # and of them all, the content of their car.yml
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+TEMPLATES = {"data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video_key}}/{FILE}.mp4"}  # of LeRobot
+# What a small file may claim to hold: frames for which there are bytes, and numbers and pixels that fit in memory.
+FRAMES_FREE, FRAME_BYTES = 20_000, 20
+MOST_VALUES, MOST_PIXELS = 20_000_000, 20_000_000
+UNPACKED_FREE, UNPACKED_TIMES = 100_000_000, 4
 COPY_AGAIN = "copy the whole dataset again"
 UNEVEN = 0.1  # the time between two frames may differ by this share
 
@@ -80,20 +88,36 @@ class _Pictures:
         """Read one frame's pictures by the cameras' names, (h, w, 3) uint8 BGR each."""
         with _said_of(path, f"its frame {row} cannot be decoded"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torchvision warns of the decoder that LeRobot has chosen
+            for camera in self.cameras:
+                self._check_size(camera, self._size(camera, row), row, path)  # a bomb is not decoded
             item = self.dataset[row]
             # Each is (3, h, w) float32 in [0, 1]. Dividing a uint8 by 255 and multiplying by 255 again is exact.
             pixels = [(item[camera.key] * 255).round().byte().permute(1, 2, 0).numpy() for camera in self.cameras]
         frames = {}
         for camera, frame in zip(self.cameras, pixels, strict=True):
-            if frame.shape != (*camera.size, 3):
-                raise EpisodeError(
-                    f"{path}: its frame {row} of '{camera.key}' has another shape than meta/info.json says, "
-                    f"{(*camera.size, 3)}",
-                    found=frame.shape,
-                    remedy="record pictures of one size in one dataset",
-                )
+            self._check_size(camera, frame.shape, row, path)
             frames[camera.name] = np.ascontiguousarray(frame[..., ::-1])
         return frames
+
+    def _size(self, camera: _Camera, row: int) -> tuple[int, ...]:
+        """Return the shape that a picture's header gives; for a video, what it should be."""
+        from PIL import Image
+
+        if camera.key in self.dataset.meta.video_keys:
+            return *camera.size, 3
+        packed = self.dataset.hf_dataset.data.column(camera.key)[row]["bytes"].as_py()
+        with Image.open(io.BytesIO(packed)) as image:
+            return *image.size[::-1], 3
+
+    @staticmethod
+    def _check_size(camera: _Camera, shape: tuple[int, ...], row: int, path: Path) -> None:
+        if shape != (*camera.size, 3):
+            raise EpisodeError(
+                f"{path}: its frame {row} of '{camera.key}' has another shape than meta/info.json says, "
+                f"{(*camera.size, 3)}",
+                found=shape,
+                remedy="record pictures of one size in one dataset",
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +151,10 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     root = source.path
     info = _read_info(root)
     layout, cameras = _layout(root, info, source)
+    _check_files(root, info)
     _check_tables(root, info["features"], {*NUMBERS, INTERVENTION, SUCCESS, *(camera.key for camera in cameras)})
     dataset = _open_local(root)
+    _check_pictures(root, dataset, cameras)
     columns = _columns(root, dataset, layout)
     pictures = _Pictures(dataset, cameras)
     _check_rate(root, columns, float(info["fps"]))
@@ -325,9 +351,55 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:
     shape = list(feature["shape"])
-    if len(shape) == 3 and 3 in (shape[0], shape[2]):
+    if len(shape) == 3 and 3 in (shape[0], shape[2]) and math.prod(shape) <= 3 * MOST_PIXELS:
         return (shape[0], shape[1]) if shape[2] == 3 else (shape[1], shape[2])
     raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy="choose another: --camera NAME")
+
+
+def _check_files(root: Path, info: Mapping[str, Any]) -> None:
+    """Raise EpisodeError for files that are none, and for tables that claim to hold more than their bytes can.
+
+    This comes before LeRobot opens anything: it would wait for a pipe, and unpack whatever a table claims.
+    """
+    from pyarrow import parquet
+
+    for key, template in TEMPLATES.items():
+        if info.get(key, template) not in (template, None):
+            raise EpisodeError(
+                f"{root}: its {key} is not LeRobot's", found=quote(info[key]), remedy=f"write {template}"
+            )
+    size = 0
+    for path in (path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*")):
+        if not path.is_dir() and not path.is_file():
+            raise EpisodeError(f"{path}: not a plain file", remedy=COPY_AGAIN)
+        size += path.stat().st_size
+        if path.suffix == ".json" and path.stat().st_size > INFO_BYTES:
+            raise EpisodeError(f"{path}: is larger than any that LeRobot writes", remedy=COPY_AGAIN)
+    rows = values = unpacked = 0
+    for path in root.rglob("*.parquet"):
+        with _said_of(path, "LeRobot cannot read it"):
+            footer = parquet.read_metadata(path)
+        groups = [footer.row_group(i) for i in range(footer.num_row_groups)]
+        columns = [group.column(i) for group in groups for i in range(group.num_columns)]
+        rows += footer.num_rows
+        values += sum(column.num_values for column in columns)
+        unpacked += sum(column.total_uncompressed_size for column in columns)
+    most = FRAMES_FREE + size // FRAME_BYTES, MOST_VALUES, UNPACKED_FREE + UNPACKED_TIMES * size
+    for what, found, limit in zip(("rows", "values", "bytes"), (rows, values, unpacked), most, strict=True):
+        if found > limit:
+            raise EpisodeError(f"{root}: its tables claim {found:,} {what}, more than files of {size:,} bytes can hold")
+
+
+def _check_pictures(root: Path, dataset: "LeRobotDataset", cameras: tuple[_Camera, ...]) -> None:
+    """Raise EpisodeError for pictures that are not in the dataset's own tables: a path may lead anywhere."""
+    for camera in cameras:
+        if camera.key in dataset.meta.video_keys:
+            continue
+        for chunk in dataset.hf_dataset.data.column(camera.key).chunks:
+            if chunk.null_count or chunk.field("bytes").null_count:
+                raise EpisodeError(
+                    f"{root}: pictures of '{camera.key}' are not in its tables, but named by a path", remedy=COPY_AGAIN
+                )
 
 
 def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> None:

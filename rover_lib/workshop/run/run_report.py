@@ -30,6 +30,7 @@ CARD = "rover-policy"  # this project's name, by which a card that we wrote is k
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
     "04_worst_frames": "The frames on which static INT8 differs most from FP32",
+    "02_odd_frames": "Frames that the policy answers far more strongly than the others",
     "03_sensitivity": "How much of the error each block causes",
     "04_hits": "Balloons hit, by mode",
     "05_latency": "How long a plan takes, by mode",
