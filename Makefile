@@ -90,8 +90,9 @@ lint: $(READY)
 $(DEMO): $(READY) $(shell find rover_lib rover_learn balloon_world notebooks -name '*.py' -o -name '*.ipynb' -o -name '*.html') $(wildcard params.yml car.yml)
 	$(MAKE) demo
 
+# Some tests call make, for which it does not matter how this one was called.
 test: lint $(DEMO)
-	$(PYTEST)
+	MAKEFLAGS= $(PYTEST)
 
 # No notebook is among these tests, so they do without nbval, whose import takes three seconds in each process.
 test-fast: $(READY)

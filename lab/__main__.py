@@ -89,6 +89,25 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as
 
 
 @main.command()
+@click.argument("output", type=FILE, required=False)
+@click.option("--ncnn", "graphs", type=FILE, help="benchmark/models of a copy of ncnn, for what is not counted yet.")
+@click.pass_context
+def clock(ctx: click.Context, output: Path | None, graphs: Path | None) -> None:
+    """Predict what networks and our policies take on a Raspberry Pi 5, and hold it against published times.
+
+    OUTPUT [default: results/clock/clock.json] keeps the counts, so that only what it lacks is counted, in the emulated
+    Cortex-A76: everything takes half an hour on two quiet cores. The exit code is 1 if a gate of lab/params.yml does
+    not hold.
+    """
+    from lab.a76.clock import OUTPUT, table, tell_time
+    from lab.params import lab_params
+
+    content = tell_time(output or OUTPUT, graphs=graphs, limits=lab_params()["clock"], progress=terminal_bar())
+    click.echo(table(content))
+    ctx.exit(0 if all(row["passed"] for row in content["metrics"]["gates"]) else 1)
+
+
+@main.command()
 @click.argument("run_dir", type=FILE)
 @click.option("--samples", type=click.IntRange(min=1), default=64, show_default=True, help="Calibration samples.")
 @click.option("--steps", type=click.IntRange(min=1), default=24, show_default=True, help="Training steps.")
@@ -155,6 +174,32 @@ def view(ctx: click.Context, output: Path, artifact: Path, pairs: int, stops: in
     for sentence in wrong:
         click.echo(f"rover: {sentence}", err=True)
     ctx.exit(1 if wrong else 0)
+
+
+@main.command("mutants")
+@click.argument("output", type=FILE, required=False)
+@click.option("--only", multiple=True, metavar="NAME", help="Only this mutant; several times for more.")
+@click.option("--drives", is_flag=True, help="Random drives, too, must notice those that an invariant is about.")
+@click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True)
+@click.pass_context
+def plant_mutants(ctx: click.Context, output: Path | None, only: tuple[str, ...], drives: bool, jobs: int) -> None:
+    """Break single lines of the safety path, each in a copy, and see that a named test fails.
+
+    The exit code is 1 if one survives.
+    """
+    from lab.repository.mutants import read_mutants, try_mutants
+    from rover_lib.onboard.stage import write_stage
+
+    outcomes = try_mutants([m for m in read_mutants() if not only or m.name in only], jobs, drives)
+    for outcome in outcomes:
+        click.echo(str(outcome))
+    survived = [outcome.mutant.name for outcome in outcomes if outcome.survived]
+    noticed = sum(outcome.noticed is True for outcome in outcomes)
+    metrics = {"mutants": len(outcomes), "survived": survived, "noticed_by_random_drives": noticed}
+    if output:
+        write_stage(output, "mutants", params={"drives": drives}, metrics=metrics)
+    show(metrics, False)
+    ctx.exit(1 if survived else 0)
 
 
 @main.command("random")

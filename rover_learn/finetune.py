@@ -43,6 +43,7 @@ from rover_learn.lessons import (
 )
 from rover_learn.student import gmac, not_a_cars
 from rover_learn.training import Resumable, descend, optimiser, threads
+from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
@@ -50,7 +51,7 @@ from rover_lib.onboard.recording.episode import HUMAN
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import act
 from rover_lib.workshop.cache import cache_root, key_of
-from rover_lib.workshop.checkpoint.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_both
 from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
@@ -333,7 +334,7 @@ def _refuse_another_camera(read: Sequence[Recordings]) -> None:
     shapes = [r.episodes[0].samples[0].frame_bgr().shape[:2] for r in read]
     height, width = shapes[0]
     for recordings, (own_height, own_width) in zip(read, shapes, strict=True):
-        if abs(own_width * height / (own_height * width) - 1) > SQUEEZED:
+        if is_squeezed((own_width, own_height), (width, height)):
             raise FinetuneError(
                 f"{recordings.root}: its camera has another shape than that of {read[0].root}",
                 found=f"{own_width}x{own_height} beside {width}x{height}",

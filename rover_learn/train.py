@@ -64,6 +64,7 @@ from rover_lib.workshop.checkpoint.files import trainer_config
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings.episodes import load_recordings, split
+from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     Recordings,
@@ -256,14 +257,6 @@ def _rate_hz(recordings: Recordings) -> float:
     rates = [found for e in recordings.episodes if (found := frame_rate_hz(e.samples)) is not None]
     found_hz = layout.rate_hz or (float(np.median(rates)) if rates else PLANNED_HZ)
     return float(round(found_hz)) if layout.rate_hz or is_another_rate(found_hz, PLANNED_HZ) else PLANNED_HZ
-
-
-def lerobot_train(dataset: Path | str) -> str:
-    """Return the command of LeRobot's own that trains an ACT on a LeRobotDataset."""
-    return (
-        f"lerobot-train --dataset.repo_id=local/drives --dataset.root={dataset} --policy.type=act "
-        "--policy.push_to_hub=false --policy.chunk_size=32 --policy.n_action_steps=32 --output_dir=trained"
-    )
 
 
 def _turned(recordings: Recordings, progress: Progress) -> Recordings:

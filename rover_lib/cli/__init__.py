@@ -26,7 +26,7 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
         prepare.list_runs,
     ),
     "Teach": (),
-    "Recordings": (ROVERS["label"], prepare.export_dataset),
+    "Recordings": (ROVERS["label"], prepare.import_tub, prepare.export_dataset),
     "A rover's models, and arming it": (
         prepare.wheelhouse,
         ROVERS["release"],

@@ -12,7 +12,7 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +37,7 @@ MANIFEST_KEYS: dict[str, type | tuple[type, ...]] = {
     "mode": str,  # one of MODES
     "scheme": str,  # one of SCHEMES
     "engine": str,  # see engines.py
-    "cameras": list,  # [{name, height, width}], in the graph's order
+    "cameras": list,  # [{name, height, width}], in the graph's order, and recorded, see seen_size
     "state_names": list,
     "action_names": list,
     "chunk": int,  # actions per inference
@@ -240,11 +240,13 @@ def check_manifest(manifest: Any, where: str) -> None:
     if not manifest["cameras"]:
         raise ArtifactError(f"{where}: manifest has no cameras", remedy="quantize again")
     for camera in manifest["cameras"]:
-        if not isinstance(camera, dict) or not {"name", "height", "width"} <= camera.keys():
+        recorded = camera.get("recorded", [1, 1]) if isinstance(camera, dict) else None
+        pair = isinstance(recorded, list) and len(recorded) == 2
+        if not isinstance(camera, dict) or not pair or not {"name", "height", "width"} <= camera.keys():
             raise ArtifactError(
                 f"{where}: manifest camera {str(camera)[:80]!r} lacks name, height or width", remedy="quantize again"
             )
-        sides = [camera["height"], camera["width"]]
+        sides = [camera["height"], camera["width"], *camera.get("recorded", ())]
         if not is_name(camera["name"]) or not all(isinstance(s, int) and _is_within(s, SIDE_PX) for s in sides):
             raise ArtifactError(
                 f"{where}: manifest camera {str(camera)[:80]!r} is not a name and a size", remedy="quantize again"
@@ -274,6 +276,17 @@ def check_manifest(manifest: Any, where: str) -> None:
                 found=repr(value)[:60],
                 remedy="quantize again",
             )
+
+
+def seen_size(manifest: Mapping[str, Any]) -> tuple[int, int]:
+    """Return (width, height) of the pictures that a policy's first camera gave.
+
+    That is the policy's own size unless its recordings have another shape, which then is the camera's `recorded`:
+    [height, width].
+    """
+    camera = manifest["cameras"][0]
+    height, width = camera.get("recorded", (camera["height"], camera["width"]))
+    return width, height
 
 
 def largest_tolerance(mode: str, action: str) -> float:

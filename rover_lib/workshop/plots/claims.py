@@ -52,6 +52,13 @@ def error(report: Fidelity, mode: str = GATED) -> str:
     return f"{_upper(_called(mode))} is off by {how}, most in {action}"
 
 
+def odd_frames(odd: Mapping[str, Any], most: float) -> str:
+    """odd: `frames.describe_odd`. most: how many times the median frame's largest value any frame's is."""
+    if not odd:
+        return f"No frame is odd: none has values above {most:.1f} times the median frame's"
+    return f"On {odd['share_pct']:.1f} % of the frames {odd['block']} answers {odd['times']:.0f} times more than usual"
+
+
 def worst_frame(frame: WorstFrame) -> str:
     return f"On its worst frame {_called(frame.mode)} is {frame.error_pct:.2f} % off, in {frame.action}"
 

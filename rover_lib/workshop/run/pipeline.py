@@ -22,10 +22,12 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.int8.choose import Chooser
 from rover_lib.workshop.int8.export import Exporter, Parity, export
+from rover_lib.workshop.int8.frames import describe_odd, odd_samples, odd_share
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, quantize
-from rover_lib.workshop.int8.scheme import Scheme
+from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.compare import ARTIFACTS
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
@@ -41,13 +43,14 @@ class Recipe:
     """What params.yml says of making artifacts.
 
     samples: at most this many frames calibrate. seed: of their choice. scheme: static INT8, before its observer is
-    chosen. parity: what an artifact must answer where it is loaded.
+    chosen. parity: what an artifact must answer where it is loaded. observers: to choose from.
     """
 
     samples: int
     seed: int
     scheme: Scheme
     parity: Parity
+    observers: tuple[str, ...] = OBSERVERS
 
     @classmethod
     def of(cls, p: Mapping[str, Any], samples: int | None = None) -> "Recipe":
@@ -60,11 +63,22 @@ class Recipe:
                 kind=quantization["scheme"], smooth=quantization["smooth"], percentile=quantization["percentile"]
             ),
             parity=Parity(parity["fp32"], parity["int8_errors"], parity["vectors"]),
+            observers=tuple(quantization["observers"]),
         )
 
     def choose(self, samples: tuple[Sample, ...]) -> tuple[tuple[Sample, ...], str | None]:
         """Those of the samples that calibrate, and a note if they are fewer than asked for."""
         return choose_calibration(samples, self.samples, self.seed)
+
+
+def prepare_chooser(
+    checkpoint: Checkpoint, loaded: Opened, calibration: Calibration, frames: int = CHOOSING_FRAMES
+) -> Chooser:
+    """A chooser on this many frames that calibration has not seen, and on some of the odd ones that it met."""
+    parts = loaded.parts
+    odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
+    few = pick_evenly(parts.choosing or parts.calibration, frames)
+    return Chooser(checkpoint, calibration, few, loaded.recordings.action_range(), odd)
 
 
 def turn_params(**sections: Mapping[str, Any]) -> dict[str, Any]:
@@ -95,6 +109,7 @@ def make_artifact(
 ) -> tuple[str, list[str]]:
     """One artifact at `path`: calibrated on the recordings, quantized by the recipe's scheme, exported.
 
+    Where there are odd frames, which one scale may not serve, the ranges are chosen first; else that saves its time.
     fp32: exported as it is. Returns its content hash, and warnings. Raises QuantizeError, in `calibrate`, `quantize`
     and `export`.
     """
@@ -104,7 +119,10 @@ def make_artifact(
         return export(ACT(checkpoint.config, checkpoint.weights), checkpoint, path, samples, parity=recipe.parity), []
     chosen, note = recipe.choose(parts.calibration)
     calibration = calibrate(checkpoint, chosen, smooth=recipe.scheme.smooth, progress=progress)
-    policy = quantize(checkpoint, recipe.scheme, calibration)
+    scheme = recipe.scheme
+    if odd_share(calibration.frames):
+        scheme, _ = prepare_chooser(checkpoint, loaded, calibration).observer(scheme, recipe.observers, progress)
+    policy = quantize(checkpoint, scheme, calibration)
     digest = export(policy, checkpoint, path, samples, calibration, recipe.parity)
     return digest, ([note] if note else []) + policy.report["warnings"]
 
@@ -148,8 +166,7 @@ def requantize(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
         raise QuantizeError(
             f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json", remedy="quantize again"
         )
-    scheme = Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
-    return quantize(checkpoint, scheme, Calibration.load(calibrated))
+    return quantize(checkpoint, Scheme.of(made["scheme"]), Calibration.load(calibrated))
 
 
 def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, str]:
@@ -229,6 +246,7 @@ def write_calibrate(
         "note": note,
         "seconds_s": calibration.seconds,
         "ranges": calibration.ranges,
+        "odd": describe_odd(calibration.frames, calibration.seen),
         "episodes": sorted({s.episode for s in samples}),
     }
     digests = {path: sha256_of(path) for path in {s.frame_path for s in samples}}  # a video holds many frames

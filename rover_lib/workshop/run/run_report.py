@@ -26,9 +26,11 @@ from rover_lib.workshop.judge.verdict import CALLED, Names, against, count, erro
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
 LATER = ("arm", "students")  # that `make count` and `rover world students` add to a run
 PAGE = "report.html"
+CARD = "rover-policy"  # this project's name, by which a card that we wrote is known
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
     "04_worst_frames": "The frames on which static INT8 differs most from FP32",
+    "02_odd_frames": "Frames that the policy answers far more strongly than the others",
     "03_sensitivity": "How much of the error each block causes",
     "04_hits": "Balloons hit, by mode",
     "05_latency": "How long a plan takes, by mode",
@@ -197,6 +199,32 @@ def table(judged: Mapping[str, Any]) -> list[str]:
 
 
 # --- as a page --------------------------------------------------------------------------------------------------------
+
+
+def write_card(run_dir: Path | str) -> Path:
+    """Write README.md into a run's folder, a model card for the Hub, from its run.json and load.json; return its path.
+
+    Raises RoverError if the run has no verdict, and if there is a README.md that this has not written.
+    """
+    folder = Path(run_dir)
+    judged, load = (read_stage(folder / f"{name}.json", name)["metrics"] for name in ("run", "load"))
+    path, recordings = folder / "README.md", load["recordings"]
+    if path.exists() and CARD not in path.read_text(errors="replace"):
+        raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
+    header, *rows = columns(judged)
+    recorded = f"{count(recordings['episodes'], 'episode')}, {recordings['samples']} frames"
+    use = f"rover drive {judged['artifact']}" if judged["artifact"] else "none of them: no artifact should drive a car"
+    text = [
+        "---", "library_name: lerobot", "pipeline_tag: robotics", "tags: [lerobot, robotics, act, int8]", "---", "",
+        f"# {folder.resolve().name}: {judged['headline']}", "", *judged["why"], "",
+        f"| {' | '.join(header)} |", f"|{'---|' * len(header)}", *(f"| {' | '.join(row)} |" for row in rows), "",
+        f"Errors are mean differences from FP32, in percent of the recorded range. Speed: {judged['timing']}.", "",
+        f"Calibrated and judged on {recorded}: {recordings['layout'].replace('|', '/')}.", "",
+        f"To drive, in a checkout of {CARD}: `{use}`. In LeRobot: `python -m lerobot_robot_rover ARTIFACT FOLDER`.",
+        "", "## Keep in mind", "", *(f"- {line}" for line in judged["cautions"] or ["Nothing speaks against it."]), "",
+    ]  # fmt: skip
+    path.write_text("\n".join(text))
+    return path
 
 
 def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes], files: Sequence[str] = ()) -> str:

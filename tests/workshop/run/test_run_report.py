@@ -123,6 +123,17 @@ def test_commands_work_as_they_are_printed(run_dir, monkeypatch):
     assert report.typed("rover list") == "rover list"
 
 
+def test_a_card_says_what_the_verdict_says_and_replaces_only_cards(run_dir):
+    content = report.write(run_dir)["metrics"]
+    for _ in range(2):
+        text = report.write_card(run_dir).read_text()
+    assert text.startswith("---\nlibrary_name: lerobot\n") and content["headline"] in text
+    assert f"`rover drive {content['artifact']}`" in text and all(line in text for line in content["cautions"])
+    (run_dir / "README.md").write_text("mine")
+    with pytest.raises(RoverError, match="is not a card that this has written; move it away"):
+        report.write_card(run_dir)
+
+
 def test_the_page_needs_no_other_file_and_fits_a_phone(run_dir):
     report.write(run_dir)
     html = (run_dir / report.PAGE).read_text()
