@@ -177,12 +177,8 @@ def _demo(root: Path) -> list[Row]:
         found = modes[mode]
         errors = [_of(found, f"{action}_mae_pct", ".2f") for action in ("steering", "throttle")]
         hits = f"{found['hits']} of {found['trials']}"
-        fields = (
-            _of(found, "size_mb", ".1f"),
-            hits,
-            " / ".join(filter(None, errors)),
-            _of(timed[mode], "speedup", ".1f"),
-        )
+        faster = f"{timed['fp32']['latency_p50_ms'] / timed[mode]['latency_p50_ms']:.1f}"
+        fields = (_of(found, "size_mb", ".1f"), hits, " / ".join(filter(None, errors)), faster)
         return EXPLAINED[mode], *(_strong(field or "", mode == BEST) for field in fields)
 
     return [("", "MB", "balloons hit", "error, %", "times faster"), *map(row, EXPLAINED)]
