@@ -530,12 +530,13 @@ def _of_odd_frames(odd: Mapping[str, Any]) -> str:
         kind: ", ".join(f"{k.removesuffix('_mae_pct')} {v:.2f}" for k, v in errors.items() if v is not None)
         for kind, errors in odd["errors"].items()
     }
+    others = f", by {off['usual']} % on the others" if "usual" in off else ""
     episodes, rows = list(odd["episodes"]), odd["rows"]
     at_start = f", frame {max(rows)} or earlier" if max(rows) < EARLY_FRAMES else ""
     return (
         f"In {odd['share_pct']:.1f} % of the frames ({_some(episodes)}{at_start}) {odd['block']} answers "
         f"{odd['times']:.0f} times more than usual: what is special there? Static INT8 is off by {off['odd']} % on "
-        f"them, by {off['usual']} % on the others."
+        f"them{others}."
     )
 
 
