@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.driving.virtual import HELD, LIVE, Hand, Seen
+from lab.driving.virtual import HELD, LIVE, Asked, Hand, Seen
 
 # What firmware/README.md and params.yml promise, with numbers that are written here anew.
 RESTING_US = 124  # a throttle pulse up to this moves no car
@@ -63,9 +63,8 @@ class Run:
         for start, end in seen.pauses:
             paused[start:end] = True
         self.clean = ~self.sick & ~_for_any(paused, STOP_MS + 20)
-        self.receiver = {
-            pin: _each_ms(seen.hands, n, lambda h, i=i: h.pulses()[i]) for i, pin in enumerate(("steering", "throttle"))
-        }
+        sent = [[(ms, hand.pulses()[channel]) for ms, hand in seen.hands] for channel in (0, 1)]
+        self.receiver = {pin: _each_ms(sent[i], n, int) for i, pin in enumerate(("steering", "throttle"))}
         self.live = _each_ms(seen.hands, n, lambda h: h.receiver == LIVE)
         self.stick = {
             "steering": _each_ms(seen.hands, n, lambda h: h.sticks[0]),
@@ -307,7 +306,8 @@ def _bad_ends(run: Run) -> str | None:
 
 def _answered(run: Run) -> str | None:
     """A drive that has had no answer for 150 ms sends nothing more."""
-    heard, waiting, at = run.seen.heard, deque(), 0
+    heard, at = run.seen.heard, 0
+    waiting: deque[Asked] = deque()
     for command in run.seen.commands:
         while at < len(heard) and heard[at][0] <= command.at_ms:
             while waiting and (heard[at][1] - waiting[0].sequence) % 2**32 < 2**31:

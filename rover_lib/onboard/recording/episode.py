@@ -259,8 +259,9 @@ class EpisodeWriter:
         self._extra = dict.fromkeys(name for row in controls for name in row if name not in known)
         times = [row["system_timestamp"] for row in controls] + [row["timestamp"] for row in frames]
         self.controls, self.frames, self._first_s, self._last_s = len(controls), len(frames), min(times), max(times)
-        height, width = cv2.imread(str(part / frames[0]["image_path"])).shape[:2]
-        self.resolution = width, height
+        first = cv2.imread(str(part / frames[0]["image_path"]))
+        if first is not None:
+            self.resolution = first.shape[1], first.shape[0]
         self.metadata["fault"] = "the program that recorded it was killed"
 
     def _append(self, kind: str, row: dict[str, Any], t_s: float) -> None:
