@@ -361,7 +361,7 @@ def _told(run: Run) -> str | None:
             continue  # the answer to arming was lost, so no drive began, and the firmware stopped without a command
         for begin, end, words in seen.drives:
             late = end - left > ENDED_MS + seen.paused_ms
-            drove = any(begin <= armed <= left for armed in run.armed)  # and did not only wait for the next request
+            drove = any(begin <= armed <= left for armed in run.armed)  # and did not only wait for a request
             if (
                 begin <= left < end and drove and late and words is not None
             ):  # if it is None, the next start tells of it
