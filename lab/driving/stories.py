@@ -320,6 +320,7 @@ def _suspend(stage: Stage, h: Happening) -> None:
     stage.world.suspend(h.for_ms)
 
 
+@_may("the process stutters for long", (75, 98), (900, 2500))
 @_may("the process stutters", (20, 140), A_WHILE)
 def _stutter(stage: Stage, h: Happening) -> None:
     stage.again_and_again(h, 150, lambda: stage.world.pause(h.amount))
@@ -366,6 +367,12 @@ def _start(stage: Stage, h: Happening) -> None:
         stage.process.ask()
     else:
         stage.start_due = True
+
+
+@_may("the operator starts it, and the machine is suspended", for_ms=(2500, 20_000))
+def _start_and_suspend(stage: Stage, h: Happening) -> None:
+    _start(stage, h)
+    stage.world.at(stage.world.now_ms + 5, lambda: stage.world.suspend(h.for_ms))
 
 
 H = Happening
