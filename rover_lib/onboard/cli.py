@@ -386,7 +386,7 @@ def calibrate(
     """
     from rover_lib.onboard.car.calibrate import measure, refuse_existing, write_car
     from rover_lib.onboard.car.car import Car, default_place, read_car, yaml_of
-    from rover_lib.onboard.car.servo_link import ServoLink
+    from rover_lib.onboard.car.servo_link import LinkError, ServoLink
     from rover_lib.onboard.errors import CarError
 
     path = output or default_place()
@@ -406,7 +406,10 @@ def calibrate(
             notify=lambda text: click.echo(text, err=True),
             **more,
         )
-        link.tell(car)  # the Arduino still has the last one that was tried
+        # The Arduino still has the last one that was tried. It may refuse this one while the throttle's stick is off
+        # that one's rest; the next command that opens the port tells it again.
+        with contextlib.suppress(LinkError):
+            link.tell(car)
     click.echo(yaml_of(car), nl=False)  # before writing: if that fails, it can be copied from here
     write_car(car, path)
     click.echo(f"rover: written to {path}", err=True)
