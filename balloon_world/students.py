@@ -179,7 +179,7 @@ def _artifact_of(run_dir: Path) -> Path:
 
 
 def _counts(run_dir: Path) -> dict[str, Any] | None:
-    """Return what arm.json says about policy_static.pt; None if it was not counted, or as another file, or without lines."""
+    """Return what arm.json says about policy_static.pt; None if nothing, or of another file, or without cache lines."""
     if not (path := run_dir / "arm.json").is_file():
         return None
     arm = read_stage(path, "arm")

@@ -126,6 +126,28 @@ def full(run_dir: Path, steps: int, learned: bool, **options: Any) -> None:
 
 
 @main.command()
+@click.argument("episodes", type=FILE)
+@click.argument("folder", type=FILE)
+@click.option("--trainings", type=click.IntRange(min=1), default=6, show_default=True, help="Each with all statistics.")
+@click.pass_context
+def statistics(ctx: click.Context, episodes: Path, folder: Path, trainings: int) -> None:
+    """Train small policies on EPISODES whose statistics come from elsewhere, and judge their static INT8.
+
+    Leaves statistics.json in FOLDER, and goes on there if it was ended. Each policy takes some minutes. Exit code 1 if
+    fewer than 28 of 30 keep the gate.
+    """
+    from lab.int8.statistics import judge_statistics
+
+    metrics = judge_statistics(episodes, folder, trainings, progress=terminal_bar())["metrics"]
+    for row in metrics["policies"]:
+        errors = f"{row['steering_mae_pct']:.2f} / {row['throttle_mae_pct']:.2f} %"
+        odd = f"{row['odd']['share_pct']:.0f} % odd, {row['odd']['times']:.0f} times" if row["odd"] else "no odd frames"
+        kept = "holds" if row["passed"] else "MISSES"
+        click.echo(f"training {row['training']}, {row['statistics']}: {errors} ({row['observer']}; {odd}) {kept}")
+    ctx.exit(0 if all(g["passed"] for g in metrics["gates"]) else 1)
+
+
+@main.command()
 @click.argument("output", type=FILE, required=False)
 @click.option("--only", metavar="NAME", multiple=True, help="Only this row, 'fuzz' or 'bytes'; several times for more.")
 @click.option("--kind", "kinds", metavar="KIND", multiple=True, help="Rows of this kind; several times for more.")
@@ -200,6 +222,30 @@ def plant_mutants(ctx: click.Context, output: Path | None, only: tuple[str, ...]
         write_stage(output, "mutants", params={"drives": drives}, metrics=metrics)
     show(metrics, False)
     ctx.exit(1 if survived else 0)
+
+
+@main.command("kills")
+@click.argument("output", type=FILE, required=False)
+@click.option("--each", type=click.IntRange(min=1), default=50, show_default=True, help="Kills of each.")
+@click.pass_context
+def kill_commands(ctx: click.Context, output: Path | None, each: int) -> None:
+    """Kill what writes files at random moments, and fill its disk (as root). Exit code 1 if anything is lost."""
+    import tempfile
+
+    from lab.repository import kills
+    from rover_lib.onboard.stage import write_stage
+
+    metrics: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = kills.make_inputs(Path(folder))
+        for work in kills.WORKS:
+            metrics[f"{work.name}_killed"] = kills.kill_randomly(work, inputs, each)
+            if os.geteuid() == 0:
+                metrics[f"{work.name}_disk_full"] = kills.fill_randomly(work, inputs, max(1, each // 5))
+    if output:
+        write_stage(output, "kills", params={"each": each}, metrics=metrics)
+    show(metrics, False)
+    ctx.exit(1 if any(found["wrong"] for found in metrics.values()) else 0)
 
 
 @main.command("random")

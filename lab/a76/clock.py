@@ -39,8 +39,7 @@ HELD = 0.9  # the share of times that an interval is to hold
 GENTLE = 0.05  # a relative error below it weighs by its square, above it more and more by its size
 STEPS, START = 60, (150.0, 2000.0, 6000.0)  # of the fit, and where it begins
 NOT_JUDGED = {  # rows that are predicted but neither fitted nor judged, and why
-    "executorch/googlenet/int8": "its card states no threads, and its time is that of one",
-    "executorch/mobilenet_v2/fp32": "its source states no threads",
+    "executorch/googlenet/int8": "its time is that of one thread, in INT8 and in FP32",
 }
 
 
@@ -118,10 +117,13 @@ def told(span: Span) -> dict[str, float]:
     return {key: float(f"{ms:.4g}") for key, ms in zip(keys, span, strict=True)}
 
 
-def judge(rows: Sequence[Row], predicted: Sequence[Mapping[str, float]], off: Sequence[float]) -> dict[str, float]:
-    """Return how many there are, the median and the worst error in percent, and the share that the interval holds."""
-    errors = [100 * abs(math.exp(-o) - 1) for o in off]
-    held = [p["predicted_low_ms"] <= r.ms <= p["predicted_high_ms"] for r, p in zip(rows, predicted, strict=True)]
+def judge(rows: Sequence[tuple[Row, Mapping[str, float], float]]) -> dict[str, float]:
+    """Return how many there are, the median and the worst error in percent, and the share that the interval holds.
+
+    rows: each with its prediction and its `off_of`.
+    """
+    errors = [100 * abs(math.exp(-off) - 1) for _, _, off in rows]
+    held = [span["predicted_low_ms"] <= row.ms <= span["predicted_high_ms"] for row, span, _ in rows]
     return {
         "n": len(rows),
         "median_pct": float(np.median(errors)),
@@ -159,9 +161,9 @@ def tell_time(
     with atomic_path(FITTED) as temporary:
         temporary.write_text(json.dumps(fitted, indent=1) + "\n")
     found = {}
-    for n in (1, THREADS):
-        at = [i for i, row in enumerate(judged) if row.threads == n]
-        found[str(n)] = judge(*([values[i] for i in at] for values in (judged, predicted, off)))
+    for threads in (1, THREADS):
+        chosen = [told for told in zip(judged, predicted, off, strict=True) if told[0].threads == threads]
+        found[str(threads)] = judge(chosen)
     metrics = {
         "networks": rows,
         "policies": _policies(counts, fitted),

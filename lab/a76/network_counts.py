@@ -189,6 +189,8 @@ POLICIES = (
 class _Noise:
     state: np.ndarray
     picture: np.ndarray
+    episode: str = "noise"
+    row: int = 0
 
     def frame_bgr(self) -> np.ndarray:
         return self.picture
@@ -197,7 +199,7 @@ class _Noise:
 def count_policy(core: Core, shape: Shape) -> dict[str, Any]:
     """Make a policy of that shape with random weights, and count it. Returns its counts and its manifest's gmac."""
     rng, ((height, width),) = np.random.default_rng(0), shape.config.image_sizes
-    noise = [_Noise(np.zeros(2, np.float32), rng.integers(0, 256, (height, width, 3), np.uint8)) for _ in range(2)]
+    noise: Any = [_Noise(np.zeros(2, np.float32), rng.integers(0, 256, (height, width, 3), np.uint8)) for _ in range(2)]
 
     def make(folder: Path) -> None:
         weights = random_weights(shape.config, shape.backbone_channels)

@@ -274,6 +274,9 @@ def _as_planned(run: Run) -> str | None:
     for p in good:
         fresh[p.at_ms : p.at_ms + 200] = True
     well = run.clean & _for_ms(fresh, PLANNED_MS) & ~young & ~_for_any(young, PLANNED_MS)
+    most_us = NEUTRAL_US["throttle"] + LIMIT * PER_UNIT_US["throttle"] + 1  # on the pins, the firmware's cap hides it
+    if over := [c for c in run.seen.commands if c.planned and c.throttle_us > most_us]:
+        return f"the host asks for throttle {over[0].throttle_us} us at {over[0].at_ms} ms"
     for i, (pin, neutral_us) in enumerate(NEUTRAL_US.items()):
         meant = [(p.at_ms, neutral_us + PER_UNIT_US[pin] * (min(p[2], LIMIT) if i else p[1])) for p in good]
         values = _each_ms([(0, neutral_us), *meant], n, round)
@@ -337,8 +340,9 @@ def _in_time(run: Run) -> str | None:
 NAMED = re.compile(
     "as requested|no heartbeat|from the view|have passed since"
     "|took over|before it began|before a human armed|told to stop|transmitter|wiggled|at rest|was reset"
-    "|no valid command|the host asked|the host paused|took no data|writing failed|reading failed|cannot be opened|no hello|no answer"
-    "|said nothing|no status|not answered|no time|frozen|black|contrast|pictures in a row|no frame|ended after|too old"
+    "|no valid command|the host asked|the host paused|took no data|writing failed|reading failed"
+    "|cannot be opened|no hello|no answer|said nothing|no status|not answered|no time|frozen|black|contrast"
+    "|pictures in a row|no frame|ended after|too old"
     "|not finite|outside the range|told to fail|fresh plan|plan within|raised in the loop"
 )
 UNFORESEEN = re.compile(r"\w+(Error|Exception): (?!raised in the loop)")  # sentence_of()'s form for unforeseen errors

@@ -36,7 +36,7 @@ class Story:
 
     wiggled: whether the gesture comes before the start. service: whether the drive is a service; then the operator also
     asks it to arm the car. limited, heartbeat: see Process. terminal: whether the drive waits for the gesture.
-    longer_ms: how much later it is stopped. clock_ms: the Arduino's clock when it is switched on.
+    longer_ms: how much later it is stopped, and if `late`, begun. clock_ms: the Arduino's clock when it is switched on.
     """
 
     happenings: tuple[Happening, ...] = ()
@@ -47,6 +47,7 @@ class Story:
     limited: bool = False
     heartbeat: bool = False
     longer_ms: int = 0
+    late: bool = False
 
 
 # ---- what may happen
@@ -240,6 +241,13 @@ def _lose_steering(stage: Stage, h: Happening) -> None:
     stage.during(h, stage.world.hand, steering_wire=False)
 
 
+@_may("the human steers to both sides, seconds apart", (3200, 6000))
+def _steer_slowly(stage: Stage, h: Happening) -> None:
+    for ms, amount in ((0, -300), (h.amount, 300)):
+        moved = Happening(h.at_ms, h.what, amount, 120)
+        stage.world.at(stage.world.now_ms + ms, partial(_steer, stage, moved))
+
+
 @_may("the human drives by hand", (130, 400), (1000, 12_000))
 def _by_hand(stage: Stage, h: Happening) -> None:
     """Around corners, with stops of a second in between."""
@@ -425,7 +433,8 @@ def random_story(seed: int) -> Story:
     limits = rng.random() < 0.2, rng.random() < 0.2
     clock_ms = rng.choice([0, 2**32 - 2000])
     return Story(
-        in_order, rng.random() < 0.8, path == "service", clock_ms, path == "terminal", *limits, longer_ms=longer_ms
+        *(in_order, rng.random() < 0.8, path == "service", clock_ms, path == "terminal", *limits),
+        *(longer_ms, bool(longer_ms) and rng.random() < 0.5),
     )
 
 
@@ -441,7 +450,7 @@ def shortest(story: Story, breaks: Callable[[Story], bool]) -> Story:
 def _simpler(story: Story) -> Iterator[Story]:
     if story.clock_ms:
         yield replace(story, clock_ms=0)
-    for name in ("service", "terminal", "limited", "heartbeat", "longer_ms"):
+    for name in ("service", "terminal", "limited", "heartbeat", "late", "longer_ms"):
         if getattr(story, name):
             yield replace(story, **{name: type(getattr(story, name))()})
     if not story.wiggled:
@@ -468,11 +477,12 @@ def drive_story(story: Story) -> Seen:
     for h in story.happenings:
         world.at(h.at_ms, lambda h=h: HAPPENINGS[h.what][0](stage, h))  # type: ignore[misc]
     stop_ms = STOP_MS + story.longer_ms
+    later_ms = story.longer_ms * story.late
     start, stop = (Happening(ms, what) for ms, what in ((START_MS, "start"), (stop_ms, "stop")))
-    world.at(START_MS, lambda: _start(stage, start))
+    world.at(START_MS + later_ms, lambda: _start(stage, start))
     world.at(stop_ms, lambda: _stop(stage, stop))
     if story.service:
-        world.at(ASK_MS, lambda: _start(stage, start))
+        world.at(ASK_MS + later_ms, lambda: _start(stage, start))
     while world.now_ms < END_MS + story.longer_ms:
         world.advance(world.now_ms + 1)
         if stage.start_due and world.now_ms < stop_ms:

@@ -66,6 +66,7 @@ def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
         lines = [header, ("---",) * len(header), *rows]
         return match[1] + "".join(map(_line, lines)) + match[4]
 
+    placed = {path: PLACE.sub(place, text) for path, text in texts.items()}
     times = _clock(root)
 
     def tell(match: re.Match[str]) -> str:
@@ -77,14 +78,14 @@ def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
             )
         return match[1] + times[match[2]] + match[4]
 
-    return {path: TIME.sub(tell, PLACE.sub(place, text)) for path, text in texts.items()}
+    return {path: TIME.sub(tell, text) for path, text in placed.items()}
 
 
 def _clock(root: Path) -> dict[str, str]:
     """What each policy takes on the cores that drive, as "low to high"; on others as "POLICY, 4 threads"."""
     times = {}
     for row in _metrics(root / "results" / "clock", "clock")["policies"]:
-        span = f"{row['predicted_low_ms']:.2g} to {row['predicted_high_ms']:.2g}"
+        span = span_of(row)
         times[f"{row['name']}, {row['threads']} threads"] = span
         if row["threads"] == DRIVING:
             times[row["name"]] = span
@@ -96,7 +97,7 @@ def _policies(root: Path) -> list[Row]:
     """What our policies take by threads."""
     rows = _metrics(root / "results" / "clock", "clock")["policies"]
     times = _clock(root)
-    table = [
+    table: list[Row] = [
         ("a plan, ms, *computed*: policy", "10^9 instructions", *(f"{n} thread{'s' * (n > 1)}" for n in range(1, 5)))
     ]
     for row in rows[::CORES]:
@@ -120,7 +121,7 @@ def _fit(root: Path) -> list[Row]:
 def _judged(root: Path) -> list[Row]:
     """How far off the computed times were."""
     metrics = _metrics(root / "results" / "clock", "clock")
-    rows = [("", "times", "median error, %", "worst error, %", "in the interval, %")]
+    rows: list[Row] = [("", "times", "median error, %", "worst error, %", "in the interval, %")]
     for n, found in metrics["judged"].items():
         shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct", "held_pct"))
         rows.append((f"{n} thread{'s' * (n != '1')}, architecture left out", *shown))
@@ -135,12 +136,19 @@ def _networks(root: Path) -> list[Row]:
     rows: dict[tuple[str, ...], dict[int, Mapping[str, Any]]] = {}
     for row in _metrics(root / "results" / "clock", "clock")["networks"]:
         rows.setdefault((row["runtime"], row["name"], row["precision"]), {})[row["threads"]] = row
-    table = [("network", "10^9 instructions", *(f"{n}: published, computed" for n in ("1 thread", "4 threads")))]
+    table: list[Row] = [
+        ("network", "10^9 instructions", *(f"{n}: published, computed" for n in ("1 thread", "4 threads")))
+    ]
     for (runtime, name, precision), by_threads in rows.items():
         cells = (_against(by_threads[n]) if n in by_threads else "" for n in (1, CORES))
         any_row = next(iter(by_threads.values()))
         table.append((f"{runtime} {name}, {precision}", f"{any_row['instructions_g']:.3g}", *cells))
     return table
+
+
+def span_of(row: Mapping[str, Any]) -> str:
+    """Return the ends of a computed time with two digits each."""
+    return " to ".join(f"{float(f'{row[key]:.2g}'):g}" for key in ("predicted_low_ms", "predicted_high_ms"))
 
 
 def _against(row: Mapping[str, Any]) -> str:
@@ -169,12 +177,8 @@ def _demo(root: Path) -> list[Row]:
         found = modes[mode]
         errors = [_of(found, f"{action}_mae_pct", ".2f") for action in ("steering", "throttle")]
         hits = f"{found['hits']} of {found['trials']}"
-        fields = (
-            _of(found, "size_mb", ".1f"),
-            hits,
-            " / ".join(filter(None, errors)),
-            _of(timed[mode], "speedup", ".1f"),
-        )
+        faster = f"{timed['fp32']['latency_p50_ms'] / timed[mode]['latency_p50_ms']:.1f}"
+        fields = (_of(found, "size_mb", ".1f"), hits, " / ".join(filter(None, errors)), faster)
         return EXPLAINED[mode], *(_strong(field or "", mode == BEST) for field in fields)
 
     return [("", "MB", "balloons hit", "error, %", "times faster"), *map(row, EXPLAINED)]

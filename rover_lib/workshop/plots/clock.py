@@ -56,7 +56,7 @@ def _ours(ax: Axes, policies: Sequence[Mapping[str, Any]], measured: Sequence[Ma
         low, ms, high = (row[f"predicted{end}_ms"] for end in ("_low", "", "_high"))
         ax.plot([low, high], [y, y], color=MIST, lw=7, solid_capstyle="butt")
         ax.plot(ms, y, "|", color=BLACK, ms=9, mew=2)
-        ax.annotate(f"{low:.2g} to {high:.2g}", (high, y), (4, -3), textcoords="offset points", fontsize=8)
+        ax.annotate(f"{_two(low)} to {_two(high)}", (high, y), (4, -3), textcoords="offset points", fontsize=8)
         for own in measured:
             if (own["name"], own["threads"]) == (row["name"], row["threads"]):
                 ax.plot(own["measured_ms"], y, "*", ms=12, color=RED)
@@ -65,3 +65,8 @@ def _ours(ax: Axes, policies: Sequence[Mapping[str, Any]], measured: Sequence[Ma
     left, right = min(r["predicted_low_ms"] for r in rows), max(r["predicted_high_ms"] for r in rows)
     ax.set(xscale="log", xlabel="a plan of ours, computed (ms)", xlim=(left / 1.2, right * 3))
     ax.set_title("policy, threads", fontsize=10, loc="left")
+
+
+def _two(ms: float) -> str:
+    """Return a time with two digits."""
+    return f"{float(f'{ms:.2g}'):g}"

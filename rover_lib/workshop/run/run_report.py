@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 from base64 import b64encode
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -41,8 +41,9 @@ body{font:16px/1.5 system-ui,sans-serif;margin:0 auto;max-width:64rem;padding:1r
 h1{font-size:1.4rem;line-height:1.25}h2{font-size:1.1rem;margin-top:2rem}
 .verdict{border-left:.4rem solid #2a7;padding:.2rem .8rem;background:#f2faf6}.none{border-color:#c33;background:#fdf3f3}
 .wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
-td,th{padding:.25rem .6rem;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
-td:first-child,th:first-child{text-align:left}tr.deploy{font-weight:bold;background:#f2faf6}
+td,th{padding:.25rem .45rem;text-align:right;border-bottom:1px solid #ddd}
+td{white-space:nowrap}td:first-child{white-space:normal}
+td:first-child,th:first-child{text-align:left}.deploy{font-weight:bold;background:#f2faf6}
 img{max-width:100%;height:auto}figure{margin:1rem 0}figcaption,small{color:#666}
 code{font-size:.9rem;overflow-wrap:anywhere}li{margin:.3rem 0}
 """
@@ -79,8 +80,10 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         folder / "run.json", "run", params={"verdict": p["verdict"], "gates": p["gates"]}, metrics=judged, inputs=inputs
     )
     figures = {name: (folder / "figures" / f"{name}.png") for name in FIGURES}
+    drawn = {name: path.read_bytes() for name, path in figures.items() if path.is_file()}
+    beside = [path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))]
     with atomic_path(folder / PAGE) as temporary:
-        temporary.write_text(page(content, names.name, {n: f.read_bytes() for n, f in figures.items() if f.is_file()}))
+        temporary.write_text(page(content, names.name, drawn, beside))
     return content
 
 
@@ -177,7 +180,7 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
         "times smaller",
         *(f"{action} error, %" for action in actions),
         "hits",
-        "p50 ms",
+        judged["compared"],
         "times faster",
     ]
     lines = [tuple([*header, *(["10^9 instructions"] if counted else [])])]
@@ -185,7 +188,7 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
         errors = [number(row["errors_pct"].get(action), ".2f") for action in actions]
         hits = f"{row['hits']} of {row['trials']}" if row["trials"] else "-"
         cells = [CALLED[row["mode"]], f"{row['size_mb']:.1f}", f"{row['times_smaller']:.1f}", *errors, hits]
-        cells += [number(row["latency_p50_ms"], ".1f"), number(row["times_faster"], ".1f")]
+        cells += [number(row["time_ms"], ".1f"), number(row["times_faster"], ".1f")]
         lines.append(tuple([*cells, *([number(row["instructions_g"], ".3g")] if counted else [])]))
     return lines
 
@@ -224,8 +227,10 @@ def write_card(run_dir: Path | str) -> Path:
     return path
 
 
-def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) -> str:
-    """run.json as one HTML page that needs no other file. name: the run's. figures: PNGs by their names in FIGURES."""
+def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes], files: Sequence[str] = ()) -> str:
+    """run.json as one HTML page that needs no other file. name: the run's. figures: PNGs by their names in FIGURES.
+    files: names of files beside it, to which it links.
+    """
     judged, env = content["metrics"], content["env"]
     title = f"{name}: {judged['headline']}"
     kind = "verdict none" if judged["deploy"] is None else "verdict"
@@ -236,7 +241,8 @@ def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) ->
         _html_table(judged),
         _list([f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]),
         f"<small>Errors are mean differences from FP32, in percent of the recorded range. "
-        f"Speed: {escape(judged['timing'])}, on {escape(judged['host'])}.</small>",
+        f"Times faster: FP32's {escape(judged['compared'])} over the mode's, {escape(judged['timing'])}, on "
+        f"{escape(judged['host'])}.</small>",
     ]
     if judged["failed"]:
         parts.append("<h2>What failed, and what to do</h2>")
@@ -253,6 +259,8 @@ def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) ->
             source = f"data:image/png;base64,{b64encode(figures[figure]).decode()}"
             picture = f'<img src="{source}" alt="{escape(caption)}">'
             parts.append(f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>")
+    links = ", ".join(f'<a href="{escape(file)}">{escape(file)}</a>' for file in files)
+    parts += ["<h2>Behind it</h2>", f"<p>The notebooks, and the numbers of each stage: {links}.</p>"] if files else []
     made = ", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key))
     parts.append(f"<small>{escape(made)}</small>")
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(name)}</title>'
@@ -262,11 +270,13 @@ def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) ->
 
 
 def _html_table(judged: Mapping[str, Any]) -> str:
-    header, *rows = columns(judged)
-    lines = ["<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in header) + "</tr>"]
-    for row, mode in zip(rows, judged["modes"], strict=True):
-        kind = ' class="deploy"' if mode["mode"] == judged["deploy"] else ""
-        lines.append(f"<tr{kind}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
+    """A column for each mode, so that a phone shows all numbers without scrolling."""
+    kinds = ["", *(' class="deploy"' if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])]
+    lines = []
+    for number_of, cells in enumerate(zip(*columns(judged), strict=True)):
+        tag = "td" if number_of else "th"
+        row = zip(cells, kinds, strict=True)
+        lines.append("<tr>" + "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for cell, kind in row) + "</tr>")
     return '<div class="wide"><table>' + "\n".join(lines) + "</table></div>"
 
 

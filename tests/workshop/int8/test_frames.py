@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from policies import memory_samples
+from policies import dazzled_by_white, memory_samples
 from recorded import odd_policy
 
 from rover_lib.onboard.errors import QuantizeError
@@ -64,13 +64,7 @@ def test_a_range_reaches_from_usual_frames_to_all(place, wider, expected):
 
 @pytest.fixture(scope="module")
 def dazzled(tiny):
-    """The tiny policy with one channel of its first layer that answers only to white, and then far above the rest."""
-    weights = {k: v.clone() for k, v in tiny.weights.items()}
-    gain, white = 1000.0, 2.2  # a normalised white pixel is 2.2 to 2.6
-    weights["backbone.conv1.weight"][0] = gain / weights["backbone.conv1.weight"][0].numel()
-    for name, value in (("weight", 1.0), ("bias", -white * gain), ("running_mean", 0.0), ("running_var", 1.0)):
-        weights[f"backbone.bn1.{name}"][0] = value
-    return replace(tiny, weights=weights, sha256="dazzled")
+    return dazzled_by_white(tiny)
 
 
 @pytest.fixture(scope="module")

@@ -55,7 +55,7 @@ def test_the_demo_deploys_static(demo):
     assert row(judged, "mixed")["because"].startswith("is no better than static INT8")
     assert "times as long as static INT8" in row(judged, "fp32")["because"]
     assert len(judged["next"]) == 3
-    assert commands(judged)[0] == "rover drive runs/mine/policy_static.pt --world --max-seconds 60"
+    assert commands(judged)[0] == "rover view runs/mine/policy_static.pt"
     assert "rover_artifact=runs/mine/policy_static.pt" in commands(judged)[1]
 
 
