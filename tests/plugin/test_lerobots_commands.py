@@ -180,7 +180,7 @@ def test_lerobots_own_parser_takes_what_the_page_says(monkeypatch):
         if not (BIN / program).exists() or (ENDING and program == "lerobot-record" and "policy" in line):
             continue
         module = importlib.import_module(f"lerobot.scripts.{program.replace('-', '_')}")
-        (config,) = typing.get_type_hints(getattr(module, program.partition("-")[2]).__wrapped__).values()
+        config = typing.get_type_hints(getattr(module, program.partition("-")[2]).__wrapped__)["cfg"]
         monkeypatch.setattr(sys, "argv", [program, *words])  # where LeRobot looks for a policy's path
         assert draccus.parse(config, args=words).robot.type == "rover"
         parsed.append(program)
