@@ -85,26 +85,10 @@ def made(tmp_path, recorded, monkeypatch):
 
 
 KEYS = [
-    "name",
-    "height",
-    "width",
-    "decoder_layers",
-    "feedforward",
-    "qat",
-    "instructions_g",
-    "simd_g",
-    "size_mb",
-    "computed_ms",
-    "teacher_steering_pct",
-    "teacher_throttle_pct",
-    "recorded_steering_pct",
-    "recorded_throttle_pct",
-    "hits",
-    "trials",
-    "pushed_hits",
-    "pushed_trials",
-    "pushed_latency_ms",
-]
+    "name", "height", "width", "decoder_layers", "feedforward", "qat", "instructions_g", "simd_g", "size_mb",
+    "computed_ms", "teacher_steering_pct", "teacher_throttle_pct", "recorded_steering_pct", "recorded_throttle_pct",
+    "hits", "trials", "pushed_hits", "pushed_trials", "pushed_latency_ms",
+]  # fmt: skip
 
 
 def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):

@@ -19,43 +19,14 @@ pytestmark = pytest.mark.slow
 
 # the keys of the user's best_model.pth
 CHECKPOINT_KEYS = [
-    "epoch",
-    "model_state_dict",
-    "optimizer_state_dict",
-    "scheduler_state_dict",
-    "best_val_loss",
-    "config",
-]
+    "epoch", "model_state_dict", "optimizer_state_dict", "scheduler_state_dict", "best_val_loss", "config",
+]  # fmt: skip
 CONFIG_KEYS = {
-    "image_width",
-    "image_height",
-    "n_obs_steps",
-    "chunk_size",
-    "n_action_steps",
-    "hidden_size",
-    "n_encoder_layers",
-    "n_decoder_layers",
-    "n_heads",
-    "feedforward_dim",
-    "dropout",
-    "kl_weight",
-    "vision_encoder",
-    "pretrained_backbone",
-    "learning_rate",
-    "weight_decay",
-    "betas",
-    "grad_clip",
-    "num_epochs",
-    "batch_size",
-    "train_split",
-    "data_dir",
-    "output_dir",
-    "device",
-    "seed",
-    "log_freq",
-    "save_freq",
-    "num_workers",
-}
+    "image_width", "image_height", "n_obs_steps", "chunk_size", "n_action_steps", "hidden_size", "n_encoder_layers",
+    "n_decoder_layers", "n_heads", "feedforward_dim", "dropout", "kl_weight", "vision_encoder", "pretrained_backbone",
+    "learning_rate", "weight_decay", "betas", "grad_clip", "num_epochs", "batch_size", "train_split", "data_dir",
+    "output_dir", "device", "seed", "log_freq", "save_freq", "num_workers",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module", autouse=True)

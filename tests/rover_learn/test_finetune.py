@@ -328,15 +328,11 @@ def test_arguments_that_cannot_be_are_refused(checkpoint, old, new, tmp_path, op
 @pytest.mark.parametrize(
     ("values", "says"),
     [
-        ({"seed": -1}, "steps and seed"),
-        ({"batch": 0}, "at least 1"),
-        ({"correction_weight": 0.0}, "above 0"),
-        ({"correction_weight": math.inf}, "must be finite"),
-        ({"focus": -1.0}, "focus at least 0"),
-        ({"to_parent": 1.5}, "from 0 to 1"),
-        ({"held_out_share": 1.0}, "below 1"),
+        ({"seed": -1}, "steps and seed"), ({"batch": 0}, "at least 1"), ({"correction_weight": 0.0}, "above 0"),
+        ({"correction_weight": math.inf}, "must be finite"), ({"focus": -1.0}, "focus at least 0"),
+        ({"to_parent": 1.5}, "from 0 to 1"), ({"held_out_share": 1.0}, "below 1"),
     ],
-)
+)  # fmt: skip
 def test_a_recipe_that_cannot_be_is_refused(recipe, values, says):
     with pytest.raises(FinetuneError, match=says):
         replace(recipe, **values)
@@ -455,19 +451,8 @@ def test_a_recipe_of_few_steps_keeps_both_phases(recipe, steps):
 @pytest.mark.slow
 def test_the_command_prints_what_it_learned_from_and_where_it_left_it(checkpoint, old, new, tmp_path):
     given_ = [
-        "--name",
-        "better",
-        "--runs-dir",
-        tmp_path,
-        "--samples",
-        8,
-        "--steps",
-        2,
-        "--weight",
-        3,
-        "--device",
-        "cpu",
-    ]
+        "--name", "better", "--runs-dir", tmp_path, "--samples", 8, "--steps", 2, "--weight", 3, "--device", "cpu",
+    ]  # fmt: skip
     result = CliRunner().invoke(main, [str(a) for a in ("finetune", checkpoint, old, new, *given_)])
     assert result.exit_code == 0, result.output
     assert "8 of corrections" in result.output and f"done: {tmp_path / 'better'}" in result.output

@@ -22,14 +22,9 @@ from rover_lib.workshop.recordings.samples import pick_evenly
 CHUNK = 3
 RANGE = {"steering": (-0.2, 0.6), "throttle": (0.0, 0.1)}
 LIMITS = {
-    "steering_mae_pct": 1.0,
-    "throttle_mae_pct": 1.0,
-    "of_spread_pct": 5.0,
-    "hits_lost": 2,
-    "fp32_hits": 36,
-    "size_full_mb": 70,
-    "original": {"model_size_mb": 100, "accuracy_loss_pct": 5},
-}
+    "steering_mae_pct": 1.0, "throttle_mae_pct": 1.0, "of_spread_pct": 5.0, "hits_lost": 2, "fp32_hits": 36,
+    "size_full_mb": 70, "original": {"model_size_mb": 100, "accuracy_loss_pct": 5},
+}  # fmt: skip
 
 
 class Fixed:
