@@ -171,9 +171,8 @@ class Experiment:
 
     def recipe(self) -> FinetuneRecipe:
         """Return the recipe for both arms. It learns from all recordings of the rounds, as worlds judge here."""
-        alike = {"correction_weight": 1.0, "held_out_share": 0.0, "judged_frames": JUDGED_FRAMES}
-        recipe = FinetuneRecipe.of(params(), samples=self.samples, **alike)
-        return recipe.of_steps(self.steps) if self.steps else recipe
+        alike: dict[str, Any] = {"correction_weight": 1.0, "held_out_share": 0.0, "judged_frames": JUDGED_FRAMES}
+        return FinetuneRecipe.of(params(), steps=self.steps, samples=self.samples, **alike)
 
 
 def run_experiment(
