@@ -22,6 +22,7 @@ from rover_lib.onboard.artifact.engines import HAILO, ONNXRUNTIME
 from rover_lib.onboard.artifact.onnx_file import check_model
 from rover_lib.onboard.artifact.torchscript import check_program
 from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import ArtifactError, CarError
 from rover_lib.onboard.stage import atomic_path
 
@@ -245,14 +246,14 @@ def check_manifest(manifest: Any, where: str) -> None:
                 f"{where}: manifest camera {str(camera)[:80]!r} lacks name, height or width", remedy="quantize again"
             )
         sides = [camera["height"], camera["width"]]
-        if not is_name(camera["name"]) or not all(isinstance(s, int) and _is_within(s, SIDE_PX) for s in sides):
+        if not is_name(camera["name"]) or not all(is_whole(s, *SIDE_PX) for s in sides):
             raise ArtifactError(
                 f"{where}: manifest camera {str(camera)[:80]!r} is not a name and a size", remedy="quantize again"
             )
-    if not isinstance(manifest["chunk"], int) or not _is_within(manifest["chunk"], CHUNK):
+    if not is_whole(manifest["chunk"], *CHUNK):
         raise _out_of_range(where, manifest, "chunk", CHUNK)
     for key, limits in (("rate_hz", RATE_HZ), ("weights_mb", WEIGHTS_MB), ("gmac", GMAC)):
-        if not _is_within(manifest[key], limits):
+        if not is_number(manifest[key], *limits):
             raise _out_of_range(where, manifest, key, limits)
     for key in ("state_names", "action_names", "cameras"):
         names = [c["name"] for c in manifest[key]] if key == "cameras" else manifest[key]
@@ -268,7 +269,7 @@ def check_manifest(manifest: Any, where: str) -> None:
         )
     for name, value in tolerance.items():
         most = largest_tolerance(manifest["mode"], name)
-        if not _is_within(value, (0.0, most)):
+        if not is_number(value, 0, most):
             raise ArtifactError(
                 f"{where}: manifest parity tolerance of {name} must be from 0 to {most:g}",
                 found=repr(value)[:60],
@@ -295,11 +296,6 @@ def _check_values(value: Any, where: str, depth: int) -> None:
         raise ArtifactError(f"{where}: its manifest is nested more than {MOST_DEPTH} deep", remedy="quantize again")
     for each in inner:
         _check_values(each, where, depth - 1)
-
-
-def _is_within(value: Any, limits: tuple[float, float]) -> bool:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return number and limits[0] <= value <= limits[1] and value != math.inf
 
 
 def is_name(value: Any) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop import hub
 from rover_lib.workshop.act import ActConfig, Affine
@@ -61,7 +62,7 @@ class Checkpoint:
             raise CheckpointError(
                 f"{self.path}: has {len(self.config.cameras)} cameras", remedy="another size is only known for one"
             )
-        if not all(isinstance(n, int) and not isinstance(n, bool) for n in (height, width)):
+        if not all(map(is_whole, (height, width))):
             raise CheckpointError(
                 "an image size must be two whole numbers",
                 found=f"{quote(height)} and {quote(width)}",

@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import Affine
@@ -184,7 +185,7 @@ def read_origin(folder: Path) -> dict[str, Any]:
 def _own_rate_hz(folder: Path) -> float:
     """Return the steps of a plan in a second: what we noted in a folder that we wrote, else RATE_HZ."""
     rate_hz = read_origin(folder).get("rate_hz", RATE_HZ)
-    if isinstance(rate_hz, bool) or not isinstance(rate_hz, (int, float)) or not 0 < rate_hz <= 1000:
+    if not is_number(rate_hz, 0, 1000) or not rate_hz:
         raise CheckpointError(
             f"{folder / ORIGIN}: 'rate_hz' must be above 0 and at most 1000", found=quote(rate_hz), remedy=COPY_AGAIN
         )

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
@@ -221,7 +222,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     if not version.startswith("v3"):
         raise EpisodeError(f"{root}: a LeRobotDataset {quote(version)}, only v3 is known here")
     features, fps = info.get("features"), info.get("fps")
-    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
+    if not is_number(fps, 0, 1000) or not fps:
         raise EpisodeError(f"{path}: does not give a number of frames per second", found=quote(fps), remedy=COPY_AGAIN)
     if not isinstance(features, dict) or not all(_is_feature(f) for f in features.values()):
         raise EpisodeError(f"{path}: its features are not objects with a dtype and a shape", remedy=COPY_AGAIN)
@@ -230,7 +231,7 @@ def _read_info(root: Path) -> dict[str, Any]:
 
 def _is_feature(feature: Any) -> bool:
     shape = feature.get("shape") if isinstance(feature, dict) else None
-    return isinstance(shape, list) and all(isinstance(n, int) and 0 < n <= 10_000 for n in shape)
+    return isinstance(shape, list) and all(is_whole(n, 1, 10_000) for n in shape)
 
 
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, tuple[_Camera, ...]]:
