@@ -214,10 +214,13 @@ def read_manifest(path: Path | str) -> dict[str, Any]:
 
 def check_manifest(manifest: Any, where: str) -> None:
     """Raise ArtifactError, naming the key, if the manifest has another schema or an impossible value."""
+
+    def wrong(what: str, found: object = None, length: int = 60) -> ArtifactError:
+        shown = None if found is None else repr(found)[:length]
+        return ArtifactError(f"{where}: {what}", found=shown, remedy="quantize again")
+
     if not isinstance(manifest, dict):
-        raise ArtifactError(
-            f"{where}: its manifest is no JSON object", found=type(manifest).__name__, remedy="quantize again"
-        )
+        raise wrong(f"its manifest is no JSON object but a {type(manifest).__name__}")
     _check_values(manifest, where, MOST_DEPTH)
     if manifest.get("schema") != SCHEMA:
         raise ArtifactError(
@@ -227,54 +230,34 @@ def check_manifest(manifest: Any, where: str) -> None:
     for key, kind in MANIFEST_KEYS.items():
         if not isinstance(manifest.get(key), kind):
             value = repr(manifest[key])[:60] if key in manifest else "nothing"
-            raise ArtifactError(
-                f"{where}: manifest key '{key}' is {value}, not what it should be", remedy="quantize again"
-            )
+            raise wrong(f"manifest key '{key}' is {value}, not what it should be")
     for key, known in (("mode", MODES), ("scheme", SCHEMES)):
         if manifest[key] not in known:
-            raise ArtifactError(
-                f"{where}: manifest {key} must be one of {', '.join(known)}",
-                found=repr(manifest[key])[:60],
-                remedy="quantize again",
-            )
+            raise wrong(f"manifest {key} must be one of {', '.join(known)}", manifest[key])
     car_of(manifest)
     if not manifest["cameras"]:
-        raise ArtifactError(f"{where}: manifest has no cameras", remedy="quantize again")
+        raise wrong("manifest has no cameras")
     for camera in manifest["cameras"]:
         if not isinstance(camera, dict) or not {"name", "height", "width"} <= camera.keys():
-            raise ArtifactError(
-                f"{where}: manifest camera {str(camera)[:80]!r} lacks name, height or width", remedy="quantize again"
-            )
+            raise wrong(f"manifest camera {str(camera)[:80]!r} lacks name, height or width")
         sides = [camera["height"], camera["width"]]
         if not is_name(camera["name"]) or not all(is_whole(s, *SIDE_PX) for s in sides):
-            raise ArtifactError(
-                f"{where}: manifest camera {str(camera)[:80]!r} is not a name and a size", remedy="quantize again"
-            )
-    if not is_whole(manifest["chunk"], *CHUNK):
-        raise _out_of_range(where, manifest, "chunk", CHUNK)
-    for key, limits in (("rate_hz", RATE_HZ), ("weights_mb", WEIGHTS_MB), ("gmac", GMAC)):
-        if not is_number(manifest[key], *limits):
-            raise _out_of_range(where, manifest, key, limits)
+            raise wrong(f"manifest camera {str(camera)[:80]!r} is not a name and a size")
+    numbers = {"chunk": CHUNK, "rate_hz": RATE_HZ, "weights_mb": WEIGHTS_MB, "gmac": GMAC}
+    for key, limits in numbers.items():
+        if not (is_whole if key == "chunk" else is_number)(manifest[key], *limits):
+            raise wrong(f"manifest {key} must be from {limits[0]:g} to {limits[1]:g}", manifest[key])
     for key in ("state_names", "action_names", "cameras"):
         names = [c["name"] for c in manifest[key]] if key == "cameras" else manifest[key]
         if not 1 <= len(names) <= MOST_NAMES or not all(map(is_name, names)) or len(set(names)) != len(names):
-            raise ArtifactError(
-                f"{where}: manifest {key} must be names, each once", found=repr(names)[:80], remedy="quantize again"
-            )
+            raise wrong(f"manifest {key} must be names, each once", names, 80)
     tolerance = manifest["parity"].get("tolerance")
     if not isinstance(tolerance, dict) or set(tolerance) != set(manifest["action_names"]):
-        raise ArtifactError(
-            f"{where}: manifest parity tolerance {str(tolerance)[:80]!r} does not cover its actions",
-            remedy="quantize again",
-        )
+        raise wrong(f"manifest parity tolerance {str(tolerance)[:80]!r} does not cover its actions")
     for name, value in tolerance.items():
         most = largest_tolerance(manifest["mode"], name)
         if not is_number(value, 0, most):
-            raise ArtifactError(
-                f"{where}: manifest parity tolerance of {name} must be from 0 to {most:g}",
-                found=repr(value)[:60],
-                remedy="quantize again",
-            )
+            raise wrong(f"manifest parity tolerance of {name} must be from 0 to {most:g}", value)
 
 
 def largest_tolerance(mode: str, action: str) -> float:
@@ -301,14 +284,6 @@ def _check_values(value: Any, where: str, depth: int) -> None:
 def is_name(value: Any) -> bool:
     """Whether a manifest may give this name to a camera, a state or an action."""
     return isinstance(value, str) and 0 < len(value) <= NAME_LENGTH and "/" not in value
-
-
-def _out_of_range(where: str, manifest: dict[str, Any], key: str, limits: tuple[float, float]) -> ArtifactError:
-    return ArtifactError(
-        f"{where}: manifest {key} must be from {limits[0]:g} to {limits[1]:g}",
-        found=repr(manifest[key])[:60],
-        remedy="quantize again",
-    )
 
 
 def distinct_names(paths: Sequence[Path], drop: str = "") -> dict[str, Path]:
