@@ -297,7 +297,7 @@ def test_a_policy_with_other_statistics_is_asked_again(checkpoint, old, new, rec
         config = replace(was.config, action_unnorm=Affine((1.0, 1.0), (0.0, shift)))
         write_lerobot(tmp_path / "parent", config, was.weights, {})
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            interrupt(patch, finetune_module, "_train")
+            interrupt(patch, finetune_module._Room, "train")
             finetune(tmp_path / "parent", [old, new], "better", runs_dir=tmp_path, recipe=recipe, device="cpu")
     before, corrected = plans
     assert corrected[..., 1] - before[..., 1] == pytest.approx(0.02, abs=1e-6)

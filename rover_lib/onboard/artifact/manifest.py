@@ -17,7 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rover_lib.onboard.artifact.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record
+from rover_lib.onboard.artifact.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record, refused
 from rover_lib.onboard.artifact.engines import HAILO, ONNXRUNTIME
 from rover_lib.onboard.artifact.onnx_file import check_model
 from rover_lib.onboard.artifact.torchscript import check_program
@@ -216,8 +216,7 @@ def check_manifest(manifest: Any, where: str) -> None:
     """Raise ArtifactError, naming the key, if the manifest has another schema or an impossible value."""
 
     def wrong(what: str, found: object = None, length: int = 60) -> ArtifactError:
-        shown = None if found is None else repr(found)[:length]
-        return ArtifactError(f"{where}: {what}", found=shown, remedy="quantize again")
+        return refused(where, what, None if found is None else repr(found)[:length])
 
     if not isinstance(manifest, dict):
         raise wrong(f"its manifest is no JSON object but a {type(manifest).__name__}")
@@ -271,12 +270,10 @@ def _check_values(value: Any, where: str, depth: int) -> None:
     Such characters could control the terminal: a manifest's values appear in sentences, and some stay in a release.
     """
     if isinstance(value, str) and not value.isprintable():
-        raise ArtifactError(
-            f"{where}: its manifest holds text that cannot be printed", found=ascii(value)[:60], remedy="quantize again"
-        )
+        raise refused(where, "its manifest holds text that cannot be printed", ascii(value)[:60])
     inner = [*value, *value.values()] if isinstance(value, dict) else value if isinstance(value, list) else []
     if inner and not depth:
-        raise ArtifactError(f"{where}: its manifest is nested more than {MOST_DEPTH} deep", remedy="quantize again")
+        raise refused(where, f"its manifest is nested more than {MOST_DEPTH} deep")
     for each in inner:
         _check_values(each, where, depth - 1)
 
@@ -320,11 +317,7 @@ def _manifest_in(z: zipfile.ZipFile, path: Path | str) -> dict[str, Any]:
     check_manifest(manifest, str(path))
     kind = manifest["engine"] if manifest["engine"] in (ONNXRUNTIME, HAILO) else "torch"
     if kind != kind_of(z.infolist()):
-        raise ArtifactError(
-            f"{path}: its manifest names another engine than its policy is for",
-            found=manifest["engine"][:60],
-            remedy="quantize again",
-        )
+        raise refused(path, "its manifest names another engine than its policy is for", manifest["engine"][:60])
     return manifest
 
 
@@ -341,21 +334,18 @@ def _parity_in(z: zipfile.ZipFile, path: Path, manifest: dict[str, Any]) -> "dic
             for name, (dtype, shape) in wanted.items():
                 size = packed.getinfo(f"{name}.npy").file_size
                 if size > MOST_VECTORS * math.prod(shape) * np.dtype(dtype).itemsize + 200:
-                    raise ArtifactError(f"{path}: its parity vectors are too large", remedy="quantize again")
+                    raise refused(path, "its parity vectors are too large")
                 raw = io.BytesIO(read_record(packed, f"{name}.npy"))
                 if np.lib.format.read_magic(raw) != (1, 0):
                     raise ValueError("another version of numpy's format")
                 found, _, kind = np.lib.format.read_array_header_1_0(raw)
                 if found[1:] != shape or not 1 <= found[0] <= MOST_VECTORS or kind != dtype:
-                    raise ArtifactError(
-                        f"{path}: its parity vectors have another shape than its manifest says",
-                        found=f"{name} of {kind} {found}",
-                        remedy="quantize again",
-                    )
+                    what = "its parity vectors have another shape than its manifest says"
+                    raise refused(path, what, f"{name} of {kind} {found}")
                 raw.seek(0)
                 vectors[name] = np.load(raw, allow_pickle=False)
     except (KeyError, ValueError, OSError, zipfile.BadZipFile, zlib.error, RuntimeError) as e:
-        raise ArtifactError(f"{path}: its parity vectors are not readable ({e})", remedy="quantize again") from None
+        raise refused(path, f"its parity vectors are not readable ({e})") from None
     if len({len(v) for v in vectors.values()}) != 1 or not all(np.isfinite(v).all() for v in vectors.values()):
-        raise ArtifactError(f"{path}: its parity vectors do not belong together", remedy="quantize again")
+        raise refused(path, "its parity vectors do not belong together")
     return vectors
