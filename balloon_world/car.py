@@ -330,6 +330,13 @@ class VirtualCar:
         report = self.report()
         return {"hits": report.hits, "trials": report.trials, "camera_late": report.late}
 
+    @staticmethod
+    def shown(artifact: Path) -> Any:
+        """What a view shows of an artifact in this world: a Simulation, which is no drive of this car."""
+        from balloon_world.show import Simulation
+
+        return Simulation(artifact)
+
     def close(self) -> None:
         """End the process. Raises nothing."""
         self._process.close()

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -26,9 +26,10 @@ from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
 from rover_lib.onboard.errors import DriveFault, WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import find_stage, write_stage
-from rover_lib.workshop.judge.compare import GATED, gate
-from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from rover_lib.workshop.notebook_table import Table
 
 LATENCY_MOST_S = 5.0
 ROUNDING = 1e-6  # how far times may be rounded, in ticks
@@ -117,7 +118,7 @@ class LatencyReport:
 Watch = Callable[[Order], bool]
 
 
-class _Car:
+class TimedCar:
     """A world, and the loop's camera, planner, clock and sleep in it. Only sleep() moves the time on.
 
     Frames come at the ticks. The car is held until the first plan is there, like the car of `rover drive --world`.
@@ -182,10 +183,10 @@ class _Car:
             self._coming = plan, self.world.state
 
 
-class _Pilot(PolicyPilot):
+class WorldPilot(PolicyPilot):
     """A pilot whose orders move the virtual car and are kept. watch: see `drive_in`."""
 
-    def __init__(self, car: _Car, commanded: Commanded, settings: Settings, rate_hz: float, watch: Watch | None):
+    def __init__(self, car: TimedCar, commanded: Commanded, settings: Settings, rate_hz: float, watch: Watch | None):
         camera_and_planner: Any = car
         super().__init__(camera_and_planner, camera_and_planner, commanded, settings, rate_hz)
         self.orders: list[Order] = []
@@ -199,7 +200,7 @@ class _Pilot(PolicyPilot):
             self._car.stop.set()  # the drive ends after this tick
 
 
-class _NoLog:
+class NoLog:
     """A flight log that keeps nothing."""
 
     start_s = 0.0
@@ -226,10 +227,10 @@ def drive_in(policy: Plans, world: World, condition: Condition, watch: Watch | N
     PolicyError for a plan that no car may be driven by.
     """
     commanded = Commanded()
-    car = _Car(world, policy, condition.latency_s, commanded)
-    pilot = _Pilot(car, commanded, condition.settings, policy.rate_hz, watch)
+    car = TimedCar(world, policy, condition.latency_s, commanded)
+    pilot = WorldPilot(car, commanded, condition.settings, policy.rate_hz, watch)
     try:
-        drive(pilot, None, _NoLog(), rate_hz=RATE_HZ, until=Until(stop=car.stop), clock=car.clock, sleep=car.sleep)
+        drive(pilot, None, NoLog(), rate_hz=RATE_HZ, until=Until(stop=car.stop), clock=car.clock, sleep=car.sleep)
         outcome = str(world.outcome) if world.done else "taken over"
     except DriveFault as fault:
         if fault.__cause__:  # the policy failed; without a cause, a plan had become too old
@@ -327,6 +328,8 @@ def measure_latencies(
     Sets torch to one thread, as worlds are driven in parallel. Raises WorldError if there is no policy or no latency.
     """
     run_dir, p = Path(run_dir), params()
+    from rover_lib.workshop.judge.compare import GATED  # imports torch, which a view of another engine's artifact lacks
+
     artifact, path = run_dir / f"policy_{GATED}.pt", run_dir / "drive.json"
     if not artifact.is_file():
         raise WorldError(f"{artifact}: not there", remedy="run notebooks 01 to 03, or `make demo`, first")
@@ -397,10 +400,12 @@ def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]
 
     before, late = hits(0.0), hits(JUDGED_MS)
     lost = None if before is None or late is None else before - late
+    from rover_lib.workshop.judge.compare import GATED, gate
+
     return [gate(f"{GATED} hits lost at {JUDGED_MS:g} ms", lost, "<=", limit)]
 
 
-def table(content: Mapping[str, Any]) -> Table:
+def table(content: Mapping[str, Any]) -> "Table":
     """Show the content of drive.json as a table."""
     rows = []
     for r in content["metrics"]["rows"]:
@@ -413,4 +418,6 @@ def table(content: Mapping[str, Any]) -> Table:
     notes, verdict = [], {True: "pass", False: "FAIL", None: "not measured"}
     for g in content["metrics"]["gates"]:
         notes.append(f"{g['gate']}: {g['found']}, at most {g['limit']}: {verdict[g['passed']]}")
+    from rover_lib.workshop.notebook_table import Table
+
     return Table(("", "latency", "plan age, p95", "hits", "stopped"), rows, notes=notes)

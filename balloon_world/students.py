@@ -23,7 +23,7 @@ from balloon_world.side_by_side import append_row, everywhere, load_for_cores, r
 from balloon_world.trial import run_trials, wilson_interval
 from rover_learn.distill import errors_of
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
-from rover_lib.onboard.care.lower_bound import PI5_SEEN_GMAC_PER_S
+from rover_lib.onboard.care.pi5 import Work, estimate_ms, predict_ms
 from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import DistillError
@@ -42,13 +42,9 @@ WORLDS, PUSHES = 200, 4
 HELD_OUT_FRAMES = 300
 TEACHER = "teacher"
 ARTIFACT = f"policy_{GATED}.pt"
-COUNTED = (
-    "Pushed at the high end of the time computed from counted instructions: what such kernels were seen to reach; "
-    "the low end is what no program can beat."
-)
+COUNTED = "Pushed at the high end of the time that was computed for a Raspberry Pi 5 from counted work."
 ESTIMATED = (
-    f"Pushed at an estimate, as the teacher's instructions are not counted: multiply-accumulates at "
-    f"{PI5_SEEN_GMAC_PER_S:g} G a second, the rate that such kernels were seen to reach."
+    "Pushed at an estimate for a Raspberry Pi 5 by multiply-accumulates, as the teacher's instructions are not counted."
 )
 
 
@@ -68,11 +64,14 @@ class _Run:
     @property
     def computed_ms(self) -> list[float] | None:
         """The low and the high end of the computed latency on a Pi 5; None if instructions were not counted."""
-        return [self.counts["computed_pi5_ms"][end] for end in ("low", "high")] if self.counts else None
+        if not self.counts:
+            return None
+        span = predict_ms(Work.of(self.counts))
+        return [span.low, span.high]
 
     @property
     def estimated_ms(self) -> float:
-        return 1e3 * self.manifest["gmac"] / PI5_SEEN_GMAC_PER_S
+        return estimate_ms(self.manifest["gmac"])
 
 
 def judge_students(
@@ -175,12 +174,13 @@ def _artifact_of(run_dir: Path) -> Path:
 
 
 def _counts(run_dir: Path) -> dict[str, Any] | None:
-    """Return what arm.json says about policy_static.pt; None if nothing was counted, or it was another file then."""
+    """Return what arm.json says about policy_static.pt; None if nothing, or of another file, or without cache lines."""
     if not (path := run_dir / "arm.json").is_file():
         return None
     arm = read_stage(path, "arm")
     same = arm["inputs"].get(ARTIFACT) == sha256_of(run_dir / ARTIFACT)
-    return arm["metrics"]["artifacts"][Path(ARTIFACT).stem] if same else None
+    row = arm["metrics"]["artifacts"].get(Path(ARTIFACT).stem, {})
+    return row if same and "far_lines_g" in row else None
 
 
 def _source_of(run_dir: Path, episodes: Path | str | None) -> Source:

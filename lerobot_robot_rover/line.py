@@ -7,10 +7,18 @@ link = line.open()                  # the first user opens the port, and the las
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from typing import Any
 from weakref import WeakSet, WeakValueDictionary
 
 from rover_lib.onboard.car.servo_link import LinkError, ServoLink
+
+# lerobot-rollout leaves out each number whose name does not end in .pos or .vel, and moves those in .pos to where they
+# were at the start. Recording and replaying use the same names, so that datasets can be merged.
+ENDING = ".vel" if find_spec("lerobot.rollout") else ""
+ACTIONS = ("steering", "throttle")
+FEATURES = {name + ENDING: float for name in ACTIONS}
 
 _lines: WeakValueDictionary[str, Line] = WeakValueDictionary()
 
@@ -85,3 +93,13 @@ def wait_for_humans() -> None:
     for line in list(_lines.values()):
         if line.before_drive:
             line.before_drive()
+
+
+def named(steering: float, throttle: float) -> dict[str, float]:
+    """Return an action, or a state, by LeRobot's names."""
+    return dict(zip(FEATURES, (steering, throttle), strict=True))
+
+
+def unnamed(action: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an action by our names, whichever of the two LeRobot recorded it with."""
+    return {name.removesuffix(".vel"): value for name, value in action.items()}

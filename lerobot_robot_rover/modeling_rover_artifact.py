@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig, not_trained
 from lerobot_robot_rover.line import count_ended_drives, wait_for_humans
+from lerobot_robot_rover.rollout import find_rollout
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.drive.drive import another_car
@@ -106,6 +107,8 @@ class RoverArtifactPolicy(PreTrainedPolicy):
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, *, config: Any = None, **kwargs: Any):
         """Return the policy in a folder that pack() wrote. Raises ParamsError for anything else, such as a Hub name."""
+        if config is not None and pretrained_name_or_path is None:  # lerobot-rollout with --policy.artifact
+            return cls(config, **kwargs).eval()
         folder = Path(pretrained_name_or_path)
         if not folder.is_dir():
             raise ParamsError(f"{folder}: not a folder", remedy="`python -m lerobot_robot_rover` packs an artifact")
@@ -113,7 +116,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         config.pretrained_path = folder
         return cls(config, **kwargs).eval()
 
-    def _save_pretrained(self, save_directory: Path) -> None:
+    def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
         shutil.copyfile(self.config.file, save_directory / self.config.file.name)
         self.config._save_pretrained(save_directory)
 
@@ -135,6 +138,13 @@ class RoverArtifactPolicy(PreTrainedPolicy):
             )
         if sentence := another_car(manifest, this_car()):
             _log.warning(sentence)
+        rollout = find_rollout()
+        if rollout is not None and rollout.fps != rate_hz:
+            raise PolicyError(
+                f"this artifact's actions are {rate_hz:g} a second",
+                found=f"--fps={rollout.fps:g}",
+                remedy=f"--fps={rate_hz:g}",
+            )
         if dataset_meta is None:
             return
         if dataset_meta.fps != rate_hz:

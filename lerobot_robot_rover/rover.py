@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,9 +14,10 @@ import numpy as np
 from lerobot.robots import Robot, RobotConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from lerobot_robot_rover.line import line_to
+from lerobot_robot_rover.line import ACTIONS, FEATURES, line_to, named, unnamed
 from lerobot_robot_rover.ride import HOLD_S, RATE_HZ, Ride
-from rover_lib.onboard.car.camera import Camera, CameraError
+from lerobot_robot_rover.rollout import DAGGER, STAYS, check_rollout, find_rollout
+from rover_lib.onboard.car.camera import Camera, CameraError, check_shape, size_like
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import boottime, default_log
 from rover_lib.onboard.car.pwm import NEUTRAL
@@ -25,11 +27,10 @@ from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
 from rover_lib.onboard.drive.pilot import HOLE_S, LATE_FRAME_S, Sight
 from rover_lib.onboard.drive.plan import Plan, Settings
 from rover_lib.onboard.drive.watch import find_unfinished_drive
-from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.errors import ParamsError, PolicyError, TakenOver
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
 
-ACTIONS = ("steering", "throttle")
 NO_PROMISE = (
     "LeRobot's loop has no deadlines, knows no age of a plan and does not make up for its latency: an action holds for "
     f"{HOLD_S * 1e3:g} ms, then the car stops; `rover drive` does more"
@@ -92,7 +93,7 @@ class Rover(Robot):
     @cached_property
     def action_features(self) -> dict[str, type]:
         """steering in [-1, 1], its side as car.yml says, and throttle in [0, 1], or from -1 on a car with reverse."""
-        return dict.fromkeys(ACTIONS, float)
+        return dict(FEATURES)
 
     @property
     def is_connected(self) -> bool:
@@ -112,16 +113,24 @@ class Rover(Robot):
         """Open camera and Arduino. Nothing is armed yet: the first action does that.
 
         Without a `rover_transmitter`, this then waits until a human has made the gesture for arming, and says what is
-        missing. Raises CameraError, LinkError or CarError for what is not there or does not fit, ParamsError, and
-        DeviceAlreadyConnectedError.
+        missing. Raises CameraError, LinkError or CarError for what is not there or does not fit, ParamsError, also for
+        options of lerobot-rollout that a car cannot take, and DeviceAlreadyConnectedError.
         """
         if self._open:
             raise DeviceAlreadyConnectedError(f"the rover at {self.config.port} is connected already")
+        if rollout := find_rollout():
+            check_rollout(rollout)
+        self._dagger = rollout.strategy if type(getattr(rollout, "strategy", None)).__name__ == DAGGER else None
+        self._given: dict[str, Any] | None = None
+        self._humans = False
         if not self.config.film:
             check_no_film(self.config.camera)
         with ExitStack() as stack:
             self._log = stack.enter_context(self._flight_log())
-            self._camera = stack.enter_context(Camera(self.config.camera))
+            wanted = self.config.width, self.config.height
+            self._camera = stack.enter_context(Camera(self.config.camera, size=size_like(*wanted)))
+            if frame := self._camera.latest():
+                check_shape(self.config.camera, frame.image, wanted)
             self._link: ServoLink = self._line.open()
             stack.callback(self._line.close)
             stack.callback(self._end_ride)
@@ -132,6 +141,8 @@ class Rover(Robot):
             self._captured_s = self._looked_s = 0.0
             self._action, self._acted_s = NEUTRAL, 0.0
             self._log.event(NO_PROMISE)
+            if rollout and rollout.return_to_initial_position:
+                self._log.event(STAYS)
             if not self._line.transmitters:
                 self._wait_for_human()
             self._line.before_drive = self._wait_for_human
@@ -147,10 +158,10 @@ class Rover(Robot):
         """
         self._check_connected()
         if self._ride:
-            self._ride.check()
-            if self._ride.over:
-                self._end_ride()
-                self._action = NEUTRAL
+            self._unless_taken_over(self._ride.check)
+        if self._ride and self._ride.over:
+            self._end_ride()
+            self._action = NEUTRAL
         if not self._ride:
             self._link.latest()
             if not self._line.transmitters:
@@ -163,7 +174,7 @@ class Rover(Robot):
             self._action = NEUTRAL
         self._seen, self._captured_s, self._looked_s = frame.number, frame.captured_s, boottime()
         picture = prepare_frame(frame.image, self.config.height, self.config.width)
-        return {**dict(zip(ACTIONS, self._action, strict=True)), self.config.camera_name: picture}
+        return {**named(*self._action), self.config.camera_name: picture}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         """Drive by an action and return what the car was told. A human's own action is not sent: the car follows them.
@@ -171,17 +182,26 @@ class Rover(Robot):
         action: finite steering and throttle, at most 0.25 beyond an end of their range. They are clipped to it, and the
         throttle of an action that is sent also to the limit. Raises PolicyError for other actions, LinkError if arming
         is refused, and what ended the drive.
+
+        In DAgger, LeRobot "holds the position" in a pause by giving one and the same action again and again. A car that
+        did so would drive on: it is put in neutral and disarmed, until there is a new one.
         """
         self._check_connected()
         steering, throttle = self._valid(action)
-        if self._line.take_humans_action():
+        paused, self._given = bool(self._dagger) and action is self._given, action
+        self._humans &= not paused
+        if paused or self._humans:
+            self._end_ride()
+            self._line.take_humans_action()
+            steering, throttle = NEUTRAL
+        elif self._line.take_humans_action():
             self._end_ride()
             self._sight.sent(time.monotonic(), throttle)
         else:
             limit = self.settings.throttle_limit
             steering, throttle = self._driven(steering, max(min(throttle, limit), -limit))
         self._action, self._acted_s = (steering, throttle), time.monotonic()
-        return dict(zip(ACTIONS, self._action, strict=True))
+        return named(*self._action)
 
     def disconnect(self) -> None:
         """Send neutral, then close everything. Raises DeviceNotConnectedError."""
@@ -223,6 +243,7 @@ class Rover(Robot):
 
     def _valid(self, action: dict[str, Any]) -> tuple[float, float]:
         """Return steering and throttle, checked and clipped as at the last boundary of `rover drive`."""
+        action = unnamed(action)
         if set(action) != set(ACTIONS):
             raise PolicyError("an action of the rover is steering and throttle", found=sorted(map(str, action)))
         try:
@@ -234,9 +255,11 @@ class Rover(Robot):
 
     def _driven(self, steering: float, throttle: float) -> tuple[float, float]:
         """Drive by an action, and return what was sent: neutral if its picture was too old."""
-        if self._ride:
-            self._ride.put(steering, throttle)
-            return steering, throttle
+        if ride := self._ride:
+            self._unless_taken_over(lambda: ride.put(steering, throttle))
+            return (steering, throttle) if self._ride else NEUTRAL
+        if self._dagger:  # between a human's correction and the policy
+            self._wait_for_human()
         self._camera.latest()  # raises if it failed
         age_s = max(time.monotonic() - self._captured_s, boottime() - self._looked_s)
         if age_s > self.settings.stop_s:
@@ -249,6 +272,21 @@ class Rover(Robot):
             self._end_ride()
             raise
         return steering, throttle
+
+    def _unless_taken_over(self, check: Callable[[], None]) -> None:
+        """Call check(), which may raise what ended the drive.
+
+        In DAgger a takeover ends only the drive if LeRobot records nothing but corrections: then the human has the car,
+        presses its keys for a pause and a correction, and drives on.
+        """
+        try:
+            check()
+        except TakenOver as error:
+            if self._dagger is None or self._dagger.record_autonomous:
+                raise
+            self._log.event(f"{error}; to record a correction, press LeRobot's keys for a pause and for a correction")
+            self._end_ride()
+            self._humans = True
 
     def _end_ride(self) -> None:
         ride, self._ride = self._ride, None

@@ -9,7 +9,7 @@ from typing import Any
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from lerobot_robot_rover.line import line_to
+from lerobot_robot_rover.line import FEATURES, line_to, named
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, ServoLink, Telemetry
 from rover_lib.onboard.drive.service import CHECK_S
 from rover_lib.onboard.errors import ParamsError
@@ -52,7 +52,7 @@ class RoverTransmitter(Teleoperator):
     @cached_property
     def action_features(self) -> dict[str, type]:
         """steering in [-1, 1], its side as car.yml says, and throttle in [0, 1], or from -1 on a car with reverse."""
-        return {"steering": float, "throttle": float}
+        return dict(FEATURES)
 
     @property
     def feedback_features(self) -> dict[str, type]:
@@ -109,7 +109,7 @@ class RoverTransmitter(Teleoperator):
             raise self._lost()
         self._check_passed_on(telemetry)
         self._line.humans_action = True
-        return {"steering": actions.steering, "throttle": actions.throttle}
+        return named(actions.steering, actions.throttle)
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Do nothing."""

@@ -21,6 +21,7 @@ FEW: dict[str, Any] = {
     "latencies_ms": [0, 150],
     "pushed_latencies_ms": [150],
     "shown_ms": 150,
+    "students": ["../runs/demo-small"],
 }
 
 

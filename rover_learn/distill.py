@@ -41,8 +41,8 @@ from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.files import find_written
 from rover_lib.workshop.checkpoint.lerobot import read_origin
-from rover_lib.workshop.int8.choose import Chooser
 from rover_lib.workshop.int8.export import export
+from rover_lib.workshop.int8.frames import describe_odd
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, quantize
 from rover_lib.workshop.int8.scheme import Scheme
@@ -334,7 +334,7 @@ def _train_rounded(work: _Work, room: _Room, policy: BatchedPolicy, saved: Resum
         with atomic_path(path) as temporary:
             torch.save({"calibration": calibration.__dict__, "scheme": asdict(scheme)}, temporary)
     kept = _read_phase(path)
-    rounded = RoundedPolicy(student, Scheme(**kept["scheme"]), Calibration(**kept["calibration"])).to(work.device)
+    rounded = RoundedPolicy(student, Scheme.of(kept["scheme"]), Calibration(**kept["calibration"])).to(work.device)
     exact = BatchedPolicy(work.config, student.weights).to(work.device)
 
     def off(batch: Batch) -> Tensor:
@@ -353,13 +353,11 @@ def _checkpoint(work: _Work, weights: dict[str, Tensor]) -> Checkpoint:
 
 def _calibrate(work: _Work, student: Checkpoint) -> tuple[Calibration, Scheme]:
     """Calibration, and static INT8 with the observer that loses least: as a run of the student would have them."""
-    p, parts = params(), work.opened.parts
-    how = quantization.Recipe.of(p)
-    samples, _ = how.choose(parts.calibration)
+    how = quantization.Recipe.of(params())
+    samples, _ = how.choose(work.opened.parts.calibration)
     calibration = calibrate(student, samples, smooth=how.scheme.smooth, progress=work.progress)
-    choosing = pick_evenly(parts.choosing, quantization.CHOOSING_FRAMES)
-    chooser = Chooser(student, calibration, choosing, work.opened.recordings.action_range())
-    return calibration, chooser.observer(how.scheme, p["quantization"]["observers"], work.progress)[0]
+    chooser = quantization.prepare_chooser(student, work.opened, calibration)
+    return calibration, chooser.observer(how.scheme, how.observers, work.progress)[0]
 
 
 def _quantize(work: _Work, weights: dict[str, Tensor]) -> tuple[QuantizedPolicy, Calibration]:
@@ -450,9 +448,12 @@ def summary(content: dict[str, Any]) -> str:
             lines.append(f"in INT8{f', {title}' if title else ''}: to its own FP32 {own}; to the teacher {teachers}")
     for row in metrics["gates"]:
         if row["passed"] is False:
-            lines.append(
-                f"INT8 loses {row['found']:.1f} % of the recorded range, more than {row['limit']} %: train with --qat"
-            )
+            remedy = "train with --qat"
+            if odd := metrics.get("odd"):  # training with INT8's rounding does not mend those
+                remedy = f"{odd['share_pct']:.0f} % of the frames are odd, and `rover run` names them"
+            elif metrics["before_qat"]:
+                remedy = "--qat was not enough, and `rover run` says where it comes from"
+            lines.append(f"INT8 loses {row['found']:.1f} % of the recorded range, more than {row['limit']} %: {remedy}")
     return "\n".join([*lines, metrics["note"]])
 
 
@@ -494,6 +495,7 @@ def _leave(new: Path, name: str, work: _Work, taught: Taught) -> None:
             "losses": taught.losses,
             **taught.notes,
             "before_qat": unrounded,
+            "odd": describe_odd(calibration.frames, calibration.seen),
             "gates": [_quantization_gate(students[1])],
             "judged_frames": len(held_out),
             "held_out_episodes": parts.episodes["held_out"],

@@ -145,7 +145,8 @@ def parameters(config: ActConfig, weights: Mapping[str, Tensor]) -> Iterator[tup
         if f"{name}.downsample" in w:
             yield f"{name}.shortcut", fold(w.at(f"{name}.downsample.0"), w.at(f"{name}.downsample.1"))
     yield "image_project", pair(w.at("encoder_img_feat_input_proj"))
-    yield "state_project", pair(w.at("encoder_robot_state_input_proj"))
+    if config.sees_state:
+        yield "state_project", pair(w.at("encoder_robot_state_input_proj"))
     if config.pre_norm:
         yield "encoder_norm", pair(w.at("encoder.norm"))
     for part, count in (("encoder", config.encoder_layers), ("decoder", config.decoder_layers)):

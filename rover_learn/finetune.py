@@ -33,6 +33,7 @@ from rover_learn.lessons import Batch, BatchedPolicy, Lessons, Part, judged_rang
 from rover_learn.phases import FromZero, Positive, Recipe, Room, Share, Taught, Weight, Within, Work, make_run
 from rover_learn.student import not_a_cars
 from rover_learn.training import Resumable
+from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
@@ -40,7 +41,7 @@ from rover_lib.onboard.recording.episode import HUMAN
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import act
 from rover_lib.workshop.cache import cache_root, key_of
-from rover_lib.workshop.checkpoint.checkpoint import SQUEEZED, Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
@@ -289,7 +290,7 @@ def _refuse_another_camera(read: Sequence[Recordings]) -> None:
     shapes = [r.episodes[0].samples[0].frame_bgr().shape[:2] for r in read]
     height, width = shapes[0]
     for recordings, (own_height, own_width) in zip(read, shapes, strict=True):
-        if abs(own_width * height / (own_height * width) - 1) > SQUEEZED:
+        if is_squeezed((own_width, own_height), (width, height)):
             raise FinetuneError(
                 f"{recordings.root}: its camera has another shape than that of {read[0].root}",
                 found=f"{own_width}x{own_height} beside {width}x{height}",

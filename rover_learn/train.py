@@ -63,6 +63,7 @@ from rover_lib.workshop.checkpoint.files import trainer_config
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings.episodes import load_recordings, split
+from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     Recordings,
@@ -254,14 +255,6 @@ def _rate_hz(recordings: Recordings) -> float:
     return float(round(found_hz)) if layout.rate_hz or is_another_rate(found_hz, PLANNED_HZ) else PLANNED_HZ
 
 
-def lerobot_train(dataset: Path | str) -> str:
-    """Return the command of LeRobot's own that trains an ACT on a LeRobotDataset."""
-    return (
-        f"lerobot-train --dataset.repo_id=local/drives --dataset.root={dataset} --policy.type=act "
-        "--policy.push_to_hub=false --policy.chunk_size=32 --policy.n_action_steps=32 --output_dir=trained"
-    )
-
-
 def _turned(recordings: Recordings, progress: Progress) -> Recordings:
     """Return the recordings with the pictures of those that are mirrored beside most others turned over."""
     mirrored = measure_sides(recordings, progress).mirrored
@@ -311,6 +304,7 @@ class _Training:
     rng: np.random.Generator
     saved: Resumable
     plan: dict[str, tuple[int, int]]
+    seen: Callable[[Tensor], Tensor]
 
     @property
     def device(self) -> torch.device:
@@ -347,9 +341,18 @@ class _Training:
 
 
 def _train(
-    recordings: Recordings, size: ActConfig, recipe: TrainingRecipe, seed: int, device: torch.device, saved: Resumable
+    recordings: Recordings,
+    size: ActConfig,
+    recipe: TrainingRecipe,
+    seed: int,
+    device: torch.device,
+    saved: Resumable,
+    seen: Callable[[Tensor], Tensor] = lambda pictures: pictures,
 ) -> dict[str, Any]:
-    """Train, and return everything in the checkpoint except its config."""
+    """Train, and return everything in the checkpoint except its config.
+
+    seen: what the frozen statistics are measured on, of normalised pictures (n, 3, h, w).
+    """
     p = params()["calibration"]
     parts = split(recordings, p["held_out_share"], p["seed"])
     rng = np.random.default_rng([seed, 77])
@@ -373,7 +376,7 @@ def _train(
             policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
         policy.to(device)
         judges_first = frames_of(judging, *first.image_sizes[0])
-        training = _Training(first, policy, data, judges_first, recipe, loss_weights, rng, saved, plan)
+        training = _Training(first, policy, data, judges_first, recipe, loss_weights, rng, saved, plan, seen)
         _train_backbone(training)
         _train_transformer(training)
         last = "all together"
@@ -471,7 +474,7 @@ def _train_backbone(training: _Training) -> None:
         norm.momentum = None  # torch then takes the plain mean over the batches below
     for _ in training.steps("statistics", backbone=live):
         with torch.no_grad():
-            live(training.batch(recipe.batch)[IMAGE])
+            live(training.seen(training.batch(recipe.batch)[IMAGE]))
     weights = {k: v for k, v in live.state_dict().items() if not k.endswith("num_batches_tracked")}
     training.policy.model.backbone.load_state_dict(weights)
 

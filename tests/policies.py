@@ -2,7 +2,9 @@
 
 # LeRobot takes ten seconds to import, and every process that collects tests would pay for it: import it in functions.
 
-from dataclasses import dataclass
+import gc
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,8 @@ import torch
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
+
+    from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 
 TINY = {
     "dim_model": 64,
@@ -38,11 +42,14 @@ def lerobot_policy(
 
     The statistics of its frozen batch norms are set from pictures, so that its features do not vanish.
     """
+    first = "lerobot" not in sys.modules
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy
     from torchvision.ops.misc import FrozenBatchNorm2d
 
+    if first:
+        gc.freeze()  # each collection would take 0.3 s to find that all those modules are still used
     cameras = cameras or {"observation.images.cam_front": (72, 128)}
     config.setdefault("n_action_steps", config.get("chunk_size", 100))
     torch.manual_seed(seed)
@@ -50,7 +57,7 @@ def lerobot_policy(
         ACTConfig(
             input_features={
                 **{k: PolicyFeature(FeatureType.VISUAL, (3, *size)) for k, size in cameras.items()},
-                "observation.state": PolicyFeature(FeatureType.STATE, (states,)),
+                **({"observation.state": PolicyFeature(FeatureType.STATE, (states,))} if states else {}),
             },
             output_features={"action": PolicyFeature(FeatureType.ACTION, (actions,))},
             pretrained_backbone_weights=None,
@@ -79,6 +86,57 @@ def lerobot_policy(
     for hook in hooks:
         hook.remove()
     return policy
+
+
+def saved(policy: "ACTPolicy", folder: Path, stats: dict | None = None) -> tuple:
+    policy.save_pretrained(folder)
+    return saved_processors(policy, folder, stats)
+
+
+def saved_processors(policy: "ACTPolicy", folder: Path, stats: dict | None) -> tuple:
+    """Save and return LeRobot's two processors. A feature without statistics gets the mode IDENTITY: not normalised."""
+    from lerobot.configs.types import NormalizationMode
+    from lerobot.policies.act.processor_act import make_act_pre_post_processors
+
+    for kind, name in (("VISUAL", "images"), ("STATE", "state"), ("ACTION", "action")):
+        if not any(name in key for key in stats or ()):
+            policy.config.normalization_mapping[kind] = NormalizationMode.IDENTITY
+    inner, outer = make_act_pre_post_processors(policy.config, stats)
+    inner.save_pretrained(folder)
+    outer.save_pretrained(folder)
+    return inner, outer
+
+
+def normalised(policy: "ACTPolicy", mode: str) -> tuple:
+    """Return LeRobot's two processors, which normalise all inputs and outputs by `mode`, and their statistics."""
+    from lerobot.configs.types import NormalizationMode
+    from lerobot.policies.act.processor_act import make_act_pre_post_processors
+
+    policy.config.normalization_mapping = dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode(mode))
+    low, high = torch.tensor([-0.3, 0.1]), torch.tensor([0.9, 0.4])
+    numbers = {"mean": (low + high) / 2, "std": high - low, "min": low, "max": high}
+    colours = {"mean": (0.5, 0.4, 0.3), "std": (0.2, 0.3, 0.25), "min": (0.0, 0.1, 0.05), "max": (1.0, 0.9, 0.95)}
+    stats = {
+        "observation.images.cam_front": {k: torch.tensor(v)[:, None, None] for k, v in colours.items()},
+        "observation.state": numbers,
+        "action": numbers,
+    }
+    return *make_act_pre_post_processors(policy.config, stats), stats
+
+
+def check_is(checkpoint, policy: "ACTPolicy", inner, outer) -> None:
+    """Check that a checkpoint's actions equal LeRobot's, processors included, within 1e-5, and are not all the same."""
+    from rover_lib.workshop.act import ACT
+
+    (sample,) = memory_samples(1)
+    frame, state = cv2.cvtColor(sample.picture, cv2.COLOR_BGR2RGB), torch.from_numpy(sample.state)
+    (key,) = policy.config.image_features
+    raw = {key: torch.from_numpy(frame).permute(2, 0, 1).float() / 255, "observation.state": state}
+    with torch.inference_mode():
+        expected = outer(policy.predict_action_chunk(inner(raw))[0])
+        ours = ACT(checkpoint.config, checkpoint.weights)(state[None], torch.from_numpy(frame))[0]
+    assert (ours - expected).abs().max() < 1e-5 * min(expected.abs().max(), 1)
+    assert expected.std() > 1e-3
 
 
 def trainer_config(policy: "ACTPolicy") -> dict:
@@ -131,12 +189,24 @@ def of_a_cars_size(path: Path) -> Path:
     return path
 
 
+def dazzled_by_white(checkpoint: "Checkpoint") -> "Checkpoint":
+    """The same policy, but a channel of its first layer answers only to white pictures, and far above the others."""
+    weights = {k: v.clone() for k, v in checkpoint.weights.items()}
+    gain, white = 1000.0, 2.2  # a normalised white pixel is 2.2 to 2.6
+    weights["backbone.conv1.weight"][0] = gain / weights["backbone.conv1.weight"][0].numel()
+    for name, value in (("weight", 1.0), ("bias", -white * gain), ("running_mean", 0.0), ("running_var", 1.0)):
+        weights[f"backbone.bn1.{name}"][0] = value
+    return replace(checkpoint, weights=weights, sha256="dazzled")
+
+
 @dataclass(frozen=True, eq=False)
 class MemorySample:
     """A sample like a recorded one, but without files."""
 
     state: np.ndarray
     picture: np.ndarray
+    row: int = 0
+    episode: str = "memory"
 
     def frame_bgr(self) -> np.ndarray:
         return self.picture
@@ -145,6 +215,6 @@ class MemorySample:
 def memory_samples(count: int, height: int = 72, width: int = 128, seed: int = 0) -> list[MemorySample]:
     rng = np.random.default_rng(seed)
     return [
-        MemorySample(rng.uniform(-0.5, 0.5, 2).astype(np.float32), smooth_frame(rng, height, width))
-        for _ in range(count)
+        MemorySample(rng.uniform(-0.5, 0.5, 2).astype(np.float32), smooth_frame(rng, height, width), row)
+        for row in range(count)
     ]

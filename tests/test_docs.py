@@ -1,7 +1,11 @@
 """The pages: each is one click from README, no link is dead, and the commands and options that they show exist."""
 
+import ast
 import re
+import shlex
+from collections import Counter
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import click
@@ -43,43 +47,104 @@ def test_troubleshooting_names_lines_that_the_doctor_has():
     assert len(named) > 10 and not [name for name in named if f'"{name}"' not in source]
 
 
-def typed(page: Path) -> Iterator[list[str]]:
-    """Yield the words of each command in a page's indented lines and between backticks, without `sudo` and comments."""
-    text = page.read_text().replace("\\\n", " ")
-    for code in re.findall(r"^    (\S.*)$", text, re.M) + re.findall(r"`([^`\n]+)`", text):
-        for command in re.split(r"&&|[;|]", code.partition(" #")[0]):
-            words = command.replace("python -m lab", "lab").split()
-            yield words[1:] if words[:1] == ["sudo"] else words
+SOURCES = [*ROOT.glob("rover_*/**/*.py"), *ROOT.glob("balloon_world/**/*.py"), *ROOT.glob("lerobot_robot_rover/*.py")]
+PLAYS = [*ROOT.glob("ansible/**/*.yml"), *ROOT.glob("ansible/**/*.j2")]
+PROGRAM = r"rover|lab|make|ansible-playbook|lerobot-[a-z-]+|python -m [\w.]+"
 
 
-def unknown_in(group: click.Command, words: list[str]) -> list[str]:
-    """Return the command among these words, or else the options, that `group` does not have."""
-    while isinstance(group, click.Group) and words and not words[0].startswith("-"):
+def texts(path: Path) -> Iterator[str]:
+    """Yield what a file shows people: a page's lines of code, a program's texts, each with X for what is filled in."""
+    if path.suffix != ".py":
+        text = path.read_text().replace("\\\n", " ")
+        yield from re.findall(r"^    (\S.*)$", text, re.M) if path in PAGES else ()
+        yield from (f"`{code}`" for code in re.findall(r"[`']([^`'\n]+)[`'](?! there)", text))
+        return
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(str(part.value) if isinstance(part, ast.Constant) else "X" for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def commands(path: Path) -> Iterator[tuple[str, list[str], bool]]:
+    """Yield (program, its words, whether it is a whole command) for each command that a file shows.
+
+    One in the middle of a sentence ends anywhere: only its first word and its options can be checked.
+    """
+    for text in texts(path):
+        for match in re.finditer(rf"(?:^|(?<=[`'\s(/]))({PROGRAM}) +(--?\w|[a-zX][\w./X-]*)?([^`'\n;|&]*)", text):
+            start = text[: match.start()].rstrip()
+            whole = start.endswith(("`", "'", ".venv/bin/", "&&", "sudo")) or (path in PAGES and not start)
+            rest = (match[2] or "") + match[3].partition(" #")[0]
+            yield match[1], rest.split() if '"' in rest or "{" in rest else shlex.split(rest, posix=True), whole
+
+
+def refusal_of(group: click.Command, words: list[str], whole: bool) -> str:
+    """Say why click would refuse the words; "" if it would not. Behind a command that is not whole, words are prose."""
+    while isinstance(group, click.Group):
+        if not words or words[0].startswith("-") or words[0] == "X":
+            words = [w for w in words if w.startswith("--")]
+            break
         if words[0] not in group.commands:
-            return words[:1]
+            return f"no command {words[0]}" if whole and not words[0].endswith(":") else ""
         group, words = group.commands[words[0]], words[1:]
-    known = {"--help", *(option for p in group.params for option in (*p.opts, *p.secondary_opts))}
-    return [word for word in words if word.startswith("-") and word != "-" and word.partition("=")[0] not in known]
+    words = [word.rstrip(".,:)") for word in words]
+    known = {"--help": 0, **{o: int(not getattr(p, "is_flag", False)) for p in group.params for o in p.opts}}
+    known |= {option: 0 for p in group.params for option in p.secondary_opts}
+    for i, word in enumerate(words):
+        name, _, value = word.partition("=")
+        if not re.fullmatch(r"--?[a-z][a-z-]*", name):
+            continue
+        if name not in known:
+            return f"no option {name}"
+        param = next((p for p in group.params if name in p.opts), None)
+        value = value or (words[i + 1] if i + 1 < len(words) else "")
+        if whole and known[name] and isinstance(param.type, click.Choice | click.IntRange | click.FloatRange):
+            if not value or value.isupper():
+                continue
+            try:
+                param.type.convert(value, param, None)
+            except click.UsageError as error:
+                return str(error)
+    return ""
 
 
-def test_commands_and_options_in_the_pages_are_there():
+def test_every_command_that_we_print_is_one():
+    """All that the pages, the program and its playbooks show, by the parser of the program that is named."""
     from lab.__main__ import main as lab
     from rover_lib.cli import main as rover
 
     targets = set(" ".join(re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.M)).split())
-    seen = 0
-    for page in PAGES:
-        for program, *words in filter(None, typed(page)):
-            program = program.rpartition("/")[2]
+    variables = set(re.findall(r"^ +(\w+):", (ROOT / "ansible/roles/rover/meta/argument_specs.yml").read_text(), re.M))
+    variables |= {"ansible_user", "ansible_host", "ansible_ssh_private_key_file"}
+    seen: Counter[str] = Counter()
+    refused = []
+    for path in [
+        *(page for page in PAGES if page.name != "CHANGELOG.md"),
+        *SOURCES,
+        *PLAYS,
+        *ROOT.glob("notebooks/*.ipynb"),
+    ]:
+        for program, words, whole in commands(path):
+            wrong = ""
+            if program == "python -m lab":
+                program = "lab"
             if program in ("rover", "lab"):
-                unknown = unknown_in(rover if program == "rover" else lab, words)
-            elif program == "make":
-                unknown = [word for word in words if re.fullmatch(r"[a-z][a-z-]*", word) and word not in targets]
-            else:
-                continue
-            seen += 1
-            assert not unknown, f"{page.name}: {program} {' '.join(words)}: {unknown}"
-    assert seen > 200
+                wrong = refusal_of(rover if program == "rover" else lab, words, whole)
+            elif program == "make" and whole:
+                named = [word for word in words if re.fullmatch(r"[a-z][a-z-]+", word)]
+                wrong = ", ".join(word for word in named if word not in targets)
+            elif program == "ansible-playbook":
+                plays = [word for word in words if word.endswith(".yml") and "X" not in word]
+                wrong = ", ".join(play for play in plays if not (ROOT / play).is_file())
+                wrong += ", ".join(set(re.findall(r"-e [\"']?(?:{\\?\")?(\w+)", " ".join(words))) - variables - {"X"})
+            elif program.startswith("python -m"):
+                wrong = "" if find_spec(program.split()[2]) else "no such module"
+            seen[program.partition("-")[0].partition(" ")[0]] += 1
+            if wrong:
+                refused.append(f"{path.relative_to(ROOT)}: {program} {' '.join(words)}: {wrong}")
+    assert not refused, "\n".join(refused)
+    assert seen["rover"] > 350 and seen["make"] > 40 and seen["ansible"] > 15 and seen["lab"] > 10, seen
 
 
 def test_readme_says_how_to_begin_in_few_words():

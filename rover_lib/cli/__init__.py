@@ -19,13 +19,14 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
     "Look": (drive.view, drive.log),
     "Step by step": (
         prepare.quantize,
+        prepare.notebook,
         prepare.compare,
         ROVERS["benchmark"],
         prepare.export,
         prepare.list_runs,
     ),
     "Teach": (),
-    "Recordings": (ROVERS["label"], prepare.export_dataset),
+    "Recordings": (ROVERS["label"], prepare.import_tub, prepare.export_dataset),
     "A rover's models, and arming it": (
         prepare.wheelhouse,
         ROVERS["release"],

@@ -12,6 +12,7 @@ import click
 
 from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
 from rover_lib.onboard.columns import align
+from rover_lib.onboard.errors import printable
 from rover_lib.onboard.kinds import Output, PathTo
 from rover_lib.workshop.progress import terminal_bar
 
@@ -77,6 +78,27 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     _judge(folder)
 
 
+@click.command(short_help="Execute one notebook of a run again.")
+@click.argument("name")
+@click.argument("run_dir", type=PathTo("run"))
+@click.option("-p", "turned", type=(str, str), multiple=True, metavar="PARAMETER VALUE", help="May be repeated.")
+def notebook(name: str, run_dir: Path, turned: tuple[tuple[str, str], ...]) -> None:
+    """Execute the notebook NAME, such as 03_quantize, on the run in RUN_DIR, with other parameters.
+
+    Its results replace those in RUN_DIR, so take a copy of a run that you want to keep (`make notebooks-open NAME=demo
+    AS=try1`). A value is YAML: 0.5, affine, [static, mixed]. A parameter that the notebook does not have is refused.
+    """
+    import yaml
+
+    from rover_lib.workshop.run.run import execute
+
+    try:
+        given = {key: yaml.safe_load(value) for key, value in turned}
+    except yaml.YAMLError as error:
+        raise click.BadParameter(f"a value is not YAML: {' '.join(str(error).split())}") from None
+    click.echo(f"executed: {execute(name.removesuffix('.ipynb'), run_dir, **given)}")
+
+
 @click.command(short_help="Judge an existing run again.")
 @click.argument("run_dir", type=PathTo("run"))
 @AS_JSON
@@ -123,7 +145,7 @@ def list_runs(runs_dir: Path, as_json: bool) -> None:
     if as_json:
         return show(found, True)
     for each in found:
-        click.echo(f"{each['name']:<16} {each['verdict']}")
+        click.echo(printable(f"{each['name']:<16} {each['verdict']}"))
     if not found:
         click.echo(f"no run in {runs_dir}: make demo, or rover run, makes the first")
 
@@ -211,20 +233,27 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
 @click.command(short_help="Write a run's policies for other engines: ONNX Runtime, Hailo.")
 @click.argument("run_dir", type=PathTo("run"))
 @click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")
+@click.option("--card", is_flag=True, help="README.md, a model card to publish the run's artifacts with.")
 @click.option("--hailo", "kit", type=FILE, metavar="OUT", help="A kit for Hailo's compiler, in the new folder OUT.")
 @click.option(
     "--samples", type=click.IntRange(min=1), default=1024, show_default=True, help="Frames to calibrate the kit with."
 )
-def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
-    """Write the policies of the run in RUN_DIR for another engine.
+def export(run_dir: Path, onnx: bool, card: bool, kit: Path | None, samples: int) -> None:
+    """Write the policies of the run in RUN_DIR for another engine, or for others to use.
 
     --onnx: for ONNX Runtime, with the run's own calibration. Such a file can be used like any artifact (benchmark,
     compare, drive, release), and a rover with that engine needs no torch; model.onnx is inside.
 
+    --card: what the verdict and the recordings say of the artifacts, for the Hub; docs/lerobot.md says how to publish.
+
     --hailo: a kit of networks, calibration set and scripts, calibrated on the run's recordings; see docs/hailo.md.
     """
-    if not onnx and kit is None:
-        raise click.UsageError("for which engine? --onnx, or --hailo OUT")
+    if not (onnx or card) and kit is None:
+        raise click.UsageError("for what? --onnx, --card, or --hailo OUT")
+    if card:
+        from rover_lib.workshop.run.run_report import write_card
+
+        click.echo(f"written: {write_card(run_dir)}")
     if onnx:
         from rover_lib.workshop.run.pipeline import export_onnx
 
@@ -258,13 +287,43 @@ def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> 
     fifth as long. What is repaired in the recordings or left out is printed, and kept in OUT/rover_export.json. In a
     drive of a policy, each frame says whether a human had taken over: LeRobot's `intervention`.
     """
-    from rover_lib.workshop.recordings.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
     from rover_lib.workshop.recordings.export_dataset import export_dataset as write
 
     report = write(episodes, out, progress=terminal_bar(), **options)
+    _say_export(report, out, "exported", as_json)
+
+
+def _say_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> None:
+    from rover_lib.workshop.recordings.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
+    from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
+
     for name in ("episodes_are", CAR, DRIVEN_BY, OUTCOMES):  # too long to print; the file has them
         del report[name]
-    show({"exported": report | {"report": str(out / REPORT)}}, as_json)
+    show({done: report | {"report": str(out / REPORT)}}, as_json)
+    if not as_json:
+        click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
+
+
+@click.command("import", short_help="Write a donkeycar tub as a LeRobotDataset v3.")
+@click.argument("tub", type=PathTo("tub"))
+@click.argument("out", type=FILE)
+@click.option(
+    "--size", callback=size_option, metavar="WIDTHxHEIGHT", help="Size of the pictures [default: as recorded]."
+)
+@AS_JSON
+def import_tub(tub: Path, out: Path, size: tuple[int, int] | None, as_json: bool) -> None:
+    """Write the donkeycar tub in the folder TUB, of any age, as a LeRobotDataset v3 to the new folder OUT.
+
+    Steering and throttle become those of this machine's car (car.yml). Deleted records and those at which a pilot drove
+    are left out, and episodes end where records are missing. What was left out is printed, and kept in
+    OUT/rover_export.json.
+    """
+    from rover_lib.onboard.car.car import this_car
+    from rover_lib.workshop.recordings.export_dataset import export_dataset as write
+    from rover_lib.workshop.recordings.tub import read_tub
+
+    report = write(read_tub(tub, this_car(), terminal_bar()), out, size=size, progress=terminal_bar())
+    _say_export(report, out, "imported", as_json)
 
 
 @click.command(short_help="Collect the packages for a Pi without internet.")

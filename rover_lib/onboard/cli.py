@@ -18,7 +18,7 @@ from typing import Any, TextIO, cast
 import click
 
 from rover_lib.onboard.columns import align, benchmark_rows, number
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import RoverError, of_system, printable
 from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
 
 FILE = click.Path(path_type=Path)
@@ -31,7 +31,7 @@ CAMERA = click.option(
     "--camera", default="0", show_default=True, help="A number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
 )
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's serial port.")
+PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")
 LOG_DRIVE = click.option(
     "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
 )
@@ -84,7 +84,7 @@ class Rover(click.Group):
         except RoverError as e:
             if ctx.params.get("debug"):
                 raise
-            click.echo(f"rover: {e}", err=True)
+            click.echo(f"rover: {printable(str(e))}", err=True)
         except ModuleNotFoundError as e:
             if ctx.params.get("debug") or (e.name or "").startswith("rover_lib"):
                 raise
@@ -92,10 +92,14 @@ class Rover(click.Group):
             if e.name == "aiohttp":
                 sentence = "the view needs aiohttp: provision the rover with -e rover_view=true; on a laptop, make demo"
             click.echo(f"rover: {sentence}", err=True)
-        except (OSError, MemoryError) as e:
+        except OSError as e:
             if ctx.params.get("debug"):
                 raise
-            click.echo(f"rover: {type(e).__name__}: {e}", err=True)
+            click.echo(f"rover: {of_system(e)}", err=True)
+        except MemoryError:
+            if ctx.params.get("debug"):
+                raise
+            click.echo("rover: there is not enough memory; end other programs, or use fewer samples", err=True)
         ctx.exit(1)
 
 
@@ -128,11 +132,11 @@ def show(value: Any, as_json: bool) -> None:
             if isinstance(inner, list) and len(inner) > LONG_LIST:
                 click.echo(f"{indent}{key:<28} {len(inner)} values, see --json")
             elif isinstance(inner, (dict, list)) and inner:
-                click.echo(f"{indent}{key}")
+                click.echo(f"{indent}{printable(key)}")
                 lines(inner, indent + "  ")
             else:
-                text = f"{inner:.4g}" if isinstance(inner, float) else inner
-                click.echo(f"{indent}{key:<28} {text}")
+                text = f"{inner:.4g}" if isinstance(inner, float) else printable(inner)
+                click.echo(f"{indent}{printable(key):<28} {text}")
 
     lines(value, "")
 
@@ -283,15 +287,20 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
     show_default=True,
     help="Episodes to record, one after another.",
 )
+@click.option("--finish", is_flag=True, help="Only make episodes of what killed recordings have left in OUT_DIR.")
 @click.pass_context
-def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -> None:
+def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **options: Any) -> None:
     """Record a human who drives with the transmitter: episode folders in OUT_DIR, to train and calibrate with.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGQUIT end an episode, and it is kept. Exit code 1 if a fault ended it; what was
     recorded until then is kept too.
     """
+    from rover_lib.onboard.recording.episode import find_killed, finish_killed
     from rover_lib.onboard.recording.recorder import record_episodes
 
+    if finish:
+        finished = [finish_killed(part) for part in find_killed(out_dir)]
+        return click.echo("\n".join(f"finished: {path}" for path in finished) or f"{out_dir}: nothing to finish")
     fault = None
     for report in record_episodes(
         folder=out_dir, rate_hz=hz, status=sys.stderr, notify=lambda text: click.echo(text, err=True), **options
@@ -555,7 +564,7 @@ def release(
 ALLOW = click.option(
     "--allow",
     multiple=True,
-    type=click.Choice(["mode", "chunk", "camera"]),
+    type=click.Choice(["mode", "chunk", "camera", "aspect"]),
     help="Accept an artifact that differs in this.",
 )
 
@@ -694,11 +703,12 @@ def open_view(
     feed: Path | None,
     drive_user: str | None,
     opened: Callable[[str], object] = lambda url: None,
-    replay: Any = None,
+    shown: Any = None,
 ) -> None:
     """Serve the view until SIGINT or SIGTERM.
 
-    opened: called with its URL. replay: a Replay of drive_log, shown instead of the drives that connect.
+    opened: called with its URL. shown: what is shown instead of the drives that connect, a Replay of drive_log, or
+    balloon_world's Simulation, whose `ask` gets what is asked for on the page.
     """
     import asyncio
 
@@ -706,14 +716,16 @@ def open_view(
     from rover_lib.onboard.view.server import Address, View, new_token, read_token
 
     token = read_token(token_file) if token_file else new_token()
-    place = None if replay else feed or default_view()
+    place = None if shown else feed or default_view()
+    ask = getattr(shown, "ask", None)
     view = View(
         Address(web_port, interface),
         token,
         place,
         drive_user=drive_user,
-        replay=replay is not None,
-        car=replay and replay.car,
+        replay=shown is not None and ask is None,
+        car=shown and shown.car,
+        ask=ask,
     )
 
     def tell(url: str) -> None:
@@ -722,7 +734,7 @@ def open_view(
         sys.stdout.flush()
         opened(url)
 
-    asyncio.run(view.run(tell, replay and replay.show))
+    asyncio.run(view.run(tell, shown and shown.show))
 
 
 @main.command(short_help="Summarize a flight log.")

@@ -6,6 +6,21 @@ The command line prints an error as one sentence and exits with 1; it shows a tr
 needs a part of an error reads that field and never parses the text.
 """
 
+import errno
+import os
+
+SYSTEM_REMEDIES = {  # what a user can do about an error of the system
+    errno.ENOSPC: "make room on that disk (df -h shows it)",
+    errno.EDQUOT: "make room, your quota is used up",
+    errno.EACCES: "name another place, or let this user write there (ls -ld shows whose it is)",
+    errno.EPERM: "name another place, or let this user write there (ls -ld shows whose it is)",
+    errno.EROFS: "name a place on another disk, this one is read-only",
+    errno.ENOENT: "is its name right?",
+    errno.EISDIR: "name a file, this is a folder",
+    errno.ENOTDIR: "name a folder, this is a file",
+    errno.EMFILE: "end other programs, or raise `ulimit -n`",
+}
+
 
 class RoverError(Exception):
     """Base of every error that is caused by the input and not by the program.
@@ -21,6 +36,18 @@ class RoverError(Exception):
     def __str__(self) -> str:
         text = self.what if self.found is None else f"{self.what}, found {self.found}"
         return f"{text}; {self.remedy}" if self.remedy else text
+
+
+def of_system(error: OSError) -> RoverError:
+    """Return a system's error in a sentence with its file, if it names one, and a remedy."""
+    reason = os.strerror(error.errno).lower() if error.errno else f"{type(error).__name__}: {error}"
+    where = f"{printable(str(error.filename))}: " if error.filename else ""
+    return RoverError(f"{where}{reason}", remedy=SYSTEM_REMEDIES.get(error.errno or 0, ""))
+
+
+def printable(value: object) -> object:
+    """Return a text with what could control a terminal escaped; any other value as it is."""
+    return value if not isinstance(value, str) or value.isprintable() else repr(value)[1:-1]
 
 
 def sentence_of(error: BaseException) -> str:

@@ -29,13 +29,18 @@ CALLED = {
     "flight log": "a flight log",
     "recordings": "a folder of recordings",
     "dataset": "a LeRobotDataset",
+    "tub": "a donkeycar tub",
     "run": "a run's folder",
+    "checkpoint part": "a part of a LeRobot checkpoint",
+    "dataset part": "a part of a LeRobotDataset",
+    "document": "a document",
 }
 WANTED = {  # what a command wants: the kinds that it accepts, and how to get one
     "artifact": (("artifact",), "give a policy_<mode>.pt, which rover run makes of a checkpoint"),
     "checkpoint": (("checkpoint", "pretrained"), "give the trainer's best_model.pth, or LeRobot's pretrained_model"),
     "recordings": (("recordings", "dataset"), "give the folder that holds episode_*, or a LeRobotDataset's"),
     "run": (("run",), "give a folder that rover run has made, such as runs/mine"),
+    "tub": (("tub",), "give the folder with manifest.json and the catalogs, or with record_<number>.json"),
     "flight log": (("flight log",), "give the file that rover drive wrote, named by its --log"),
 }
 INSTEAD = {  # (what was given, what was wanted): what to do instead
@@ -47,11 +52,13 @@ INSTEAD = {  # (what was given, what was wanted): what to do instead
     ("dataset", "checkpoint"): "recordings come second: rover run CHECKPOINT EPISODES",
     ("checkpoint", "recordings"): "the checkpoint comes first: rover run CHECKPOINT EPISODES",
     ("pretrained", "recordings"): "the checkpoint comes first: rover run CHECKPOINT EPISODES",
+    ("tub", "recordings"): "rover import TUB OUT makes a LeRobotDataset of it",
     ("recordings", "flight log"): "rover inspect says what is in recordings; a flight log is a file of its own",
     ("run", "artifact"): "give one of its policy_<mode>.pt; rover report says which",
     ("run", "checkpoint"): "give the checkpoint that it was made of, which its load.json names",
     ("run", "recordings"): "give the recordings that it was made of, which its load.json names",
 }
+PARTS = ("checkpoint part", "dataset part")
 EPISODE_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
 HEAD = 65536  # bytes that are read of a file
 PICKLE_HEAD = 4096  # bytes that are read of a torch file's pickle, which names its keys early
@@ -79,9 +86,22 @@ def check_kind(path: Path | str, wanted: str) -> None:
     takes, remedy = WANTED[wanted]
     if not found or set(found) & set(takes):
         return
+    refuse_part(path)
     kind = found[0]
     what = "an artifact already" if (kind, wanted) == ("artifact", "checkpoint") else CALLED[kind]
     raise KindError(f"{path}: this is {what}, not {CALLED[takes[0]]}", remedy=INSTEAD.get((kind, wanted), remedy))
+
+
+def refuse_part(path: Path | str) -> None:
+    """Raise KindError for a file of a LeRobot checkpoint or LeRobotDataset, and for a document, which nothing reads."""
+    kind = next(iter(kinds_of(path)), "")
+    if kind in PARTS:
+        folder = Path(path).absolute().parent
+        if kind == "dataset part":
+            folder = next((p for p in (folder, *folder.parents[:4]) if (p / "meta" / "info.json").is_file()), folder)
+        raise KindError(f"{path}: this is {CALLED[kind]}", remedy=f"give its folder, {os.path.relpath(folder)}")
+    if kind == "document":
+        raise KindError(f"{path}: this is {CALLED[kind]}", remedy="give a file or folder that it describes")
 
 
 def check_output(path: Path, kind: str | None, *, appended: bool = False) -> None:
@@ -89,7 +109,7 @@ def check_output(path: Path, kind: str | None, *, appended: bool = False) -> Non
     if path.is_dir():
         raise KindError(f"{path}: this is a folder, and one file is to be written", remedy="name the file in it")
     there = path.exists()
-    if found := set(kinds_of(path)) - {kind}:
+    if found := set(kinds_of(path)) - {kind, "dataset part", "document"}:  # a film may take the place of a film
         raise KindError(f"{path}: this is {CALLED[found.pop()]}, and would be lost", remedy="give another name")
     if there and not path.is_file() and not appended:
         raise KindError(f"{path}: this is no ordinary file, and would be replaced by one", remedy="give another name")
@@ -150,7 +170,8 @@ class PathTo(click.Path):
 def _of_folder(folder: Path) -> tuple[str, ...]:
     names = {p.name for p in folder.iterdir()}
     kinds = []
-    if names & {"load.json", "run.json", "quantize.json"} or any(n.startswith("policy_") for n in names):
+    artifacts = [n for n in names if n.startswith("policy_") and n.endswith((".pt", ".zip"))]  # not policy_...json
+    if names & {"load.json", "run.json", "quantize.json"} or artifacts:
         kinds.append("run")
     if (folder / "meta" / "info.json").is_file():
         kinds.append("dataset")
@@ -158,6 +179,11 @@ def _of_folder(folder: Path) -> tuple[str, ...]:
         kinds.append("pretrained")
     if names & set(EPISODE_FILES) or any(n.startswith("episode_") and (folder / n).is_dir() for n in names):
         kinds.append("recordings")
+    if not kinds and (
+        {"catalog_0.catalog", "record_0.json"} & names
+        or ("manifest.json" in names and any(n.endswith(".catalog") for n in names))
+    ):
+        kinds.append("tub")
     return tuple(kinds)
 
 
@@ -173,6 +199,13 @@ def _of_file(file: Path) -> tuple[str, ...]:
             return ("stage",) if stage else ()
     if file.name in EPISODE_FILES:
         return ("recordings",)
+    of_policy = file.name in ("config.json", "train_config.json") or file.name.startswith(("policy_pre", "policy_post"))
+    if file.suffix == ".safetensors" or (file.suffix == ".json" and of_policy):
+        return ("checkpoint part",)
+    if file.suffix in (".parquet", ".mp4") or (file.parent.name == "meta" and file.suffix in (".json", ".jsonl")):
+        return ("dataset part",)
+    if file.suffix.lower() in (".md", ".txt", ".html", ".ipynb", ".yml", ".yaml", ".py", ".pdf", ".csv"):
+        return ("document",)
     return ()
 
 
@@ -182,7 +215,7 @@ def _of_archive(file: Path) -> tuple[str, ...]:
         with file.open("rb") as f:  # an artifact's directory, which names its records, is not opened as a zip for that
             f.seek(max(0, file.stat().st_size - DIRECTORY_BYTES))
             directory = f.read()
-        if any(name.encode() in directory for name in (ONNX, HEF, "/code/__torch__")):
+        if any(name.encode() in directory for name in (ONNX, HEF, "/code/")):
             return ("artifact",)
         with zipfile.ZipFile(file) as z:
             names = z.namelist()

@@ -32,19 +32,23 @@ PARTS = ("params", "metrics", "inputs", "env")
 def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path`. It is renamed to `path` if the block succeeds, and removed if it fails.
 
-    Raises RoverError if torch.save cannot write the whole file.
+    Raises RoverError if torch.save cannot write the whole file, and OSError that names `path` for all else.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{path.suffix}")
     # Not mkstemp, whose mode of 0600 would hide the file from the service's user. Here the kernel applies the umask;
     # a process can learn its umask only by setting it, which would affect all of its threads.
-    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         with temporary.open("rb") as f:
             os.fsync(f.fileno())  # a power cut after the rename must not leave an empty file
         temporary.replace(path)
+    except OSError as error:
+        if error.filename in (None, str(temporary)):  # of a full disk it says no name, else a name that nobody knows
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
     except RuntimeError as error:
         if "inline_container" not in str(error):  # torch's file writer, which hides the system's error
             raise

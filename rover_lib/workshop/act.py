@@ -87,6 +87,7 @@ class ActConfig:
     rate_hz: float = 30.0  # steps of a plan in a second
     image_norm: tuple[Affine, ...] = field(default_factory=lambda: (imagenet(),))  # of pixels in [0, 1]
     state_norm: Affine | None = None
+    sees_state: bool = True  # False: it was trained without a state; what is given as one is not looked at
     action_unnorm: Affine | None = None
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
@@ -104,8 +105,9 @@ def lerobot_act(c: ActConfig) -> "ACTPolicy":
 
     cameras = zip(c.cameras, c.image_sizes, strict=True)
     inputs = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, *size)) for name, size in cameras}
+    state = PolicyFeature(FeatureType.STATE, (len(c.state_names),))
     config = ACTConfig(
-        input_features={**inputs, "observation.state": PolicyFeature(FeatureType.STATE, (len(c.state_names),))},
+        input_features=inputs | ({"observation.state": state} if c.sees_state else {}),
         output_features={"action": PolicyFeature(FeatureType.ACTION, (len(c.action_names),))},
         device="cpu",
         chunk_size=c.chunk,
@@ -579,8 +581,10 @@ class ACT(nn.Module):
         weight = project["weight"]
         out_channels, in_channels, _, _ = weight.shape
         self.image_project = _load(nn.Conv2d(in_channels, out_channels, 1, device="meta"), weight, project["bias"])
-        state = w.at("encoder_robot_state_input_proj")
-        self.state_project = linear(state["weight"], state["bias"])
+        self.sees_state = config.sees_state
+        if config.sees_state:
+            state = w.at("encoder_robot_state_input_proj")
+            self.state_project = linear(state["weight"], state["bias"])
         # The latent is zero when driving, so its projection gives the bias alone.
         self.latent: Tensor
         self.pos: Tensor
@@ -604,7 +608,9 @@ class ACT(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, state: Tensor, *frames: Tensor) -> Tensor:
-        tokens = [self.latent, self.state_project(self.state_norm(state))[:, None]]
+        tokens = [self.latent]
+        if self.sees_state:
+            tokens.append(self.state_project(self.state_norm(state))[:, None])
         for i, image_input in enumerate(self.image_input):  # frames by index, because FX cannot trace an iteration
             x = self.image_project(self.backbone(image_input(frames[i])))  # (1, D, h, w)
             tokens.append(x.flatten(2).transpose(1, 2))  # (1, h * w, D)

@@ -2,11 +2,15 @@
 
 import os
 import sys
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import TextIO, TypeVar
 
+LINES_S = 20.0  # seconds of silence in a log
+LOG_VARIABLE = "ROVER_PROGRESS_LOG"  # the file into which the run's messages go, if that is no terminal
 TTY_VARIABLE = "ROVER_PROGRESS_TTY"  # the terminal where a run was started: the notebooks draw their bars there
 
 T = TypeVar("T")
@@ -19,19 +23,33 @@ def silent(items: Iterable[T], **_: object) -> Iterable[T]:
 
 
 def terminal_bar() -> Progress:
-    """A bar if the output is a terminal; nothing if it goes to a log."""
+    """A bar if the output is a terminal; a line now and then if it goes to a log."""
     from tqdm import tqdm
 
-    return partial(tqdm, disable=not sys.stderr.isatty(), leave=False)
+    return partial(tqdm, leave=False) if sys.stderr.isatty() else partial(lines, sys.stderr)
+
+
+def lines(stream: TextIO, items: Iterable[T], *, desc: str = "", total: int | None = None, **_: object) -> Iterator[T]:
+    """Yield the items, and write a line to the stream once LINES_S have passed, and then as often as that."""
+    told_s = time.monotonic()
+    for count, item in enumerate(items):
+        if time.monotonic() - told_s > LINES_S:
+            told_s = time.monotonic()
+            print(f"rover: {desc or 'at work'}: {count}{f' of {total}' if total else ''}", file=stream, flush=True)
+        yield item
 
 
 def notebook_bar() -> Progress:
     """A notebook's bar if somebody watches; in stored outputs, bars would only be noise.
 
-    Somebody watches in the terminal where `rover run` was started, or in a JupyterLab session.
+    Somebody watches in the terminal where `rover run` was started, or in a JupyterLab session. If that command's output
+    goes into a log, lines go there.
     """
     from tqdm import tqdm
 
+    if name := os.environ.get(LOG_VARIABLE):
+        with suppress(OSError):
+            return partial(lines, Path(name).open("a"))
     if name := os.environ.get(TTY_VARIABLE):
         try:
             stream = Path(name).open("w")  # noqa: SIM115, open as long as the kernel lives

@@ -89,7 +89,10 @@ def _put_back(old: Path, folder: Path) -> None:
 def _lock(folder: Path) -> int:
     """Lock the folder, which is made if needed; return the descriptor that holds the lock."""
     while True:
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:  # of a hidden folder that nobody knows: its place is what the user named
+            raise OSError(error.errno, error.strerror, str(folder.parent)) from error
         held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -22,12 +22,19 @@ def here(tmp_path, monkeypatch):
             z.writestr("archive/data.pkl", keys)
     (tmp_path / "flight.log").write_text('{"schema":1,"kind":"header","columns":[]}\n')
     (tmp_path / "notes.txt").write_text("hello")
+    for name in ("noise.bin", "model.safetensors", "x.mp4"):
+        (tmp_path / name).write_bytes(b"\0\1\2hello")
     stage = {"schema": 1, "stage": "load", "params": {}, "metrics": {}, "inputs": {}, "env": {}}
-    for folder in ("episodes/episode_1/frames", "dataset/meta", "runs/mine", "pretrained_model", "empty"):
+    folders = (
+        "episodes/episode_1/frames dataset/meta dataset/data/chunk-000 runs/mine pretrained_model old_policy empty"
+    )
+    for folder in folders.split():
         (tmp_path / folder).mkdir(parents=True)
     (tmp_path / "episodes/episode_1/episode_data.json").write_text("{}")
     (tmp_path / "dataset/meta/info.json").write_text("{}")
-    (tmp_path / "pretrained_model/config.json").write_text("{}")
+    (tmp_path / "dataset/data/chunk-000/file-000.parquet").write_bytes(b"PAR1")
+    for name in ("pretrained_model/config.json", "old_policy/config.json", "old_policy/policy_preprocessor.json"):
+        (tmp_path / name).write_text("{}")
     (tmp_path / "runs/mine/load.json").write_text(json.dumps(stage))
     return tmp_path
 
@@ -40,14 +47,41 @@ WRONG = [
     ("distill policy_static.pt episodes --name a", "policy_static.pt: this is an artifact already", "deploy it"),
     ("run calibration.pt episodes", "calibration.pt: this is the calibration of a run", "best_model.pth"),
     ("run flight.log episodes", "flight.log: this is a flight log", "best_model.pth"),
-    ("quantize notes.txt episodes -o o.pt", "notes.txt: not a torch checkpoint", "copy it again"),
+    ("quantize notes.txt episodes -o o.pt", "notes.txt: this is a document", "that it describes"),
+    ("run noise.bin episodes", "noise.bin: neither a trainer's checkpoint nor", "copy it again"),
+    (
+        "run pretrained_model/config.json episodes",
+        "config.json: this is a part of a LeRobot",
+        "folder, pretrained_model",
+    ),
+    ("inspect model.safetensors", "model.safetensors: this is a part of a LeRobot checkpoint", "give its folder, ."),
+    (
+        "run best_model.pth dataset/meta/info.json",
+        "info.json: this is a part of a LeRobotD",
+        "give its folder, dataset",
+    ),
+    (
+        "inspect dataset/data/chunk-000/file-000.parquet",
+        "this is a part of a LeRobotDataset",
+        "give its folder, dataset",
+    ),
+    (
+        "compare policy_static.pt x.mp4 --episodes episodes",
+        "x.mp4: this is a part of a LeRobotDataset",
+        "its folder, .",
+    ),
+    ("drive nothing.pt", "nothing.pt: not found", "rover run"),
+    ("world trial nothing.pt", "nothing.pt", ";"),
+    ("drive old_policy", "old_policy: this is a LeRobot checkpoint", "rover run CHECKPOINT EPISODES"),
+    ("export old_policy", "old_policy: this is a LeRobot checkpoint", "such as runs/mine"),
+    ("run best_model.pth old_policy", "old_policy: this is a LeRobot checkpoint", "the checkpoint comes first"),
     ("drive best_model.pth", "best_model.pth: this is a trainer's checkpoint", "rover run CHECKPOINT EPISODES"),
     ("drive pretrained_model", "pretrained_model: this is a LeRobot checkpoint", "rover run CHECKPOINT EPISODES"),
     ("doctor best_model.pth", "best_model.pth: this is a trainer's checkpoint", "rover run CHECKPOINT EPISODES"),
     ("benchmark calibration.pt", "calibration.pt: this is the calibration of a run", "policy_<mode>.pt"),
     ("world trial best_model.pth", "best_model.pth: this is a trainer's checkpoint", "rover run CHECKPOINT"),
     ("log policy_static.pt", "policy_static.pt: this is an artifact", "rover drive wrote"),
-    ("log notes.txt", "notes.txt", "rover drive"),
+    ("log notes.txt", "notes.txt: this is a document", "that it describes"),
     ("release pack best_model.pth parts", "best_model.pth: this is a trainer's checkpoint", "rover run"),
     ("inspect damaged.zip", "damaged.zip", ";"),
     # wrong folder
@@ -72,7 +106,7 @@ WRONG = [
         "rover run has made",
     ),
     # no device
-    ("drive policy_static.pt --dry-run --camera 99", "/dev/video99: no such camera", "rover doctor"),
+    ("drive policy_static.pt --dry-run --camera 99", "policy_static.pt: a record that no artifact has", "again"),
     ("record out --port ttyNONE --camera 99", "99", ";"),
     ("doctor --receiver --port ttyNONE", "ttyNONE", "is the Arduino plugged in"),
     # an output that would cost something else

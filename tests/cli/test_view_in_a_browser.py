@@ -28,16 +28,65 @@ GREEN = """(() => {  // pixels of the picture that are of the ribbon's colour
 })()"""
 
 
+def start(*words, tmp_path):
+    env = {**os.environ, "XDG_STATE_HOME": str(tmp_path), "DISPLAY": ""}
+    command = [sys.executable, "-m", "rover_lib.cli", *map(str, words)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env)
+
+
+def end(*processes):
+    for process in processes:
+        process.send_signal(signal.SIGINT)
+        process.wait(30)
+        process.stdout.close()
+
+
 @pytest.fixture
 def view(demo_run, tmp_path):
-    """The demo's policy that drives through the balloon world, and the page's URL."""
-    command = [sys.executable, "-m", "rover_lib.cli", "view", demo_run / "policy_static.pt", "--web-port", "0"]
-    env = {**os.environ, "XDG_STATE_HOME": str(tmp_path), "DISPLAY": ""}
-    process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True, env=env)
-    yield process.stdout.readline().strip()
-    process.send_signal(signal.SIGINT)
-    process.wait(30)
-    process.stdout.close()
+    """The demo's policy that drives a simulated car in real time, with another process's view of it: the page's URL."""
+    place = tmp_path / "place"
+    shown = start("view", "--web-port", "0", "--feed", place, tmp_path=tmp_path)
+    url = shown.stdout.readline().strip()
+    driving = start("drive", demo_run / "policy_static.pt", "--world", "--view", place, tmp_path=tmp_path)
+    yield url
+    end(driving, shown)
+
+
+@pytest.fixture
+def simulation(demo_run, tmp_path):
+    """What `make watch` shows: the page's URL."""
+    shown = start("view", demo_run / "policy_static.pt", "--web-port", "0", tmp_path=tmp_path)
+    yield shown.stdout.readline().strip()
+    end(shown)
+
+
+def test_a_simulation_lives_through_a_busy_machine(simulation, tmp_path):
+    """Beside four processes that compute without end, the car goes on from world to world, and the page shows it."""
+
+    async def scene():
+        async with Browser(tmp_path / "profile") as browser:
+            tab = await browser.open(quote(simulation, safe=""))
+            await tab.ask("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=2, mobile=True)
+            await tab.until("newest.world")
+            old = []
+            for _ in range(60):
+                await asyncio.sleep(1)
+                old.append(await tab.value("document.body.classList.contains('old')"))
+            assert sum(old) < 6 and await tab.value("document.documentElement.scrollWidth") <= 390
+            await tab.click("drive FP32")
+            await tab.until("newest.world.results.INT8[1] > 0 && newest.world.drives === 'FP32'")
+            await tab.click("stop")
+            await tab.until("newest.phase === 'ended' && newest.text.startsWith('stopped here')")
+            await tab.click("next")
+            await tab.until("newest.phase === 'driving'")
+
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(4)]
+    try:
+        asyncio.run(scene())
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 def test_ten_pages_show_the_flight_log_and_one_click_stops_the_car(view, tmp_path):

@@ -103,9 +103,10 @@ def test_a_receiver_that_holds_its_last_pulses_arms_nothing(armed):
 
 def test_arming_asks_for_one_thing_after_the_other():
     board = NativeArduino()
-    board.sticks = [0, 0]
-    board.run(200)
-    assert (board.command("A"), board.status.missing) == ("s", "s")
+    for present in ([0, 0], [0, 124], [1460, 0]):
+        board.sticks = present
+        board.run(200)
+        assert (board.command("A"), board.status.missing) == ("s", "s")
     board.sticks = [1460, 300]
     board.run(200)
     assert (board.command("A"), board.status.missing) == ("t", "t")
@@ -114,7 +115,13 @@ def test_arming_asks_for_one_thing_after_the_other():
     assert (board.command("A"), board.status.missing) == ("w", "w")
     board.wiggle()
     assert board.status.missing == "-"
+    assert board.command("N") == "i"  # a human drives, and goes on
+    assert set(board.drive(1700, 232, 100)) == {(1460, 124)}  # not armed
     assert (board.command("A"), board.status.state) == ("k", State.AUTONOMOUS)
+    assert board.status.missing == "w"  # used up
+    board.command("N")
+    assert set(board.drive(1700, 232, 200)) == {NEUTRAL}
+    assert (board.status.state, board.status.reason, board.status.result) == (State.STOPPED, "n", "i")
 
 
 @pytest.mark.parametrize("sides", [(1750,), (1150,), (1300, 1600), (1750, 1750)])
@@ -199,6 +206,25 @@ def test_a_human_who_drives_keeps_the_car_when_another_is_told(board, throttle_u
     assert board.command("C", 20000, 1000, 1500, 2000, 20000, 1000, 1500, 2000, 100) == result
     if result == "t":
         assert set(board.run(300)) == {(1600, 300)}
+
+
+@pytest.mark.parametrize(("channel", "off", "missing"), [(0, 1.2, "w"), (0, 1.3, "s"), (1, 1.2, "w"), (1, 1.3, "s")])
+def test_the_period_of_a_signal_may_be_off_by_a_quarter(channel, off, missing):
+    board = NativeArduino()
+    periods = list(board.periods_us)
+    periods[channel] = round(off * periods[channel])
+    board.periods_us = tuple(periods)
+    board.run(400)
+    assert board.status.missing == missing
+
+
+def test_a_throttle_at_rest_frees_nothing_while_the_steering_is_lost(board):
+    board.sticks = [0, 0]
+    board.run(200)
+    board.sticks = [0, 120]
+    board.run(300)
+    board.sticks = [1500, 300]
+    assert set(throttles(board.run(400))) == {120}
 
 
 def test_a_wiggle_is_good_for_one_arming_within_30_seconds(board):

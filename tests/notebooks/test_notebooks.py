@@ -1,9 +1,11 @@
 """The notebooks as files: they call, check and show; what a function could hold is not in them."""
 
 import ast
+import json
 import re
 import shutil
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +17,8 @@ from lab.repository.publish import NOTEBOOK_LIMIT, RESULTS_OF
 from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop import progress
 from rover_lib.workshop.run import run as runs
-from rover_lib.workshop.run import session
+from rover_lib.workshop.run import run_report, session
+from rover_lib.workshop.run.copy_run import copy_run
 from rover_lib.workshop.run.run import AFTERWARDS, NAMES, NOTEBOOKS, parameters_of
 
 PATHS = [NOTEBOOKS / f"{name}.ipynb" for name in NAMES + AFTERWARDS]
@@ -211,10 +214,28 @@ def test_a_run_that_does_not_end_costs_nothing_of_the_last_one(one_notebook, old
         whole(source, folder, given, bars)
         raise error
 
-    before = contents(old_run.parent)
+    before = contents(old_run)
     with pytest.raises(type(error)):
         run_with(monkeypatch, one_notebook, old_run, ends_early)
-    assert contents(old_run.parent) == before
+    assert contents(old_run) == before
+    kept = contents(old_run.parent / ".mine.unfinished")
+    assert kept["policy_static.pt"] == "new" and sorted(p.name for p in old_run.parent.iterdir())[1:] == ["mine"]
+    # the same command goes on there, and with another checkpoint it begins anew
+    assert run_with(monkeypatch, one_notebook, old_run, lambda *args: pytest.fail("it began again")) == old_run
+    assert contents(old_run)["policy_static.pt"] == "new" and [p.name for p in old_run.parent.iterdir()] == ["mine"]
+    with pytest.raises(type(error)):
+        run_with(monkeypatch, one_notebook, old_run, ends_early)
+    monkeypatch.setattr(runs, "_execute", lambda *args: (_ for _ in ()).throw(error))
+    with pytest.raises(type(error)):
+        runs.run("other", "episodes", "mine", runs_dir=old_run.parent, notebooks=one_notebook)
+    assert [p.name for p in old_run.parent.iterdir()] == ["mine"]
+
+
+def test_root_learns_at_once_that_it_may_load_no_artifact(one_notebook, old_run, monkeypatch):
+    monkeypatch.delenv("ROVER_AS_ROOT")
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    with pytest.raises(runs.RoverError, match="root does not load artifacts"):
+        run_with(monkeypatch, one_notebook, old_run, lambda *args: pytest.fail("it began"))
 
 
 def test_a_second_run_of_the_same_name_waits_for_the_first(one_notebook, old_run, monkeypatch):
@@ -393,3 +414,75 @@ def test_nobody_watches_a_test(monkeypatch):
     monkeypatch.delenv("JPY_SESSION_NAME", raising=False)
     monkeypatch.setenv(runs.TTY_VARIABLE, "")
     assert progress.notebook_bar() is progress.silent
+
+
+# --- turning parameters ---
+
+TURNED = {
+    "02_calibrate": ("calibrate", {"samples": 7, "seed": 3, "smooth": 0.7}),
+    "03_quantize": (
+        "quantize",
+        {
+            "scheme": "affine",
+            "observer": "percentile",
+            "percentile": 99.5,
+            "float_blocks": ["backbone.stem"],
+            "modes": ["mixed"],
+            "choosing_frames": 2,
+        },
+    ),
+    "04_compare": ("compare", {"held_out_frames": 4, "worlds": 1}),
+    "05_benchmark": (f"benchmark-{runs.socket.gethostname()}", {"iterations": 3, "threads": 1}),
+}
+
+
+@pytest.fixture(scope="module")
+def turned(demo_run, tmp_path_factory):
+    """A copy of the demo's run in which each parameter of notebooks 02 to 05 was turned."""
+    runs_dir = tmp_path_factory.mktemp("runs")
+    (runs_dir / "demo").symlink_to(demo_run)
+    folder = copy_run("demo", "copy", runs_dir)
+    for name, (_, given) in TURNED.items():
+        runs.execute(name, folder, **given)
+    return folder
+
+
+def test_each_parameter_that_is_turned_is_seen_in_the_json(turned):
+    found = {stage: json.loads((turned / f"{stage}.json").read_text()) for stage, _ in TURNED.values()}
+    assert found["calibrate"]["params"] == {"samples": 7, "seed": 3, "smooth": 0.7}
+    assert found["calibrate"]["metrics"]["samples"] == 7
+    schemes = {mode: made.get("scheme") for mode, made in found["quantize"]["metrics"]["modes"].items()}
+    assert schemes.keys() == {"fp32", "static", "mixed"} and schemes["mixed"]["float_blocks"] == ["backbone.stem"]
+    for key, value in {"kind": "affine", "observer": "percentile", "percentile": 99.5, "smooth": 0.7}.items():
+        assert schemes["static"][key] == schemes["mixed"][key] == value
+    assert found["quantize"]["params"]["scheme"] == "affine" and found["quantize"]["params"]["modes"] == ["mixed"]
+    assert {p.name for p in turned.glob("policy_*.pt")} == {f"policy_{mode}.pt" for mode in schemes}
+    compared = found["compare"]["metrics"]
+    assert (compared["frames"], compared["fp32"]["trials"]) == (4, 1) and compared["modes"].keys() == {
+        "static",
+        "mixed",
+    }
+    timed = found[TURNED["05_benchmark"][0]]
+    assert timed["params"]["threads"] == 1 and timed["metrics"]["artifacts"]["static"]["n"] == 3
+    assert run_report.write(turned)["metrics"]["modes"]
+
+
+def test_the_batch_of_the_docs_runs(demo_run, tmp_path, monkeypatch, capsys):
+    """As it stands in docs/notebooks.md, on fewer frames."""
+    (code,) = re.findall(
+        r"^```python\n(.*?)^```", (NOTEBOOKS.parent / "docs" / "notebooks.md").read_text(), re.M | re.S
+    )
+    few, execute = {"03_quantize": {"choosing_frames": 1}, "04_compare": {"held_out_frames": 2}}, runs.execute
+    monkeypatch.setattr(runs, "execute", lambda name, folder, **given: execute(name, folder, **few[name], **given))
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "demo").symlink_to(demo_run)
+    monkeypatch.chdir(tmp_path)
+    exec(code, {})
+    assert len(re.findall(r"^\{.*\} \d+\.\d\d \d+\.\d\d % off$", capsys.readouterr().out, re.M)) == 3
+
+
+def test_an_unknown_parameter_is_refused_before_anything_runs(tmp_path):
+    began = time.monotonic()
+    with pytest.raises(runs.NotebookError, match=r"03_quantize.ipynb has no parameter schem; known are .*'scheme'"):
+        runs.execute("03_quantize", tmp_path, schem="affine")
+    assert time.monotonic() - began < 2

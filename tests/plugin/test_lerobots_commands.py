@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import CONTINUES, HUMAN, STOPPED, Command, Gates, Observation, judge
 from lab.driving.policy import PLAIN, make_artifact, pictures
+from lerobot_robot_rover.line import ENDING, FEATURES
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.drive.flight_log import read_log
 
@@ -50,7 +52,7 @@ def plugin(made_once):
 class LeRobot:
     """One of LeRobot's commands, in a process of its own, and what it says."""
 
-    def __init__(self, name, plugin, folder, **options):
+    def __init__(self, name, plugin, folder, stdin=subprocess.DEVNULL, **options):
         words = [f"--{key.replace('__', '.')}={value}" for key, value in options.items()]
         offline = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(folder / "cache"), "HF_LEROBOT_HOME": str(folder)}
         env = {**os.environ, **offline, "OMP_NUM_THREADS": "1", "PYTHONPATH": f"{plugin}{os.pathsep}{ROOT}"}
@@ -59,7 +61,7 @@ class LeRobot:
             [BIN / name, *words],
             env=env,
             cwd=folder,
-            stdin=subprocess.DEVNULL,
+            stdin=stdin,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -131,8 +133,20 @@ def dataset(folder, name, **more):
 
 
 def recording(folder, name, **more):
-    given = {"single_task": "drive", "push_to_hub": False, "vcodec": "h264", "fps": 30} | more
+    codec = "rgb_encoder__vcodec" if ENDING else "vcodec"
+    given = {"single_task": "drive", "push_to_hub": False, codec: "h264", "fps": 30} | more
     return dataset(folder, name, **given) | {"play_sounds": False, "display_data": False}
+
+
+def driving(folder, artifact, seconds):
+    """The command by which this LeRobot lets a policy drive for one episode, and its options."""
+    policy = {"policy__type": "rover_artifact", "policy__artifact": artifact}
+    if not ENDING:
+        options = recording(folder, "eval_a", num_episodes=1, episode_time_s=seconds, reset_time_s=0)
+        return "lerobot-record", policy | options
+    options = recording(folder, "rollout_a", num_episodes=1, episode_time_s=seconds, reset_time_s=0)
+    strategy = {"strategy__type": "episodic", "strategy__reset_to_initial_position": False}
+    return "lerobot-rollout", policy | options | strategy
 
 
 def rows(root):
@@ -205,9 +219,7 @@ class TestHuman:
         monkeypatch.setenv("HF_HUB_OFFLINE", "1")
         data = LeRobotDataset("local/drives", root=drives, video_backend="pyav")
         assert (data.num_episodes, data.fps, data.meta.robot_type) == (3, 30, "rover")
-        assert (
-            data.features["action"]["names"] == data.features["observation.state"]["names"] == ["steering", "throttle"]
-        )
+        assert data.features["action"]["names"] == data.features["observation.state"]["names"] == list(FEATURES)
         picture = data[5]["observation.images.cam_front"]
         ours = load_recordings(drives, 8)
         assert len(ours.episodes) == 3 and not ours.faults
@@ -292,9 +304,8 @@ def take_over(process, board):
 def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifact, plugin, tmp_path):
     folder = Path(tempfile.mkdtemp(dir=tmp_path))  # of this attempt
     with EmulatedArduino(transmitter=REST_US, ready=True, nice=NICE) as board:
-        given = robot(board.port, eyes) | {"policy__type": "rover_artifact", "policy__artifact": artifact}
-        given |= recording(folder, "eval_a", num_episodes=1, episode_time_s=60, reset_time_s=0)
-        with LeRobot("lerobot-record", plugin, eyes, **given) as record:
+        command, given = driving(folder, artifact, 60)
+        with LeRobot(command, plugin, eyes, **robot(board.port, eyes), **given) as record:
             record.wait_for("Recording episode 0")
             moving_s, events = None, []
             end = time.monotonic() + 20
@@ -332,6 +343,48 @@ def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifac
         needs.until(lambda pid=pid: needs.ended(pid), 10)
 
 
+@pytest.mark.emulated
+@pytest.mark.slow
+@needs.simavr
+@needs.real_time
+@pytest.mark.skipif(not ENDING, reason="LeRobot has had lerobot-rollout since 0.5")
+def test_daggers_correction_is_a_takeover(eyes, artifact, plugin, tmp_path):
+    """Space pauses the policy, Tab begins and ends the human's correction, which alone is recorded."""
+    from rover_lib.workshop.recordings.episodes import load_recordings
+
+    folder = Path(tempfile.mkdtemp(dir=tmp_path))  # of this attempt
+    keyboard, terminal = pty.openpty()
+    with EmulatedArduino(transmitter=REST_US, ready=True, nice=NICE) as board:
+        throttles: list[int] = []
+
+        def throttle():
+            throttles.extend(e.pulse_us for e in board.pulses() if e.pin == "throttle")
+            return throttles[-1] if throttles else 0
+
+        given = {"policy__type": "rover_artifact", "policy__artifact": artifact, "strategy__type": "dagger"}
+        given |= recording(folder, "rollout_d", num_episodes=1) | {"strategy__smooth_handover": False}
+        given |= {"teleop__type": "rover_transmitter", "teleop__port": board.port}
+        with LeRobot("lerobot-rollout", plugin, folder, stdin=terminal, **robot(board.port, eyes), **given) as rollout:
+            needs.until(lambda: throttle() > 190 or rollout.process.poll() is not None, START_S)
+            os.write(keyboard, b" ")
+            needs.until(lambda: throttle() <= GATES.throttle_max_us, 5)
+            time.sleep(0.5)
+            assert throttle() <= GATES.throttle_max_us and rollout.process.poll() is None, rollout.text[-3000:]
+            os.write(keyboard, b"\t")
+            board.transmitter(*STICKS[0])
+            time.sleep(1.5)
+            os.write(keyboard, b"\t")
+            rollout.wait_for("Correction 1/1 saved", 60)
+            board.transmitter(*REST_US)
+            assert rollout.ended() == 0, rollout.text[-3000:]
+    table = rows(folder / "rollout_d")
+    assert len(table) > 10 and np.stack(table["intervention"]).all()
+    pulses = pulses_of(np.stack(table["action"]))
+    assert (np.abs(pulses - STICKS[0]).max(1) <= ARDUINO_STEP_US).mean() > 0.5  # from when they were moved
+    (episode,) = load_recordings(folder / "rollout_d", 8).episodes
+    assert episode.by_policy and {sample.driver for sample in episode.samples} == {"human"}
+
+
 # ---- in the balloon world
 
 
@@ -344,13 +397,17 @@ def test_the_demos_policy_hits_balloons(demo_run, plugin, tmp_path):
     subprocess.run(packing, check=True, env={**os.environ, "PYTHONPATH": f"{plugin}{os.pathsep}{ROOT}"})
     with VirtualCar() as car:
         given = robot(car.port, folder, camera=car.camera, width=128, height=72)
-        given |= recording(folder, "eval_world", num_episodes=2, episode_time_s=5, reset_time_s=0)
-        with LeRobot("lerobot-record", plugin, folder, policy__path=folder / "packed", **given) as record:
+        name = "rollout_world" if ENDING else "eval_world"
+        given |= recording(folder, name, num_episodes=2, episode_time_s=5, reset_time_s=0)
+        if ENDING:
+            given |= {"strategy__type": "episodic", "strategy__reset_to_initial_position": False}
+        command = "lerobot-rollout" if ENDING else "lerobot-record"
+        with LeRobot(command, plugin, folder, policy__path=folder / "packed", **given) as record:
             end_s = time.monotonic() + START_S
             needs.until(lambda: record.over(end_s), START_S + 1)
             assert record.ended() == 0, record.text[-3000:]
         report = car.report()
     assert report.hits >= 1, report.outcomes
-    table = rows(folder / "eval_world")
+    table = rows(folder / name)
     assert sorted(set(table["episode_index"])) == [0, 1]
     assert read_log(folder / "flight.log").drives == 2

@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.policy import PLAIN, pictures
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig
+from lerobot_robot_rover.line import FEATURES, named
 from lerobot_robot_rover.ride import HOLD_S, Ride
 from rover_lib.onboard.car.camera import CameraError
 from rover_lib.onboard.car.pwm import PwmCalibration
@@ -64,8 +66,8 @@ def test_lerobot_makes_it_of_its_config(tmp_path):
 
 def test_features_are_the_datasets(tmp_path):
     rover = Rover(RoverConfig(width=64, height=36, calibration_dir=tmp_path))
-    assert rover.observation_features == {"steering": float, "throttle": float, "cam_front": (36, 64, 3)}
-    assert rover.action_features == {"steering": float, "throttle": float}
+    assert rover.observation_features == {**FEATURES, "cam_front": (36, 64, 3)}
+    assert rover.action_features == FEATURES
     assert list(rover.cameras) == ["cam_front"]
 
 
@@ -136,7 +138,7 @@ def test_connected_once(rover, standin):
 
 def test_an_observation_is_what_the_features_say(rover):
     before = rover.get_observation()
-    assert (before["steering"], before["throttle"]) == (0.0, 0.0)
+    assert [before[name] for name in FEATURES] == [0.0, 0.0]
     picture = before["cam_front"]
     assert picture.shape == (48, 96, 3) and picture.dtype == np.uint8 and picture.flags.c_contiguous
     red, blue = picture[:12, :24, 0].mean(), picture[:12, :24, 2].mean()
@@ -167,7 +169,7 @@ def test_actions_are_on_the_pins_and_the_next_state(make_rover, standin, patient
     standin.pulses()
     try:
         observation = turn(rover, seconds=0.5)
-        assert (observation["steering"], observation["throttle"]) == (0.2, 0.15)
+        assert [observation[name] for name in FEATURES] == [0.2, 0.15]
         assert on_pins(standin, "steering")[-1] == SENT.steering_us and on_pins(standin, "throttle") == []
     finally:
         rover.disconnect()
@@ -181,7 +183,7 @@ def test_a_throttle_above_the_limit_is_cut(make_rover, standin):
     rover.connect()
     try:
         rover.get_observation()
-        assert rover.send_action({"steering": 1.1, "throttle": 0.9}) == {"steering": 1.0, "throttle": 0.1}
+        assert rover.send_action({"steering": 1.1, "throttle": 0.9}) == named(1.0, 0.1)
         until(lambda: standin._pins[1] == PwmCalibration().throttle.pulse_us(0.1))
         assert rover._link.latest().cap_us <= 180  # and what the Arduino would give is lowered
     finally:
@@ -219,7 +221,7 @@ def test_without_actions_the_car_stops_and_takes_another_gesture(make_rover, sta
         until(lambda: standin._state == "S")
         assert standin._reason == "n"  # by the host, before the Arduino had to
         observation = rover.get_observation()
-        assert (observation["steering"], observation["throttle"]) == (0.0, 0.0)
+        assert [observation[name] for name in FEATURES] == [0.0, 0.0]
         assert standin._state == "S"  # looking arms nothing
         turn(rover, seconds=0.2)  # this human has always just wiggled
         assert standin._state == "A"
@@ -307,7 +309,7 @@ def test_a_black_picture_arms_nothing(rover, standin, when):
 def test_a_picture_that_is_too_old_arms_nothing(rover, standin):
     rover.get_observation()
     rover._captured_s -= 5
-    assert rover.send_action(GO) == {"steering": 0.0, "throttle": 0.0}
+    assert rover.send_action(GO) == named(0.0, 0.0)
     assert standin._state == "M"
 
 
@@ -333,7 +335,7 @@ def test_what_the_human_does_is_not_sent_and_ends_a_drive(make_rover, standin, t
         for _ in range(5):
             rover.get_observation()
             sticks = transmitter.get_action()
-            assert rover.send_action(sticks) == sticks == pytest.approx({"steering": 0.0, "throttle": 0.0}, abs=1e-3)
+            assert rover.send_action(sticks) == sticks == pytest.approx(named(0.0, 0.0), abs=1e-3)
         assert standin._state == "M"
         turn(rover, seconds=0.2)  # the same loop, by a policy
         assert standin._state == "A"
@@ -395,3 +397,72 @@ def test_an_action_holds_for_a_tenth_of_a_second():
     clock.now_s += 0.002
     assert ride._late() == "no action came from LeRobot for 100 ms"
     assert HOLD_S + 1 / 50 < 0.15  # neutral goes out before the Arduino would stop by itself
+
+
+# ---- lerobot-rollout, of LeRobot 0.6
+
+
+class DAggerStrategyConfig(SimpleNamespace):
+    """Known by its name."""
+
+
+class RolloutConfig(SimpleNamespace):
+    """Known by its name, and by that of the variable in which LeRobot's functions have it."""
+
+    def __init__(self, strategy, **options):
+        usual = {"interpolation_multiplier": 1, "teleop": None, "return_to_initial_position": True}
+        super().__init__(strategy=strategy, **usual | options)
+
+
+EPISODIC = {"smooth_handover": True, "reset_to_initial_position": True}
+
+
+@pytest.mark.parametrize(
+    ("strategy", "options", "says"),
+    [
+        ({}, {"interpolation_multiplier": 3}, "--interpolation_multiplier=1"),
+        (EPISODIC, {}, "--strategy.reset_to_initial_position=false"),
+        (EPISODIC, {"teleop": "rover_transmitter"}, "--strategy.smooth_handover=false"),
+    ],
+)
+def test_what_an_arm_does_is_refused_before_anything_is_opened(tmp_path, strategy, options, says):
+    cfg = RolloutConfig(SimpleNamespace(**strategy), **options)
+    rover = Rover(RoverConfig(port="/dev/nothing", calibration_dir=tmp_path))
+    with pytest.raises(ParamsError, match=f"; {says}$") as error:
+        rover.connect()
+    assert one_sentence(error) and cfg.strategy
+
+
+@pytest.mark.slow
+@real_time
+def test_daggers_pause_stops_the_car_and_a_takeover_is_a_correction(make_rover, standin, tmp_path, patient):
+    cfg = RolloutConfig(DAggerStrategyConfig(record_autonomous=False, smooth_handover=False), teleop="transmitter")
+    rover, _ = make_rover(standin.port)
+    rover.connect()
+    transmitter = RoverTransmitter(RoverTransmitterConfig(port=standin.port, calibration_dir=tmp_path))
+    transmitter.connect()
+    try:
+        rover.get_observation()
+        rover.send_action(dict(GO))
+        assert standin._state == "A"
+        held = dict(GO)
+        for _ in range(3):  # the pause: one and the same action again and again
+            rover.get_observation()
+            state = rover.send_action(held)
+        assert standin._state in "MS" and state == named(0.0, 0.0)
+        rover.get_observation()
+        sticks = transmitter.get_action()
+        for _ in range(2):  # the correction, and the pause after it
+            assert rover.send_action(sticks) in (sticks, named(0.0, 0.0))
+            rover.get_observation()
+        assert standin._state in "MS"
+        rover.send_action(dict(GO))
+        assert standin._state == "A"
+        standin._enter("M", "h")
+        for _ in range(30):  # LeRobot's loop does not know of it yet
+            rover.get_observation()
+            rover.send_action(dict(GO))
+        assert standin._state not in "A" and "record a correction" in (tmp_path / "flight.log").read_text()
+        assert cfg.strategy.smooth_handover is False
+    finally:
+        transmitter.disconnect()

@@ -1,5 +1,6 @@
 """An artifact as a policy of LeRobot: the same actions as by our own loader, from LeRobot's own factories."""
 
+import importlib
 from types import SimpleNamespace
 
 import cv2
@@ -9,15 +10,16 @@ import torch
 from click.testing import CliRunner
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_policy, make_pre_post_processors
-from lerobot.utils.control_utils import predict_action
 
 from lab.driving.policy import make_artifact
 from lerobot_robot_rover import RoverArtifactConfig, modeling_rover_artifact
-from lerobot_robot_rover.line import line_to
+from lerobot_robot_rover.line import ENDING, line_to
 from lerobot_robot_rover.pack import pack
 from rover_lib.onboard.errors import ArtifactError, ParamsError, PolicyError
 from rover_lib.onboard.policy.load import load_policy
 
+moved = "common" if ENDING else "utils"
+predict_action = importlib.import_module(f"lerobot.{moved}.control_utils").predict_action
 NUMBERS = {"dtype": "float32", "shape": (2,), "names": ["steering", "throttle"]}
 
 

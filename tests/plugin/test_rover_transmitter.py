@@ -8,7 +8,7 @@ from lerobot.teleoperators.utils import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig, line
-from lerobot_robot_rover.line import line_to, wait_for_humans
+from lerobot_robot_rover.line import FEATURES, line_to, named, unnamed, wait_for_humans
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry
 from rover_lib.onboard.errors import ParamsError
@@ -65,18 +65,18 @@ def transmitter(tmp_path):
 
 def test_the_sticks_by_car_yml(transmitter):
     assert isinstance(transmitter, RoverTransmitter) and not transmitter.is_connected and transmitter.is_calibrated
-    assert transmitter.action_features == {"steering": float, "throttle": float}
+    assert transmitter.action_features == FEATURES
     assert transmitter.feedback_features == {}
     transmitter.connect()
     action = transmitter.get_action()
-    assert action == pytest.approx({"steering": 0.5, "throttle": 0.1}, abs=2e-3)
-    assert CALIBRATION.pulses(**action) == DRIVEN
+    assert action == pytest.approx(named(0.5, 0.1), abs=2e-3)
+    assert CALIBRATION.pulses(**unnamed(action)) == DRIVEN
 
 
 def test_the_sticks_ends_are_the_ends(transmitter):
     transmitter.connect()
     Link.status = status(2190, 118)
-    assert transmitter.get_action() == {"steering": 1.0, "throttle": 0.0}
+    assert transmitter.get_action() == named(1.0, 0.0)
 
 
 def test_connected_once(transmitter):

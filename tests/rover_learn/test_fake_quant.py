@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from policies import TINY, lerobot_policy, memory_samples, trainer_content
+from policies import TINY, lerobot_policy, memory_samples, saved, trainer_content
 from torch.func import functional_call
 
 from rover_learn.fake_quant import RoundedPolicy, parameters
@@ -129,8 +129,6 @@ def test_its_gradients_lead_to_what_float_plans(tiny, rounded, batch):
     "shape", [{"pre_norm": True}, {"feedforward_activation": "gelu"}, {"vision_backbone": "resnet50"}]
 )
 def test_other_shapes(shape, tmp_path):
-    from test_act import saved
-
     policy = lerobot_policy(**TINY, **shape)
     if "vision_backbone" in shape:
         torch.save(trainer_content(policy), tmp_path / "best_model.pth")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from policies import FULL, TINY, lerobot_policy, smooth_frame
+from policies import FULL, TINY, check_is, lerobot_policy, saved, saved_processors, smooth_frame
 from torch.utils.flop_counter import FlopCounterMode
 
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise
@@ -45,25 +45,6 @@ SHAPES = {
 }
 
 
-def saved(policy, folder, stats=None):
-    policy.save_pretrained(folder)
-    return saved_processors(policy, folder, stats)
-
-
-def saved_processors(policy, folder, stats):
-    """Save and return LeRobot's two processors. A feature without statistics gets the mode IDENTITY: not normalised."""
-    from lerobot.configs.types import NormalizationMode
-    from lerobot.policies.act.processor_act import make_act_pre_post_processors
-
-    for kind, name in (("VISUAL", "images"), ("STATE", "state"), ("ACTION", "action")):
-        if not any(name in key for key in stats or ()):
-            policy.config.normalization_mapping[kind] = NormalizationMode.IDENTITY
-    inner, outer = make_act_pre_post_processors(policy.config, stats)
-    inner.save_pretrained(folder)
-    outer.save_pretrained(folder)
-    return inner, outer
-
-
 def observation(policy, seed=0):
     rng = np.random.default_rng(seed)
     frames = {k: smooth_frame(rng, *f.shape[1:]) for k, f in policy.config.image_features.items()}
@@ -98,6 +79,7 @@ def test_equals_lerobot(name, request, tmp_path):
             assert ours.shape == expected.shape
             assert expected.std() > 1e-3  # a constant answer would prove nothing
             assert (ours - expected).abs().max() < 1e-5
+        del checkpoint, model  # a policy of the user's size has 600 MB of these
 
 
 @pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY"])
@@ -111,14 +93,7 @@ def test_lerobots_processors_end_up_inside(mode, tmp_path):
     numbers |= {"min": low, "max": high, "q01": low, "q99": high, "q10": low, "q90": high}
     stats = image_stats(policy) | {"observation.state": numbers, "action": numbers}
     inner, outer = saved(policy, tmp_path, stats)
-    checkpoint = load_checkpoint(tmp_path)
-    frames, state = observation(policy)
-    ((key, frame),) = frames.items()
-    raw = {key: torch.from_numpy(frame).permute(2, 0, 1).float() / 255, "observation.state": torch.from_numpy(state)}
-    with torch.inference_mode():
-        expected = outer(policy.predict_action_chunk(inner(raw))[0])
-        ours = ACT(checkpoint.config, checkpoint.weights)(torch.from_numpy(state)[None], torch.from_numpy(frame))[0]
-    assert (ours - expected).abs().max() < 1e-5
+    check_is(load_checkpoint(tmp_path), policy, inner, outer)
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,11 @@ def _resize(bench: DrivingBench) -> None:
     bench.feed.show(*pictures(PLAIN, size=(80, 160)))
 
 
+@FAULTS.add("camera of another shape", REFUSED, "they would be squeezed", "pictures of 160x120 since before the drive")
+def _another_shape(bench: DrivingBench) -> None:
+    bench.feed.show(*pictures(PLAIN, size=(120, 160)))
+
+
 @FAULTS.add(
     "frames late",
     CONTINUES,

@@ -12,7 +12,7 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,7 +38,7 @@ MANIFEST_KEYS: dict[str, type | tuple[type, ...]] = {
     "mode": str,  # one of MODES
     "scheme": str,  # one of SCHEMES
     "engine": str,  # see engines.py
-    "cameras": list,  # [{name, height, width}], in the graph's order
+    "cameras": list,  # [{name, height, width}], in the graph's order, and recorded, see seen_size
     "state_names": list,
     "action_names": list,
     "chunk": int,  # actions per inference
@@ -237,9 +237,11 @@ def check_manifest(manifest: Any, where: str) -> None:
     if not manifest["cameras"]:
         raise wrong("manifest has no cameras")
     for camera in manifest["cameras"]:
-        if not isinstance(camera, dict) or not {"name", "height", "width"} <= camera.keys():
+        recorded = camera.get("recorded", [1, 1]) if isinstance(camera, dict) else None
+        pair = isinstance(recorded, list) and len(recorded) == 2
+        if not isinstance(camera, dict) or not pair or not {"name", "height", "width"} <= camera.keys():
             raise wrong(f"manifest camera {str(camera)[:80]!r} lacks name, height or width")
-        sides = [camera["height"], camera["width"]]
+        sides = [camera["height"], camera["width"], *camera.get("recorded", ())]
         if not is_name(camera["name"]) or not all(is_whole(s, *SIDE_PX) for s in sides):
             raise wrong(f"manifest camera {str(camera)[:80]!r} is not a name and a size")
     numbers = {"chunk": CHUNK, "rate_hz": RATE_HZ, "weights_mb": WEIGHTS_MB, "gmac": GMAC}
@@ -257,6 +259,17 @@ def check_manifest(manifest: Any, where: str) -> None:
         most = largest_tolerance(manifest["mode"], name)
         if not is_number(value, 0, most):
             raise wrong(f"manifest parity tolerance of {name} must be from 0 to {most:g}", value)
+
+
+def seen_size(manifest: Mapping[str, Any]) -> tuple[int, int]:
+    """Return (width, height) of the pictures that a policy's first camera gave.
+
+    That is the policy's own size unless its recordings have another shape, which then is the camera's `recorded`:
+    [height, width].
+    """
+    camera = manifest["cameras"][0]
+    height, width = camera.get("recorded", (camera["height"], camera["width"]))
+    return width, height
 
 
 def largest_tolerance(mode: str, action: str) -> float:

@@ -23,7 +23,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car.picture import LEAST, MOST_BYTES, PictureError, block_sums, brightness, decode_jpeg
+from rover_lib.onboard.car.picture import (
+    LEAST,
+    MOST_BYTES,
+    PictureError,
+    block_sums,
+    brightness,
+    decode_jpeg,
+    is_squeezed,
+)
 from rover_lib.onboard.errors import RoverError
 
 FIRST_FRAME_S = 5.0
@@ -40,6 +48,7 @@ REMEMBERED = 32  # pictures; a driver has at most this many buffers that it coul
 DECIDING = 5  # frames after which it is decided which clock the time stamps come from
 OLD_S = 0.5  # a frame this old is of no use: a plan's throttle begins to fade at this age
 AHEAD_S = 0.01  # a time stamp may lie this far in the future, because it may be rounded
+USUAL_SIZES = ((640, 360), (640, 480))  # (width, height) that nearly every USB camera gives
 NEAR_S = 600.0  # a time stamp further from a clock than this does not come from that clock
 
 Read = tuple[bytes | np.ndarray, float | None]  # a JPEG or a decoded picture, and its time stamp if there is one
@@ -48,6 +57,23 @@ Reader = Generator[Read, None, None]
 
 class CameraError(RoverError):
     """A camera that is missing, has stopped, or delivers something different than before."""
+
+
+def size_like(width: int, height: int) -> tuple[int, int]:
+    """Return the (width, height) to ask a camera for, so that its pictures have the shape of width x height."""
+    usual = [size for size in USUAL_SIZES if not is_squeezed(size, (width, height))]
+    return usual[0] if usual else (USUAL_SIZES[0][0], round(USUAL_SIZES[0][0] * height / width / 2) * 2)
+
+
+def check_shape(source: str, image: np.ndarray, wanted: tuple[int, int]) -> None:
+    """Raise CameraError for a picture of another shape than the policy has seen. wanted: (width, height) of those."""
+    height, width = image.shape[:2]
+    if is_squeezed((width, height), wanted):
+        raise CameraError(
+            f"{source}: gives {width}x{height}, and the policy has seen pictures of the shape of "
+            f"{wanted[0]}x{wanted[1]}: they would be squeezed",
+            remedy="use a camera that can give that shape ('rover doctor' lists sizes), or a policy for this one",
+        )
 
 
 @dataclass(frozen=True, slots=True)

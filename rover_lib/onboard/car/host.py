@@ -8,6 +8,7 @@ import errno
 import os
 import re
 import resource
+import shutil
 import socket
 import subprocess
 import sys
@@ -55,8 +56,28 @@ class Host:
             found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
         except (OSError, subprocess.SubprocessError):
             return None
+        return self._value_in(found)
+
+    @staticmethod
+    def _value_in(found: "subprocess.CompletedProcess[str]") -> str | None:
         name, _, value = found.stdout.strip().partition("=")
         return value if found.returncode == 0 and name == "throttled" and THROTTLED_VALUE.fullmatch(value) else None
+
+    def vcgencmd_trouble(self) -> str | None:
+        """Return why `vcgencmd get_throttled` gives no value although it is there; None if it is not there, or works.
+
+        Its own words, such as "VCHI initialization failed", are cut to one line.
+        """
+        if shutil.which(self.vcgencmd) is None:
+            return None
+        try:
+            found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
+        except (OSError, subprocess.SubprocessError) as error:
+            return f"{self.vcgencmd}: {type(error).__name__}"
+        if self._value_in(found):
+            return None
+        said = ascii(" ".join((found.stderr + found.stdout).split()))[1:-1][:160]
+        return f"{self.vcgencmd} says {said!r}" if said else f"{self.vcgencmd} ended with {found.returncode}, silently"
 
     def process_peak_memory_mb(self) -> float | None:
         """Return the largest resident memory that this process has ever had, in MB of 10**6 bytes."""

@@ -25,6 +25,7 @@ MOST_SCANS = 32  # a progressive JPEG has about ten, and each costs as much as a
 FILLED_MOST = 4  # bytes that some webcams put before a marker; many more mean that a piece is missing
 LEAST = (48, 27)  # width and height below which there are no blocks to compare
 ROWS, COLUMNS = 9, 16  # of blocks
+SQUEEZED = 0.05  # largest relative change of the aspect ratio; 432x240 instead of 640x360 is 0.013
 
 
 class PictureError(RoverError):
@@ -82,3 +83,8 @@ def block_sums(image: np.ndarray) -> np.ndarray:
     lines = image.reshape(height, width * 3)[: rows * ROWS, : words * COLUMNS * 8]
     eights = np.ascontiguousarray(lines).view(np.uint64)  # eight bytes at a time; overflow does not matter
     return eights.reshape(ROWS, rows, -1).sum(1).reshape(ROWS, COLUMNS, words).sum(2).ravel()
+
+
+def is_squeezed(given: tuple[int, int], wanted: tuple[int, int]) -> bool:
+    """Whether a picture would be squeezed by more than 5 % if it were resized. given, wanted: (width, height) each."""
+    return abs(given[0] * wanted[1] / (given[1] * wanted[0]) - 1) > SQUEEZED

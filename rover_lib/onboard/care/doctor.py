@@ -1,6 +1,6 @@
 """Check everything that driving needs, and say in one line each what was found and what to do about it.
 
-    for check in examine("policy_static.pt", camera="0", port="/dev/ttyUSB0"):
+    for check in examine("policy_static.pt", camera="0"):
         print(check)
 
 "fail" means that the car would not drive, "warning" that it would drive worse or stop more often than it could. The
@@ -23,10 +23,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rover_lib.onboard.artifact.manifest import car_of, read_manifest
-from rover_lib.onboard.car.camera import Camera, path_of
+from rover_lib.onboard.artifact.manifest import car_of, read_manifest, seen_size
+from rover_lib.onboard.car.camera import Camera, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import car_file, this_car
 from rover_lib.onboard.car.host import Host, throttled_means
+from rover_lib.onboard.car.ports import find_port, list_ports
 from rover_lib.onboard.car.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, ServoLink, Telemetry
 from rover_lib.onboard.drive.flight_log import log_limits
 from rover_lib.onboard.drive.inference import PolicyProcess
@@ -83,7 +84,7 @@ def examine(
     artifact: Path | str | None = None,
     *,
     camera: str = "0",
-    port: str = "/dev/ttyUSB0",
+    port: str = "",
     rate_hz: float = 30.0,
     log_folder: Path | None = None,
     host: Host | None = None,
@@ -102,9 +103,9 @@ def examine(
         checks["group video"] = lambda: access("group video", device, "video")
         checks["cameras"] = lambda: cameras(dev)
     checks |= {
-        "camera": lambda: camera_rate(device, rate_hz=rate_hz, proc_root=host.proc_root),
-        "group dialout": lambda: access("group dialout", Path(port), "dialout"),
-        "Arduino": lambda: arduino(port, dev=dev, proc_root=host.proc_root, boot_s=boot_s),
+        "camera": lambda: camera_rate(device, seen_by(artifact), rate_hz=rate_hz, proc_root=host.proc_root),
+        "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports(dev)), dev)), "dialout"),
+        "Arduino": lambda: arduino(port or find_port(dev), dev=dev, proc_root=host.proc_root, boot_s=boot_s),
         "ModemManager": lambda: modem_manager(host.proc_root),
         "car": lambda: car(artifact),
         "engines": lambda: engines_here(),
@@ -247,20 +248,31 @@ def _text(data: bytes) -> str:
     return data.partition(b"\0")[0].decode(errors="replace")
 
 
+def seen_by(artifact: Path | str | None) -> tuple[int, int] | None:
+    """Return (width, height) of the pictures that an artifact was made with; None if there is no sound artifact."""
+    with contextlib.suppress(ArtifactError, OSError):
+        return seen_size(read_manifest(Path(artifact))) if artifact else None
+    return None
+
+
 def camera_rate(
     source: Path | str,
+    seen: tuple[int, int] | None = None,
     *,
     rate_hz: float = 30.0,
     proc_root: Path = Path("/proc"),
     open_camera: Callable[..., Any] = Camera,
 ) -> Iterator[Check]:
-    """Measure for a second what the camera really delivers: frame rate, size, and whether anything can be seen."""
+    """Measure for a second what the camera really delivers: frame rate, size, and whether anything can be seen.
+
+    seen: (width, height) of the pictures that the policy was made with. The camera is asked for that shape.
+    """
     if not Path(source).exists():
         yield Check("camera", "fail", f"no {source}", "plug it in, or name another with --camera")
         return
     users = users_of(source, proc_root)
     try:
-        with open_camera(source, rate_hz=rate_hz) as camera:
+        with open_camera(source, rate_hz=rate_hz, **({"size": size_like(*seen)} if seen else {})) as camera:
             end = time.monotonic() + SETTLE_S
             first = camera.latest()
             while (left := end - time.monotonic()) > 0 and (frame := camera.wait(first.number, left)):
@@ -269,6 +281,8 @@ def camera_rate(
             while (left := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, left)):
                 last = frame
             clock = camera.time_stamps
+            if seen:
+                check_shape(str(source), last.image, seen)
     except RoverError as error:
         used = f"; used by {', '.join(users)}" if users else ""
         yield Check("camera", "fail", f"{_found(error)}{used}", f"end {users[0]}" if users else error.remedy)
@@ -505,7 +519,10 @@ def power(host: Host) -> Iterator[Check]:
     """Check what get_throttled reports about the supply and the clock, now and since the machine started."""
     value = host.throttled()
     means = throttled_means(value)
-    if means is None:
+    if means is None and (trouble := host.vcgencmd_trouble()):
+        remedy = "sudo usermod -aG video $USER, log in again; `vcgencmd get_throttled` shows the rest"
+        yield Check("power", "warning", f"cannot be read, so low voltage would not be seen: {trouble}", remedy)
+    elif means is None:
         yield Check("power", "ok", "no vcgencmd here: not a Raspberry Pi, or not its system")
     elif not means:
         yield Check("power", "ok", f"get_throttled {value}: supply and clock were as they should be")

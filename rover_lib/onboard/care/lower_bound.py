@@ -8,8 +8,6 @@ from rover_lib.onboard.errors import ParamsError
 # Measured peaks of a Raspberry Pi 5, four cores at 2.4 GHz (public cpufp results), in 10**9 multiply-accumulates
 # per second: INT8 SDOT 614 GOPS, FP16 307 GFLOPS, FP32 153.5 GFLOPS, two operations to a multiply-accumulate.
 PI5_GMAC_PER_S = {"int8": 307.0, "fp16": 153.5, "fp32": 76.75}
-# Seen there: ResNet18 at 224x224 in INT8, ExecuTorch with XNNPACK, 8.75 ms p50 (published); two thirds of the peak.
-PI5_SEEN_GMAC_PER_S = 207.0
 PRECISION = {"dynamic": "int8", "static": "int8", "mixed": "int8"}  # of an artifact's mode, at its best
 
 

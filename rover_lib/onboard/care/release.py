@@ -55,7 +55,7 @@ SANDBOX = "rover-check@{}.service"
 
 STAGE_MB = 400  # memory that staging may take: until an artifact is staged, it is not trusted
 # What can be allowed to differ. Torch, engine and actions cannot: this rover could not drive with others.
-MAY_DIFFER = ("mode", "chunk", "camera")
+MAY_DIFFER = ("mode", "chunk", "camera", "aspect")
 CODE_OF_MODE = {"static": b"ops.quantized.conv2d", "mixed": b"ops.quantized.conv2d", "dynamic": b"linear_dynamic"}
 ONNX_OF_MODE = {"static": b"QuantizeLinear", "mixed": b"QuantizeLinear"}
 OF_MODE: dict[str, dict[str, bytes]] = {"torch": CODE_OF_MODE, "onnxruntime": ONNX_OF_MODE, "hailo": {}}
@@ -77,16 +77,20 @@ class Expected:
     modes: tuple[str, ...] = ("static", "mixed")
 
     def refusals(self, manifest: dict[str, Any]) -> dict[str, str]:
-        """Return reasons to refuse an artifact, by kind: "mode", "chunk", "camera", "torch", "engine", "actions"."""
+        """Return reasons to refuse an artifact, by kind.
+
+        The kinds are those of MAY_DIFFER, and "torch", "engine", "actions" and "state".
+        """
         refusals = {}
         if manifest["mode"] not in self.modes:
             refusals["mode"] = f"its mode is {manifest['mode']}, which is several times slower than {self.modes[0]}"
         if manifest["chunk"] != self.chunk:
             refusals["chunk"] = f"it plans {manifest['chunk']} actions, this rover takes {self.chunk}"
         cameras = ", ".join(f"{c['name']} {c['width']}x{c['height']}" for c in manifest["cameras"])
-        shapes = [(c["name"], round(c["width"] / c["height"], 1)) for c in manifest["cameras"]]
-        if shapes != [(self.camera, round(self.aspect, 1))]:
-            refusals["camera"] = f"it looks through {cameras}, this rover has {self.camera} at {self.aspect:.2f} to 1"
+        if [c["name"] for c in manifest["cameras"]] != [self.camera]:
+            refusals["camera"] = f"it looks through {cameras}, this rover has {self.camera}"
+        if any(round(c["width"] / c["height"], 1) != round(self.aspect, 1) for c in manifest["cameras"]):
+            refusals["aspect"] = f"it looks through {cameras}, this rover's pictures are {self.aspect:.2f} to 1"
         engine, made_with = manifest["engine"], str(manifest["versions"].get("torch", "?"))
         package = PACKAGES.get(engine)
         here = version_of(package) if package else None
@@ -96,8 +100,9 @@ class Expected:
             refusals["engine"] = f"it needs {package}, which is not installed here"
         elif engine == TORCH and made_with.split(".")[:2] != here.split(".")[:2]:
             refusals["torch"] = f"it was made with torch {made_with}, rovers have {here}"
-        if manifest["action_names"] != ["steering", "throttle"] or manifest["state_names"] != ["steering", "throttle"]:
-            refusals["actions"] = f"it gives {manifest['action_names']}, this car has steering and throttle"
+        for kind, key, does in (("actions", "action_names", "gives"), ("state", "state_names", "is told")):
+            if manifest[key] != ["steering", "throttle"]:
+                refusals[kind] = f"it {does} {', '.join(manifest[key])}, this car has steering and throttle"
         return refusals
 
 
@@ -250,7 +255,10 @@ class Staged:
 
 @dataclass(frozen=True)
 class Release:
-    """One release on the disk. signed: by a laptop that the rover knows now. wrong: with its bytes, "" if nothing."""
+    """One release on the disk.
+
+    signed: whether a laptop that the rover knows now has signed it. wrong: what is wrong with its bytes, "" if nothing.
+    """
 
     name: str
     current: bool
@@ -398,10 +406,9 @@ class Releases:
         """Make a release of an artifact, or of a folder that pack() wrote. The release in use stays in use.
 
         The signature is policy.pt.sig in that folder, or lies beside the artifact with .sig added to its name. sha256:
-        what the artifact's must be, if it is known. unsigned: accept it without a signature. A release that exists
-        and is intact only gets the signature that it may lack. A damaged one is replaced; if it is in use, a second
-        copy is made beside it.
-        Raises ReleaseError, ArtifactError.
+        what the artifact's must be, if it is known. unsigned: accept it without a signature. A release that exists and
+        is intact only gets the signature that it may lack. A damaged one is replaced; if it is in use, a second copy
+        is made beside it. Raises ReleaseError, ArtifactError.
         """
         source = Path(source)
         with _disk_errors_explained(), _memory_limited(source), self._exclusively():
@@ -448,7 +455,7 @@ class Releases:
             return Staged(name, True)
 
     def _accept(self, name: str, signature: Path, unsigned: bool) -> Staged:
-        """Take an intact release as staged again. One that came in unsigned needs a signature, unless `unsigned`."""
+        """Stage an intact release again. One that came in unsigned needs a signature now, unless `unsigned`."""
         if unsigned or self.is_signed(name):
             return Staged(name, False)
         policy = self.path_of(name)

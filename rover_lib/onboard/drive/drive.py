@@ -18,8 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from rover_lib.onboard.artifact.manifest import Artifact, car_of
-from rover_lib.onboard.car.camera import Camera, CameraError, path_of
+from rover_lib.onboard.artifact.manifest import Artifact, car_of, seen_size
+from rover_lib.onboard.car.camera import Camera, CameraError, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import boottime, default_log, default_view
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink, Telemetry
@@ -77,7 +77,7 @@ class DriveOptions:
 
     artifact: Path | None = None
     camera: str = "0"
-    port: str = "/dev/ttyUSB0"
+    port: str = ""
     hz: float = 30.0
     dry_run: bool = False
     record: Path | None = None
@@ -130,9 +130,11 @@ def drive_car(
             remedy="replay one of this car's",
         )
     path = options.artifact.resolve() if options.artifact else None  # `current` may point to another one later
-    if not (controls or car or options.dry_run or options.film):
-        check_no_film(options.camera)
     with ExitStack() as stack:
+        artifact = stack.enter_context(Artifact(path)) if path else None
+        seen = seen_size(artifact.manifest) if artifact else (0, 0)  # read first: it may be missing, or no artifact
+        if not (controls or car or options.dry_run or options.film):
+            check_no_film(options.camera)
         log = stack.enter_context(_open_flight_log(options, settings, report))
         if path:
             most_m = settings.throttle_limit * params()["view"]["speed_mps"] * settings.blind_s
@@ -145,7 +147,6 @@ def drive_car(
             options = replace(options, camera=other.camera, port=other.port)
             stack.callback(lambda: report.world.update(other.summary()))
         service = None
-        artifact = stack.enter_context(Artifact(path)) if path else None
         if options.service and artifact:
             service = stack.enter_context(Service(report, stop, log.event, model=artifact.content_hash))
         title = (options.artifact or options.replay or Path()).name
@@ -157,7 +158,7 @@ def drive_car(
         if controls:
             _replay(opened, controls)
         elif artifact:
-            _drive_by(artifact, opened, service)
+            _drive_by(artifact, seen, opened, service)
         else:
             raise ParamsError("a drive needs an artifact or a replay")
 
@@ -198,12 +199,17 @@ def _replay(opened: _Opened, controls: Controls) -> None:
         opened.feed.ended(report, None, link)
 
 
-def _drive_by(artifact: Artifact, opened: _Opened, service: Service | None) -> None:
-    """Drive by an artifact's plans: once, or as a service each time that a human arms the car."""
+def _drive_by(artifact: Artifact, seen: tuple[int, int], opened: _Opened, service: Service | None) -> None:
+    """Drive by an artifact's plans: once, or as a service each time that a human arms the car.
+
+    seen: (width, height) of the pictures that the policy was made with.
+    """
     options, report, log, link, feed = opened.options, opened.report, opened.log, opened.link, opened.feed
     this, stop = this_car(), opened.until.stop
     with ExitStack() as stack:
-        camera = stack.enter_context(Camera(options.camera, held=options.film))
+        camera = stack.enter_context(Camera(options.camera, size=size_like(*seen), held=options.film))
+        if (frame := camera.latest()) and not path_of(options.camera).is_dir():  # a folder is of an episode, for a look
+            check_shape(options.camera, frame.image, seen)
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:
             log.event(f"the policy's process is not confined: {policy.unconfined}", level=logging.WARNING)

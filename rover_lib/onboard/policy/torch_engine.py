@@ -48,7 +48,8 @@ def load(artifact: Artifact, threads: int | None) -> TorchEngine:
     made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
     if made_with.split(".")[:2] != here.split(".")[:2]:
         raise ArtifactError(
-            f"{path}: made with torch {made_with}, here is {here}", remedy=f"install torch {made_with.split('+')[0]}"
+            f"{path}: made with torch {made_with}, here is {here}",
+            remedy="make it again where this torch is: rover run CHECKPOINT EPISODES",
         )
     engine = manifest["engine"]
     if engine not in torch.backends.quantized.supported_engines:

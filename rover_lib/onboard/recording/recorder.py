@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
-from rover_lib.onboard.recording.episode import About, EpisodeExists, EpisodeWriter
+from rover_lib.onboard.recording.episode import About, EpisodeExists, EpisodeWriter, find_killed
 from rover_lib.onboard.signal_event import SignalEvent, signals
 from rover_lib.onboard.status_line import StatusLine
 
@@ -226,6 +226,9 @@ def room_for(folder: Path | str, most_mb: float) -> int:
 
 def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
     """Open an episode in `folder`, named by its start; if that name is taken, by the next free second."""
+    if killed := find_killed(folder):
+        text = f"{len(killed)} recordings here were killed; `rover record {folder} --finish` keeps what they have"
+        _log.warning(text)
     while True:
         name = time.strftime("episode_%Y%m%d_%H%M%S", time.localtime(start_s))
         writer = EpisodeWriter(folder / name, about, resolution=None, flags=True)

@@ -5,7 +5,8 @@
 It listens in two places. Drives connect to a Unix socket and send the messages that feed.py describes. Browsers get the
 page over HTTP, and each page opens a WebSocket. Through it the page receives the newest message, and the next one only
 after the page has confirmed that it shows the previous one: so no messages queue up, and a slow page gets fewer. A page
-may send only "shown N" and "stop", and the view never sends a drive anything but a stop.
+may send only "shown N" and "stop", and the view never sends a drive anything but a stop. In a simulation, a page may
+also ask for the next world or another policy.
 
 Whoever has the token may watch the drive and stop it. A request must name this machine as its host, and a WebSocket
 must come from our own page, so that no other page in the same browser can use the view.
@@ -51,6 +52,7 @@ BEAT_S = 5.0  # between two pings; a page that does not answer one is gone
 GONE = "gone"
 PAGE = Path(__file__).with_name("view.html")
 HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]{1,253})(:\d{1,5})?", re.ASCII)
+ASKED = re.compile(r"ask ([\w. ]{1,60})", re.ASCII)  # by the page of a simulation
 SHOWN = re.compile(r"shown (\d{1,12})", re.ASCII)
 
 
@@ -124,10 +126,11 @@ def read_token(path: Path) -> str:
 class View:
     """The web server of the view.
 
-    address: where browsers reach it. place: the socket to which drives connect; None if a replay is shown instead.
+    address: where browsers reach it. place: the socket to which drives connect; None if something else is shown.
     drive_user: another user whose drives are accepted, besides this user's and root's. replay: whether a past drive is
-    shown. car: the car whose drives are shown; None means this machine's. Raises ViewError for an unknown user, and
-    CarError and ParamsError like this_car() and CarShape.of().
+    shown. car: the car whose drives are shown; None means this machine's. ask: takes what a simulation's page asks for;
+    None for a car, whose page can only stop it. Raises ViewError for an unknown user, and CarError and ParamsError like
+    this_car() and CarShape.of().
     """
 
     def __init__(
@@ -138,8 +141,9 @@ class View:
         drive_user: str | None = None,
         replay: bool = False,
         car: Car | None = None,
+        ask: Callable[[str], object] | None = None,
     ):
-        self._address, self._token, self._place, self._replay = address, token, place, replay
+        self._address, self._token, self._place, self._replay, self._ask = address, token, place, replay, ask
         self._users = {0, os.geteuid()}
         if drive_user:
             try:
@@ -231,6 +235,9 @@ class View:
     def stop(self, who: str) -> int:
         """Ask each drive to stop, and return how many were asked. who: the IP address that asks."""
         asked = 0
+        if self._ask:
+            self._ask("stop")
+            return 1
         for drive in tuple(self._drives):
             with contextlib.suppress(OSError):  # this drive no longer reads
                 drive.send(f"stop {who}".encode())
@@ -380,6 +387,8 @@ class View:
                         await wire.send_str("asked for a stop" if count else "no drive is there to be stopped")
                     elif shown := SHOWN.fullmatch(message.data):
                         page.was_shown(int(shown[1]))
+                    elif self._ask and (asked := ASKED.fullmatch(message.data)):
+                        self._ask(asked[1])
             finally:
                 await _end(sending)
         finally:

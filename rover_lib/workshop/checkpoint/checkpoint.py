@@ -14,8 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.kinds import refuse_part
 from rover_lib.workshop import hub
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.checkpoint.contents import CORRECT_IT, TWO_ACTIONS, Contents, expected_shapes, tensor_bytes
@@ -25,7 +27,6 @@ from rover_lib.workshop.recordings.samples import Layout
 from rover_lib.workshop.untrusted import quote, quote_all
 
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
-SQUEEZED = 0.05  # largest relative change of the aspect ratio; 432x240 instead of 640x360 is 0.013
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,10 @@ class Checkpoint:
         """
         if self.format == "trainer":
             return self.sha256
-        content = json.dumps([self.sha256, asdict(self.config)], sort_keys=True)
+        config = asdict(self.config)
+        if config["sees_state"]:  # as nearly all do: their hashes are of before there were others
+            del config["sees_state"]
+        content = json.dumps([self.sha256, config], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()
 
     def at_size(self, height: int, width: int) -> "Checkpoint":
@@ -74,7 +78,7 @@ class Checkpoint:
                 remedy=f"use at least {FEATURE_PX}",
             )
         ((trained_height, trained_width),) = self.config.image_sizes
-        if abs(width * trained_height / (height * trained_width) - 1) > SQUEEZED:
+        if is_squeezed((width, height), (trained_width, trained_height)):
             raise CheckpointError(
                 f"an image of {width}x{height} has another aspect ratio than {trained_width}x{trained_height}, which "
                 "the policy was trained with",
@@ -94,9 +98,9 @@ class Checkpoint:
         trainer's files and ours, if the recordings have another rate or other names.
         """
         c, rate_hz = self.config, layout.rate_hz
-        has = len(c.cameras), len(c.state_names), len(c.action_names)
+        has = len(c.cameras), len(c.state_names) if c.sees_state else 0, len(c.action_names)
         recorded = len(layout.cameras), len(layout.state_names), len(layout.action_names)
-        if has != recorded:
+        if has != (recorded if c.sees_state else (recorded[0], 0, recorded[2])):
             raise CheckpointError(
                 f"{self.path}: a policy of cameras, states and actions {', '.join(map(str, has))}",
                 found=f"recordings of {', '.join(map(str, recorded))}",
@@ -111,20 +115,35 @@ class Checkpoint:
                     found=f"recordings of {rate_hz:g} frames a second",
                     remedy="give recordings of that rate",
                 )
-            pairs = (c.state_names, layout.state_names), (c.action_names, layout.action_names)
-            if any(own == TWO_ACTIONS != recorded_names for own, recorded_names in pairs):
-                raise CheckpointError(
-                    f"{self.path}: a policy of {quote_all(TWO_ACTIONS)}",
-                    found="recordings of state "
-                    f"{quote_all(layout.state_names)} and action {quote_all(layout.action_names)}",
-                    remedy="if they are the same, say so in the order of the recordings' numbers: --action-names",
-                )
+            numbers = (("state", c.state_names, layout.state_names), ("action", c.action_names, layout.action_names))
+            for what, own, theirs in numbers[not c.sees_state :]:
+                if own == TWO_ACTIONS != theirs:
+                    raise CheckpointError(
+                        f"{self.path}: a policy whose {what} is {quote_all(own)}",
+                        found=f"recordings whose {what} is {quote_all(theirs)}",
+                        remedy=f"if they are the same, rename the {what} in the dataset's meta/info.json"
+                        if what == "state"
+                        else "if they are the same, say so in the order of the recordings' numbers: --action-names",
+                    )
             return self
 
         def reordered(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
             return norm and Affine(tuple(norm.scale[i] for i in order), tuple(norm.shift[i] for i in order))
 
         states, actions = list(layout.state_order), list(layout.action_order)
+        cameras = c.cameras if set(c.cameras) == set(layout.cameras) else layout.cameras
+        notes = list(self.report["notes"])
+        if c.cameras != cameras:
+            notes.append(f"its cameras are {quote_all(c.cameras)}, and the recordings' are {quote_all(cameras)}")
+        # LeRobot never resizes: a policy was trained on its dataset's pictures, whatever its config.json says, which
+        # a fine-tuned one has from its base. No weight of ACT depends on their size.
+        sizes = tuple(layout.image_sizes.get(name, size) for name, size in zip(cameras, c.image_sizes, strict=True))
+        for name, (h, w), (height, width) in zip(cameras, c.image_sizes, sizes, strict=True):
+            if (h, w) != (height, width):
+                notes.append(
+                    f"config.json says {w}x{h} for {name}, and the recordings are {width}x{height}: LeRobot never "
+                    f"resizes, so the policy sees {width}x{height}"
+                )
         weights = dict(self.weights)
         for name, order, axis in (
             ("encoder_robot_state_input_proj.weight", states, 1),
@@ -137,16 +156,17 @@ class Checkpoint:
                 weights[name] = weights[name].index_select(axis, torch.tensor(order))
         config = replace(
             c,
-            cameras=c.cameras if set(c.cameras) == set(layout.cameras) else layout.cameras,
-            state_names=layout.state_names,
+            cameras=cameras,
+            image_sizes=sizes,
+            # A state that is not looked at may as well be the car's.
+            state_names=TWO_ACTIONS if not c.sees_state and len(layout.state_names) == 2 else layout.state_names,
             action_names=layout.action_names,
             rate_hz=rate_hz,
             state_norm=reordered(c.state_norm, layout.state_order),
             action_unnorm=reordered(c.action_unnorm, layout.action_order),
         )
-        return replace(
-            self, config=config, weights=weights, report=self.report | {"normalisation": normalisation(config)}
-        )
+        report = self.report | {"normalisation": normalisation(config), "notes": notes}
+        return replace(self, config=config, weights=weights, report=report)
 
 
 def load_checkpoint(path: Path | str) -> Checkpoint:
@@ -161,14 +181,16 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
     """
     path = hub.fetch(path, "model", CheckpointError) if hub.is_hub_id(path) else Path(path)
     if path.is_dir():
-        path = lerobot_folder(path) or path
-        return _check_policy(path, read_lerobot(path))
+        path, notes = lerobot_folder(path) or (path, [])
+        found = _check_policy(path, read_lerobot(path))
+        return replace(found, report=found.report | {"notes": notes + found.report["notes"]})
     if not path.is_file():
         what = "neither a file nor a folder" if path.exists() else "not found"
         raise CheckpointError(
             f"{path}: {what}",
             remedy="give the trainer's .pth file, LeRobot's pretrained_model folder, or user/name@revision of the Hub",
         )
+    refuse_part(path)
     return _check_policy(path, read_trainer(path))
 
 
@@ -185,7 +207,7 @@ def normalisation(c: ActConfig) -> dict[str, str]:
         return f"({name} - {centre}) / {numbers(1 / a for a in norm.scale)}"
 
     words = {name: described("pixel / 255", norm) for name, norm in zip(c.cameras, c.image_norm, strict=True)}
-    words["state"] = described("state", c.state_norm)
+    words["state"] = described("state", c.state_norm) if c.sees_state else "not looked at"
     out = c.action_unnorm
     words["action"] = "output, as it is" if out is None else f"output * {numbers(out.scale)} + {numbers(out.shift)}"
     return words

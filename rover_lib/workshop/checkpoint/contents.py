@@ -26,6 +26,7 @@ MOST_ACTIONS = 1000  # actions, numbers in a state, and numbers in the latent
 
 # The remedies that help most often.
 COPY_AGAIN = "copy it again, the whole folder if it is one"
+FIRST_WEIGHT = "backbone.conv1.weight"  # every ACT has it once, so what is before it is before all its names
 CORRECT_IT = "correct the config to what the policy was trained with"
 IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole?"
 
@@ -42,20 +43,23 @@ class Contents:
     extra: dict[str, Any]  # for the report
 
 
-def named_weights(path: Path, state: dict[Any, Any], file_bytes: int) -> dict[str, Tensor]:
-    """Return the weights by LeRobot's names without `model.`.
+def named_weights(path: Path, state: dict[Any, Any], file_bytes: int) -> tuple[dict[str, Tensor], list[str]]:
+    """Return the weights by LeRobot's names without `model.`, and a note if they began with anything else.
 
-    Raises CheckpointError unless all names begin with `model.` and all weights are dense floats that together fit into
-    the file.
+    A policy saved inside torch.compile or DistributedDataParallel has `_orig_mod.` or `module.` in all its names, and
+    the network alone has no `model.`. Raises CheckpointError unless all names begin alike and all weights are dense
+    floats that together fit into the file.
     """
     odd = [k for k, v in state.items() if not isinstance(k, str) or not isinstance(v, Tensor)]
     if odd:
         raise CheckpointError(
             f"{path}: these weights are not tensors: {quote_all(odd)}", remedy="save policy.state_dict() as it is"
         )
-    if outside := [k for k in state if not k.startswith("model.")]:
-        raise CheckpointError(f"{path}: names outside 'model.': {quote_all(outside)}", remedy=IS_IT_WHOLE)
-    weights = {k.removeprefix("model."): v for k, v in state.items()}
+    begins = {k.removesuffix(FIRST_WEIGHT) for k in state if k.endswith(FIRST_WEIGHT)}
+    prefix = begins.pop() if len(begins) == 1 else "model."
+    if outside := [k for k in state if not k.startswith(prefix)]:
+        raise CheckpointError(f"{path}: names outside {quote(prefix)}: {quote_all(outside)}", remedy=IS_IT_WHOLE)
+    weights = {k.removeprefix(prefix): v for k, v in state.items()}
     for name, weight in weights.items():
         if problem := _unusable(weight):
             raise CheckpointError(
@@ -67,7 +71,7 @@ def named_weights(path: Path, state: dict[Any, Any], file_bytes: int) -> dict[st
             f"{path}: its weights claim {claimed / 1e6:.1f} MB in a file of {file_bytes / 1e6:.1f} MB",
             remedy="save each weight with values of its own (.clone())",
         )
-    return weights
+    return weights, [] if prefix == "model." else [f"its weights' names begin with {quote(prefix)}, which is taken off"]
 
 
 def _unusable(weight: Tensor) -> str | None:
@@ -164,9 +168,11 @@ def config_from(path: Path, weights: dict[str, Tensor], **known: Any) -> ActConf
                 f"{path}: config and weights do not agree ({count} {part} layers, {len(weights)} weights in all)",
                 remedy=CORRECT_IT,
             )
+    sees_state = known.pop("sees_state", True)
     vae = {m[1] for k in weights if (m := re.match(r"vae_encoder\.layers\.(\d+)\.", k))}
     return ActConfig(
-        state_names=_names(last("encoder_robot_state_input_proj.weight"), "state"),
+        sees_state=sees_state,
+        state_names=_names(last("encoder_robot_state_input_proj.weight"), "state") if sees_state else TWO_ACTIONS,
         action_names=_names(last("action_head.bias"), "action"),
         latent=last("encoder_latent_input_proj.weight"),
         vae_layers=len(vae),
@@ -201,9 +207,10 @@ def expected_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
 
     shapes |= {f"backbone.{k}": v for k, v in _resnet_shapes(c.backbone).items()}
     lin("encoder_img_feat_input_proj", d, BACKBONES[c.backbone][2], 1, 1)
-    lin("encoder_robot_state_input_proj", d, states)
+    if c.sees_state:
+        lin("encoder_robot_state_input_proj", d, states)
     lin("encoder_latent_input_proj", d, c.latent)
-    shapes["encoder_1d_feature_pos_embed.weight"] = (2, d)
+    shapes["encoder_1d_feature_pos_embed.weight"] = (1 + c.sees_state, d)
     shapes["decoder_pos_embed.weight"] = (c.chunk, d)
     layers("encoder", c.encoder_layers, ("self_attn",))
     layers("decoder", c.decoder_layers, ("self_attn", "multihead_attn"))
@@ -216,8 +223,9 @@ def expected_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
         if c.pre_norm:
             norm("vae_encoder.norm")
         shapes["vae_encoder_cls_embed.weight"] = (1, d)
-        shapes["vae_encoder_pos_enc"] = (1, c.chunk + 2, d)
-        lin("vae_encoder_robot_state_input_proj", d, states)
+        shapes["vae_encoder_pos_enc"] = (1, c.chunk + 1 + c.sees_state, d)
+        if c.sees_state:
+            lin("vae_encoder_robot_state_input_proj", d, states)
         lin("vae_encoder_action_input_proj", d, actions)
         lin("vae_encoder_latent_output_proj", 2 * c.latent, d)
     return shapes

@@ -49,16 +49,19 @@ STEPS = {
 BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
 
 
-def lerobot_folder(path: Path) -> Path | None:
+def lerobot_folder(path: Path) -> tuple[Path, list[str]] | None:
     """Find the folder with a policy's config: `path` itself, or one inside, as `lerobot-train` arranges them.
 
-    None if there is none. Raises CheckpointError for an output folder that has checkpoints, but no link to the last.
+    Return it with a note if it is another than the last. None if there is none. Raises CheckpointError for an output
+    folder that has several checkpoints, but no link to the last.
     """
     for inner in ("", PRETRAINED, f"last/{PRETRAINED}", f"checkpoints/last/{PRETRAINED}"):
         if any((path / inner / name).exists() for name in ("config.json", ADAPTER)):
-            return path / inner
+            return path / inner, []
     for steps in (path / "checkpoints", path):
         if found := sorted(p.parent.name for p in steps.glob(f"*/{PRETRAINED}")):
+            if len(found) == 1:
+                return steps / found[0] / PRETRAINED, [f"'last' leads nowhere: taken is {found[0]}, the only one there"]
             raise CheckpointError(
                 f"{steps}: it does not say which of its checkpoints is the last",
                 found=quote_all(found),
@@ -119,14 +122,13 @@ def read_lerobot(folder: Path) -> Contents:
     file = folder / "model.safetensors"
     _refuse_shards(folder, file)
     state = _read_safetensors(file)
-    buffers = {name: state.pop(name) for name in list(state) if name.startswith(BUFFERS)}
-    weights = named_weights(file, state, file.stat().st_size)
+    buffers = {}
+    for name in list(state):  # also inside of what torch.compile puts around a policy, see named_weights
+        if begin := next((b for b in BUFFERS if name.startswith(b) or f".{b}" in name), None):
+            buffers[name[name.index(begin) :]] = state.pop(name)
+    weights, notes = named_weights(file, state, file.stat().st_size)
     inputs, outputs = (_features(folder, raw, key) for key in ("input_features", "output_features"))
     sizes = _picture_sizes(folder, inputs)
-    if "observation.state" not in inputs:
-        raise CheckpointError(
-            f"{folder}: the policy has no 'observation.state' input", remedy="LeRobot's forward needs one too"
-        )
     if "action" not in outputs:
         raise CheckpointError(
             f"{folder}: the policy has no 'action' output",
@@ -139,11 +141,14 @@ def read_lerobot(folder: Path) -> Contents:
     asked = raw.get("normalization_mapping", dict.fromkeys(("VISUAL", "STATE", "ACTION"), "MEAN_STD"))
     inner = Normaliser(folder, PREPROCESSOR, asked, buffers)
     outer = Normaliser(folder, POSTPROCESSOR, asked, buffers)
-    states, actions = inputs["observation.state"][1], outputs["action"][1]
+    sees_state = "observation.state" in inputs
+    states, actions = inputs["observation.state"][1] if sees_state else [], outputs["action"][1]
+    seen = _recorded_cameras(inner, sizes)
     config = config_from(
         folder,
         weights,
-        cameras=tuple(camera_names(sizes)),
+        sees_state=sees_state,
+        cameras=tuple(camera_names(seen)),
         image_sizes=tuple(sizes.values()),
         chunk=chunk,
         dim=dim,
@@ -156,15 +161,15 @@ def read_lerobot(folder: Path) -> Contents:
         pre_norm=flag(folder, raw, "pre_norm"),
         activation=raw.get("feedforward_activation", "relu"),
         image_norm=tuple(inner.affine(c, "VISUAL", 3) or Affine((1.0,) * 3, (0.0,) * 3) for c in sizes),
-        state_norm=inner.affine("observation.state", "STATE", states[0]),
+        state_norm=inner.affine("observation.state", "STATE", states[0]) if sees_state else None,
         action_unnorm=outer.affine("action", "ACTION", actions[0], inverse=True),
         rate_hz=_own_rate_hz(folder),
     )
     for name, shape, size in (
-        ("observation.state", states, len(config.state_names)),
+        ("observation.state", states, len(config.state_names) if sees_state else 0),
         ("action", actions, len(config.action_names)),
     ):
-        if shape != [size]:
+        if shape != ([size] if size else []):
             raise CheckpointError(
                 f"{folder}: config and weights do not agree ('{name}' has shape {shape}, the weights are for {size})",
                 remedy=COPY_AGAIN,
@@ -173,8 +178,23 @@ def read_lerobot(folder: Path) -> Contents:
         "optimizer_mb": 0.0,
         "normalisation_from": {"in": inner.source, "out": outer.source},
         "written_here": (folder / ORIGIN).exists(),
+        "notes": notes,
     }
     return Contents("lerobot", config, weights, sha256_of(file), file.stat().st_size, extra)
+
+
+def _recorded_cameras(inner: "Normaliser", sizes: Mapping[str, Any]) -> list[str]:
+    """Return for each of the policy's cameras the key under which its recordings have it (LeRobot's --rename_map)."""
+    sources = {new: old for old, new in inner.renames.items()}
+    others = [new for new in sources if new not in sizes]
+    if others or len(sources) < len(inner.renames):
+        pairs = ", ".join(f"{quote(old)} to {quote(new)}" for old, new in inner.renames.items())
+        raise CheckpointError(
+            f"{inner.where}: renames {pairs}; only one camera to another of the policy's is known here",
+            found=f"a policy of the cameras {quote_all(sizes)}",
+            remedy="rename them in the dataset, in meta/info.json and the tables, and train without --rename_map",
+        )
+    return [sources.get(key, key) for key in sizes]
 
 
 def read_origin(folder: Path) -> dict[str, Any]:
@@ -243,6 +263,7 @@ class Normaliser:
         self.modes, self.eps = asked, 1e-8
         self.stats: dict[str, Tensor] = {}
         self.features: list[str] | None = None  # those that the processor's step names; it leaves all others alone
+        self.renames: dict[str, str] = {}  # what the recordings call an observation: what the policy calls it
         prefix, step_name = STEPS[file]
         self.old = not self.where.exists()
         if self.old:
@@ -267,9 +288,14 @@ class Normaliser:
         for step in self._steps():
             config = step["config"]
             if renames := config.get("rename_map"):
-                raise CheckpointError(
-                    f"{self.where}: renames observations ({quote(renames)})", remedy="rename the inputs instead"
-                )
+                texts = isinstance(renames, dict) and all(isinstance(v, str) for v in renames.values())
+                if not texts or self.renames or count:
+                    raise CheckpointError(
+                        f"{self.where}: its rename_map is no map of names, or not the first that it does",
+                        found=quote(renames),
+                        remedy=COPY_AGAIN,
+                    )
+                self.renames = renames
             if step["registry_name"] not in known:
                 raise CheckpointError(
                     f"{self.where}: has a processor step that is not known here: {quote(step['registry_name'])}",

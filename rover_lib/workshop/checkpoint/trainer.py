@@ -56,7 +56,7 @@ def read_trainer(path: Path) -> Contents:
                 found=quote_all(content),
                 remedy="is this a trainer checkpoint, or only its weights?",
             )
-    raw, weights = content["config"], named_weights(path, content["model_state_dict"], file_bytes)
+    raw, (weights, notes) = content["config"], named_weights(path, content["model_state_dict"], file_bytes)
     if missing := sorted(TRAINER_KEYS - set(raw)):
         raise CheckpointError(
             f"{path}: the config lacks {missing}", remedy="it cannot be read off the weights, add them"
@@ -84,6 +84,7 @@ def read_trainer(path: Path) -> Contents:
         "best_val_loss": _loss(path, content.get("best_val_loss")),
         "optimizer_mb": tensor_bytes(content.get("optimizer_state_dict")) / 1e6,
         "trainer_config": _describe_value(raw),
+        "notes": notes,
     }
     return Contents("trainer", config, weights, sha256_of(path), file_bytes, extra)
 
@@ -145,8 +146,9 @@ def _read_pickle(path: Path) -> Any:
 
 def _no_archive(path: Path, error: Exception) -> CheckpointError:
     """What to say of a file that is no archive, or a damaged one."""
+    head = b""
     with suppress(OSError), path.open("rb") as f:
-        if f.read(len(BEFORE_ZIP)) == BEFORE_ZIP:
+        if (head := f.read(len(BEFORE_ZIP))) == BEFORE_ZIP:
             return CheckpointError(
                 f"{path}: in torch's format of before 1.6, which has neither checksums nor bounds",
                 remedy="load it with torch.load(path, weights_only=True) and save that again with torch.save",
@@ -158,7 +160,9 @@ def _no_archive(path: Path, error: Exception) -> CheckpointError:
     if archive:
         return CheckpointError(f"{path}: damaged ({_reason(error)})", remedy=COPY_AGAIN)
     return CheckpointError(
-        f"{path}: not a torch checkpoint of this decade, or cut short ({_reason(error)})", remedy=COPY_AGAIN
+        f"{path}: neither a trainer's checkpoint nor anything else that is known here, or cut short",
+        found=f"a file that begins with {quote(head)}",
+        remedy=COPY_AGAIN,
     )
 
 

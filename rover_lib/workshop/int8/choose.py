@@ -1,6 +1,7 @@
 """Which observer, and which blocks stay in float: chosen by measuring, on frames that calibration has not seen.
 
-    chooser = Chooser(checkpoint, calibration, samples, recordings.action_range())
+    odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
+    chooser = Chooser(checkpoint, calibration, samples, recordings.action_range(), odd)
     scheme, by_observer = chooser.observer(Scheme("static"))
     sensitivity = chooser.sensitivity(scheme)
     mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=0.2, max_cost_pct=5)
@@ -20,7 +21,8 @@ from torch.fx import GraphModule, Interpreter, Node
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, block_of, blocks, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.int8.observe import Calibration, restore_observed
+from rover_lib.workshop.int8.frames import ODD, odd_share, usual
+from rover_lib.workshop.int8.observe import Calibration, restore_observed, set_ranges, times_of
 from rover_lib.workshop.int8.quantize import convert, forget_graphs, quantize
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.recorded_range import Range, constant_actions, not_judged, pct_of_range, worst
@@ -33,12 +35,19 @@ Errors = dict[str, float | None]  # <action>_mae_pct, None where it is not judge
 FLOAT_PER_INT8 = 4.2
 # Min-max alone clips nothing that calibration saw. On a handful of frames others often seem a little better, and on
 # frames of other episodes they were up to twice as bad: docs/quantization.md has how often, and by how much.
-CLIPPING_PAYS = 0.8  # times min-max's error: what clips must be better than that
+CLIPPING_PAYS = 0.8  # times the error of what clips less: what clips more must be better than that
+USUAL_PCT = (99, 95, 90, 75, 50)  # tried by the observer `frames`, if there are odd frames
+# Then, where odd frames reach furthest beyond the usual ones, ranges are widened, as long as that pays:
+WIDENED = 8  # this many tensors,
+WIDER = 0.2  # by this share of the way at a time,
+WIDENING_PAYS = 0.99  # if the error is at most this times what it was,
+WIDENING_COSTS = 1.2  # and that of usual frames at most this times what it was without any,
+WIDENING_ROUNDS = 3  # this many times at most
 
 
-def mae_pct(actions: Tensor, reference: Tensor, action_range: Mapping[str, Range]) -> Errors:
-    """Mean absolute difference per action, in percent of the recorded range, as {<action>_mae_pct: value}."""
-    error = (actions - reference).abs().mean((0, 1))
+def mae_pct(errors: Tensor, weights: Tensor, action_range: Mapping[str, Range]) -> Errors:
+    """Weighted mean of (frames, actions) errors, in percent of the recorded range, as {<action>_mae_pct: value}."""
+    error = (weights[:, None] * errors).sum(0) / weights.sum()
     return {
         f"{name}_mae_pct": pct_of_range(e.item(), recorded)
         for (name, recorded), e in zip(action_range.items(), error, strict=True)
@@ -48,8 +57,9 @@ def mae_pct(actions: Tensor, reference: Tensor, action_range: Mapping[str, Range
 class Chooser:
     """The float policy and its answers on a few samples, prepared once for many conversions.
 
-    warnings: a sentence for each action that is not judged. Raises QuantizeError without samples, and where no action
-    changes in the recordings.
+    odd: some of the odd frames that calibration met. Together with the odd ones among the samples they weigh in every
+    error what odd frames weigh in the recordings. warnings: a sentence for each action that is not judged. Raises
+    QuantizeError without samples, and where no action changes in the recordings.
     """
 
     def __init__(
@@ -58,6 +68,7 @@ class Chooser:
         calibration: Calibration,
         samples: Sequence[Sample],
         action_range: Mapping[str, Range],
+        odd: Sequence[Sample] = (),
     ):
         if not samples:
             raise QuantizeError(
@@ -70,29 +81,89 @@ class Chooser:
             )
         self.checkpoint, self.calibration, self.action_range = checkpoint, calibration, action_range
         self.warnings = not_judged(action_range)
-        self.inputs = [inputs_of(s, checkpoint.config) for s in samples]
+        self.inputs = [inputs_of(s, checkpoint.config) for s in (*samples, *odd)]
         self.reference = predictions(ACT(checkpoint.config, checkpoint.weights), self.inputs)
+        self.is_odd = torch.arange(len(self.inputs)) >= len(samples)
+        self.weights = torch.ones(len(self.inputs))
+        if odd:
+            graph = restore_observed(checkpoint, Scheme(smooth=calibration.smooth), calibration)
+            self.is_odd[: len(samples)] = times_of(graph, calibration, self.inputs[: len(samples)]) > ODD
+            share = odd_share(calibration.frames)
+            for of_all, kind in ((1 - share, ~self.is_odd), (share, self.is_odd)):
+                self.weights[kind] = of_all * len(kind) / kind.sum().clamp(min=1)
+
+    def errors(self, module: nn.Module) -> Tensor:
+        """(frames, actions): each frame's mean absolute difference to its own plan in FP32, in units of the actions."""
+        forget_graphs()
+        return self._from_reference(predictions(module, self.inputs))
+
+    def _from_reference(self, actions: Tensor) -> Tensor:
+        return (actions - self.reference).abs().mean(1)
 
     def error(self, module: nn.Module) -> Errors:
         """The errors of a quantized policy against FP32, on the samples, in % of the recorded range."""
-        forget_graphs()
-        return mae_pct(predictions(module, self.inputs), self.reference, self.action_range)
+        return mae_pct(self.errors(module), self.weights, self.action_range)
+
+    def error_by_kind(self, module: nn.Module) -> dict[str, Errors]:
+        """The same on usual and on odd frames, of the kinds that there are."""
+        errors, kinds = self.errors(module), {"usual": ~self.is_odd, "odd": self.is_odd}
+        return {
+            name: mae_pct(errors[kind], torch.ones(int(kind.sum())), self.action_range)
+            for name, kind in kinds.items()
+            if kind.any()
+        }
 
     def observer(
         self, scheme: Scheme, observers: Sequence[str] = OBSERVERS, progress: Progress = silent
     ) -> tuple[Scheme, dict[str, Errors]]:
         """Quantize with each observer; the one whose worse action has the least error wins.
 
-        One that clips must win clearly: its error is at most CLIPPING_PAYS of min-max's, or min-max is taken.
+        One that clips must win clearly: its error is at most CLIPPING_PAYS of that of min-max, or of `frames` with more
+        frames left, or these are taken. `frames` is tried only where there are odd frames, and its ranges are then
+        widened tensor by tensor.
         """
+        tried = {name: replace(scheme, observer=name) for name in observers if name != "frames"}
+        if "frames" in observers and (share := odd_share(self.calibration.frames)):
+            all_but_odd = round(100 * (1 - share), 1)
+            for pct in sorted({*USUAL_PCT, all_but_odd}, reverse=True):
+                tried[f"frames {pct:g}"] = replace(scheme, observer="frames", usual_pct=pct)
         table = {}
-        for name in progress(observers, desc="observers"):
-            module = quantize(self.checkpoint, replace(scheme, observer=name), self.calibration).module
+        for name in progress(tried, desc="observers"):
+            module = quantize(self.checkpoint, tried[name], self.calibration).module
             table[name] = self.error(module)
         best = min(table, key=lambda name: _worst(table[name]))
-        if "minmax" in table and _worst(table[best]) > CLIPPING_PAYS * _worst(table["minmax"]):
-            best = "minmax"
-        return replace(scheme, observer=best), table
+        for name in tried:  # of these, what clips less comes first
+            if name.startswith(("minmax", "frames")) and _worst(table[best]) > CLIPPING_PAYS * _worst(table[name]):
+                best = name
+                break
+        if tried[best].observer != "frames":
+            return tried[best], table
+        chosen, table[f"{best}, widened"] = self._widen(tried[best], progress)
+        return chosen, table
+
+    def _widen(self, scheme: Scheme, progress: Progress) -> tuple[Scheme, Errors]:
+        """Let the tensors whose odd frames reach furthest reach further, one step at a time, while all frames gain."""
+        frames, kept = self.calibration.frames, usual(self.calibration.frames, scheme.usual_pct)
+        further = {place: seen.abs().max() / seen[kept].abs().max().clamp(min=1e-6) for place, seen in frames.items()}
+        places = sorted(further, key=lambda place: -further[place])[:WIDENED]
+        graph = restore_observed(self.checkpoint, scheme, self.calibration)
+
+        def judge(scheme: Scheme) -> tuple[Errors, float]:
+            set_ranges(graph, scheme, self.calibration)
+            errors = self.errors(convert(graph, self.checkpoint.config, scheme))
+            of_usual = mae_pct(errors, self.weights * ~self.is_odd, self.action_range)
+            return mae_pct(errors, self.weights, self.action_range), _worst(of_usual)
+
+        error, usually = judge(scheme)
+        best, wider = scheme, dict[str, float]()
+        for step in progress(range(WIDENING_ROUNDS), desc="widening"):
+            for place in (p for p in places if not step or p in wider):
+                more = wider | {place: wider.get(place, 0.0) + WIDER}
+                trial = replace(scheme, wider=tuple(more.items()))
+                found, of_usual = judge(trial)
+                if _worst(found) <= WIDENING_PAYS * _worst(error) and of_usual <= WIDENING_COSTS * usually:
+                    best, wider, error = trial, more, found
+        return best, error
 
     def sensitivity(self, scheme: Scheme, progress: Progress = silent) -> dict[str, Errors]:
         """Each block quantized alone, everything else in float: {block: errors}."""
@@ -103,11 +174,17 @@ class Chooser:
         for block in progress(blocks(config), desc="blocks"):
             forget_graphs()
             actions = before.predictions(convert(graph, config, plain, only=[block]), block)
-            table[block] = mae_pct(actions, self.reference, self.action_range)
+            table[block] = mae_pct(self._from_reference(actions), self.weights, self.action_range)
         return table
 
     def mixed(
-        self, scheme: Scheme, sensitivity: Mapping[str, Errors], *, budget_pct: float, max_cost_pct: float
+        self,
+        scheme: Scheme,
+        sensitivity: Mapping[str, Errors],
+        *,
+        budget_pct: float,
+        max_cost_pct: float,
+        blocks: Sequence[str] | None = None,
     ) -> tuple[Scheme, list[dict[str, Any]]]:
         """Leave blocks in float that take much of the error for few instructions, until every action is in the budget.
 
@@ -115,13 +192,21 @@ class Chooser:
         left of `max_cost_pct`, the instructions that mixed may have more than static, or after which the worse action
         is not better, stays INT8. Returns the mixed scheme and its steps {float_blocks, cost_pct, <action>_mae_pct},
         static first; the last is the best within the cost, in the budget or not.
+
+        blocks: leave these in float instead, whatever they cost. Raises QuantizeError for an unknown one.
         """
+        if unknown := [block for block in blocks or () if block not in sensitivity]:
+            raise QuantizeError(f"there is no block {', '.join(unknown)}", remedy=f"known: {', '.join(sensitivity)}")
         graph = restore_observed(self.checkpoint, scheme, self.calibration)
         costs = float_costs_pct(self.checkpoint)
         order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]) ** 2 / costs[block], reverse=True)
         best = replace(scheme, mode="mixed", float_blocks=())
         cost, error = 0.0, self.error(convert(graph, self.checkpoint.config, best))
         steps: list[dict[str, Any]] = [{"float_blocks": [], "cost_pct": cost, **error}]
+        if blocks is not None:
+            best, cost = replace(best, float_blocks=tuple(blocks)), sum(costs[block] for block in blocks)
+            error = self.error(convert(graph, self.checkpoint.config, best))
+            return best, [*steps, {"float_blocks": list(blocks), "cost_pct": cost, **error}]
         for block in order:
             if _worst(error) <= budget_pct:
                 break

@@ -5,7 +5,7 @@ export(quantized, checkpoint, "policy_static.onnx.zip", samples, calibration)   
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,7 @@ from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.artifact.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.wheel_version import release
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
@@ -117,6 +118,7 @@ class Exporter:
             raise QuantizeError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
         self.checkpoint, self.parity = checkpoint, parity or Parity()
         self.car = car_of(samples)
+        self.recorded = recorded_shapes(samples[0], checkpoint.config)
         self.float_policy = ACT(checkpoint.config, checkpoint.weights)
         self.inputs = [inputs_of(s, checkpoint.config) for s in samples]
         self.stored = np.unique(np.linspace(0, len(samples) - 1, self.parity.vectors).round().astype(int))
@@ -167,7 +169,7 @@ class Exporter:
             vectors[f"frame_{camera}"] = np.stack([self.inputs[i][at].numpy() for i in self.stored])
         other = not self.car.drives_like(Car()) or self.car.positive != Car().positive
         names_car = bool({*config.action_names} & {*ACTION_NAMES}) and other
-        manifest = _manifest(policy, checkpoint, calibration, form) | {
+        manifest = _manifest(policy, checkpoint, calibration, form, self.recorded) | {
             **({"car": self.car.description()} if names_car else {}),
             "weights_mb": _weights_mb(module),
             "gmac": self.gmac,
@@ -212,9 +214,13 @@ def _mode(policy: ACT | QuantizedPolicy) -> str:
 
 
 def _manifest(
-    policy: ACT | QuantizedPolicy, checkpoint: Checkpoint, calibration: Calibration | None, form: Form
+    policy: ACT | QuantizedPolicy,
+    checkpoint: Checkpoint,
+    calibration: Calibration | None,
+    form: Form,
+    recorded: Mapping[str, dict[str, Any]],
 ) -> dict[str, Any]:
-    """Return the part of the manifest that follows from the policy, its checkpoint and the form."""
+    """Return the part of the manifest that follows from the policy, its checkpoint, the form and `recorded_shapes`."""
     config = checkpoint.config
     scheme = policy.scheme if isinstance(policy, QuantizedPolicy) else None
     mode = _mode(policy)
@@ -225,7 +231,8 @@ def _manifest(
         "scheme": scheme.kind if scheme and mode not in arithmetic else arithmetic[mode],
         "engine": form.engine,
         "cameras": [
-            {"name": n, "height": h, "width": w} for n, (h, w) in zip(config.cameras, config.image_sizes, strict=True)
+            {"name": n, "height": h, "width": w} | recorded[n]
+            for n, (h, w) in zip(config.cameras, config.image_sizes, strict=True)
         ],
         "state_names": list(config.state_names),
         "action_names": list(config.action_names),
@@ -243,6 +250,19 @@ def _manifest(
         },
         "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": release(), **form.versions},
     }
+
+
+def recorded_shapes(sample: Sample, config: ActConfig) -> dict[str, dict[str, Any]]:
+    """Return {"recorded": [height, width]} for each camera whose recorded pictures were squeezed for the policy.
+
+    The trainer makes 640x360 of 640x480: a car's camera must then give 4:3, as the recorded one did. Else {}.
+    """
+    seen: Any = sample.frame_bgr()
+    shapes = {}
+    for name, (h, w) in zip(config.cameras, config.image_sizes, strict=True):
+        height, width = (seen[name] if isinstance(seen, Mapping) else seen).shape[:2]
+        shapes[name] = {"recorded": [height, width]} if is_squeezed((width, height), (w, h)) else {}
+    return shapes
 
 
 def _in_blocks(frame: Tensor, size: int = 4) -> Tensor:

@@ -10,6 +10,7 @@ import re
 import time
 import warnings
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
@@ -32,6 +33,7 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act import ACT, ActConfig, Columns, block_of, blocks, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.int8.frames import Frame, range_over, usual
 from rover_lib.workshop.int8.scales import Maxima, apply_channel_scales, channel_maxima
 from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 from rover_lib.workshop.progress import Progress, silent
@@ -41,10 +43,12 @@ BROKEN_INPUT = "check the checkpoint and the recordings"
 
 
 class RangeObserver(UniformQuantizationObserverBase):
-    """Sees a tensor's values during calibration; the range is chosen afterwards, in any of three ways.
+    """Sees a tensor's values during calibration; the range is chosen afterwards, in any of four ways.
 
     Keeps the exact minimum and maximum and a histogram over [-limit, limit] whose limit doubles when it is outgrown:
     two neighbouring bins merge into one, so nothing is ever re-binned by guess. One calibration serves all observers.
+    frames: the least and the largest value of each frame, (2,) each. of_frames: the range that the choice `frames`
+    takes, set from outside, because it depends on which frames are odd anywhere in the policy.
     """
 
     BINS = 4096
@@ -58,6 +62,8 @@ class RangeObserver(UniformQuantizationObserverBase):
             eps=SMALLEST_SCALE,
         )
         self.choice, self.percentile, self.observing = choice, percentile, True
+        self.frames: list[Tensor] = []
+        self.of_frames: tuple[float, float] | None = None
         self.min_val: Tensor
         self.max_val: Tensor
         self.limit: Tensor
@@ -74,6 +80,7 @@ class RangeObserver(UniformQuantizationObserverBase):
         low, high = torch.aminmax(v)
         if not (torch.isfinite(low) and torch.isfinite(high)):
             raise QuantizeError("calibration met NaN or Inf in an activation", remedy=BROKEN_INPUT)
+        self.frames.append(torch.stack((low, high)))
         self.min_val.copy_(torch.minimum(self.min_val, low))
         self.max_val.copy_(torch.maximum(self.max_val, high))
         largest = max(abs(low.item()), abs(high.item()), 1e-6)
@@ -103,6 +110,8 @@ class RangeObserver(UniformQuantizationObserverBase):
             low, high = self._percentiles(low, high)
         elif self.choice == "histogram":
             low, high = self._least_squares(low, high)
+        elif self.choice == "frames" and self.of_frames is not None:
+            low, high = self.of_frames
         return min(low, 0.0), max(high, 0.0)
 
     def _centres(self) -> Tensor:
@@ -147,6 +156,8 @@ class Calibration:
     observers: dict[str, Tensor] = field(repr=False)  # state of the prepared graph's observers
     ranges: dict[str, dict[str, float]] = field(repr=False)  # of each quantized layer's output: min, max
     seconds: float = 0.0
+    seen: tuple[Frame, ...] = field(default=(), repr=False)  # (episode, row) of each sample
+    frames: dict[str, Tensor] = field(default_factory=dict, repr=False)  # (samples, 2) extremes on each, by place
 
     def save(self, path: Path | str) -> None:
         with atomic_path(path) as temporary:
@@ -200,12 +211,16 @@ def calibrate(
         for x in inputs("observers"):
             prepared(*x)
     observers = {k: v.clone() for k, v in prepared.state_dict().items() if "activation_post_process" in k}
+    frames = {}
+    for place, observer in _places(prepared).items():
+        each = torch.stack(observer.frames).view(len(samples), -1, 2)  # some run once for each camera
+        frames[place] = torch.stack((each[..., 0].amin(1), each[..., 1].amax(1)), 1)
     ranges = {}
     for node in prepared.graph.nodes:
         if node.op != "call_module" or block_of(str(node.target)) in STAYS_FLOAT:
             continue
-        if (observer := _observer_behind(prepared, node)) is not None:
-            ranges[str(node.target)] = {"min": observer.min_val.item(), "max": observer.max_val.item()}
+        if (o := _observer_behind(prepared, node)) is not None:
+            ranges[str(node.target)] = {"min": o.min_val.item(), "max": o.max_val.item()}
     return Calibration(
         samples=len(samples),
         smooth=smooth,
@@ -215,7 +230,59 @@ def calibrate(
         observers=observers,
         ranges=ranges,
         seconds=time.monotonic() - start,
+        seen=tuple((s.episode, s.row) for s in samples),
+        frames=frames,
     )
+
+
+def _places(prepared: GraphModule) -> dict[str, RangeObserver]:
+    """The observers by the tensor that they see: named after the layer that gives it, or that takes it as input.
+
+    An observer that FX shares, as of a pooling's input and output, has the first of its names.
+    """
+    places: dict[str, RangeObserver] = {}
+    for node in prepared.graph.nodes:
+        if not _is_observer(prepared, node):
+            continue
+        (source,) = node.all_input_nodes
+        takes = next((user for user in node.users if user.op == "call_module"), None)
+        name = str(source.target) if source.op == "call_module" or takes is None else f"{takes.target}.input"
+        observer = cast(RangeObserver, prepared.get_submodule(str(node.target)))
+        if all(known is not observer for known in places.values()):
+            places[name] = observer
+    return places
+
+
+@torch.inference_mode()
+def times_of(prepared: GraphModule, calibration: Calibration, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
+    """(frames,) of each frame's oddness, as `frames.oddest`, against the frames that calibrated."""
+    times = torch.zeros(len(inputs))
+    usually = {place: seen.abs().amax(1).median().clamp(min=1e-12) for place, seen in calibration.frames.items()}
+    with ExitStack() as hooks:
+        for place, observer in _places(prepared).items():
+
+            def watch(_: nn.Module, args: tuple[Tensor], __: Tensor, usually: Tensor = usually[place]) -> None:
+                times[i] = torch.maximum(times[i], args[0].abs().max() / usually)
+
+            hooks.enter_context(observer.register_forward_hook(watch))
+        for i, x in enumerate(inputs):  # noqa: B007 watch reads it
+            prepared(*x)
+    return times
+
+
+def set_ranges(prepared: GraphModule, scheme: Scheme, calibration: Calibration) -> None:
+    """Let the observers of a restored graph choose their ranges by this scheme."""
+    places = _places(prepared)
+    if scheme.observer == "frames":
+        if not calibration.frames:
+            raise QuantizeError("the calibration is of a version that kept no frames", remedy="calibrate again")
+        kept, wider = usual(calibration.frames, scheme.usual_pct), dict(scheme.wider)
+        if unknown := sorted(set(wider) - set(places)):
+            raise QuantizeError(f"scheme: wider names {unknown[:3]}, which this policy does not have")
+        for place, observer in places.items():
+            observer.of_frames = range_over(calibration.frames[place], kept, wider.get(place, 0.0))
+    for observer in places.values():
+        observer.choice, observer.percentile = scheme.observer, scheme.percentile
 
 
 def _observer_behind(prepared: nn.Module, node: Node) -> RangeObserver | None:
@@ -345,6 +412,7 @@ def restore_observed(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibr
     for m in prepared.modules():
         if isinstance(m, RangeObserver):
             m.observing = False
+    set_ranges(prepared, scheme, calibration)
     return prepared
 
 

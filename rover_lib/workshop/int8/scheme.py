@@ -1,6 +1,8 @@
 """How to quantize, as a value: what `observe` prepares for, `quantize` carries out and `choose` tries."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -11,7 +13,7 @@ MODES = ("dynamic", "static", "mixed")
 # XNNPACK's fast kernels want symmetric int8 activations and weights in [-127, 127] with scales of at least 2^-12;
 # quint8 falls back to QNNPACK's kernels, which have no dot-product instructions in the wheel.
 KINDS = {"symmetric": (torch.qint8, -128, 127), "affine": (torch.quint8, 0, 255)}
-OBSERVERS = ("histogram", "minmax", "percentile")
+OBSERVERS = ("histogram", "minmax", "percentile", "frames")
 SMALLEST_SCALE = 2**-12
 STAYS_FLOAT = ("head", "state_project")
 
@@ -22,7 +24,9 @@ class Scheme:
 
     mode: dynamic (INT8 weights of linears, activations quantized on the fly), static (both, calibrated), or mixed
     (static with `float_blocks` left in float). kind: of the activations of static and mixed. observer: how a range is
-    read off what was seen. smooth: SmoothQuant's a of the channel scales, None for no scales.
+    read off what was seen. smooth: SmoothQuant's a of the channel scales, None for no scales. usual_pct: the observer
+    `frames` takes the extremes of all frames but the oddest, of which this many percent are left. wider: (place, share)
+    of tensors whose range reaches further towards all frames' extremes; see `frames`.
     """
 
     mode: str = "static"
@@ -31,6 +35,14 @@ class Scheme:
     smooth: float | None = 0.5
     percentile: float = 99.99
     float_blocks: tuple[str, ...] = ()
+    usual_pct: float = 100.0
+    wider: tuple[tuple[str, float], ...] = ()
+
+    @classmethod
+    def of(cls, stored: Mapping[str, Any]) -> "Scheme":
+        """A scheme from JSON, which has lists for its tuples."""
+        wider = tuple((place, share) for place, share in stored.get("wider", ()))
+        return cls(**{**stored, "float_blocks": tuple(stored["float_blocks"]), "wider": wider})
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -44,3 +56,6 @@ class Scheme:
             raise QuantizeError("scheme: smooth must be in [0, 1]", found=self.smooth)
         if not 50 < self.percentile <= 100:
             raise QuantizeError("scheme: percentile must be in (50, 100]", found=self.percentile)
+        if not 0 < self.usual_pct <= 100 or any(not 0 <= share <= 1 for _, share in self.wider):
+            found = f"{self.usual_pct} and {[share for _, share in self.wider]}"
+            raise QuantizeError("scheme: usual_pct must be in (0, 100], shares of wider in [0, 1]", found=found)

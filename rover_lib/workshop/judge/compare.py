@@ -130,6 +130,8 @@ class Fidelity:
             # Of plans that are all the same, no error is a share.
             judged = self.pct(action) is not None and spread[i] > 0
             summary[f"{action}_of_spread_pct"] = 100 * e.mean() / spread[i] if judged else None
+            tenth = np.sort(e.mean(1))[-math.ceil(len(e) / 10) :]
+            summary[f"{action}_worst_tenth_pct"] = self.in_pct(tenth.mean(), action)
             summary[f"{action}_p95_pct"] = self.in_pct(np.quantile(e, 0.95), action)
             summary[f"{action}_max_pct"] = self.in_pct(e.max(), action)
             summary[f"{action}_mae_recorded_steps_pct"] = self.in_pct(e[~self.is_pad].mean(), action)

@@ -6,7 +6,7 @@ plots.latency(benchmarks.by_host)
 """
 
 import socket
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from rover_lib.workshop.notebook_table import Table
 
 THIS = "this machine"  # instead of the host's name, which a committed figure need not show
 NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
+CLOCK = Path(__file__).parents[3] / "results" / "clock" / "clock.json"  # written by `python -m lab clock`
+SAME_WORK = 0.01
 NO_SOAK = "none of the rovers was soaked; -e rover_soak_minutes=30 shows temperature, clock and throttling over time"
 
 
@@ -35,6 +37,21 @@ class Benchmarks:
     def soaks(self) -> dict[str, dict[str, Any]]:
         """The benchmarks with a time series, by host."""
         return {host: b for host, b in self.by_host.items() if b["metrics"].get("series")}
+
+    def beside_clock(self, policies: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Rovers' own static artifacts, as rows of the clock's policies with `host` and `measured_ms`, the p50.
+
+        policies: those of clock.json. One is the rover's if it has as many multiply-accumulates, to 1 %, and threads.
+        """
+        rows = []
+        for host, b in self.by_host.items():
+            own = b["metrics"]["artifacts"].get("static")
+            if host == THIS or own is None or not own.get("gmac"):
+                continue
+            for row in policies:
+                if row["threads"] == b["metrics"].get("threads") and abs(row["gmac"] / own["gmac"] - 1) < SAME_WORK:
+                    rows.append({**row, "host": host, "measured_ms": own["latency_p50_ms"]})
+        return rows
 
     def table(self) -> Table:
         """A row for each host and artifact, with notes below. A dash means that the host has no such sensor."""
@@ -56,6 +73,11 @@ class Benchmarks:
             count = len(self.unusable)
             notes += [f"{count} {'files are' if count > 1 else 'file is'} left out:", *self.unusable]
         return Table(header, rows, notes=notes)
+
+
+def read_clock() -> dict[str, Any] | None:
+    """The metrics of the clock's JSON; None outside a checkout, which alone has it."""
+    return read_stage(CLOCK, "clock")["metrics"] if CLOCK.is_file() else None
 
 
 def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:

@@ -25,7 +25,8 @@ from rover_lib.workshop.plots.recordings import (
     faults,
     frame,
     observer_ranges,
+    odd_frames,
     work_per_block,
 )
 from rover_lib.workshop.plots.style import save
-from rover_lib.workshop.plots.tables import computed_times, gates
+from rover_lib.workshop.plots.tables import gates

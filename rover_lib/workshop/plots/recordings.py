@@ -9,6 +9,8 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rover_lib.workshop.act import block_of
+from rover_lib.workshop.int8 import frames
 from rover_lib.workshop.int8.observe import Calibration, RangeObserver
 from rover_lib.workshop.int8.scheme import OBSERVERS
 from rover_lib.workshop.plots import claims
@@ -246,8 +248,9 @@ def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
     For each part of the policy, up to `count` parts, it is the layer in which the observers disagree most.
     """
     rows = []
+    styles = {"minmax": ":", "percentile": "--", "histogram": "-"}
     for layer, observers in _observers(calibration).items():
-        ranges = {name: observers[name].range() for name in OBSERVERS}
+        ranges = {name: observers[name].range() for name in styles}
         widths = [high - low for low, high in ranges.values()]
         rows.append((max(widths) / max(min(widths), 1e-12), layer, observers["minmax"], ranges))
     rows.sort(key=lambda row: -row[0])
@@ -256,7 +259,6 @@ def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
         worst_of_part.setdefault(row[1].split(".")[0], row)
     shown = list(worst_of_part.values())[:count]
     fig, axes = new_figure(1, len(shown), height_in=3.6)
-    styles = {"minmax": ":", "percentile": "--", "histogram": "-"}
     for ax, (_, layer, seen, ranges) in zip(axes[0], shown, strict=False):
         share = 100 * seen.histogram / seen.histogram.sum()
         limit = seen.limit.item()
@@ -272,6 +274,34 @@ def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
         ax.set_xlabel("activation (no unit)")
     axes[0, 0].set_ylabel("values seen (%, logarithmic)")
     legend_below(fig, axes[0, 0], 3)
+    return fig
+
+
+def odd_frames(calibration: Calibration, samples: Sequence[Sample], count: int = 4) -> Figure:
+    """Draw each frame's largest value in each block, against the median frame's, and the oddest frames as pictures.
+
+    samples: those that calibrated, in their order.
+    """
+    by_block: dict[str, list[torch.Tensor]] = {}
+    for place, times in frames.oddness(calibration.frames).items():
+        by_block.setdefault(block_of(place), []).append(times)
+    table = torch.stack([torch.stack(times).amax(0) for times in by_block.values()])
+    oddest = table.amax(0).argsort(descending=True, stable=True)[:count].tolist()
+    fig, axes = new_figure(2, len(oddest), height_in=2.4 + 0.16 * len(table))
+    grid = axes[0, 0].get_gridspec()
+    for ax in axes[0]:
+        ax.remove()
+    top = fig.add_subplot(grid[0, :])
+    grid.set_height_ratios([1.2 + 0.16 * len(table), 1.6])
+    shown = top.imshow(table.log10().clamp(-1, 2), aspect="auto", cmap="coolwarm", vmin=-2, vmax=2)
+    top.set_yticks(range(len(table)), list(by_block), fontsize=7)
+    top.set_xlabel("calibration frame")
+    fig.colorbar(shown, ax=top, ticks=[-1, 0, 1, 2], format=lambda x, _: f"{10.0**x:g}", label="times the median")
+    for ax, i in zip(axes[1], oddest, strict=True):
+        ax.imshow(picture_of(samples[i]))
+        ax.set_title(f"{samples[i].episode.removeprefix('episode_')}\nframe {samples[i].row}", fontsize=8)
+        ax.axis("off")
+    claim(fig, claims.odd_frames(frames.describe_odd(calibration.frames, calibration.seen), table.max().item()))
     return fig
 
 

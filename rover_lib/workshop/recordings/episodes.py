@@ -53,6 +53,7 @@ from rover_lib.onboard.recording.episode import (
     arduino_step_s,
     driver_of,
     find_backlog,
+    find_killed,
     no_pulse,
     number_of,
     read_car_of,
@@ -87,7 +88,7 @@ class Split:
 
 
 @dataclass
-class _Faults:
+class Faults:
     """Counts faults by file and kind, and keeps the note of the first."""
 
     root: Path
@@ -161,11 +162,16 @@ def load_recordings(
             remedy="give the folder with episode_* in it, a LeRobotDataset's (with meta/info.json), or "
             "user/name@revision of the Hub",
         ) from None
+    finish = f"`rover record {root} --finish` makes an episode of it"
+    killed = find_killed(root)
     if not folders:
+        remedy = finish if killed else "give the folder that holds episode_YYYYMMDD_HHMMSS"
         raise EpisodeError(
-            f"{root}: no episode folders in it", remedy="give the folder that holds episode_YYYYMMDD_HHMMSS"
+            f"{root}: no episode folders in it", found=f"{len(killed)} killed ones" if killed else None, remedy=remedy
         )
-    faults = _Faults(root)
+    faults = Faults(root)
+    for part in killed:
+        faults.add(part, "killed_recording", finish)
     read = (
         _load_episode(folder, chunk, sync_s, faults)
         for folder in progress(folders, desc="reading episodes", total=len(folders))
@@ -183,7 +189,7 @@ def load_recordings(
     return Recordings(root, episodes, faults.listed(), source)
 
 
-def _load_episode(folder: Path, chunk: int, sync_s: float, faults: _Faults) -> Episode | None:
+def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
     """Read one folder's episode. None if it has no usable sample; a fault then says why."""
     try:
         present = any((folder / name).exists() for name in DATA_FILES)
@@ -232,7 +238,7 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: _Faults) -> E
     )
 
 
-def _read_tables(folder: Path, faults: _Faults) -> tuple[tuple[str, str | None], dict[str, tuple[Path, list]]]:
+def _read_tables(folder: Path, faults: Faults) -> tuple[tuple[str, str | None], dict[str, tuple[Path, list]]]:
     """Return (label, outcome), and for controls and frames the file that they came from and its rows.
 
     The rows are those of the JSON file if it has any, else those of the CSV file.
@@ -260,7 +266,7 @@ def _read_tables(folder: Path, faults: _Faults) -> tuple[tuple[str, str | None],
     return (label if isinstance(label, str) else "", outcome), tables
 
 
-def _read_bytes(path: Path, faults: _Faults) -> bytes | None:
+def _read_bytes(path: Path, faults: Faults) -> bytes | None:
     """Return a data file's bytes.
 
     None, with a fault, if it is absent, empty, unreadable, too large, or a link that leaves its folder.
@@ -289,7 +295,7 @@ def _read_bytes(path: Path, faults: _Faults) -> bytes | None:
     return data
 
 
-def _read_json(path: Path, faults: _Faults) -> dict[str, Any]:
+def _read_json(path: Path, faults: Faults) -> dict[str, Any]:
     data = _read_bytes(path, faults)
     if data is None:
         return {}
@@ -304,7 +310,7 @@ def _read_json(path: Path, faults: _Faults) -> dict[str, Any]:
     return content
 
 
-def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict[str, Any]]:
+def _read_csv(path: Path, fields: tuple[str, ...], faults: Faults) -> list[dict[str, Any]]:
     data = _read_bytes(path, faults)
     if data is None:
         return []
@@ -321,7 +327,7 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: _Faults) -> list[dict
     return rows
 
 
-def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults) -> tuple[list[_Control], dict]:
+def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -> tuple[list[_Control], dict]:
     """Return the usable readings, ordered by system time, and by channel the formula that its actions followed, if it
     was another than the car's, and they were recomputed.
 
@@ -357,7 +363,7 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
         rows_of = {i: values for i, values, lost, _ in read if name not in lost}
         actions[name], formula = _read_actions(pwm.channel(name), rows_of, path, faults)
         if formula:
-            formulas[name] = str(formula)
+            formulas[name] = formula
     controls = []
     for i, values, _, driver in read:
         pair = actions["steering"].get(i), actions["throttle"].get(i)
@@ -369,7 +375,7 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: _Faults)
 
 
 def _read_actions(
-    channel: Channel, rows: dict[int, dict[str, float]], path: Path, faults: _Faults
+    channel: Channel, rows: dict[int, dict[str, float]], path: Path, faults: Faults
 ) -> tuple[dict[int, float], Formula | None]:
     """Return one channel's action by the number of its control, without those that were not measured.
 
@@ -416,7 +422,7 @@ def _read_actions(
 
 
 def _in_order(
-    timed: list[tuple[float, Item]], went_on: list[bool], path: Path, what: str, faults: _Faults
+    timed: list[tuple[float, Item]], went_on: list[bool], path: Path, what: str, faults: Faults
 ) -> list[Item]:
     """Sort the items by time, keeping the order of equal times, and count the steps back in time.
 
@@ -440,7 +446,7 @@ def _was_set_back(times_s: list[float], i: int) -> bool:
     return min(times_s[i - 2 : i]) > max(times_s[i : i + 2])
 
 
-def _place_bursts(controls: list[_Control], path: Path, faults: _Faults) -> list[_Control]:
+def _place_bursts(controls: list[_Control], path: Path, faults: Faults) -> list[_Control]:
     """Give the controls of a serial burst the times at which they were measured, or drop them."""
     late = find_backlog([c.system_s for c in controls], [c.arduino_s for c in controls])
     placed: list[_Control] = []
@@ -481,7 +487,7 @@ def _inside(path: Path, folder: Path) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
-def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[_Frame]:
+def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_Frame]:
     """Return the listed frames that have a time, ordered by it. `usable` says whether the picture is whole."""
     frames: list[_Frame] = []
     numbers: set[float] = set()
@@ -505,7 +511,7 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
             continue
         numbers.add(number)
         picture = folder / name.replace("\\", "/")
-        usable = _check_picture(folder, picture, name, path, faults)
+        usable = check_picture(folder, picture, name, path, faults)
         frames.append(_Frame(int(number), time_s, picture, usable))
     went_on = [b.number > a.number for a, b in pairwise(frames)]
     frames = _in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
@@ -518,7 +524,7 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: _Faults) -> list[
     return kept
 
 
-def _check_picture(folder: Path, picture: Path, name: str, path: Path, faults: _Faults) -> bool:
+def check_picture(folder: Path, picture: Path, name: str, path: Path, faults: Faults) -> bool:
     """Whether a listed picture is there, inside the episode's folder, and whole. Only its two ends are read."""
     try:
         if Path(name).is_absolute() or not _inside(picture, folder):
@@ -584,7 +590,7 @@ def _nearest(times_s: np.ndarray, sorted_s: np.ndarray, within_s: float) -> tupl
 
 
 def _make_samples(
-    folder: Path, car: Car, frames: list[_Frame], controls: list[_Control], chunk: int, sync_s: float, faults: _Faults
+    folder: Path, car: Car, frames: list[_Frame], controls: list[_Control], chunk: int, sync_s: float, faults: Faults
 ) -> tuple[Sample, ...]:
     actions, known, near, pulses_us, drivers = _actions_of(frames, controls, sync_s)
     if not near.any():

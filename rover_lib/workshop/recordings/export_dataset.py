@@ -30,6 +30,7 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.recording.episode import HIT, HUMAN, NOBODY, POLICY
+from rover_lib.workshop.lerobot_moved import no_progress_bars
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.lerobot_dataset import (
@@ -62,14 +63,16 @@ SHORTEST = 2  # rows in the shortest episode: a single row has no spread to norm
 
 
 def export_dataset(
-    episodes: Path | str,
+    episodes: Path | str | Recordings,
     out: Path | str,
     *,
     video: bool = False,
     size: tuple[int, int] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Write all usable samples below `episodes` to `out`, a new folder, and return what was written and left out.
+    """Write all usable samples to `out`, a new folder, and return what was written and left out.
+
+    episodes: the recordings, or the folder that has them.
 
     video: True writes AV1, LeRobot's default, which is far smaller but loses detail; False writes PNG inside parquet,
     which loses nothing. size: (height, width) to which the pictures are resized, as a rover resizes what its camera
@@ -86,7 +89,10 @@ def export_dataset(
         raise EpisodeError(
             f"pictures must have {SIDES_PX[0]} to {SIDES_PX[1]} pixels a side", found=f"{size[1]}x{size[0]}"
         )
-    recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
+    if isinstance(episodes, Recordings):
+        recordings = episodes
+    else:
+        recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
     if recordings.layout.rate_hz is not None:
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = _rate_hz(recordings)
@@ -144,7 +150,6 @@ def _write(
     os.environ.setdefault("SVT_LOG", "1")  # without it the AV1 encoder prints its settings at every episode
     # Imported here, because it takes seconds that no other command should wait for.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from lerobot.datasets.utils import SuppressProgressBars
 
     recorded = recordings.samples[0].frame_bgr().shape
     shape = (*size, 3) if size else recorded
@@ -164,7 +169,7 @@ def _write(
     origins: list[str] = []
     driven_by: list[str] = []
     outcomes: list[str | None] = []
-    with SuppressProgressBars(), warnings.catch_warnings():
+    with no_progress_bars(), warnings.catch_warnings():
         warnings.filterwarnings(
             "ignore", "Converting input from bool"
         )  # numpy warns when LeRobot computes statistics of yes and no

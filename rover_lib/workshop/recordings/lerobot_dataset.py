@@ -6,7 +6,9 @@ The meaning of its numbers is read from the names of its features, or given by t
 never guessed: if throttle and steering were swapped, training, calibration and comparison would not notice.
 """
 
+import io
 import json
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager
@@ -22,6 +24,7 @@ from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
 from rover_lib.workshop import hub
+from rover_lib.workshop.lerobot_moved import conversion
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
@@ -40,7 +43,6 @@ if TYPE_CHECKING:
 
 INFO = Path("meta/info.json")
 INFO_BYTES = 5_000_000  # LeRobot's: some kB
-CONVERTER = "python -m lerobot.datasets.v30.convert_dataset_v21_to_v30"
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 STATE, ACTION = "observation.state", "action"
 NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index")
@@ -52,6 +54,12 @@ DRIVEN_BY, OUTCOMES = (
     "outcomes",
 )  # who drove where nobody intervened; what the drive came to, or null
 CAR = "car"  # and of them all, the content of their car.yml
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+TEMPLATES = {"data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video_key}}/{FILE}.mp4"}  # of LeRobot
+# What a small file may claim to hold: frames for which there are bytes, and numbers and pixels that fit in memory.
+FRAMES_FREE, FRAME_BYTES = 20_000, 20
+MOST_VALUES, MOST_PIXELS = 20_000_000, 20_000_000
+UNPACKED_FREE, UNPACKED_TIMES = 100_000_000, 4
 COPY_AGAIN = "copy the whole dataset again"
 UNEVEN = 0.1  # the time between two frames may differ by this share
 
@@ -81,20 +89,36 @@ class _Pictures:
         """Read one frame's pictures by the cameras' names, (h, w, 3) uint8 BGR each."""
         with _said_of(path, f"its frame {row} cannot be decoded"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torchvision warns of the decoder that LeRobot has chosen
+            for camera in self.cameras:
+                self._check_size(camera, self._size(camera, row), row, path)  # a bomb is not decoded
             item = self.dataset[row]
             # Each is (3, h, w) float32 in [0, 1]. Dividing a uint8 by 255 and multiplying by 255 again is exact.
             pixels = [(item[camera.key] * 255).round().byte().permute(1, 2, 0).numpy() for camera in self.cameras]
         frames = {}
         for camera, frame in zip(self.cameras, pixels, strict=True):
-            if frame.shape != (*camera.size, 3):
-                raise EpisodeError(
-                    f"{path}: its frame {row} of '{camera.key}' has another shape than meta/info.json says, "
-                    f"{(*camera.size, 3)}",
-                    found=frame.shape,
-                    remedy="record pictures of one size in one dataset",
-                )
+            self._check_size(camera, frame.shape, row, path)
             frames[camera.name] = np.ascontiguousarray(frame[..., ::-1])
         return frames
+
+    def _size(self, camera: _Camera, row: int) -> tuple[int, ...]:
+        """Return the shape that a picture's header gives; for a video, what it should be."""
+        from PIL import Image
+
+        if camera.key in self.dataset.meta.video_keys:
+            return *camera.size, 3
+        packed = self.dataset.hf_dataset.data.column(camera.key)[row]["bytes"].as_py()
+        with Image.open(io.BytesIO(packed)) as image:
+            return *image.size[::-1], 3
+
+    @staticmethod
+    def _check_size(camera: _Camera, shape: tuple[int, ...], row: int, path: Path) -> None:
+        if shape != (*camera.size, 3):
+            raise EpisodeError(
+                f"{path}: its frame {row} of '{camera.key}' has another shape than meta/info.json says, "
+                f"{(*camera.size, 3)}",
+                found=shape,
+                remedy="record pictures of one size in one dataset",
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +152,10 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     root = source.path
     info = _read_info(root)
     layout, cameras = _layout(root, info, source)
+    _check_files(root, info)
     _check_tables(root, info["features"], {*NUMBERS, INTERVENTION, SUCCESS, *(camera.key for camera in cameras)})
     dataset = _open_local(root)
+    _check_pictures(root, dataset, cameras)
     columns = _columns(root, dataset, layout)
     pictures = _Pictures(dataset, cameras)
     _check_rate(root, columns, float(info["fps"]))
@@ -197,11 +223,12 @@ def fetch_dataset(source: Source) -> Source:
     The version is checked first, before gigabytes are fetched.
     """
     given = source.path, "dataset", EpisodeError
-    _read_info(hub.fetch(*given, files=("meta/*",)))
+    _read_info(hub.fetch(*given, files=("meta/*",)), hub_id=str(source.path).partition("@")[0])
     return replace(source, path=hub.fetch(*given))
 
 
-def _read_info(root: Path) -> dict[str, Any]:
+def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
+    """Read meta/info.json. hub_id: user/name if the dataset is on the Hub. Raises EpisodeError."""
     path = root / INFO
     try:
         if path.stat().st_size > INFO_BYTES:
@@ -214,13 +241,23 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise EpisodeError(
             f"{path}: does not name a version of LeRobot's format", found=quote(version), remedy=COPY_AGAIN
         )
+    if version.startswith("v2.1"):
+        where = " and give the folder below ~/.cache/huggingface/lerobot that it names" if hub_id else ""
+        raise EpisodeError(
+            f"{root}: a LeRobotDataset v2.1, only v3 is read",
+            remedy=f"convert it once by LeRobot's own `{conversion(root, hub_id)}`{where}",
+        )
     if version.startswith(("v1", "v2")):
         raise EpisodeError(
-            f"{root}: a LeRobotDataset {version}, only v3 is read",
-            remedy=f"convert it once by LeRobot's own '{CONVERTER} --repo-id=... --root={root}'",
+            f"{root}: a LeRobotDataset {quote(version)}, only v3 is read",
+            remedy="convert it to v2.1 by a LeRobot of that time, and then as its documentation says",
         )
     if not version.startswith("v3"):
-        raise EpisodeError(f"{root}: a LeRobotDataset {quote(version)}, only v3 is known here")
+        raise EpisodeError(
+            f"{root}: a LeRobotDataset {quote(version)}, only v3 is known here", remedy="use a newer version of this"
+        )
+    if not isinstance(info.get("data_path"), str):
+        raise EpisodeError(f"{path}: has no 'data_path'", found=quote_all(info), remedy=COPY_AGAIN)
     features, fps = info.get("features"), info.get("fps")
     if not is_number(fps, 0, 1000) or not fps:
         raise EpisodeError(f"{path}: does not give a number of frames per second", found=quote(fps), remedy=COPY_AGAIN)
@@ -258,7 +295,8 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
             raise EpisodeError(what, found=found, remedy="record one")
     actions, action_order = _name_numbers(root, features, ACTION, source.action_names)
     states, state_order = _name_numbers(root, features, STATE, _state_names(features, source.action_names))
-    return Layout(names, states, actions, float(info["fps"]), state_order, action_order), cameras
+    sizes = {camera.name: camera.size for camera in cameras}
+    return Layout(names, states, actions, float(info["fps"]), state_order, action_order, sizes), cameras
 
 
 def _state_names(features: Mapping[str, Any], said: tuple[str, ...]) -> tuple[str, ...]:
@@ -307,15 +345,62 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     elif isinstance(names, dict) and len(names) == 1:
         (names,) = names.values()  # {"motors": [...]}
     if isinstance(names, list) and names and all(isinstance(n, str) for n in names):
-        return tuple(names)
+        bare = tuple(name.removesuffix(".vel") for name in names)  # as our plugin's are in LeRobot 0.6
+        return bare if set(bare) == set(ACTION_NAMES) else tuple(names)
     return ()
 
 
 def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:
     shape = list(feature["shape"])
-    if len(shape) == 3 and 3 in (shape[0], shape[2]):
+    if len(shape) == 3 and 3 in (shape[0], shape[2]) and math.prod(shape) <= 3 * MOST_PIXELS:
         return (shape[0], shape[1]) if shape[2] == 3 else (shape[1], shape[2])
     raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy="choose another: --camera NAME")
+
+
+def _check_files(root: Path, info: Mapping[str, Any]) -> None:
+    """Raise EpisodeError for files that are none, and for tables that claim to hold more than their bytes can.
+
+    This comes before LeRobot opens anything: it would wait for a pipe, and unpack whatever a table claims.
+    """
+    from pyarrow import parquet
+
+    for key, template in TEMPLATES.items():
+        if info.get(key, template) not in (template, None):
+            raise EpisodeError(
+                f"{root}: its {key} is not LeRobot's", found=quote(info[key]), remedy=f"write {template}"
+            )
+    size = 0
+    for path in (path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*")):
+        if not path.is_dir() and not path.is_file():
+            raise EpisodeError(f"{path}: not a plain file", remedy=COPY_AGAIN)
+        size += path.stat().st_size
+        if path.suffix == ".json" and path.stat().st_size > INFO_BYTES:
+            raise EpisodeError(f"{path}: is larger than any that LeRobot writes", remedy=COPY_AGAIN)
+    rows = values = unpacked = 0
+    for path in root.rglob("*.parquet"):
+        with _said_of(path, "LeRobot cannot read it"):
+            footer = parquet.read_metadata(path)
+        groups = [footer.row_group(i) for i in range(footer.num_row_groups)]
+        columns = [group.column(i) for group in groups for i in range(group.num_columns)]
+        rows += footer.num_rows
+        values += sum(column.num_values for column in columns)
+        unpacked += sum(column.total_uncompressed_size for column in columns)
+    most = FRAMES_FREE + size // FRAME_BYTES, MOST_VALUES, UNPACKED_FREE + UNPACKED_TIMES * size
+    for what, found, limit in zip(("rows", "values", "bytes"), (rows, values, unpacked), most, strict=True):
+        if found > limit:
+            raise EpisodeError(f"{root}: its tables claim {found:,} {what}, more than files of {size:,} bytes can hold")
+
+
+def _check_pictures(root: Path, dataset: "LeRobotDataset", cameras: tuple[_Camera, ...]) -> None:
+    """Raise EpisodeError for pictures that are not in the dataset's own tables: a path may lead anywhere."""
+    for camera in cameras:
+        if camera.key in dataset.meta.video_keys:
+            continue
+        for chunk in dataset.hf_dataset.data.column(camera.key).chunks:
+            if chunk.null_count or chunk.field("bytes").null_count:
+                raise EpisodeError(
+                    f"{root}: pictures of '{camera.key}' are not in its tables, but named by a path", remedy=COPY_AGAIN
+                )
 
 
 def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> None:
@@ -360,7 +445,46 @@ def _open_local(root: Path) -> "LeRobotDataset":
             for number in range(meta.total_episodes):
                 if not (video := root / meta.get_video_file_path(number, key)).is_file():
                     raise EpisodeError(f"{video}: not there", remedy=COPY_AGAIN)
+            _check_video_times(root, meta, key)
         return Local(**given, video_backend=BACKEND)
+
+
+def _check_video_times(root: Path, meta: Any, key: str) -> None:
+    """Raise EpisodeError unless each episode has a part of a video of its own, as long as the episode.
+
+    The merge of LeRobot 0.4.0 wrote times by which an episode is shown another one's pictures.
+    """
+    import av  # here, because our own recordings do not need it
+
+    names = ("length", *(f"videos/{key}/{name}" for name in ("from_timestamp", "to_timestamp")))
+    length, first_s, last_s = (np.asarray(meta.episodes[name], np.float64) for name in names)
+    frame_s = 1 / meta.fps
+    files: dict[Path, list[int]] = {}
+    for number in range(meta.total_episodes):
+        files.setdefault(root / meta.get_video_file_path(number, key), []).append(number)
+    wrong = {
+        int(n): "is not as long as it" for n in np.flatnonzero(~(abs(last_s - first_s - length * frame_s) < frame_s))
+    }
+    for video, numbers in files.items():
+        with av.open(video) as opened:
+            stream = opened.streams.video[0]
+            end_s = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else np.inf
+        numbers.sort(key=first_s.__getitem__)
+        for number, after in zip(numbers, [*numbers[1:], None], strict=True):
+            if after is not None and last_s[number] > first_s[after] + frame_s / 2:
+                wrong[after] = f"overlaps that of episode {number}"
+            if last_s[number] > end_s + frame_s or first_s[number] < 0:
+                wrong[number] = f"ends after the video, which has {end_s:.2f} s"
+    unused = sorted(set((root / "videos" / key).rglob("*.mp4")) - set(files))
+    if wrong or unused:
+        number, what = min(wrong.items(), default=(-1, ""))
+        raise EpisodeError(
+            f"{root}: meta/episodes does not fit the videos of {quote(key)}",
+            found=f"{unused[0].relative_to(root)}, which no episode uses"
+            if number < 0
+            else f"{len(wrong)} of {len(length)} episodes; the part of episode {number} {what}",
+            remedy="merge the original datasets again with a newer LeRobot (lerobot-edit-dataset), or copy it again",
+        )
 
 
 @contextmanager
@@ -404,10 +528,13 @@ def _check_numbers(root: Path, columns: Mapping[str, np.ndarray], layout: Layout
                     remedy="leave those episodes out (lerobot-edit-dataset can), or record them again",
                 )
             if wrong := np.flatnonzero((values < low) | (values > high)).tolist():
+                reverse = name == "throttle" and low == 0 and values.min() >= -1 and values.max() <= high
                 raise EpisodeError(
                     f"{root}: {name} of '{key}' is {values[wrong[0]]:g} in frame {wrong[0]} and {len(wrong) - 1} more, "
                     f"a rover's lies from {low:g} to {high:g}",
-                    remedy="are the names in the right order (--action-names), and the numbers in our units?",
+                    remedy="if that car reverses, say so in a car.yml (reverse_us, docs/build.md) and put it here"
+                    if reverse
+                    else "are the names in the right order (--action-names), and the numbers in our units?",
                 )
 
 
@@ -465,6 +592,8 @@ def _episode(
         data = root / meta.get_data_file_path(number)
         files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
         task = meta.tasks.index[meta.tasks["task_index"] == columns["task_index"][first]]
+    if not data.is_file():
+        raise EpisodeError(f"{data}: not there, and episode {number} is in it", remedy=COPY_AGAIN)
     index = np.arange(n)[:, None] + np.arange(chunk)
     actions, pads = columns[ACTION][rows], index >= n
     chunks = actions[np.minimum(index, n - 1)]
@@ -495,5 +624,14 @@ def _episode(
         controls=n,
         samples=samples,
         files=(root / INFO, data, *files[1:]),
+        corrects=bool(taken_over.any()),
         outcome=outcome,
+    )
+
+
+def lerobot_train(dataset: Path | str) -> str:
+    """Return the command of LeRobot's own that trains an ACT on a LeRobotDataset."""
+    return (
+        f"lerobot-train --dataset.repo_id=local/drives --dataset.root={dataset} --policy.type=act "
+        "--policy.push_to_hub=false --policy.chunk_size=32 --policy.n_action_steps=32 --output_dir=trained"
     )

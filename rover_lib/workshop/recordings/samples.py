@@ -18,6 +18,7 @@ from rover_lib.onboard.car.picture import PictureError, read_jpeg
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
+from rover_lib.workshop.recordings.formula import Formula
 
 OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has another rate
 
@@ -63,7 +64,8 @@ class Source:
 class Layout:
     """Which cameras and which numbers the samples have.
 
-    rate_hz: frames a second; None if the recordings do not state it. state_order, action_order: for each name, its
+    rate_hz: frames a second; None if the recordings do not state it. image_sizes: (height, width) of each camera's
+    pictures, where the recordings state them. state_order, action_order: for each name, its
     column in the file. A car's names are always [steering, throttle] here, in whatever order they were recorded.
     """
 
@@ -73,6 +75,7 @@ class Layout:
     rate_hz: float | None = None
     state_order: tuple[int, ...] = (0, 1)
     action_order: tuple[int, ...] = (0, 1)
+    image_sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict, compare=False)
 
     def words(self) -> str:
         """Describe the layout in one line, in which users should recognise their own car."""
@@ -210,12 +213,13 @@ class Episode:
     samples: tuple[Sample, ...]
     files: tuple[Path, ...]  # those that the numbers came from
     outcome: str | None = None
-    formulas: Mapping[str, str] = field(default_factory=dict)
+    formulas: Mapping[str, Formula] = field(default_factory=dict)
+    corrects: bool = False  # whether a human intervened in it: lerobot-rollout can leave out what the policy drove
 
     @cached_property
     def by_policy(self) -> bool:
         """Whether a policy drove in it, so that what a human did in it was a correction."""
-        return any(sample.driver == POLICY for sample in self.samples)
+        return self.corrects or any(sample.driver == POLICY for sample in self.samples)
 
 
 @dataclass(frozen=True, eq=False)

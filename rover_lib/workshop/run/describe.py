@@ -1,12 +1,13 @@
 """Describe a file or a folder of this project, for `rover inspect`, and list the runs, for `rover list`."""
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import kinds_of
+from rover_lib.onboard.kinds import check_kind, kinds_of
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Source
@@ -36,6 +37,8 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         return {"calibration": _calibration(path)}
     if kind == "stage":
         return {"report": _report(path)}
+    if kind == "tub":
+        check_kind(path, "recordings")  # says what to do with it
     if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
         from rover_lib.workshop.recordings.episodes import load_recordings
         from rover_lib.workshop.recordings.turning import measure_sides
@@ -109,6 +112,7 @@ def verdict_of(run_dir: Path) -> str:
             return f"its run.json cannot be used: rover report {run_dir}"
     if (run_dir / "compare.json").is_file():
         return f"no verdict yet: rover report {run_dir}"
-    if (run_dir / "best_model.pth").is_file():
-        return f"a checkpoint: rover run {run_dir / 'best_model.pth'} EPISODES --name {run_dir.name}"
+    made = run_dir / "best_model.pth" if (run_dir / "best_model.pth").is_file() else run_dir
+    if made != run_dir or "pretrained" in kinds_of(run_dir):
+        return f"a checkpoint: rover run {shlex.quote(str(made))} EPISODES --name {shlex.quote(run_dir.name)}"
     return "not whole: rover run makes it again"

@@ -12,7 +12,7 @@ and the laboratory share: which frames, which options, which files.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,13 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.int8.choose import Chooser
 from rover_lib.workshop.int8.export import Exporter, Parity, export
+from rover_lib.workshop.int8.frames import describe_odd, odd_samples, odd_share
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, quantize
-from rover_lib.workshop.int8.scheme import Scheme
+from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
+from rover_lib.workshop.judge.compare import ARTIFACTS
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
@@ -40,13 +43,14 @@ class Recipe:
     """What params.yml says of making artifacts.
 
     samples: at most this many frames calibrate. seed: of their choice. scheme: static INT8, before its observer is
-    chosen. parity: what an artifact must answer where it is loaded.
+    chosen. parity: what an artifact must answer where it is loaded. observers: to choose from.
     """
 
     samples: int
     seed: int
     scheme: Scheme
     parity: Parity
+    observers: tuple[str, ...] = OBSERVERS
 
     @classmethod
     def of(cls, p: Mapping[str, Any], samples: int | None = None) -> "Recipe":
@@ -59,6 +63,7 @@ class Recipe:
                 kind=quantization["scheme"], smooth=quantization["smooth"], percentile=quantization["percentile"]
             ),
             parity=Parity(parity["fp32"], parity["int8_errors"], parity["vectors"]),
+            observers=tuple(quantization["observers"]),
         )
 
     def choose(self, samples: tuple[Sample, ...]) -> tuple[tuple[Sample, ...], str | None]:
@@ -66,11 +71,45 @@ class Recipe:
         return choose_calibration(samples, self.samples, self.seed)
 
 
+def prepare_chooser(
+    checkpoint: Checkpoint, loaded: Opened, calibration: Calibration, frames: int = CHOOSING_FRAMES
+) -> Chooser:
+    """A chooser on this many frames that calibration has not seen, and on some of the odd ones that it met."""
+    parts = loaded.parts
+    odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
+    few = pick_evenly(parts.choosing or parts.calibration, frames)
+    return Chooser(checkpoint, calibration, few, loaded.recordings.action_range(), odd)
+
+
+def turn_params(**sections: Mapping[str, Any]) -> dict[str, Any]:
+    """params.yml's content with a notebook's parameters in it: turn_params(calibration={"samples": 50}).
+
+    A parameter that is None leaves what params.yml says.
+    """
+    p = params()
+    for section, turned in sections.items():
+        p[section] |= {key: value for key, value in turned.items() if value is not None}
+    return p
+
+
+def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None) -> dict[str, Scheme]:
+    """The schemes of a run's artifacts beside FP32, by name: static, which all others are held against, and `modes`.
+
+    modes: None means all. Raises QuantizeError for an unknown one.
+    """
+    dynamic, affine = replace(static, mode="dynamic"), replace(static, kind="affine")
+    schemes = {"dynamic": dynamic, "static": static, "mixed": mixed, "static_affine": affine}
+    if unknown := [mode for mode in modes or () if mode not in schemes]:
+        raise QuantizeError(f"there is no mode {', '.join(unknown)}", remedy=f"known are {', '.join(schemes)}")
+    return {name: each for name, each in schemes.items() if modes is None or name in ("static", *modes)}
+
+
 def make_artifact(
     loaded: Opened, path: Path | str, recipe: Recipe, *, fp32: bool = False, progress: Progress = silent
 ) -> tuple[str, list[str]]:
     """One artifact at `path`: calibrated on the recordings, quantized by the recipe's scheme, exported.
 
+    Where there are odd frames, which one scale may not serve, the ranges are chosen first; else that saves its time.
     fp32: exported as it is. Returns its content hash, and warnings. Raises QuantizeError, in `calibrate`, `quantize`
     and `export`.
     """
@@ -80,7 +119,10 @@ def make_artifact(
         return export(ACT(checkpoint.config, checkpoint.weights), checkpoint, path, samples, parity=recipe.parity), []
     chosen, note = recipe.choose(parts.calibration)
     calibration = calibrate(checkpoint, chosen, smooth=recipe.scheme.smooth, progress=progress)
-    policy = quantize(checkpoint, recipe.scheme, calibration)
+    scheme = recipe.scheme
+    if odd_share(calibration.frames):
+        scheme, _ = prepare_chooser(checkpoint, loaded, calibration).observer(scheme, recipe.observers, progress)
+    policy = quantize(checkpoint, scheme, calibration)
     digest = export(policy, checkpoint, path, samples, calibration, recipe.parity)
     return digest, ([note] if note else []) + policy.report["warnings"]
 
@@ -93,8 +135,12 @@ def export_policies(
     samples: Sequence[Sample],
     parity: Parity,
 ) -> dict[str, dict[str, Any]]:
-    """Write policy_<name>.pt of each policy into `folder`. Returns what quantize.json says of each."""
+    """Write policy_<name>.pt of each policy into `folder`, and remove those of other modes, which would be of an
+    earlier scheme. Returns what quantize.json says of each.
+    """
     described = {}
+    for mode in set(ARTIFACTS) - policies.keys():
+        (Path(folder) / f"policy_{mode}.pt").unlink(missing_ok=True)
     exporter = Exporter(checkpoint, samples, parity)
     for name, policy in policies.items():
         forget_graphs()
@@ -120,8 +166,7 @@ def requantize(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
         raise QuantizeError(
             f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json", remedy="quantize again"
         )
-    scheme = Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
-    return quantize(checkpoint, scheme, Calibration.load(calibrated))
+    return quantize(checkpoint, Scheme.of(made["scheme"]), Calibration.load(calibrated))
 
 
 def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, str]:
@@ -201,6 +246,7 @@ def write_calibrate(
         "note": note,
         "seconds_s": calibration.seconds,
         "ranges": calibration.ranges,
+        "odd": describe_odd(calibration.frames, calibration.seen),
         "episodes": sorted({s.episode for s in samples}),
     }
     digests = {path: sha256_of(path) for path in {s.frame_path for s in samples}}  # a video holds many frames
@@ -210,8 +256,17 @@ def write_calibrate(
     write_stage(Path(run_dir) / "calibrate.json", "calibrate", params=given, metrics=metrics, inputs=inputs)
 
 
-def write_quantize(run_dir: Path | str, checkpoint: Checkpoint, metrics: dict[str, Any]) -> None:
-    """quantize.json. metrics: `modes` from `export_policies`, and the tables of choosing."""
+def write_quantize(
+    run_dir: Path | str, checkpoint: Checkpoint, metrics: dict[str, Any], given: Mapping[str, Any] | None = None
+) -> None:
+    """quantize.json. metrics: `modes` from `export_policies`, and the tables of choosing. given: the parameters, None
+    for those of params.yml.
+    """
     inputs = {"calibration.pt": sha256_of(Path(run_dir) / "calibration.pt"), "checkpoint": checkpoint.sha256}
-    given = params()["quantization"]
-    write_stage(Path(run_dir) / "quantize.json", "quantize", params=given, metrics=metrics, inputs=inputs)
+    write_stage(
+        Path(run_dir) / "quantize.json",
+        "quantize",
+        params=dict(given or params()["quantization"]),
+        metrics=metrics,
+        inputs=inputs,
+    )

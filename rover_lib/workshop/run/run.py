@@ -14,7 +14,7 @@ import shutil
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,12 @@ from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import RoverError, of_system
+from rover_lib.onboard.params import params
+from rover_lib.onboard.policy.confine import refuse_root
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.hub import absolute
-from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
+from rover_lib.workshop.progress import LOG_VARIABLE, TTY_VARIABLE, Progress, silent
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.swap_folder import build_beside
 
@@ -93,8 +95,11 @@ def run(
     other hosts stay.
 
     Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C, the old run
-    is as it was and nothing of the new one is left. Raises RoverError while another process makes a run of that name.
+    is as it was, and what the finished notebooks made waits in .<name>.unfinished: the same command continues there.
+    Raises ArtifactError at once for root, who may not load artifacts, and RoverError while another process makes a run
+    of that name.
     """
+    refuse_root()
     folder = run_folder(runs_dir, name, NotebookError)
     sources = [Path(notebooks) / f"{n}.ipynb" for n in NAMES]
     if missing := [s.name for s in sources if not s.is_file()]:
@@ -109,13 +114,41 @@ def run(
         for path in others:  # notebook 05 shows them
             shutil.copy2(path, new)
         executed = sources if timed else sources[:-1]
-        for source in progress(executed, desc="notebooks", total=len(executed)):
-            known_to_it = {k: v for k, v in given.items() if k in parameters_of(source)}
-            _execute(source, new, known_to_it, progress is not silent)
+        asked = json.dumps([given, params(), [s.read_text() for s in sources]], sort_keys=True, default=str)
+        with _kept_if_unfinished(folder, new, asked) as finished:
+            for source in progress(executed, desc="notebooks", total=len(executed)):
+                if source.name not in finished:
+                    known_to_it = {k: v for k, v in given.items() if k in parameters_of(source)}
+                    _execute(source, new, known_to_it, progress is not silent)
         for path in others:
             (new / path.name).unlink()
         _say_final_paths(new, folder)
     return folder
+
+
+@contextmanager
+def _kept_if_unfinished(folder: Path, new: Path, asked: str) -> Iterator[set[str]]:
+    """Keep what `new` holds, in .<name>.unfinished, if the block ends early after it finished a notebook.
+
+    Yield the notebooks that an earlier run has left finished there and in `new` now, if it was asked the same. What a
+    continued run cannot go on from is not kept a second time. asked: all that decides what the notebooks make.
+    """
+    kept, note = folder.with_name(f".{folder.name}.unfinished"), "asked.json"
+    if kept.is_dir() and (kept / note).is_file() and (kept / note).read_text() == asked:
+        for path in kept.iterdir():
+            path.rename(new / path.name)
+        (new / note).unlink()
+    shutil.rmtree(kept, ignore_errors=True)
+    finished = {path.name for path in new.glob("*.ipynb")}
+    try:
+        yield finished
+    except BaseException:
+        if {path.name for path in new.glob("*.ipynb")} > finished:
+            kept.mkdir()
+            for path in new.iterdir():
+                path.rename(kept / path.name)
+            (kept / note).write_text(asked)
+        raise
 
 
 def files_of_a_run(folder: Path) -> list[Path]:
@@ -143,12 +176,16 @@ def _say_final_paths(new: Path, folder: Path) -> None:
 def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:
     """Execute one notebook on an existing run, and return the path of the executed notebook in the run's folder.
 
-    Raises NotebookError, in one sentence with the notebook, the cell and its error; an earlier executed one then stays.
+    Raises NotebookError for an unknown parameter, before anything runs; then in one sentence with the notebook, the
+    cell and its error. An earlier executed one then stays.
     """
     folder, source = Path(run_dir).resolve(), Path(notebooks) / f"{name}.ipynb"
     if not source.is_file() or not folder.is_dir():
         missing = folder if source.is_file() else source
         raise NotebookError(f"{missing}: not found", remedy="run from a checkout, on a run of it")
+    if unknown := sorted(set(overrides) - parameters_of(source)):  # papermill would only warn, and work for minutes
+        known = sorted(parameters_of(source) - {"run_dir"})
+        raise NotebookError(f"{source.name} has no parameter {', '.join(unknown)}", remedy=f"known are {known}")
     _execute(source, folder, {"run_dir": str(folder), **overrides}, False)
     return folder / source.name
 
@@ -160,10 +197,9 @@ def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> N
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
     terminal = os.ttyname(sys.stderr.fileno()) if bars and _is_terminal(sys.stderr) else ""
-    with (
-        set_environment({TTY_VARIABLE: terminal, **KERNEL_ENVIRONMENT}),
-        atomic_path(folder / source.name) as temporary,
-    ):
+    log = f"/proc/{os.getpid()}/fd/{sys.stderr.fileno()}" if bars and not terminal and _has_number(sys.stderr) else ""
+    places = {TTY_VARIABLE: terminal, LOG_VARIABLE: log}
+    with set_environment({**places, **KERNEL_ENVIRONMENT}), atomic_path(folder / source.name) as temporary:
         try:
             papermill.execute_notebook(
                 str(source),
@@ -202,9 +238,18 @@ def _is_terminal(stream: Any) -> bool:
         return False
 
 
+def _has_number(stream: Any) -> bool:
+    """Whether a stream is a file of the system, which a kernel can open too."""
+    with suppress(AttributeError, OSError, ValueError):
+        return bool(stream.fileno() >= 0)
+    return False
+
+
 def _sentence(error: Any) -> str:
     """Return a RoverError's own text; for any other error also its name, and how to see the traceback."""
     text = " ".join(str(error.evalue).split())
+    if system := re.fullmatch(r"\[Errno (\d+)\] [^:]*(?:: '(.*)')?", text):
+        return str(of_system(OSError(int(system[1]), "", system[2] or None)))
     ours = {c.__name__ for c in _subclasses(RoverError)} | {RoverError.__name__}
     if error.ename in ours:
         return text

@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 from base64 import b64encode
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,11 @@ from rover_lib.workshop.judge.verdict import CALLED, Names, against, count, erro
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
 LATER = ("arm", "students")  # that `make count` and `rover world students` add to a run
 PAGE = "report.html"
+CARD = "rover-policy"  # this project's name, by which a card that we wrote is known
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
     "04_worst_frames": "The frames on which static INT8 differs most from FP32",
+    "02_odd_frames": "Frames that the policy answers far more strongly than the others",
     "03_sensitivity": "How much of the error each block causes",
     "04_hits": "Balloons hit, by mode",
     "05_latency": "How long a plan takes, by mode",
@@ -68,8 +70,10 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         folder / "run.json", "run", params={"verdict": p["verdict"], "gates": p["gates"]}, metrics=judged, inputs=inputs
     )
     figures = {name: (folder / "figures" / f"{name}.png") for name in FIGURES}
+    drawn = {name: path.read_bytes() for name, path in figures.items() if path.is_file()}
+    beside = [path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))]
     with atomic_path(folder / PAGE) as temporary:
-        temporary.write_text(page(content, names.name, {n: f.read_bytes() for n, f in figures.items() if f.is_file()}))
+        temporary.write_text(page(content, names.name, drawn, beside))
     return content
 
 
@@ -166,7 +170,7 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
         "times smaller",
         *(f"{action} error, %" for action in actions),
         "hits",
-        "p50 ms",
+        judged["compared"],
         "times faster",
     ]
     lines = [tuple([*header, *(["10^9 instructions"] if counted else [])])]
@@ -174,7 +178,7 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
         errors = [number(row["errors_pct"].get(action), ".2f") for action in actions]
         hits = f"{row['hits']} of {row['trials']}" if row["trials"] else "-"
         cells = [CALLED[row["mode"]], f"{row['size_mb']:.1f}", f"{row['times_smaller']:.1f}", *errors, hits]
-        cells += [number(row["latency_p50_ms"], ".1f"), number(row["times_faster"], ".1f")]
+        cells += [number(row["time_ms"], ".1f"), number(row["times_faster"], ".1f")]
         lines.append(tuple([*cells, *([number(row["instructions_g"], ".3g")] if counted else [])]))
     return lines
 
@@ -191,19 +195,49 @@ def _worth(judged: Mapping[str, Any]) -> list[str]:
 # --- as a page --------------------------------------------------------------------------------------------------------
 
 
-def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) -> str:
-    """run.json as one HTML page that needs no other file. name: the run's. figures: PNGs by their names in FIGURES."""
-    judged, env = content["metrics"], content["env"]
+def write_card(run_dir: Path | str) -> Path:
+    """Write README.md into a run's folder, a model card for the Hub, from its run.json and load.json; return its path.
+
+    Raises RoverError if the run has no verdict, and if there is a README.md that this has not written.
+    """
+    folder = Path(run_dir)
+    judged, load = (read_stage(folder / f"{name}.json", name)["metrics"] for name in ("run", "load"))
+    path, recordings = folder / "README.md", load["recordings"]
+    if path.exists() and CARD not in path.read_text(errors="replace"):
+        raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
     header, *rows = columns(judged)
+    recorded = f"{count(recordings['episodes'], 'episode')}, {recordings['samples']} frames"
+    use = f"rover drive {judged['artifact']}" if judged["artifact"] else "none of them: no artifact should drive a car"
+    text = [
+        "---", "library_name: lerobot", "pipeline_tag: robotics", "tags: [lerobot, robotics, act, int8]", "---", "",
+        f"# {folder.resolve().name}: {judged['headline']}", "", *judged["why"], "",
+        f"| {' | '.join(header)} |", f"|{'---|' * len(header)}", *(f"| {' | '.join(row)} |" for row in rows), "",
+        f"Errors are mean differences from FP32, in percent of the recorded range. Speed: {judged['timing']}.", "",
+        f"Calibrated and judged on {recorded}: {recordings['layout'].replace('|', '/')}.", "",
+        f"To drive, in a checkout of {CARD}: `{use}`. In LeRobot: `python -m lerobot_robot_rover ARTIFACT FOLDER`.",
+        "", "## Keep in mind", "", *(f"- {line}" for line in judged["cautions"] or ["Nothing speaks against it."]), "",
+    ]  # fmt: skip
+    path.write_text("\n".join(text))
+    return path
+
+
+def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes], files: Sequence[str] = ()) -> str:
+    """run.json as one HTML page that needs no other file. name: the run's. figures: PNGs by their names in FIGURES.
+    files: names of files beside it, to which it links.
+    """
+    judged, env = content["metrics"], content["env"]
+    header, *rows = zip(*columns(judged), strict=True)  # a column for each mode: a phone shows all without scrolling
     pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
     pages.filters["words"] = _to_html
     return pages.get_template(PAGE).render(
         name=name,
         judged=judged,
         header=header,
-        rows=list(zip(rows, (mode["mode"] for mode in judged["modes"]), strict=True)),
+        rows=rows,
+        kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
         worth=_worth(judged),
         figures=[(FIGURES[figure], b64encode(figures[figure]).decode()) for figure in FIGURES if figure in figures],
+        files=files,
         made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
         against=against,
         typed=typed,

@@ -16,6 +16,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.recordings.samples import Source
+from rover_lib.workshop.run.units import in_todays_units
 from rover_lib.workshop.untrusted import quote
 
 SMALL_GMAC = 1.0  # a policy below this gains less from a second thread than the thread costs on a busy machine
@@ -34,7 +35,8 @@ def load(checkpoint: Path | str, episodes: Path | str | Source, progress: Progre
     """Read a checkpoint and its recordings, and split the recordings as params.yml says.
 
     For a LeRobot policy, the cameras that the policy uses are read from a LeRobotDataset unless the user chose others,
-    and the policy gets the dataset's order and rate of numbers. Raises CheckpointError and EpisodeError.
+    and the policy gets the dataset's order and rate of numbers. One that was trained on the actions of older firmware
+    gets today's units. Raises CheckpointError and EpisodeError.
     """
     p = params()["calibration"]
     policy = load_checkpoint(checkpoint)
@@ -44,7 +46,7 @@ def load(checkpoint: Path | str, episodes: Path | str | Source, progress: Progre
         source = replace(source, cameras=policy.config.cameras)
     recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
-    recorded = policy.recorded_as(recordings.layout)
+    recorded = in_todays_units(policy.recorded_as(recordings.layout), recordings, parts.calibration)
     _check_limits(recorded)  # after recorded_as, because its rate and names are the recordings'
     return Opened(recorded, recordings, parts)
 

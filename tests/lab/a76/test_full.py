@@ -4,8 +4,9 @@ import json
 
 import pytest
 
-from balloon_world import train as train_module
+from lab.a76 import full
 from lab.a76.full import LEARNED_NOTE, NOTE, SIZES, STEPS, full_run
+from rover_learn import train as train_module
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
@@ -55,19 +56,26 @@ def test_leaves_what_counting_needs(run_dir):
 @pytest.mark.parametrize("suffix", ["", "_54x96"])
 def test_quantize_json_says_how_to_make_it_again(run_dir, suffix):
     made = read_stage(run_dir / "quantize.json", "quantize")["metrics"]["modes"][f"static{suffix}"]
-    scheme = Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
+    scheme = Scheme.of(made["scheme"])
     checkpoint = open_run(run_dir).checkpoint
     checkpoint = checkpoint.at_size(54, 96) if suffix else checkpoint
     again = quantize(checkpoint, scheme, Calibration.load(run_dir / f"calibration{suffix}.pt"))
     assert json.loads(json.dumps(again.report["layers"])) == made["layers"]
 
 
-def test_what_was_made_before_is_taken_from_the_cache(run_dir, tmp_path):
+@pytest.fixture
+def checkpoint_alone(monkeypatch):
+    """A run quantizes nothing, which takes longer than to train it."""
+    monkeypatch.setattr(full, "_quantize", lambda *_, **__: {})
+    monkeypatch.setattr(full, "export_onnx", lambda *_: None)
+
+
+def test_what_was_made_before_is_taken_from_the_cache(run_dir, checkpoint_alone, tmp_path):
     again = full_run(tmp_path / "full", steps=5, **SIZE | {"sizes": (), "curve": ()})
     assert sha256_of(again / "best_model.pth") == sha256_of(run_dir / "best_model.pth")
 
 
-def test_the_whole_recipe_is_that_of_the_balloon_world(cache, tmp_path, monkeypatch):
+def test_the_whole_recipe_is_that_of_the_balloon_world(cache, checkpoint_alone, tmp_path, monkeypatch):
     """So that a checkpoint that `rover train` left in the cache is used."""
     short = train_module.RECIPES["small", "cpu"].of_steps(4)
     monkeypatch.setitem(train_module.RECIPES, ("small", "cpu"), short)

@@ -1,14 +1,11 @@
 """The link: by its rules against an Arduino made of a pty and a thread, and for real against the emulated one."""
 
+import fcntl
 import functools
 import os
-import pty
-import select
 import termios
 import threading
 import time
-import tty
-from contextlib import contextmanager
 
 import needs
 import numpy as np
@@ -16,7 +13,8 @@ import pytest
 import serial
 from hypothesis import given
 from hypothesis import strategies as st
-from uno import body_of, line
+from pty_board import Board, board_of, obedient
+from uno import line
 
 from lab.arduino.emulator import EmulatedArduino
 from rover_lib.onboard.car.car import Car
@@ -69,92 +67,6 @@ def test_a_garbled_status_says_nothing(data):
     at = data.draw(st.integers(0, len(good) - 1))
     flip = data.draw(st.integers(1, 255))
     assert parse(good[:at] + bytes([good[at] ^ flip]) + good[at + 1 :], 0) is None
-
-
-FIELDS = {
-    "boot": 7, "ms": 999, "sequence": 0, "result": "k", "state": "M", "reason": "r", "missing": "-",
-    "steering_us": 1456, "throttle_us": 120, "cap_us": 238,
-}  # fmt: skip
-STATUS_LINE = (
-    "<S {boot} {ms} {sequence} {result} {state} {reason} {missing} {steering_us} {throttle_us} {cap_us} - - - - 0 0 0 0"
-)
-
-
-class Board:
-    """The other end of a pty: says what it is told to, and records what the host says."""
-
-    def __init__(self, hello=f"<H 4 4.0.0 7 0 e {DEFAULT}", answer=None):
-        self.master, slave = pty.openpty()
-        tty.setraw(slave)
-        self.port = os.ttyname(slave)
-        self._slave = slave
-        self.heard: list[str] = []
-        self.hello = hello
-        self.answer = answer or (lambda board, body: None)
-        self.reading = True
-        self._closing = False
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-        if hello:
-            threading.Timer(0.1, self.greet).start()
-
-    def greet(self):
-        self.say(self.hello)
-        self.status(result="-", boot=self.hello.split()[3] if self.hello.count(" ") == 5 else 7)
-
-    def say(self, body):
-        if not self._closing:
-            os.write(self.master, line(body))
-
-    def status(self, state="M", reason="r", result="k", **fields):
-        """Say a status line; fields: of the line, see FIELDS."""
-        said = {"state": state, "reason": reason, "result": result, "sequence": self.sequence}
-        assert fields.keys() <= FIELDS.keys()
-        self.say(STATUS_LINE.format(**FIELDS | said | fields))
-
-    @property
-    def sequence(self):
-        numbered = [int(b.split()[2]) for b in self.heard if b[1] != "Q"]
-        return numbered[-1] if numbered else 0
-
-    def _run(self):
-        pending = b""
-        while not self._closing:
-            if not self.reading or not select.select([self.master], [], [], 0.01)[0]:
-                time.sleep(0.001)
-                continue
-            *lines, pending = (pending + os.read(self.master, 4096)).split(b"\n")
-            for said in lines:
-                body = body_of(said[said.rindex(b">") :])  # as the firmware: a '>' starts a line
-                assert body, said
-                self.heard.append(body)
-                if body == ">Q" and self.hello:
-                    self.greet()
-                self.answer(self, body)
-
-    def close(self):
-        self._closing = True
-        self._thread.join()
-        os.close(self.master)
-        os.close(self._slave)
-
-
-def obedient(board, body):
-    if body[1] == "A":
-        board.status("A", "a")
-    elif body[1] == "N":
-        board.status("S", "n")
-    elif body[1] == "D":
-        board.status("A", "a", steering_us=body.split()[4], throttle_us=body.split()[5])
-
-
-@contextmanager
-def board_of(**options):
-    board = Board(**options)
-    try:
-        yield board
-    finally:
-        board.close()
 
 
 def test_a_drive_ends_in_neutral():
@@ -313,6 +225,28 @@ def test_a_status_from_before_is_no_answer():
     sentence = "no answer to arming"
     with board_of(answer=old) as board, ServoLink(board.port) as link, pytest.raises(LinkError, match=sentence):
         link.arm()
+
+
+def test_a_status_of_another_start_is_no_answer():
+    def other(board, body):
+        board.status("A", "a", boot=9)
+
+    with board_of(answer=other) as board, ServoLink(board.port) as link, pytest.raises(LinkError, match="no answer to"):
+        link.arm()
+
+
+def test_what_waited_in_the_port_is_dropped_and_nobody_else_gets_it():
+    with board_of(hello="") as board:
+        board.hello = f"<H 4 4.0.0 7 0 e {DEFAULT}"
+        board.say(f"<H 4 4.0.0 3 99 e {DEFAULT}")  # of before the port was opened
+        time.sleep(0.05)
+        threading.Timer(0.2, board.greet).start()
+        with ServoLink(board.port) as link:
+            assert link.hello.boot == 7
+            with pytest.raises(serial.SerialException):
+                serial.Serial(board.port, exclusive=True)
+            excluded = fcntl.ioctl(board._slave, 0x80045440, bytes(4))  # TIOCGEXCL, for programs that lock nothing
+            assert int.from_bytes(excluded, "little") == 1
 
 
 def test_a_reset_meanwhile_needs_arming_again():

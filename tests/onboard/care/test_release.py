@@ -425,13 +425,19 @@ def test_a_wrong_hash(releases, two):
         ({"chunk": 16}, "plans 16 actions, this rover takes 32; deploy another, or allow it: chunk"),
         ({"mode": "dynamic"}, "its manifest says dynamic, its code is not"),
         ({"mode": "fp32"}, "parity tolerance of steering must be from 0 to 0.001"),
-        ({"state_names": ["speed", "heading"]}, "this car has steering and throttle; deploy another$"),
+        (
+            {"state_names": ["speed", "yaw_rate"]},
+            "is told speed, yaw_rate, this car has steering and throttle; deploy ",
+        ),
         ({"schema": 2}, "manifest schema 2"),
         (
             {"cameras": [{"name": "cam_rear", "width": 128, "height": 72}]},
-            "looks through cam_rear 128x72, this rover has cam_front at 1.78 to 1; deploy another, or allow it: camera",
+            "looks through cam_rear 128x72, this rover has cam_front; deploy another, or allow it: camera",
         ),
-        ({"cameras": [{"name": "cam_front", "width": 96, "height": 96}]}, "cam_front 96x96.*allow it: camera"),
+        (
+            {"cameras": [{"name": "cam_front", "width": 96, "height": 96}]},
+            "cam_front 96x96, this rover's pictures are 1.78 to 1; .*allow it: aspect",
+        ),
     ],
 )
 def test_refused_by_its_manifest_before_it_travels_and_on_arrival(releases, two, tmp_path, changes, sentence):
@@ -457,14 +463,14 @@ def test_a_slow_artifact_only_if_it_is_allowed(releases, signed, mode):
 
 
 def test_what_cannot_drive_cannot_be_allowed(two):
-    with pytest.raises(ReleaseError, match="only mode, chunk, camera can be allowed, found torch"):
+    with pytest.raises(ReleaseError, match="only mode, chunk, camera, aspect can be allowed, found torch"):
         inspect_artifact(two[0], allow=["torch"])
 
 
 def test_a_rover_with_another_chunk_or_camera(two):
     with pytest.raises(ReleaseError, match=r"plans 32 actions, this rover takes 50"):
         inspect_artifact(two[0], Expected(chunk=50))
-    with pytest.raises(ReleaseError, match=r"this rover has cam_front at 1\.33 to 1"):
+    with pytest.raises(ReleaseError, match=r"this rover's pictures are 1\.33 to 1"):
         inspect_artifact(two[0], Expected(aspect=4 / 3))
 
 

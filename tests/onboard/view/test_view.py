@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import errno
 import gc
+import inspect
 import json
 import os
 import socket
@@ -76,6 +77,22 @@ class Bench:
         return await self.browser.ws_connect(f"{self.base}/ws?token={token}", headers=headers)
 
 
+def on_a_bench(test):
+    """Run an async test with an open bench, its first argument."""
+    first, *others = inspect.signature(test).parameters.values()
+
+    def run(tmp_path, **given):
+        async def scene():
+            async with Bench(tmp_path) as bench:
+                await test(bench, **given)
+
+        asyncio.run(scene())
+
+    run.__name__, run.__doc__ = test.__name__, test.__doc__
+    run.__signature__ = inspect.Signature([first.replace(name="tmp_path"), *others])
+    return run
+
+
 async def message(page, shown=True):
     """The next whole message of a page: its head, and its picture."""
     while (got := await asyncio.wait_for(page.receive(), 5)).type != aiohttp.WSMsgType.BINARY:
@@ -94,26 +111,23 @@ async def driving(page):
     return found
 
 
-def test_a_page_shows_what_the_drive_says(tmp_path):
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            page = await bench.page()
-            assert (await message(page))[0]["phase"] == "no drive"
-            drive = bench.drive()
-            drive.send()
-            head, picture = await driving(page)
-            assert picture == JPEG and head["n"] == 1
-            assert {k: head[k] for k in ("title", "who", "pins", "tick", "events")} == {
-                k: HEAD[k] for k in ("title", "who", "pins", "tick", "events")
-            }
-            assert head["throttled"] == "under-voltage since the start, throttled since the start"
-            assert len(head["ribbon"]) > 10 and not head["stopped"] and not head["replay"]
-            assert head["pins_actions"][1] == pytest.approx(0.05, abs=0.01)
-            drive.send(HEAD | {"phase": "ended", "pins": [1456, 120], "plan": None})
-            head, _ = await message(page)
-            assert head["stopped"] and head["ribbon"] == [] and head["delay_ms"] is not None
-
-    asyncio.run(scene())
+@on_a_bench
+async def test_a_page_shows_what_the_drive_says(bench):
+    page = await bench.page()
+    assert (await message(page))[0]["phase"] == "no drive"
+    drive = bench.drive()
+    drive.send()
+    head, picture = await driving(page)
+    assert picture == JPEG and head["n"] == 1
+    assert {k: head[k] for k in ("title", "who", "pins", "tick", "events")} == {
+        k: HEAD[k] for k in ("title", "who", "pins", "tick", "events")
+    }
+    assert head["throttled"] == "under-voltage since the start, throttled since the start"
+    assert len(head["ribbon"]) > 10 and not head["stopped"] and not head["replay"]
+    assert head["pins_actions"][1] == pytest.approx(0.05, abs=0.01)
+    drive.send(HEAD | {"phase": "ended", "pins": [1456, 120], "plan": None})
+    head, _ = await message(page)
+    assert head["stopped"] and head["ribbon"] == [] and head["delay_ms"] is not None
 
 
 @pytest.mark.parametrize(
@@ -136,37 +150,29 @@ def test_a_page_shows_what_the_drive_says(tmp_path):
         ("/ws", {"Origin": "the right one"}),
     ],
 )
-def test_who_may_not_look_gets_a_sentence_and_reaches_no_drive(tmp_path, path, headers):
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            drive = bench.drive()
-            drive.send()
-            if headers.get("Origin") == "the right one":
-                headers["Origin"] = bench.base
-            upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
-            upgrade |= {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="} if path.startswith("/ws") else {}
-            async with bench.browser.get(bench.base + path, headers=upgrade | headers) as answer:
-                assert answer.status == 403
-                text = await answer.text()
-                assert len(text.splitlines()) == 1 and TOKEN not in text and "policy.pt" not in text
-            assert drive.asked_nothing()
-
-    asyncio.run(scene())
+@on_a_bench
+async def test_who_may_not_look_gets_a_sentence_and_reaches_no_drive(bench, path, headers):
+    drive = bench.drive()
+    drive.send()
+    if headers.get("Origin") == "the right one":
+        headers["Origin"] = bench.base
+    upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+    upgrade |= {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="} if path.startswith("/ws") else {}
+    async with bench.browser.get(bench.base + path, headers=upgrade | headers) as answer:
+        assert answer.status == 403
+        text = await answer.text()
+        assert len(text.splitlines()) == 1 and TOKEN not in text and "policy.pt" not in text
+    assert drive.asked_nothing()
 
 
-@pytest.mark.parametrize(
-    "path", ["/ws/../arm", "/arm", "/stop", "/view.py", "/static/../../etc/passwd", "/favicon.ico"]
-)
-@pytest.mark.parametrize("method", ["GET", "POST", "PUT", "DELETE"])
-def test_there_is_nothing_else(tmp_path, method, path):
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            drive = bench.drive()
+@on_a_bench
+async def test_there_is_nothing_else(bench):
+    drive = bench.drive()
+    for path in ("/ws/../arm", "/arm", "/stop", "/view.py", "/static/../../etc/passwd", "/favicon.ico"):
+        for method in ("GET", "POST", "PUT", "DELETE"):
             async with bench.browser.request(method, f"{bench.base}{path}?token={TOKEN}") as answer:
-                assert answer.status in (404, 405)
-            assert drive.asked_nothing()
-
-    asyncio.run(scene())
+                assert answer.status in (404, 405), (method, path)
+    assert drive.asked_nothing()
 
 
 def test_the_page_itself_may_load_nothing_and_be_framed_by_nobody(tmp_path):
@@ -183,97 +189,78 @@ def test_the_page_itself_may_load_nothing_and_be_framed_by_nobody(tmp_path):
     asyncio.run(scene())
 
 
-def test_a_stop_from_each_of_ten_pages_reaches_the_drive(tmp_path):
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            drive = bench.drive()
-            drive.send()
-            pages = [await bench.page() for _ in range(10)]
-            for page in pages:
-                await driving(page)
-                await page.send_str("stop")
-                assert await drive.asked() == b"stop 127.0.0.1"
-                assert (await asyncio.wait_for(page.receive(), 5)).data == "asked for a stop"
-            other = await bench.page()
-            drive.wire.close()
-            while (await message(other))[0]["phase"] != v.GONE:
-                pass
-            await other.send_str("stop")
-            assert (await asyncio.wait_for(other.receive(), 5)).data == "no drive is there to be stopped"
-
-    asyncio.run(scene())
+@on_a_bench
+async def test_a_stop_from_each_of_ten_pages_reaches_the_drive(bench):
+    drive = bench.drive()
+    drive.send()
+    pages = [await bench.page() for _ in range(10)]
+    for page in pages:
+        await driving(page)
+        await page.send_str("stop")
+        assert await drive.asked() == b"stop 127.0.0.1"
+        assert (await asyncio.wait_for(page.receive(), 5)).data == "asked for a stop"
+    other = await bench.page()
+    drive.wire.close()
+    while (await message(other))[0]["phase"] != v.GONE:
+        pass
+    await other.send_str("stop")
+    assert (await asyncio.wait_for(other.receive(), 5)).data == "no drive is there to be stopped"
 
 
-@pytest.mark.parametrize(
-    "said", ["arm", "STOP", "stop ", "steer 1", "shown", "shown -1", "shown 99999999", '{"ask": "arm"}']
-)
-def test_a_page_can_say_nothing_else(tmp_path, said):
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            drive = bench.drive()
-            drive.send()
-            page = await bench.page()
-            await driving(page)
-            await page.send_str(said)
-            drive.send()
-            await message(page)  # it goes on
-            assert drive.asked_nothing()
-
-    asyncio.run(scene())
+@on_a_bench
+async def test_a_page_can_say_nothing_else(bench):
+    drive, page = bench.drive(), await bench.page()
+    for said in ("arm", "STOP", "stop ", "steer 1", "shown", "shown -1", "shown 99999999", '{"ask": "arm"}'):
+        drive.send()
+        await driving(page)
+        await page.send_str(said)
+        drive.send()
+        await message(page)  # it goes on
+        assert drive.asked_nothing(), said
 
 
 @pytest.mark.parametrize("said", [b"stop", b"x" * 100, "stop" * 100])
-def test_a_page_that_says_what_no_page_says_is_closed(tmp_path, said):
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            drive = bench.drive()
-            page = await bench.page()
-            await message(page)
-            await (page.send_bytes(said) if isinstance(said, bytes) else page.send_str(said))
-            got = await asyncio.wait_for(page.receive(), 5)
-            assert got.type in (aiohttp.WSMsgType.CLOSE, aiohttp.WSMsgType.CLOSED)
-            assert drive.asked_nothing()
-
-    asyncio.run(scene())
+@on_a_bench
+async def test_a_page_that_says_what_no_page_says_is_closed(bench, said):
+    drive = bench.drive()
+    page = await bench.page()
+    await message(page)
+    await (page.send_bytes(said) if isinstance(said, bytes) else page.send_str(said))
+    got = await asyncio.wait_for(page.receive(), 5)
+    assert got.type in (aiohttp.WSMsgType.CLOSE, aiohttp.WSMsgType.CLOSED)
+    assert drive.asked_nothing()
 
 
-def test_nothing_waits_for_a_page_that_is_slow(tmp_path):
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            drive = bench.drive()
-            slow, quick = await bench.page(), await bench.page()
-            await message(slow, shown=False)
-            await message(quick)
-            for number in range(1, 40):
-                drive.send(HEAD | {"frame": number})
-                assert (await message(quick))[0]["frame"] == number
-            with pytest.raises(asyncio.TimeoutError):
-                await asyncio.wait_for(slow.receive(), 0.05)
-            await slow.send_str("shown 0")
-            head, _ = await message(slow)
-            assert head["frame"] == 39  # the newest, and none of those between
-            await slow.send_str("stop")
-            assert await drive.asked() == b"stop 127.0.0.1"
-
-    asyncio.run(scene())
+@on_a_bench
+async def test_nothing_waits_for_a_page_that_is_slow(bench):
+    drive = bench.drive()
+    slow, quick = await bench.page(), await bench.page()
+    await message(slow, shown=False)
+    await message(quick)
+    for number in range(1, 40):
+        drive.send(HEAD | {"frame": number})
+        assert (await message(quick))[0]["frame"] == number
+    with pytest.raises(asyncio.TimeoutError):
+        await asyncio.wait_for(slow.receive(), 0.05)
+    await slow.send_str("shown 0")
+    head, _ = await message(slow)
+    assert head["frame"] == 39  # the newest, and none of those between
+    await slow.send_str("stop")
+    assert await drive.asked() == b"stop 127.0.0.1"
 
 
-def test_more_pages_than_anybody_opens_are_refused(tmp_path, monkeypatch):
+@on_a_bench
+async def test_more_pages_than_anybody_opens_are_refused(bench, monkeypatch):
     monkeypatch.setattr(v, "PAGES", 3)
-
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            pages = [await bench.page() for _ in range(3)]
-            with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
-                await bench.page()
-            await pages[0].close()
-            for _ in range(100):
-                with contextlib.suppress(aiohttp.WSServerHandshakeError):
-                    return await bench.page()
-                await asyncio.sleep(0.01)
-            raise AssertionError("a closed page still counts")
-
-    asyncio.run(scene())
+    pages = [await bench.page() for _ in range(3)]
+    with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
+        await bench.page()
+    await pages[0].close()
+    for _ in range(100):
+        with contextlib.suppress(aiohttp.WSServerHandshakeError):
+            return await bench.page()
+        await asyncio.sleep(0.01)
+    raise AssertionError("a closed page still counts")
 
 
 def test_idle_connections_keep_no_page_waiting(tmp_path, monkeypatch, caplog):
@@ -321,24 +308,20 @@ def test_no_token_is_in_the_log(tmp_path, caplog, capsys):
     assert TOKEN not in caplog.text + "".join(capsys.readouterr())
 
 
-def test_a_second_click_hides_no_end(tmp_path):
+@on_a_bench
+async def test_a_second_click_hides_no_end(bench):
     """A drive that has ended closes its socket with the second stop unread."""
-
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            page, drive = await bench.page(), bench.drive()
-            drive.send()
-            await driving(page)
-            for _ in range(2):
-                await page.send_str("stop")
-                await page.receive()
-            assert await drive.asked() == b"stop 127.0.0.1"
-            drive.send(HEAD | {"phase": "ended", "text": "stopped from the view", "pins": [1456, 120]})
-            drive.wire.close()
-            head, _ = await message(page)
-            assert (head["phase"], head["stopped"]) == ("ended", True)
-
-    asyncio.run(scene())
+    page, drive = await bench.page(), bench.drive()
+    drive.send()
+    await driving(page)
+    for _ in range(2):
+        await page.send_str("stop")
+        await page.receive()
+    assert await drive.asked() == b"stop 127.0.0.1"
+    drive.send(HEAD | {"phase": "ended", "text": "stopped from the view", "pins": [1456, 120]})
+    drive.wire.close()
+    head, _ = await message(page)
+    assert (head["phase"], head["stopped"]) == ("ended", True)
 
 
 NONSENSE = [b"", b"\n", b"{}", b"[]\n", b"no json\n" + JPEG, b'{"phase": "driving", "plan": 3}\n', b"\xff\xfe\n",
@@ -348,24 +331,22 @@ NONSENSE = [b"", b"\n", b"{}", b"[]\n", b"no json\n" + JPEG, b'{"phase": "drivin
             b'"plan": {"captured_s": 0, "rate_hz": 30, "actions": [[0, 1]]}}\n']  # fmt: skip
 
 
-@pytest.mark.parametrize("said", NONSENSE[1:], ids=lambda m: repr(m[:30]))
-def test_a_drive_that_talks_nonsense_ends_nothing_but_its_own_line(tmp_path, said):
+def test_a_drive_that_talks_nonsense_ends_nothing_but_its_own_line(tmp_path):
     async def scene():
         unforeseen = []
         asyncio.get_running_loop().set_exception_handler(lambda loop, context: unforeseen.append(context))
         async with Bench(tmp_path) as bench:
-            mad = bench.drive()
-            mad.wire.send(said)
-            page = await bench.page()
-            drive = bench.drive()
-            for _ in range(20):
-                drive.send(HEAD | {"frame": 77})
-                if (await message(page))[0].get("frame") == 77:
-                    break
-            else:
-                raise AssertionError("the drive after it is not shown")
-            await page.send_str("stop")
-            assert await drive.asked() == b"stop 127.0.0.1"
+            for number, said in enumerate(NONSENSE[1:]):
+                bench.drive().wire.send(said)
+                page, drive = await bench.page(), bench.drive()
+                for _ in range(20):
+                    drive.send(HEAD | {"frame": 77 + number})
+                    if (await message(page))[0].get("frame") == 77 + number:
+                        break
+                else:
+                    raise AssertionError(f"the drive after {said[:30]!r} is not shown")
+                await page.send_str("stop")
+                assert await drive.asked() == b"stop 127.0.0.1"
         gc.collect()  # a task that failed is told of when it goes
         assert not unforeseen
 
@@ -417,35 +398,29 @@ throttle: {period_us: 20000, neutral_us: 1500, forward_us: 2000, reverse_us: 100
     asyncio.run(scene())
 
 
-def test_a_stop_goes_to_every_drive_and_the_newest_is_shown(tmp_path):
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            page = await bench.page()
-            first = bench.drive()
-            first.send(HEAD | {"title": "first"})
-            assert (await driving(page))[0]["title"] == "first"
-            second = bench.drive()
-            second.send(HEAD | {"title": "second"})
-            while (await message(page))[0]["title"] != "second":
-                pass
-            first.send(HEAD | {"title": "first"})
-            second.send(HEAD | {"title": "second", "frame": 8})
-            assert (await message(page))[0]["title"] == "second"
-            await page.send_str("stop")
-            assert await first.asked() == await second.asked() == b"stop 127.0.0.1"
-
-    asyncio.run(scene())
+@on_a_bench
+async def test_a_stop_goes_to_every_drive_and_the_newest_is_shown(bench):
+    page = await bench.page()
+    first = bench.drive()
+    first.send(HEAD | {"title": "first"})
+    assert (await driving(page))[0]["title"] == "first"
+    second = bench.drive()
+    second.send(HEAD | {"title": "second"})
+    while (await message(page))[0]["title"] != "second":
+        pass
+    first.send(HEAD | {"title": "first"})
+    second.send(HEAD | {"title": "second", "frame": 8})
+    assert (await message(page))[0]["title"] == "second"
+    await page.send_str("stop")
+    assert await first.asked() == await second.asked() == b"stop 127.0.0.1"
 
 
-def test_a_camera_of_raw_pictures_is_shown_as_jpeg(tmp_path):
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            page, drive = await bench.page(), bench.drive()
-            drive.send(HEAD | {"shape": [30, 40, 3]}, bytes(30 * 40 * 3))
-            _, picture = await driving(page)
-            assert picture[:2] == b"\xff\xd8" and picture[-2:] == b"\xff\xd9"
-
-    asyncio.run(scene())
+@on_a_bench
+async def test_a_camera_of_raw_pictures_is_shown_as_jpeg(bench):
+    page, drive = await bench.page(), bench.drive()
+    drive.send(HEAD | {"shape": [30, 40, 3]}, bytes(30 * 40 * 3))
+    _, picture = await driving(page)
+    assert picture[:2] == b"\xff\xd8" and picture[-2:] == b"\xff\xd9"
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be somebody else")

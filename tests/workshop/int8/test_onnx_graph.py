@@ -8,7 +8,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from policies import TINY, MemorySample, lerobot_policy, memory_samples, smooth_frame
+from policies import TINY, MemorySample, lerobot_policy, memory_samples, saved, smooth_frame
 from torch import nn
 
 from rover_learn.channels import without_channels
@@ -61,8 +61,6 @@ def observations(config: ActConfig, count: int = 3) -> list[tuple[torch.Tensor, 
 @pytest.mark.parametrize("name", ["tiny", *(pytest.param(n, marks=pytest.mark.slow) for n in SHAPES if n != "tiny")])
 @pytest.mark.parametrize("for_int8", [False, True], ids=["linears", "columns and convolutions"])
 def test_float_policy_is_the_same(name, for_int8, tmp_path):
-    from test_act import saved
-
     saved(lerobot_policy(**SHAPES[name]), tmp_path)
     checkpoint = load_checkpoint(tmp_path)
     model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
@@ -82,6 +80,7 @@ def test_float_policy_is_the_same(name, for_int8, tmp_path):
     [
         pytest.param(Scheme(), id="static"),
         pytest.param(Scheme(kind="affine"), id="affine"),
+        pytest.param(Scheme(observer="frames", usual_pct=75, wider=(("image_project", 0.4),)), id="frames"),
         pytest.param(Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward")), id="mixed"),
     ],
 )
@@ -103,8 +102,6 @@ def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibrati
 @pytest.mark.slow
 def test_int8_policy_of_two_cameras_is_the_same(tmp_path):
     """They share a backbone's weights, but not the steps of its numbers."""
-    from test_act import saved
-
     saved(lerobot_policy(**SHAPES["two cameras, odd"]), tmp_path)
     checkpoint, rng = load_checkpoint(tmp_path), np.random.default_rng(0)
     named_sizes = dict(zip(checkpoint.config.cameras, checkpoint.config.image_sizes, strict=True))

@@ -3,6 +3,7 @@
 import functools
 import gc
 import itertools
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from policies import TINY, lerobot_policy, memory_samples, trainer_content
+from policies import TINY, lerobot_policy, memory_samples, saved, trainer_content
 
 from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE
 from rover_lib.onboard.errors import QuantizeError
@@ -20,6 +21,7 @@ from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint.contents import expected_shapes
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.choose import Chooser, float_costs_pct
@@ -47,8 +49,6 @@ def made(tiny, calibration):
     "variant", [{}, {"pre_norm": True, "n_encoder_layers": 2}, {"feedforward_activation": "gelu"}], ids=str
 )
 def test_channel_scales_are_exact_in_float(variant, tmp_path):
-    from test_act import saved
-
     saved(lerobot_policy(**(TINY | variant)), tmp_path)
     checkpoint = load_checkpoint(tmp_path)
     seen = inputs(checkpoint, 3)
@@ -328,11 +328,13 @@ def test_chooses_by_error(tiny, calibration):
     assert list(sensitivity) == act.blocks(tiny.config)
     assert all(max(e.values()) > 0 for e in sensitivity.values())  # each block alone does something
     graph = restore_observed(tiny, scheme, calibration)
-    for block, error in sensitivity.items():  # what is before a block is not run again: the same as running all of it
-        assert chooser.error(q.convert(graph, tiny.config, replace(scheme, float_blocks=()), only=[block])) == error
+    for block in list(sensitivity)[::4]:  # what is before a block is not run again: the same as running all of it
+        alone = q.convert(graph, tiny.config, replace(scheme, float_blocks=()), only=[block])
+        assert chooser.error(alone) == sensitivity[block]
     costs = float_costs_pct(tiny)
     assert 0 < sum(costs.values()) <= 100 * 3.2  # all in float, but for the head: 4.2 times the instructions
-    mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=1e-6, max_cost_pct=60)
+    few = dict(list(sensitivity.items())[::2])  # each block takes a conversion
+    mixed, steps = chooser.mixed(scheme, few, budget_pct=1e-6, max_cost_pct=60)
     errors = [max(s["steering_mae_pct"], s["throttle_mae_pct"]) for s in steps]
     assert errors == sorted(errors, reverse=True) and len(set(errors)) == len(errors) > 1
     assert mixed.mode == "mixed" and list(mixed.float_blocks) == steps[-1]["float_blocks"]
@@ -489,14 +491,26 @@ def test_the_optimizer_is_not_in_the_artifact(tiny_policy, artifacts):
     assert artifacts["static"].stat().st_size < 0.3 * artifacts["fp32"].stat().st_size
 
 
+def he_weights(config: ActConfig) -> dict[str, torch.Tensor]:
+    """Random weights under which activations keep their size, without those that only train."""
+    torch.manual_seed(0)
+    weights = {}
+    for name, shape in expected_shapes(replace(config, vae_layers=0)).items():
+        if len(shape) > 1:
+            weights[name] = torch.randn(shape) * (2 / math.prod(shape[1:])) ** 0.5
+        else:
+            weights[name] = torch.ones(shape) if name.endswith(("weight", "running_var")) else torch.zeros(shape)
+    return weights
+
+
 @pytest.mark.slow
-def test_the_users_full_size_static_artifact_is_at_most_70_mb(full_policy, tmp_path):
+def test_the_users_full_size_static_artifact_is_at_most_70_mb(tmp_path):
     """The floor is 66.4 MB, a byte per weight that acts; the optimizer and the VAE encoder are not in it.
 
     Calibrated on small frames: their size adds 0.5 MB of positions at 640x360, and no weight.
     """
-    weights = {k.removeprefix("model."): v for k, v in full_policy.state_dict().items()}
-    checkpoint = Checkpoint(Path("full"), "trainer", ActConfig(), weights, "full", {}).at_size(72, 128)
+    config = ActConfig()
+    checkpoint = Checkpoint(Path("full"), "trainer", config, he_weights(config), "full", {}).at_size(72, 128)
     samples = memory_samples(2)
     calibration = calibrate(checkpoint, samples)
     quantized = quantize(checkpoint, Scheme("static"), calibration)

@@ -2,7 +2,12 @@
 
 import functools
 import json
+import os
+import re
+import shlex
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +16,7 @@ import pyarrow
 import pytest
 import torch
 from click.testing import CliRunner
-from policies import TINY, lerobot_policy, memory_samples, smooth_frame
+from policies import TINY, lerobot_policy, memory_samples, normalised, smooth_frame
 from pyarrow import parquet
 
 from rover_lib.cli import main
@@ -38,7 +43,9 @@ def info(**changes):
         "observation.state": {"dtype": "float32", "shape": [2], "names": CAR},
         "action": {"dtype": "float32", "shape": [2], "names": CAR},
     }
-    return {"codebase_version": "v3.0", "fps": FPS, "features": features, "total_episodes": 1} | changes
+    written = {"codebase_version": "v3.0", "fps": FPS, "features": features, "total_episodes": 1}
+    written["data_path"] = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+    return written | changes
 
 
 def written(root, content):
@@ -73,7 +80,7 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
     [
         (
             info(codebase_version="v2.1"),
-            "only v3 is read; convert it once by LeRobot's own 'python -m lerobot.datasets",
+            "only v3 is read; convert it once by LeRobot's own `python -m lerobot.",
         ),
         (info(codebase_version="v4.0"), "only v3 is known here"),
         (info(codebase_version=3), "does not name a version"),
@@ -252,6 +259,31 @@ def rows(kept):
     return change
 
 
+VIDEO = "videos/observation.images.cam_front/"
+MERGED = [  # what LeRobot 0.4.0 wrote when it merged datasets: one change for each thing that is then wrong
+    ((f"{VIDEO}to_timestamp", [0.4, 1.05, 1.65]), "found 1 of 3 episodes; the part of episode 0 is not as long as it"),
+    (
+        (f"{VIDEO}from_timestamp", [0.0, 0.0, 1.05], f"{VIDEO}to_timestamp", [0.5, 0.55, 1.65]),
+        "the part of episode 1 overlaps that of episode 0",
+    ),
+    (
+        (f"{VIDEO}from_timestamp", [0.0, 0.5, 5.0], f"{VIDEO}to_timestamp", [0.5, 1.05, 5.6]),
+        "the part of episode 2 ends after the video",
+    ),
+]
+
+
+def columns(*changes):
+    """Sets whole columns of a table: name and values, one after the other."""
+
+    def change(path):
+        table = pandas.read_parquet(path)
+        table = table.assign(**dict(zip(changes[::2], changes[1::2], strict=True)))
+        table.to_parquet(path)
+
+    return change
+
+
 def column(name, value=...):
     """Sets the first row's value of a table's column, or leaves the column out."""
 
@@ -304,7 +336,13 @@ def cut(path):
         ("image", "meta/episodes/chunk-000/file-000.parquet", column("length", 10**12), "do not belong together"),
         ("image", "meta/episodes/chunk-000/file-000.parquet", column("data/chunk_index", None),
          "where the files of episode 0 lie, and what its task was, cannot be read (TypeError"),
-        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.pop("data_path")), "cannot be read (KeyError"),
+        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.pop("data_path")), "has no 'data_path'"),
+        ("image", "meta/episodes/chunk-000/file-000.parquet", column("data/file_index", 7),
+         "file-007.parquet: not there, and episode 0 is in it"),
+        *(("video", "meta/episodes/chunk-000/file-000.parquet", columns(*change), says)
+          for change, says in MERGED),
+        ("video", "videos/observation.images.cam_front/chunk-000/file-000.mp4",
+         lambda p: shutil.copy(p, p.with_name("file-009.mp4")), "file-009.mp4, which no episode uses"),
         ("image", "meta/tasks.parquet",
          lambda p: pandas.DataFrame({"number": [0]}, index=["drive"]).to_parquet(p), "cannot be read (KeyError"),
     ],
@@ -332,7 +370,65 @@ def test_one_picture_that_is_not_there_is_a_sentence(copied):
 @pytest.mark.slow
 @pytest.mark.parametrize("value", [(0.1, -0.5), (1500, 0.1)])
 def test_numbers_that_no_rover_has_are_refused(datasets, value):
-    assert "a rover's lies from" in refused(datasets(value=value))
+    says = refused(datasets(value=value))
+    assert "a rover's lies from" in says and ("reverse_us" in says) == (value == (0.1, -0.5))
+
+
+@pytest.mark.slow
+def test_lerobots_way_decides_of_which_size_its_policys_pictures_are(trained, datasets, tmp_path):
+    """A fine-tuned policy has its base's input_features, and LeRobot never resizes."""
+    smaller = shutil.copytree(trained, tmp_path / "smaller")
+    edit(
+        smaller / "config.json",
+        lambda c: c["input_features"]["observation.images.cam_front"].update(shape=[3, 36, 128]),
+    )
+    loaded, right = load(smaller, datasets()), load(trained, datasets())
+    (note,) = loaded.checkpoint.report["notes"]
+    assert note.startswith(
+        "config.json says 128x36 for cam_front, and the recordings are 128x72: LeRobot never resizes"
+    )
+    assert loaded.checkpoint.config == right.checkpoint.config and not right.checkpoint.report["notes"]
+    sample = right.recordings.samples[0]
+    assert np.array_equal(planned(loaded.checkpoint, sample), planned(right.checkpoint, sample))
+    write_lerobot(
+        tmp_path / "ours", replace(right.checkpoint.config, image_sizes=((36, 64),)), right.checkpoint.weights, {}
+    )
+    assert load(tmp_path / "ours", datasets()).checkpoint.config.image_sizes == ((36, 64),)  # squeezed on purpose
+
+
+@pytest.mark.slow
+def test_what_we_print_converts_a_dataset_of_v21(datasets, tmp_path):
+    """Made of a v3 one, as LeRobot wrote it then: a file an episode, and JSON lines."""
+    old = tmp_path / "my data"
+    table = pandas.read_parquet(datasets() / "data/chunk-000/file-000.parquet")
+    content = json.loads((datasets() / "meta/info.json").read_text())
+    stats = json.loads((datasets() / "meta/stats.json").read_text())
+    (old / "data/chunk-000").mkdir(parents=True)
+    (old / "meta").mkdir()
+    lines = {"episodes": [], "tasks": [], "episodes_stats": []}
+    for number, episode in table.groupby("episode_index"):
+        task = f"hit the {number}. balloon"
+        parquet_file = old / f"data/chunk-000/episode_{number:06d}.parquet"
+        parquet.write_table(
+            parquet.read_table(datasets() / "data/chunk-000/file-000.parquet").take(episode.index.to_numpy()),
+            parquet_file,
+        )
+        lines["episodes"].append({"episode_index": number, "tasks": [task], "length": len(episode)})
+        lines["tasks"].append({"task_index": number, "task": task})
+        lines["episodes_stats"].append({"episode_index": number, "stats": stats})
+    for name, rows_of in lines.items():
+        (old / f"meta/{name}.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows_of))
+    content |= {
+        "codebase_version": "v2.1",
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+    }
+    content |= {"total_chunks": 1, "total_videos": 0, "chunks_size": 1000, "video_path": None}
+    (old / "meta/info.json").write_text(json.dumps(content))
+    command = re.search("`(.*)`", refused(old))[1]
+    words = [sys.executable, *shlex.split(command)[1:]]
+    done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, "HF_HUB_OFFLINE": "1"})
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert [len(e.samples) for e in load_recordings(old, CHUNK).episodes] == [FRAMES, FRAMES + 1, FRAMES + 2]
 
 
 # ---- policies that were trained on one -----------------------------------------------------------------------------
@@ -341,8 +437,6 @@ def test_numbers_that_no_rover_has_are_refused(datasets, value):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A LeRobot policy of two numbers that its dataset calls [throttle, steering], with statistics of both."""
-    from test_checkpoint import normalised
-
     folder = tmp_path_factory.mktemp("trained")
     policy = lerobot_policy(**TINY)
     inner, outer, _ = normalised(policy, "MEAN_STD")
@@ -383,7 +477,10 @@ def test_a_policy_of_other_numbers_or_another_rate_is_refused(trained, tiny):
     assert tiny.recorded_as(Layout(("front",), rate_hz=30.0)) is tiny
     wheels, ours = ("left", "right"), ("steering", "throttle")
     for layout in (Layout(("front",), wheels, wheels, 30.0), Layout(("front",), wheels, ours, 30.0)):
-        with pytest.raises(CheckpointError, match=r"of steering, throttle, found recordings of state left, right and"):
+        says = (
+            "whose state is steering, throttle, found recordings whose state is left, right; if they are the same, ren"
+        )
+        with pytest.raises(CheckpointError, match=says):
             tiny.recorded_as(layout)
     twice = replace(tiny, config=replace(tiny.config, cameras=("front", "wrist")))
     with pytest.raises(CheckpointError, match="2, 2, 2, found recordings of 1, 2, 2"):

@@ -1,0 +1,208 @@
+"""The balloon world in a view: one world after the other, in a time that keeps to the clock where this machine can.
+
+    open_view(..., shown=Simulation("runs/demo/policy_static.pt"))
+
+The car's own loop drives, on a virtual clock, as in `latency`. On a busy machine the simulation's time goes slower, and
+the page says so. A real car would have to be stopped there.
+"""
+
+import asyncio
+import contextlib
+import os
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+
+from balloon_world.latency import NoLog, TimedCar, WorldPilot
+from balloon_world.world import RATE_HZ, World
+from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
+from rover_lib.onboard.car.pwm import NEUTRAL
+from rover_lib.onboard.drive.flight_log import Tick
+from rover_lib.onboard.drive.loop import Until, drive
+from rover_lib.onboard.drive.plan import Commanded, Settings
+from rover_lib.onboard.errors import DriveFault
+from rover_lib.onboard.params import params
+from rover_lib.onboard.policy.load import Policy, load_policy
+
+if TYPE_CHECKING:
+    from rover_lib.onboard.view.server import View
+
+PLAN_S = 0.1  # what a plan takes, in the simulation's time: about what a Pi may need for one of the real car's size
+PICTURE_S = 1 / 15  # between two pictures, by the clock
+HOLD_S = 1.5  # between two worlds
+PACE_S = 2.0  # the pace is that of the last seconds
+SLOW = 0.9  # of the clock; the page speaks of a slower pace
+MODES = {"static": "INT8", "mixed": "mixed INT8", "fp32": "FP32"}  # that can be chosen on the page, as it calls them
+SAID = {"hit": "hit!", "left": "missed it", "timeout": "out of time", "stopped": "stopped"}
+
+Post = Callable[[dict[str, Any], bytes], object]  # a message as in feed.py, and a JPEG
+
+
+class Simulation:
+    """Drives an artifact through balloon worlds, for a view; what was chosen on its page arrives by `ask`.
+
+    artifact: as policy_<mode>; the run's other modes, which lie beside it, can be chosen on the page. seed: of the
+    first world. Raises what load_policy() raises.
+    """
+
+    def __init__(self, artifact: Path | str, seed: int = 10_000):
+        artifact = Path(artifact)
+        suffix = ONNX_SUFFIX if artifact.name.endswith(ONNX_SUFFIX) else artifact.suffix
+        beside = {mode: artifact.with_name(f"policy_{mode}{suffix}") for mode in MODES}
+        self._paths = {MODES[mode]: path for mode, path in beside.items() if path.is_file()}
+        if artifact not in self._paths.values():
+            self._paths = {artifact.name: artifact}
+        self._wanted = next(name for name, path in self._paths.items() if path == artifact)
+        self._policies: dict[str, Policy] = {self._wanted: load_policy(artifact)}
+        self.car = self._policies[self._wanted].car
+        self._results = {name: [0, 0] for name in self._paths}  # hits, worlds
+        self._seed, self._artifact = seed, artifact
+        if (torch := sys.modules.get("torch")) and os.getloadavg()[0] > (os.cpu_count() or 1):
+            torch.set_num_threads(1)  # beside other busy programs, threads would mostly wait for each other
+        self._closing, self._next, self._held = threading.Event(), threading.Event(), False
+        self._driving: PacedCar | None = None
+
+    async def show(self, view: "View") -> None:
+        """Drive in a thread until this is cancelled. While the view has not taken a picture, no other one follows."""
+        loop, taken = asyncio.get_running_loop(), threading.Event()
+        taken.set()
+
+        def give(head: dict[str, Any], picture: bytes) -> None:
+            view.show(head, picture)
+            taken.set()
+
+        def post(head: dict[str, Any], picture: bytes) -> None:
+            if taken.is_set() and not self._closing.is_set():
+                taken.clear()
+                with contextlib.suppress(RuntimeError):  # the view has just ended
+                    loop.call_soon_threadsafe(give, head, picture)
+
+        try:
+            await asyncio.to_thread(self.run, post)
+        finally:
+            self._closing.set()
+            self.ask("stop")
+
+    def ask(self, what: str) -> None:
+        """Do what the page asks for: "stop", "next", or "drive <name>" of another mode. Anything else is ignored."""
+        name = what.removeprefix("drive ")
+        if what != "stop" and what != "next" and name not in self._paths:
+            return
+        self._held = what == "stop"
+        if name in self._paths:
+            self._wanted = name
+        if self._driving:
+            self._seed += what == "next" and not self._driving.world.done  # another policy gets the same world
+            self._driving.stop.set()
+        if what != "stop":
+            self._next.set()
+
+    def run(self, post: Post, worlds: int | None = None) -> None:
+        """Drive through `worlds` worlds, None: until the view has ended. post: takes each picture."""
+        settings, driven = Settings.of(params()["drive"]), 0
+        while not self._closing.is_set() and driven != worlds:
+            name = self._wanted
+            if name not in self._policies:
+                self._policies[name] = load_policy(self._paths[name])
+            world = World(self._seed, left=self.car.left)  # as in `trial`: older recordings turned left
+            car = self._driving = PacedCar(world, self._policies[name], lambda car: post(*self._seen(car)))
+            self._next.clear()
+            outcome = car.drive(settings)
+            driven += 1
+            if car.world.done or not car.stop.is_set():  # what somebody interrupted counts for nobody
+                self._results[name][0] += car.world.hit
+                self._results[name][1] += 1
+                self._seed += 1
+            self._wait(car, outcome, post)
+
+    def _wait(self, car: "PacedCar", outcome: str, post: Post) -> None:
+        """Show how a drive ended, until the next one is asked for; unless somebody stopped it, for a moment only."""
+        end_s = time.monotonic() + HOLD_S
+        while not self._closing.is_set() and (self._held or time.monotonic() < end_s):
+            head, picture = self._seen(car)
+            text = "stopped here; nobody drives" if self._held else SAID[outcome]
+            neutral = self.car.pwm.pulses(*NEUTRAL)
+            pins = [neutral.steering_us, neutral.throttle_us]
+            post(head | {"phase": "ended", "text": text, "tick": None, "pins": pins, "who": "S"}, picture)
+            if self._next.wait(0.3):
+                return
+
+    def _seen(self, car: "PacedCar") -> tuple[dict[str, Any], bytes]:
+        """What the page shows of a car now: a message as in feed.py, with `world` for what only a simulation knows."""
+        world, row, plan = car.world, car.log.row, car.newest()
+        frame, pace = world.render(), car.pace()
+        slow = f"this machine is busy: time in the simulation runs at {pace:.0%} of the clock" if pace < SLOW else ""
+        head: dict[str, Any] = {
+            "phase": "driving", "text": slow, "title": f"{self._artifact.parent.name}: {self._wanted}, balloon world",
+            "sent_s": car.clock(), "missing": "", "who": "A", "why": "simulated", "events": [], "machine": {},
+            "missed": 0, "hz": RATE_HZ, "late_most_ms": 0.0, "tick": row and row._asdict(),
+            "pins": row and [row.steering_us, row.throttle_us], "frame": round(car.clock() * RATE_HZ),
+            "captured_s": time.monotonic(), "size": [frame.shape[1], frame.shape[0]],
+        }  # fmt: skip
+        if plan:
+            rate_hz = car.policy.rate_hz
+            head["plan"] = {"captured_s": plan.captured_s, "rate_hz": rate_hz, "actions": plan.actions.tolist()}
+        head["world"] = {
+            "seed": world.seed,
+            "results": self._results,
+            "drives": self._wanted,
+            "pace": round(pace, 2),
+            "path": [[round(s.x_m, 2), round(s.y_m, 2)] for s in (*world.trajectory[::3], world.state)],
+            "balloon": [world.balloon.x_m, world.balloon.y_m],
+        }
+        return head, cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+
+
+class _LastTick(NoLog):
+    row: Tick | None = None
+
+    def tick(self, row: Any) -> None:
+        self.row = row
+
+
+class PacedCar(TimedCar):
+    """A car in a world whose time goes as fast as the clock, or slower. seen: called for each picture to be shown."""
+
+    def __init__(self, world: World, policy: Any, seen: Callable[["PacedCar"], object]):
+        self.policy, self.log, self._seen = policy, _LastTick(), seen
+        self._due_s = self._shown_s = time.monotonic()
+        self._times = deque([(self._due_s, 0.0)], maxlen=round(PACE_S * RATE_HZ))
+        self._commanded = Commanded()
+        super().__init__(world, policy, PLAN_S, self._commanded)
+
+    def drive(self, settings: Settings) -> str:
+        """Drive until the world ends or `stop` is set; return the outcome."""
+        pilot = WorldPilot(self, self._commanded, settings, self.policy.rate_hz, None)
+        try:
+            drive(
+                pilot, None, self.log, rate_hz=RATE_HZ, until=Until(stop=self.stop), clock=self.clock, sleep=self.sleep
+            )
+        except DriveFault as fault:
+            if fault.__cause__:
+                raise fault.__cause__ from None
+        return self.world.outcome or "stopped"
+
+    def sleep(self, seconds: float) -> None:
+        super().sleep(seconds)
+        self._due_s += seconds
+        now_s = time.monotonic()
+        if now_s < self._due_s:
+            time.sleep(self._due_s - now_s)
+        else:
+            self._due_s = now_s  # what this machine could not do in time is not caught up: time has been slower
+        self._times.append((time.monotonic(), self.clock()))
+        # every second tick at most: where time is slow already, pictures in between would make it slower still
+        if self._times[-1][0] - self._shown_s >= PICTURE_S and round(self.clock() * RATE_HZ) % 2 == 0:
+            self._shown_s = self._times[-1][0]
+            self._seen(self)
+
+    def pace(self) -> float:
+        """How fast the simulation's time went in the last seconds, against the clock."""
+        (began_s, first_s), (now_s, last_s) = self._times[0], self._times[-1]
+        return min((last_s - first_s) / (now_s - began_s), 1.0) if now_s > began_s and last_s > first_s else 1.0

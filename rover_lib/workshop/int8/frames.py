@@ -1,0 +1,94 @@
+"""Odd frames: those that a policy answers far more strongly than the others, so that one scale hardly serves both.
+
+    extremes = calibration.frames                # {place: (frames, 2)}, what each tensor's least and largest value was
+    times = oddness(extremes)                    # {place: (frames,)}, of each frame against the median frame
+    low, high = range_over(extremes[place], usual(extremes, 95), wider=0.25)
+
+A place is a tensor of the graph, named after the layer that gives it, or after the layer that takes it.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rover_lib.workshop.act import block_of
+from rover_lib.workshop.recordings.episodes import Sample
+from rover_lib.workshop.recordings.samples import pick_evenly
+
+Extremes = Mapping[str, Tensor]
+Frame = tuple[str, int]  # episode, row
+ODD = 10.0  # times the median frame's largest value; frames of policies that keep their gates with min-max stay below
+ODD_FRAMES = 8  # at most this many odd frames of the calibration take part in choosing
+
+
+def oddness(extremes: Extremes) -> dict[str, Tensor]:
+    """How many times larger each frame's largest magnitude is than the median frame's, at each place: (frames,)."""
+    largest = {place: seen.abs().amax(1) for place, seen in extremes.items()}
+    return {place: x / x.median().clamp(min=1e-12) for place, x in largest.items()}
+
+
+def oddest(extremes: Extremes) -> Tensor:
+    """(frames,) of each frame's largest oddness at any place; empty for a calibration that kept no frames."""
+    times = list(oddness(extremes).values())
+    return torch.stack(times).amax(0) if times else torch.empty(0)
+
+
+def usual(extremes: Extremes, usual_pct: float) -> Tensor:
+    """(frames,) bool: all frames but the oddest, of which this many percent are left."""
+    times = oddest(extremes)
+    return times <= times.quantile(usual_pct / 100)
+
+
+def range_over(extremes: Tensor, kept: Tensor, wider: float) -> tuple[float, float]:
+    """The range of the frames that are kept, widened by a share of the way to that of all frames, in logarithms.
+
+    extremes: (frames, 2). kept: (frames,) bool. wider: in [0, 1]. Returns low <= 0 and high >= 0.
+    """
+    ends = []
+    for few, every in zip(_reach(extremes[kept]), _reach(extremes), strict=True):
+        ends.append(max(few, 1e-6) ** (1 - wider) * every**wider if every else 0.0)
+    return -ends[0], ends[1]
+
+
+def _reach(extremes: Tensor) -> tuple[float, float]:
+    """How far the values of (frames, 2) least and largest ones reach below and above 0."""
+    return -min(extremes[:, 0].min().item(), 0.0), max(extremes[:, 1].max().item(), 0.0)
+
+
+def odd_samples(extremes: Extremes, seen: Sequence[Frame], samples: Sequence[Sample]) -> tuple[Sample, ...]:
+    """Those of the samples on which calibration met odd frames, or some of them, evenly chosen by their oddness.
+
+    seen: what frame each row of `extremes` is of.
+    """
+    times = oddest(extremes).tolist()
+    odd = {frame: t for frame, t in zip(seen, times, strict=True) if t > ODD}
+    found = [s for s in samples if (s.episode, s.row) in odd]
+    return pick_evenly(sorted(found, key=lambda s: odd[s.episode, s.row]), ODD_FRAMES)
+
+
+def odd_share(extremes: Extremes) -> float:
+    """The share of the frames that are odd."""
+    times = oddest(extremes)
+    return float((times > ODD).float().mean()) if len(times) else 0.0
+
+
+def describe_odd(extremes: Extremes, seen: Sequence[Frame]) -> dict[str, Any]:
+    """What JSON says of the odd frames: their share, the block that answers most, how many times more, and which they
+    are; empty if there are none. times: the median of the odd frames' oddness there.
+    """
+    odd = oddest(extremes) > ODD
+    if not len(odd) or not odd.any():
+        return {}
+    at = {place: times[odd].median().item() for place, times in oddness(extremes).items()}
+    place = max(at, key=lambda p: at[p])
+    frames = [frame for frame, is_odd in zip(seen, odd.tolist(), strict=True) if is_odd]
+    return {
+        "share_pct": 100 * odd_share(extremes),
+        "block": block_of(place),
+        "times": at[place],
+        "episodes": dict(Counter(episode for episode, _ in frames).most_common()),
+        "rows": [row for _, row in frames],
+    }

@@ -1,0 +1,167 @@
+"""Donkeycar tubs, of all ages and with all their faults; written here in donkeycar's format."""
+
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rover_lib.cli import main
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.kinds import kinds_of
+from rover_lib.workshop.recordings.export_dataset import export_dataset
+from rover_lib.workshop.recordings.samples import frame_rate_hz
+from rover_lib.workshop.recordings.tub import read_tub
+
+LEFT = Car.of(
+    {
+        "name": "reverses, and turns left",
+        "steering": {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1000},
+        "throttle": {"period_us": 20000, "neutral_us": 1500, "forward_us": 2000, "reverse_us": 1000},
+    }
+)
+
+
+def angle(i):
+    return round(0.8 * math.sin(i / 5), 4)
+
+
+def throttle(i):
+    return round(0.3 * math.cos(i / 7), 4)
+
+
+def records(count, session="21-08-21_0", first=0, start_ms=1_629_500_000_000):
+    return [
+        {
+            "_index": i, "_session_id": session, "_timestamp_ms": start_ms + 50 * i,
+            "cam/image_array": f"{i}_cam_image_array_.jpg", "user/angle": angle(i), "user/mode": "user",
+            "user/throttle": throttle(i),
+        }
+        for i in range(first, first + count)
+    ]  # fmt: skip
+
+
+def picture(folder, row, number):
+    folder.mkdir(exist_ok=True)
+    rng = np.random.default_rng(number)
+    frame = cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (160, 120))
+    cv2.imwrite(str(folder / row["cam/image_array"]), frame)
+
+
+def tub(root, rows, deleted=(), per_catalog=30, lines=lambda rows: [json.dumps(row) for row in rows]):
+    """A tub of donkeycar 4 on."""
+    root.mkdir(parents=True)
+    paths = []
+    for k, at in enumerate(range(0, len(rows), per_catalog)):
+        paths.append(f"catalog_{k}.catalog")
+        (root / paths[-1]).write_text("\n".join(lines(rows[at : at + per_catalog])) + "\n")
+        (root / f"catalog_{k}.catalog_manifest").write_text("{}")
+    for row in rows:
+        picture(root / "images", row, row["_index"])
+    last = {"paths": paths, "current_index": len(rows), "max_len": per_catalog, "deleted_indexes": list(deleted)}
+    head = [["cam/image_array", "user/angle", "user/throttle", "user/mode"], ["image_array", "float", "float", "str"]]
+    (root / "manifest.json").write_text("\n".join(map(json.dumps, [*head, {}, {"created_at": 1.0}, last])) + "\n")
+    return root
+
+
+def old_tub(root, count):
+    """A tub of donkeycar 3: a file for each picture, and no times."""
+    root.mkdir()
+    for i, row in enumerate(records(count)):
+        kept = {k: v for k, v in row.items() if not k.startswith("_")}
+        (root / f"record_{i}.json").write_text(json.dumps(kept))
+        picture(root, row, i)
+    (root / "meta.json").write_text("{}")
+    return root
+
+
+def kinds(recordings):
+    return {fault.kind: fault.count for fault in recordings.faults}
+
+
+@pytest.mark.parametrize(("car", "side"), [(Car(), 1), (LEFT, -1)], ids=["ours", "left, with reverse"])
+@pytest.mark.parametrize(
+    "make", [lambda path: tub(path, records(70)), lambda path: old_tub(path, 70)], ids=["v2", "v1"]
+)
+def test_a_whole_tub(tmp_path, make, car, side):
+    recordings = read_tub(make(tmp_path / "tub"), car)
+    (episode,) = recordings.episodes
+    assert len(episode.samples) == 70 and frame_rate_hz(episode.samples) == pytest.approx(20)
+    low = -1 if car.reverses else 0
+    for i, s in enumerate(episode.samples):
+        following = min(i + 1, 69)
+        expected = [[side * angle(k), max(throttle(k), low)] for k in (i, following)]
+        assert s.chunk == pytest.approx(np.array(expected), abs=1e-6) and s.is_pad.tolist() == [False, i == 69]
+        before = [side * angle(i - 1), max(throttle(i - 1), low)] if i else [0, 0]
+        assert s.state == pytest.approx(np.array(before), abs=1e-6) and s.car == car
+    stopped = sum(throttle(i) < 0 for i in range(70))
+    assert kinds(recordings) == ({} if car.reverses else {"reverse_on_a_car_without": stopped})
+
+
+def test_an_episode_ends_where_records_are_missing(tmp_path):
+    rows = records(40) + records(30, "21-08-21_1", 40) + records(30, "21-08-21_1", 70, 1_629_500_009_000)
+    rows[5]["user/mode"] = "pilot"
+    recordings = read_tub(tub(tmp_path / "tub", rows, deleted=[20, 21]), LEFT)
+    starts = {e.id: (e.samples[0].row, len(e.samples)) for e in recordings.episodes}
+    assert starts == {
+        "21-08-21_0 from 0": (0, 5),
+        "21-08-21_0 from 6": (1, 13),
+        "21-08-21_0 from 22": (1, 17),
+        "21-08-21_1 from 40": (0, 30),
+        "21-08-21_1 from 70": (1, 29),
+    }
+    expected = {"deleted_record": 2, "a_pilot_drove": 1, "records_missing": 2, "hole_in_time": 1}
+    assert kinds(recordings) == expected
+    assert all(fault.handled == "left out" for fault in recordings.faults)
+
+
+def test_what_is_broken_is_counted(tmp_path):
+    def lines(rows):
+        texts = [json.dumps(row) for row in rows]
+        texts[3:8] = ["{", "[1]", '{"_index": 5}', texts[6].replace('"user/angle": ', '"user/angle": 7'), "\0\0"]
+        return texts
+
+    root = tub(tmp_path / "tub", records(40), per_catalog=40, lines=lines)
+    (root / "images" / "20_cam_image_array_.jpg").unlink()
+    (root / "images" / "21_cam_image_array_.jpg").write_bytes(b"\xff\xd8 cut")
+    found = kinds(read_tub(root, LEFT))
+    assert found == {"broken_record": 5, "records_missing": 1, "frame_missing": 1, "broken_jpeg": 1}
+    (root / "catalog_0.catalog").write_text("{\n")
+    with pytest.raises(EpisodeError, match=r"no usable record in it \(broken_record 1 times"):
+        read_tub(root, LEFT)
+    (root / "catalog_0.catalog").unlink()
+    with pytest.raises(EpisodeError, match="catalog_missing"):
+        read_tub(root, LEFT)
+    (root / "manifest.json").write_text('{"paths": "all"}\n')
+    with pytest.raises(EpisodeError, match="does not say which catalogs"):
+        read_tub(root, LEFT)
+    (root / "manifest.json").unlink()
+    with pytest.raises(EpisodeError, match="no donkeycar tub"):
+        read_tub(root, LEFT)
+
+
+@pytest.mark.slow
+def test_what_is_imported_has_the_tubs_pictures_and_actions(tmp_path):
+    from rover_lib.workshop.recordings.episodes import load_recordings
+
+    root = tub(tmp_path / "tub", records(50), deleted=[25])
+    recordings = read_tub(root, LEFT)
+    export_dataset(recordings, tmp_path / "dataset")
+    again = load_recordings(tmp_path / "dataset", chunk=2)
+    assert again.layout.rate_hz == 20 and again.samples[0].car.drives_like(LEFT)
+    assert len(again.samples) == len(recordings.samples) == 48
+    for ours, theirs in zip(recordings.samples, again.samples, strict=True):
+        assert (ours.frame_bgr() == theirs.frame_bgr()).all()
+        assert (ours.state == theirs.state).all() and (ours.chunk[0] == theirs.chunk[0]).all()
+
+
+def test_every_command_calls_it_a_tub(tmp_path):
+    roots = tub(tmp_path / "new", records(3)), old_tub(tmp_path / "old", 3)
+    for root in roots:
+        assert kinds_of(root) == ("tub",)
+        for command in (["inspect", root], ["export-dataset", root, tmp_path / "out"]):
+            result = CliRunner().invoke(main, [str(word) for word in command])
+            assert result.exit_code == 1 and "a donkeycar tub" in result.output
