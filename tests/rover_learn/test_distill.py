@@ -397,7 +397,7 @@ def test_what_cannot_be_taught_is_refused(teacher, episodes, tmp_path, options, 
 )
 def test_steps_are_shared_by_the_phases_that_it_learns_in(shape, qat, phases):
     short = DistillRecipe.of(params(), steps=1000, phases=distill_module.phases_of(shape, qat))
-    counts = {phase: getattr(short, f"{phase}_steps") for phase in distill_module.PHASES}
+    counts = {phase: getattr(short, f"{phase}_steps") for phase in DistillRecipe.PHASES}
     assert {phase for phase, steps in counts.items() if steps} == phases
     assert abs(sum(counts.values()) - 1000) <= len(phases)
 
