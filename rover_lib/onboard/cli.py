@@ -4,6 +4,7 @@ It is thin: it parses arguments, calls the library and prints.
 """
 
 import contextlib
+import functools
 import json
 import os
 import platform
@@ -167,11 +168,9 @@ def main(debug: bool) -> None:
     """Drive a car with a learned policy. These commands work on the rover; on a workstation, `rover` has more."""
 
 
-def drive_options(command: Callable) -> Callable:
-    """Add the options of driving, on the rover and in the balloon world."""
-    for option in reversed(DRIVE_OPTIONS):
-        command = option(command)
-    return command
+def with_options(*options: Callable) -> Callable[[Callable], Callable]:
+    """Make one decorator of several options that more than one command has."""
+    return lambda command: functools.reduce(lambda inner, option: option(inner), reversed(options), command)
 
 
 def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
@@ -181,7 +180,7 @@ def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
     return file
 
 
-DRIVE_OPTIONS = (
+drive_options = with_options(  # on the rover and in the balloon world
     click.argument("artifact", type=ARTIFACT, required=False),
     CAMERA,
     PORT,
@@ -674,14 +673,7 @@ def status(releases: Any, as_json: bool) -> None:
         raise RoverError(report["trouble"])
 
 
-def view_options(command: Callable) -> Callable:
-    """Add the options of a view, on the rover and on a workstation."""
-    for option in reversed(VIEW_OPTIONS):
-        command = option(command)
-    return command
-
-
-VIEW_OPTIONS = (
+view_options = with_options(  # on the rover and on a workstation
     click.option(
         "--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="Port of the page; 0: any."
     ),
