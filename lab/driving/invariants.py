@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.driving.virtual import HELD, LIVE, Hand, Seen
+from lab.driving.virtual import HELD, LIVE, Asked, Hand, Seen
 
 # What firmware/README.md and params.yml promise, with numbers that are written here anew.
 RESTING_US = 124  # a throttle pulse up to this moves no car
@@ -63,9 +63,8 @@ class Run:
         for start, end in seen.pauses:
             paused[start:end] = True
         self.clean = ~self.sick & ~_for_any(paused, STOP_MS + 20)
-        self.receiver = {
-            pin: _each_ms(seen.hands, n, lambda h, i=i: h.pulses()[i]) for i, pin in enumerate(("steering", "throttle"))
-        }
+        sent = [[(ms, hand.pulses()[channel]) for ms, hand in seen.hands] for channel in (0, 1)]
+        self.receiver = {pin: _each_ms(sent[i], n, int) for i, pin in enumerate(("steering", "throttle"))}
         self.live = _each_ms(seen.hands, n, lambda h: h.receiver == LIVE)
         self.stick = {
             "steering": _each_ms(seen.hands, n, lambda h: h.sticks[0]),
@@ -198,7 +197,8 @@ def _armed_by_people(run: Run) -> str | None:
     The gesture: the steering stick at both sides within three seconds, then let go for one, without any throttle.
     """
     lost = _for_ms(run.signals == 0, 130)[130:] & _for_ms(run.signals == 1, 130)[:-130]  # gone after it was there
-    off = run.receiver["steering"] - NEUTRAL_US["steering"]
+    steering = run.receiver["steering"]
+    off = np.where(steering > 0, steering - NEUTRAL_US["steering"], 0)
     throttle = run.receiver["throttle"]
     off_rest = _for_ms((throttle > 0) & (np.abs(throttle - NEUTRAL_US["throttle"]) > 32), GLIMPSE_MS)
     used = 0
@@ -275,7 +275,7 @@ def _as_planned(run: Run) -> str | None:
         fresh[p.at_ms : p.at_ms + 200] = True
     well = run.clean & _for_ms(fresh, PLANNED_MS) & ~young & ~_for_any(young, PLANNED_MS)
     most_us = NEUTRAL_US["throttle"] + LIMIT * PER_UNIT_US["throttle"] + 1  # on the pins, the firmware's cap hides it
-    if over := [c for c in run.seen.commands if c.planned and c.throttle_us > most_us]:
+    if over := [c for c in run.seen.commands if c.throttle_us > most_us and not run.sick[c.at_ms]]:
         return f"the host asks for throttle {over[0].throttle_us} us at {over[0].at_ms} ms"
     for i, (pin, neutral_us) in enumerate(NEUTRAL_US.items()):
         meant = [(p.at_ms, neutral_us + PER_UNIT_US[pin] * (min(p[2], LIMIT) if i else p[1])) for p in good]
@@ -306,7 +306,8 @@ def _bad_ends(run: Run) -> str | None:
 
 def _answered(run: Run) -> str | None:
     """A drive that has had no answer for 150 ms sends nothing more."""
-    heard, waiting, at = run.seen.heard, deque(), 0
+    heard, at = run.seen.heard, 0
+    waiting: deque[Asked] = deque()
     for command in run.seen.commands:
         while at < len(heard) and heard[at][0] <= command.at_ms:
             while waiting and (heard[at][1] - waiting[0].sequence) % 2**32 < 2**31:
@@ -360,6 +361,9 @@ def _told(run: Run) -> str | None:
             continue  # the answer to arming was lost, so no drive began, and the firmware stopped without a command
         for begin, end, words in seen.drives:
             late = end - left > ENDED_MS + seen.paused_ms
-            if begin <= left < end and late and words is not None:  # if it is None, the next start tells of it
+            drove = any(begin <= armed <= left for armed in run.armed)  # and did not only wait for a request
+            if (
+                begin <= left < end and drove and late and words is not None
+            ):  # if it is None, the next start tells of it
                 return f"stopped at {left} ms, and the drive ended at {end}"
     return None

@@ -408,8 +408,8 @@ KEPT: dict[str, tuple[Story, str]] = {  # stories that once broke an invariant, 
         "has not answered",
     ),
     "asked for, and then the process is stopped": (
-        Story((H(2000, "the process is stopped", for_ms=2300),), service=True),
-        "before a human armed",
+        Story((H(2110, "the process is stopped", for_ms=2300),), service=True),
+        "before a human armed|said nothing",
     ),
     "asked for, and then the machine is suspended": (
         Story((H(2110, "the machine is suspended", for_ms=2300),), service=True),

@@ -349,6 +349,7 @@ class World:
         self.seen.hands.append((self.now_ms, hand))
         wires = (self.down, self.up)
         sick = any(w.latency_ms > 1 or w.lost_pct or w.garbled_pct for w in wires)
+        sick |= bool(self.lens.late_ms or self.mind.latency_ms > LATENCY_MS)  # then the throttle fades
         self.seen.sick.append((self.now_ms, bool(sick or self.stuck or self.unplugged or self.mad_us)))
         if self.board:
             steering_us, throttle_us = hand.pulses()

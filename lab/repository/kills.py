@@ -54,6 +54,8 @@ def _check_recording(inputs: Path, folder: Path, count: int) -> str:
         for part in find_killed(folder):
             finish_killed(part)
     except EpisodeError as error:
+        for part in find_killed(folder):  # as its sentence says
+            shutil.rmtree(part)
         return "" if count <= 1 else f"{count} rows were written: {error}"
     if not (folder / "episode_1").exists():
         return "" if not count else f"{count} rows were written, and there is no episode"

@@ -299,8 +299,16 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **o
     from rover_lib.onboard.recording.recorder import record_episodes
 
     if finish:
-        finished = [finish_killed(part) for part in find_killed(out_dir)]
-        return click.echo("\n".join(f"finished: {path}" for path in finished) or f"{out_dir}: nothing to finish")
+        failed = False
+        for part in (parts := find_killed(out_dir)):
+            try:
+                click.echo(f"finished: {finish_killed(part) or 'nothing, it was killed before its first row'}")
+            except RoverError as error:  # the others are finished all the same
+                failed = True
+                click.echo(f"rover: {error}", err=True)
+        if not parts:
+            click.echo(f"{out_dir}: nothing to finish")
+        ctx.exit(1 if failed else 0)
     fault = None
     for report in record_episodes(
         folder=out_dir, rate_hz=hz, status=sys.stderr, notify=lambda text: click.echo(text, err=True), **options

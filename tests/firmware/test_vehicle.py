@@ -144,6 +144,14 @@ def test_a_stick_that_is_still_moving_is_not_let_go(board):
     assert board.status.state is State.AUTONOMOUS
 
 
+def test_a_stopped_car_is_at_neutral_whatever_the_resting_sticks_say(armed):
+    armed.drive(1600, 200, 200)
+    armed.run(300)
+    armed.sticks = [1490, 140]  # not moved far enough for a takeover
+    assert set(armed.run(300)) == {NEUTRAL}
+    assert armed.status.state is State.STOPPED
+
+
 def drive_by_hand(board, steering_us, throttle_us, ms):
     board.sticks = [steering_us, throttle_us]
     board.run(ms)

@@ -259,8 +259,9 @@ class EpisodeWriter:
         self._extra = dict.fromkeys(name for row in controls for name in row if name not in known)
         times = [row["system_timestamp"] for row in controls] + [row["timestamp"] for row in frames]
         self.controls, self.frames, self._first_s, self._last_s = len(controls), len(frames), min(times), max(times)
-        height, width = cv2.imread(str(part / frames[0]["image_path"])).shape[:2]
-        self.resolution = width, height
+        first = cv2.imread(str(part / frames[0]["image_path"]))
+        if first is not None:
+            self.resolution = first.shape[1], first.shape[0]
         self.metadata["fault"] = "the program that recorded it was killed"
 
     def _append(self, kind: str, row: dict[str, Any], t_s: float) -> None:
@@ -385,10 +386,11 @@ def _is_recording(part: Path) -> bool:
     return False
 
 
-def finish_killed(part: Path) -> Path:
+def finish_killed(part: Path) -> Path | None:
     """Make an episode of what a killed recording has left, and return its folder.
 
-    A row or a picture that was cut is left out. Raises EpisodeError, and changes nothing, if there is no usable row.
+    A row or a picture that was cut is left out. A recording that was killed before its first row is removed, and None
+    returned. Raises EpisodeError, and changes nothing, if there are no controls or no pictures.
     """
     folder = part.with_name(part.name.removeprefix(".").removesuffix(".part"))
     if _is_recording(part):
@@ -404,6 +406,8 @@ def finish_killed(part: Path) -> Path:
     if all(path.is_file() for path in rows.values()):  # else all was written already, and only the rename is missing
         kept = {kind: list(_whole_rows(path)) for kind, path in rows.items()}
         kept["frame"] = [row for row in kept["frame"] if _is_whole_picture(part / str(row.get("image_path")))]
+        if not kept["control"] and not kept["frame"]:
+            return shutil.rmtree(part)
         if not kept["control"] or not kept["frame"]:
             raise EpisodeError(f"{part}: nothing usable was recorded", remedy="remove it")
         for kind, path in rows.items():
@@ -412,7 +416,7 @@ def finish_killed(part: Path) -> Path:
         writer._take(part, kept["control"], kept["frame"])
         writer._write(part)
     elif not (part / "episode_data.json").is_file():
-        raise EpisodeError(f"{part}: nothing usable was recorded", remedy="remove it")
+        return shutil.rmtree(part)
     part.rename(folder)
     return folder
 

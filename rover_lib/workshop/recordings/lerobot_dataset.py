@@ -59,7 +59,7 @@ TEMPLATES = {"data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video
 # What a small file may claim to hold: frames for which there are bytes, and numbers and pixels that fit in memory.
 FRAMES_FREE, FRAME_BYTES = 20_000, 20
 MOST_VALUES, MOST_PIXELS = 20_000_000, 20_000_000
-UNPACKED_FREE, UNPACKED_TIMES = 100_000_000, 4
+UNPACKED_FREE, PICTURES_FREE, UNPACKED_TIMES = 100_000_000, 1_000_000, 4
 COPY_AGAIN = "copy the whole dataset again"
 UNEVEN = 0.1  # the time between two frames may differ by this share
 
@@ -388,6 +388,10 @@ def _check_files(root: Path, info: Mapping[str, Any]) -> None:
         rows += footer.num_rows
         values += sum(column.num_values for column in columns)
         unpacked += sum(column.total_uncompressed_size for column in columns)
+        pictures = (column for column in columns if column.physical_type == "BYTE_ARRAY")
+        for column in pictures:  # which are compressed already; one that is packed once may be there in every row
+            if column.total_uncompressed_size > PICTURES_FREE + UNPACKED_TIMES * column.total_compressed_size:
+                raise EpisodeError(f"{path}: its {quote(column.path_in_schema)} unpacks to far more than its size")
     most = FRAMES_FREE + size // FRAME_BYTES, MOST_VALUES, UNPACKED_FREE + UNPACKED_TIMES * size
     for what, found, limit in zip(("rows", "values", "bytes"), (rows, values, unpacked), most, strict=True):
         if found > limit:

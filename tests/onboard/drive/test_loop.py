@@ -260,6 +260,12 @@ def test_ends_as_asked(link, clock):
     assert (report.ticks, report.ended, link.said[-1]) == (7, "told to stop", "neutral")
 
 
+def test_whoever_may_end_it_is_asked_at_each_tick(link, clock):
+    asked = iter([None] * 4 + ["stopped from the view"])
+    report = go(Always(), link, clock, until=Until(over=lambda: next(asked)))
+    assert (report.ticks, report.ended, link.said[-1]) == (4, "stopped from the view", "neutral")
+
+
 def test_told_to_stop_before_it_began(link, clock):
     stop = threading.Event()
     stop.set()

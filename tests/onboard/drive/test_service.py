@@ -209,6 +209,21 @@ def test_one_request_is_one_attempt(systemd):
     assert any("ask anew" in answer["text"] or "not ready" in answer["text"] for answer in answers)
 
 
+def test_nobody_can_ask_for_the_car_while_it_drives(systemd):
+    """Such a request would arm it again as soon as that drive ends."""
+    asked = []
+
+    def ask() -> None:
+        ticket = s.ask_service(ask="state")["ticket"]
+        asked.append(s.ask_service(ask="arm", model="ab12", ticket=ticket)["armed"])
+
+    with served() as service:
+        thread = beside(systemd, ask)
+        assert service.wait_for_human(armed) == "telemetry"
+        thread.join()
+        assert asked == [True] and s.ask_service(ask="state")["ticket"] == ""
+
+
 @pytest.mark.parametrize("old", [{"asked_s": -1e9}, {"asked_s": math.nan}, {}])
 def test_an_operator_who_asked_long_ago_is_asked_again(systemd, monkeypatch, old):
     """The camera was slow, or this process was stopped: the car must not set off when nobody expects it any more."""
