@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,13 @@ def main(debug: bool) -> None:
     """Prove what the rover project claims, with an emulated Arduino, faults, counted instructions and emulated Pis."""
     # Some of it needs root, and loads only artifacts that were made here.
     os.environ.setdefault(AS_ROOT, "1")
+
+
+def _end(ctx: click.Context, wrong: Sequence[object]) -> None:
+    """Say what is not as expected, and end the command with exit code 1 if that is anything."""
+    for sentence in wrong:
+        click.echo(f"rover: {sentence}", err=True)
+    ctx.exit(1 if wrong else 0)
 
 
 @main.command()
@@ -172,9 +180,7 @@ def faults(
     if output:
         outcome.write(output)
     show(outcome.summary, False)
-    for sentence in outcome.wrong:
-        click.echo(f"rover: {sentence}", err=True)
-    ctx.exit(1 if outcome.wrong else 0)
+    _end(ctx, outcome.wrong)
 
 
 @main.command()
@@ -193,9 +199,7 @@ def view(ctx: click.Context, output: Path, artifact: Path, pairs: int, stops: in
 
     metrics, wrong = measure(output, artifact, pairs, stops, click.echo)
     show(metrics, False)
-    for sentence in wrong:
-        click.echo(f"rover: {sentence}", err=True)
-    ctx.exit(1 if wrong else 0)
+    _end(ctx, wrong)
 
 
 @main.command("mutants")
@@ -267,9 +271,7 @@ def random_drives(ctx: click.Context, output: Path | None, drives: int, first: i
     if output:
         lab_random.write_random_drives(output, first, tally, failures)
     show(tally.summary, False)
-    for failure in failures:
-        click.echo(f"rover: {failure}", err=True)
-    ctx.exit(1 if failures else 0)
+    _end(ctx, failures)
 
 
 @main.group()
@@ -278,10 +280,8 @@ def pi() -> None:
 
 
 def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
-    for sentence in wrong:
-        click.echo(f"rover: {sentence}", err=True)
     click.echo(f"{'not as expected' if wrong else 'as expected'}: {output}")
-    ctx.exit(1 if wrong else 0)
+    _end(ctx, wrong)
 
 
 @pi.command("fast")

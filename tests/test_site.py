@@ -13,16 +13,8 @@ from browser import Browser, chromium
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 GATHERED = (
-    "Makefile",
-    "mkdocs.yml",
-    "*.md",
-    "docs",
-    "pictures",
-    "notebooks",
-    "results",
-    "params.yml",
-    "lab/params.yml",
-)
+    "Makefile", "mkdocs.yml", "*.md", "docs", "pictures", "notebooks", "results", "params.yml", "lab/params.yml",
+)  # fmt: skip
 PACKAGES = ("rover_lib", "balloon_world")  # docs/api.md is made of their docstrings
 READMES = ("ansible/README.md", "firmware/README.md", "lab/README.md")
 ELSEWHERE = re.compile(r"""<(?:script|img|iframe|link)\b[^>]*\b(?:src|href)=["'](?:https?:)?//[^>]*>""")

@@ -107,13 +107,9 @@ def prepare(progress: Progress = silent, cpu: str = A76) -> Core:
     Missing Debian packages are installed if this runs as root. Raises CountError or DebianError if anything cannot be
     had.
     """
-    steps = (_install_missing, build_plugin, partial(_userland, cpu))
+    steps = (partial(install_packages, missing_packages(NEEDS), "counting"), build_plugin, partial(_userland, cpu))
     _, plugin, root = [step() for step in progress(steps, desc=f"emulated {cpu}", total=len(steps))]
     return Core(root, plugin, cpu)
-
-
-def _install_missing() -> None:
-    install_packages(missing_packages(NEEDS), "counting")
 
 
 def build_plugin() -> Path:

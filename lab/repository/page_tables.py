@@ -179,19 +179,20 @@ def _demo(root: Path) -> list[Row]:
         hits = f"{found['hits']} of {found['trials']}"
         faster = f"{timed['fp32']['latency_p50_ms'] / timed[mode]['latency_p50_ms']:.1f}"
         fields = (_of(found, "size_mb", ".1f"), hits, " / ".join(filter(None, errors)), faster)
-        return EXPLAINED[mode], *(_strong(field or "", mode == BEST) for field in fields)
+        return EXPLAINED[mode], *(f"**{field}**" if field and mode == BEST else field or "" for field in fields)
 
     return [("", "MB", "balloons hit", "error, %", "times faster"), *map(row, EXPLAINED)]
 
 
 def _faults(root: Path) -> list[Row]:
     """What was done to a driving car, and what became of it."""
-    report = _metrics(root / "results" / "lab", "faults")
+    report, random = (_metrics(root / "results" / "lab", name) for name in ("faults", "random"))
     of = {e: [f for f in report["faults"] if f["expected"] == e] for e in ("stopped", "continues", "refused", "human")}
 
     def right(expected: str) -> str:
         return f"{sum(not f['wrong'] for f in of[expected])} of {len(of[expected])}"
 
+    broken = f"{len(random['broken'])} of {random['drives']:,}"
     worst, takeover = (report["summary"][key] for key in ("worst_stopped_after_ms", "takeover_ms"))
     return [
         ("what", "figure"),
@@ -206,7 +207,7 @@ def _faults(root: Path) -> list[Row]:
             "pulses that were recorded, replayed and measured again: difference",
             f"within {report['bytes']['worst_us']:.0f} us",
         ),
-        ("drives with random faults in virtual time that broke a safety rule", _random(root)),
+        ("drives with random faults in virtual time that broke a safety rule", broken),
         *_view(root),
     ]
 
@@ -226,11 +227,6 @@ def _view(root: Path) -> list[Row]:
         ("pictures in the view", picture),
         ("processor time of the view, share of one core", f"{report['cpu_pct']:.1f} %"),
     ]
-
-
-def _random(root: Path) -> str:
-    report = _metrics(root / "results" / "lab", "random")
-    return f"{len(report['broken'])} of {report['drives']:,}"
 
 
 def _drives(root: Path) -> list[Row]:
@@ -318,11 +314,9 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
 }
 
 
-def _metrics(folder: Path, stage: str, otherwise: dict[str, Any] | None = None) -> dict[str, Any]:
-    """A stage's metrics. Raises TableError if it is not there and there is nothing otherwise."""
+def _metrics(folder: Path, stage: str) -> dict[str, Any]:
+    """A stage's metrics. Raises TableError if it is not there."""
     paths = sorted(folder.glob(f"{stage}.json"))
-    if not paths and otherwise is not None:
-        return otherwise
     if len(paths) != 1:
         found = [path.name for path in paths] or "none"
         raise TableError(f"{folder.name}/{stage}.json must be there once", found=found, remedy="make notebooks")
@@ -332,10 +326,6 @@ def _metrics(folder: Path, stage: str, otherwise: dict[str, Any] | None = None) 
 def _of(values: Mapping[str, Any], key: str, form: str) -> str | None:
     value = values.get(key)
     return None if value is None else format(value, form)
-
-
-def _strong(text: str, strong: bool) -> str:
-    return f"**{text}**" if strong and text else text
 
 
 if __name__ == "__main__":

@@ -302,15 +302,10 @@ def test_an_episode_that_does_not_come_home_stays(tmp_path):
 
 
 PI = {
-    "architecture": "aarch64",
-    "os_family": "Debian",
-    "distribution": "Debian",
-    "distribution_version": "12.9",
-    "distribution_major_version": "12",
-    "python_version": "3.11.2",
-    "memtotal_mb": 7900,
+    "architecture": "aarch64", "os_family": "Debian", "distribution": "Debian", "distribution_version": "12.9",
+    "distribution_major_version": "12", "python_version": "3.11.2", "memtotal_mb": 7900,
     "mounts": [{"mount": "/", "size_available": 20_000_000_000}],
-}
+}  # fmt: skip
 
 
 def pi(**facts: object) -> dict:
@@ -420,19 +415,13 @@ def test_both_units_have_the_same_sandbox(units):
     kinds = {line.partition("=")[0] for line in differ}
     assert kinds <= {
         *(
-            "Description",
-            "Type",
-            "ExecStart",
-            "ExecStartPre",
-            "RuntimeDirectory",
-            "NotifyAccess",
-            "ConditionPathExists",
-            "StartLimitIntervalSec",
+            "Description", "Type", "ExecStart", "ExecStartPre", "RuntimeDirectory", "NotifyAccess",
+            "ConditionPathExists", "StartLimitIntervalSec",
         ),
         *("StartLimitBurst", "StateDirectory", "StateDirectoryMode", "WatchdogSec", "WatchdogSignal", "Restart"),
         *("RestartSec", "KillMode", "TimeoutStopSec", "OOMPolicy", "WantedBy"),
         *("LimitRTPRIO", "RestrictRealtime", "SupplementaryGroups", "DeviceAllow", "PrivateDevices"),
-    }, kinds
+    }, kinds  # fmt: skip
 
 
 def test_a_service_that_records_does_so_in_its_own_folder_and_may_finish(units):
@@ -505,15 +494,9 @@ def test_the_views_unit_says_what_the_command_line_takes(units):
 
 
 HOSTILE = [
-    "/dev/video0 --throttle-limit 1",
-    "/dev/video0\nExecStartPre=+/bin/touch /etc/mine",
-    "/dev/video0\\",
-    "%h/video %n %%",
-    "$HOME ${PATH} $$",
-    "\"/dev/video0\" '--record' /",
-    "; /bin/true",
-    "\t\u00fc",
-]
+    "/dev/video0 --throttle-limit 1", "/dev/video0\nExecStartPre=+/bin/touch /etc/mine", "/dev/video0\\",
+    "%h/video %n %%", "$HOME ${PATH} $$", "\"/dev/video0\" '--record' /", "; /bin/true", "\t\u00fc",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("value", HOSTILE)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from balloon_world import students
+from balloon_world import side_by_side, students
 from balloon_world.latency import SEED
 from balloon_world.students import judge_students
 from rover_learn import plots
@@ -64,7 +64,7 @@ def counted(folder, high_ms, **changed):
 def made(tmp_path, recorded, monkeypatch):
     """A teacher's run and a student's, and the drives that were driven: (off, kind, seed, latency)."""
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(students, "load_policy", Policy)
+    monkeypatch.setattr(side_by_side, "load_policy", Policy)
     monkeypatch.setattr(students, "content_hash", sha256_of)
     monkeypatch.setattr(students, "read_manifest", lambda path: json.loads(path.read_text()))
     driven = []
@@ -85,26 +85,10 @@ def made(tmp_path, recorded, monkeypatch):
 
 
 KEYS = [
-    "name",
-    "height",
-    "width",
-    "decoder_layers",
-    "feedforward",
-    "qat",
-    "instructions_g",
-    "simd_g",
-    "size_mb",
-    "computed_ms",
-    "teacher_steering_pct",
-    "teacher_throttle_pct",
-    "recorded_steering_pct",
-    "recorded_throttle_pct",
-    "hits",
-    "trials",
-    "pushed_hits",
-    "pushed_trials",
-    "pushed_latency_ms",
-]
+    "name", "height", "width", "decoder_layers", "feedforward", "qat", "instructions_g", "simd_g", "size_mb",
+    "computed_ms", "teacher_steering_pct", "teacher_throttle_pct", "recorded_steering_pct", "recorded_throttle_pct",
+    "hits", "trials", "pushed_hits", "pushed_trials", "pushed_latency_ms",
+]  # fmt: skip
 
 
 def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
@@ -174,7 +158,7 @@ def test_what_another_car_drove_is_not_taken_for_this_ones(made, monkeypatch, tm
 
 
 def test_a_kill_costs_the_drives_that_had_not_ended(made, monkeypatch):
-    whole, append = [], students._append
+    whole, append = [], students.append_row
 
     def dies(path, drive):
         if len(whole) == 3:
@@ -184,11 +168,11 @@ def test_a_kill_costs_the_drives_that_had_not_ended(made, monkeypatch):
         whole.append(drive)
         append(path, drive)
 
-    monkeypatch.setattr(students, "_append", dies)
+    monkeypatch.setattr(students, "append_row", dies)
     with pytest.raises(KeyboardInterrupt):
         judge_students(made.teacher, [made.student], worlds=3)
     assert not (made.teacher / "students.json").exists()
-    monkeypatch.setattr(students, "_append", append)
+    monkeypatch.setattr(students, "append_row", append)
     made.driven.clear()
     rows = judge_students(made.teacher, [made.student], worlds=3)["metrics"]["students"]
     assert len(made.driven) == 12 - 3 and [row["hits"] for row in rows] == [3, 2]

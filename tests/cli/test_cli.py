@@ -31,37 +31,13 @@ def test_more_threads_than_any_machine_has_are_refused(command, artifacts):
 @pytest.mark.parametrize(
     "command",
     [
-        [],
-        ["run"],
-        ["report"],
-        ["list"],
-        ["inspect"],
-        ["quantize"],
-        ["compare"],
-        ["distill"],
-        ["finetune"],
-        ["export"],
-        ["export-dataset"],
-        ["benchmark"],
-        ["log"],
-        ["doctor"],
-        ["calibrate"],
-        ["world"],
-        ["world", "record"],
-        ["world", "train"],
-        ["world", "trial"],
-        ["world", "latency"],
-        ["world", "students"],
-        ["world", "learn"],
-        ["wheelhouse"],
-        ["drive"],
-        ["view"],
-        ["record"],
-        ["label"],
-        ["release"],
+        [], ["run"], ["report"], ["list"], ["inspect"], ["quantize"], ["compare"], ["distill"], ["finetune"],
+        ["export"], ["export-dataset"], ["benchmark"], ["log"], ["doctor"], ["calibrate"], ["world"],
+        ["world", "record"], ["world", "train"], ["world", "trial"], ["world", "latency"], ["world", "students"],
+        ["world", "learn"], ["wheelhouse"], ["drive"], ["view"], ["record"], ["label"], ["release"],
     ],
     ids=" ".join,
-)
+)  # fmt: skip
 def test_help(command):
     result = rover(*command, "--help")
     assert result.exit_code == 0 and "Usage" in result.output and len(result.output) > 150

@@ -423,17 +423,13 @@ TURNED = {
     "03_quantize": (
         "quantize",
         {
-            "scheme": "affine",
-            "observer": "percentile",
-            "percentile": 99.5,
-            "float_blocks": ["backbone.stem"],
-            "modes": ["mixed"],
-            "choosing_frames": 2,
+            "scheme": "affine", "observer": "percentile", "percentile": 99.5, "float_blocks": ["backbone.stem"],
+            "modes": ["mixed"], "choosing_frames": 2,
         },
     ),
     "04_compare": ("compare", {"held_out_frames": 4, "worlds": 1}),
     "05_benchmark": (f"benchmark-{runs.socket.gethostname()}", {"iterations": 3, "threads": 1}),
-}
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -1,14 +1,18 @@
 """LeRobot's own commands, as processes, with the rover: on the emulated Arduino, and in the balloon world."""
 
 import contextlib
+import importlib
 import os
 import pty
+import re
+import shlex
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+import typing
 import zipfile
 from pathlib import Path
 
@@ -163,6 +167,24 @@ def without_repeats(pairs):
 def pulses_of(actions):
     calibration = PwmCalibration()
     return np.array([[(p := calibration.pulses(*map(float, a))).steering_us, p.throttle_us] for a in actions])
+
+
+@pytest.mark.slow
+def test_lerobots_own_parser_takes_what_the_page_says(monkeypatch):
+    """Those of this LeRobot: in 0.6 lerobot-record drives no policy, and in 0.4 there is no lerobot-rollout."""
+    import draccus
+
+    text, parsed = (ROOT / "docs" / "lerobot.md").read_text().replace("\\\n", " "), []
+    for line in re.findall(r"^    (lerobot-\w+ .*)$", text, re.M):
+        program, *words = shlex.split(line.partition(" # ")[0])
+        if not (BIN / program).exists() or (ENDING and program == "lerobot-record" and "policy" in line):
+            continue
+        module = importlib.import_module(f"lerobot.scripts.{program.replace('-', '_')}")
+        config = typing.get_type_hints(getattr(module, program.partition("-")[2]).__wrapped__)["cfg"]
+        monkeypatch.setattr(sys, "argv", [program, *words])  # where LeRobot looks for a policy's path
+        assert draccus.parse(config, args=words).robot.type == "rover"
+        parsed.append(program)
+    assert len(parsed) == (5 if ENDING else 3), parsed
 
 
 @pytest.fixture(scope="module")

@@ -407,7 +407,8 @@ def finish_killed(part: Path) -> Path | None:
         kept = {kind: list(_whole_rows(path)) for kind, path in rows.items()}
         kept["frame"] = [row for row in kept["frame"] if _is_whole_picture(part / str(row.get("image_path")))]
         if not kept["control"] and not kept["frame"]:
-            return shutil.rmtree(part)
+            shutil.rmtree(part)
+            return None
         if not kept["control"] or not kept["frame"]:
             raise EpisodeError(f"{part}: nothing usable was recorded", remedy="remove it")
         for kind, path in rows.items():
@@ -416,7 +417,8 @@ def finish_killed(part: Path) -> Path | None:
         writer._take(part, kept["control"], kept["frame"])
         writer._write(part)
     elif not (part / "episode_data.json").is_file():
-        return shutil.rmtree(part)
+        shutil.rmtree(part)
+        return None
     part.rename(folder)
     return folder
 

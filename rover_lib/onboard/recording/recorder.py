@@ -191,7 +191,9 @@ class Recorder:
         while True:
             frame = self._camera.wait(seen, 0.1)
             closing = self._closing.is_set()  # read before the queue is emptied, so that nothing is lost
-            self._write_controls()
+            for _ in range(len(self._queue)):
+                host_s, *control, extra = self._queue.popleft()
+                self._writer.control(host_s + self._to_system_s, *control, **extra)
             if closing:
                 return
             now = self._clock()
@@ -207,11 +209,6 @@ class Recorder:
             captured_s = frame.captured_s
             self._check_room()
             self._writer.frame(captured_s + self._to_system_s, frame.image)
-
-    def _write_controls(self) -> None:
-        for _ in range(len(self._queue)):
-            host_s, *control, extra = self._queue.popleft()
-            self._writer.control(host_s + self._to_system_s, *control, **extra)
 
 
 def room_for(folder: Path | str, most_mb: float) -> int:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.notebook_table import Table
@@ -135,7 +136,7 @@ def _check(path: Path, content: Mapping[str, Any]) -> None:
         for p in (metrics, *series):
             int(p.get("throttled") or "0x0", 16)
         numbers = needed + [n for n in readings if n is not None]
-        usable = metrics["main"] in metrics["artifacts"] and all(type(n) in (int, float) for n in numbers)
+        usable = metrics["main"] in metrics["artifacts"] and all(map(is_number, numbers))
         usable &= all(isinstance(v, str) for v in (env["host"], env["machine"], *content["inputs"].values()))
     except (KeyError, TypeError, ValueError, AttributeError):
         usable = False

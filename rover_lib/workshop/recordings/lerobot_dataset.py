@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
@@ -61,6 +62,11 @@ MOST_VALUES, MOST_PIXELS = 20_000_000, 20_000_000
 UNPACKED_FREE, PICTURES_FREE, UNPACKED_TIMES = 100_000_000, 1_000_000, 4
 COPY_AGAIN = "copy the whole dataset again"
 UNEVEN = 0.1  # the time between two frames may differ by this share
+
+
+def _broken(what: str, found: object = None) -> EpisodeError:
+    """The error of a dataset that no LeRobot wrote so, for the caller to raise."""
+    return EpisodeError(what, found=found, remedy=COPY_AGAIN)
 
 
 def is_dataset(root: Path) -> bool:
@@ -231,15 +237,13 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
     path = root / INFO
     try:
         if path.stat().st_size > INFO_BYTES:
-            raise EpisodeError(f"{path}: is larger than any that LeRobot writes", remedy=COPY_AGAIN)
+            raise _broken(f"{path}: is larger than any that LeRobot writes")
         info = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as e:
-        raise EpisodeError(f"{path}: not readable as JSON ({quote(str(e))})", remedy=COPY_AGAIN) from None
+        raise _broken(f"{path}: not readable as JSON ({quote(str(e))})") from None
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if not isinstance(version, str) or not version.startswith("v"):
-        raise EpisodeError(
-            f"{path}: does not name a version of LeRobot's format", found=quote(version), remedy=COPY_AGAIN
-        )
+        raise _broken(f"{path}: does not name a version of LeRobot's format", quote(version))
     if version.startswith("v2.1"):
         where = " and give the folder below ~/.cache/huggingface/lerobot that it names" if hub_id else ""
         raise EpisodeError(
@@ -256,18 +260,18 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
             f"{root}: a LeRobotDataset {quote(version)}, only v3 is known here", remedy="use a newer version of this"
         )
     if not isinstance(info.get("data_path"), str):
-        raise EpisodeError(f"{path}: has no 'data_path'", found=quote_all(info), remedy=COPY_AGAIN)
+        raise _broken(f"{path}: has no 'data_path'", quote_all(info))
     features, fps = info.get("features"), info.get("fps")
-    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
-        raise EpisodeError(f"{path}: does not give a number of frames per second", found=quote(fps), remedy=COPY_AGAIN)
+    if not is_number(fps, 0, 1000) or not fps:
+        raise _broken(f"{path}: does not give a number of frames per second", quote(fps))
     if not isinstance(features, dict) or not all(_is_feature(f) for f in features.values()):
-        raise EpisodeError(f"{path}: its features are not objects with a dtype and a shape", remedy=COPY_AGAIN)
+        raise _broken(f"{path}: its features are not objects with a dtype and a shape")
     return info
 
 
 def _is_feature(feature: Any) -> bool:
     shape = feature.get("shape") if isinstance(feature, dict) else None
-    return isinstance(shape, list) and all(isinstance(n, int) and 0 < n <= 10_000 for n in shape)
+    return isinstance(shape, list) and all(is_whole(n, 1, 10_000) for n in shape)
 
 
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, tuple[_Camera, ...]]:
@@ -371,10 +375,10 @@ def _check_files(root: Path, info: Mapping[str, Any]) -> None:
     size = 0
     for path in (path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*")):
         if not path.is_dir() and not path.is_file():
-            raise EpisodeError(f"{path}: not a plain file", remedy=COPY_AGAIN)
+            raise _broken(f"{path}: not a plain file")
         size += path.stat().st_size
         if path.suffix == ".json" and path.stat().st_size > INFO_BYTES:
-            raise EpisodeError(f"{path}: is larger than any that LeRobot writes", remedy=COPY_AGAIN)
+            raise _broken(f"{path}: is larger than any that LeRobot writes")
     rows = values = unpacked = 0
     for path in root.rglob("*.parquet"):
         with _said_of(path, "LeRobot cannot read it"):
@@ -401,9 +405,7 @@ def _check_pictures(root: Path, dataset: "LeRobotDataset", cameras: tuple[_Camer
             continue
         for chunk in dataset.hf_dataset.data.column(camera.key).chunks:
             if chunk.null_count or chunk.field("bytes").null_count:
-                raise EpisodeError(
-                    f"{root}: pictures of '{camera.key}' are not in its tables, but named by a path", remedy=COPY_AGAIN
-                )
+                raise _broken(f"{root}: pictures of '{camera.key}' are not in its tables, but named by a path")
 
 
 def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> None:
@@ -415,15 +417,13 @@ def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> No
 
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
         if not list(root.glob(pattern)):
-            raise EpisodeError(f"{root}: has no {pattern}", remedy=COPY_AGAIN)
+            raise _broken(f"{root}: has no {pattern}")
     wanted = [name for name, feature in features.items() if name in read and feature.get("dtype") != "video"]
     for path in sorted(root.glob("data/*/*.parquet")):
         with _said_of(path, "LeRobot cannot read it"):
             columns = parquet.read_schema(path).names
         if missing := [name for name in wanted if name not in columns]:
-            raise EpisodeError(
-                f"{path}: has no column {quote_all(missing)}", found=quote_all(columns), remedy=COPY_AGAIN
-            )
+            raise _broken(f"{path}: has no column {quote_all(missing)}", quote_all(columns))
 
 
 def _open_local(root: Path) -> "LeRobotDataset":
@@ -439,15 +439,13 @@ def _open_local(root: Path) -> "LeRobotDataset":
     with _said_of(root, "LeRobot cannot read it"):
         meta = LeRobotDatasetMetadata(**given)
         if meta.total_episodes > len(meta.episodes):  # LeRobot would list as many as the file claims
-            raise EpisodeError(
-                f"{root}: {INFO} says {quote(meta.total_episodes)} episodes",
-                found=f"{len(meta.episodes)} in meta/episodes",
-                remedy=COPY_AGAIN,
+            raise _broken(
+                f"{root}: {INFO} says {quote(meta.total_episodes)} episodes", f"{len(meta.episodes)} in meta/episodes"
             )
         for key in meta.video_keys:
             for number in range(meta.total_episodes):
                 if not (video := root / meta.get_video_file_path(number, key)).is_file():
-                    raise EpisodeError(f"{video}: not there", remedy=COPY_AGAIN)
+                    raise _broken(f"{video}: not there")
             _check_video_times(root, meta, key)
         return Local(**given, video_backend=BACKEND)
 
@@ -501,7 +499,7 @@ def _said_of(path: Path, what: str) -> Iterator[None]:
         cause = e.__cause__ or e  # datasets wraps pyarrow's error
         reason = " ".join(str(cause).split())[:160]
         text = f"{type(cause).__name__}: {reason}" if reason else type(cause).__name__
-        raise EpisodeError(f"{path}: {what} ({text})", remedy=COPY_AGAIN) from None
+        raise _broken(f"{path}: {what} ({text})") from None
 
 
 def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
@@ -570,10 +568,9 @@ def _check_episodes(root: Path, dataset: "LeRobotDataset", number: np.ndarray) -
         agree = np.array_equal(index, np.arange(len(index))) and lengths.sum() == len(number)
         agree = agree and np.array_equal(number, np.repeat(index, lengths))
     if not agree:
-        raise EpisodeError(
+        raise _broken(
             f"{root}: meta/episodes and the frames in data do not belong together",
-            found=f"{len(index)} episodes of {lengths.sum()} frames beside {len(np.unique(number))} of {len(number)}",
-            remedy=COPY_AGAIN,
+            f"{len(index)} episodes of {lengths.sum()} frames beside {len(np.unique(number))} of {len(number)}",
         )
 
 
@@ -596,7 +593,7 @@ def _episode(
         files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
         task = meta.tasks.index[meta.tasks["task_index"] == columns["task_index"][first]]
     if not data.is_file():
-        raise EpisodeError(f"{data}: not there, and episode {number} is in it", remedy=COPY_AGAIN)
+        raise _broken(f"{data}: not there, and episode {number} is in it")
     index = np.arange(n)[:, None] + np.arange(chunk)
     actions, pads = columns[ACTION][rows], index >= n
     chunks = actions[np.minimum(index, n - 1)]

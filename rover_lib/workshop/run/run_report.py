@@ -10,9 +10,11 @@ import shutil
 import sys
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
+
+from jinja2 import Environment, FileSystemLoader
+from markupsafe import Markup, escape
 
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.care.release import THIS_CAR
@@ -35,18 +37,6 @@ FIGURES = {  # of the run's folder, with what each shows
     "04_hits": "Balloons hit, by mode",
     "05_latency": "How long a plan takes, by mode",
 }
-# Narrow columns may be scrolled to, but the page itself never is: it is read on a phone beside the track.
-STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;margin:0 auto;max-width:64rem;padding:1rem;color:#222;background:#fff}
-h1{font-size:1.4rem;line-height:1.25}h2{font-size:1.1rem;margin-top:2rem}
-.verdict{border-left:.4rem solid #2a7;padding:.2rem .8rem;background:#f2faf6}.none{border-color:#c33;background:#fdf3f3}
-.wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
-td,th{padding:.25rem .45rem;text-align:right;border-bottom:1px solid #ddd}
-td{white-space:nowrap}td:first-child{white-space:normal}
-td:first-child,th:first-child{text-align:left}.deploy{font-weight:bold;background:#f2faf6}
-img{max-width:100%;height:auto}figure{margin:1rem 0}figcaption,small{color:#666}
-code{font-size:.9rem;overflow-wrap:anywhere}li{margin:.3rem 0}
-"""
 
 
 def write(run_dir: Path | str) -> dict[str, Any]:
@@ -195,7 +185,11 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 def table(judged: Mapping[str, Any]) -> list[str]:
     """`columns` in a terminal, and below it what each mode is worth."""
-    return align(columns(judged)) + [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
+    return align(columns(judged)) + _worth(judged)
+
+
+def _worth(judged: Mapping[str, Any]) -> list[str]:
+    return [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
 
 
 # --- as a page --------------------------------------------------------------------------------------------------------
@@ -232,62 +226,24 @@ def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes], fi
     files: names of files beside it, to which it links.
     """
     judged, env = content["metrics"], content["env"]
-    title = f"{name}: {judged['headline']}"
-    kind = "verdict none" if judged["deploy"] is None else "verdict"
-    parts = [
-        f"<h1>{escape(title)}</h1>",
-        f'<div class="{kind}">{_paragraphs(judged["why"])}</div>',
-        "<h2>The modes compared</h2>",
-        _html_table(judged),
-        _list([f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]),
-        f"<small>Errors are mean differences from FP32, in percent of the recorded range. "
-        f"Times faster: FP32's {escape(judged['compared'])} over the mode's, {escape(judged['timing'])}, on "
-        f"{escape(judged['host'])}.</small>",
-    ]
-    if judged["failed"]:
-        parts.append("<h2>What failed, and what to do</h2>")
-    for row in judged["failed"]:
-        parts += [f"<p><b>{escape(against(row))}</b></p>", _list(row["remedies"])]
-    if judged["cautions"]:
-        parts += ["<h2>Keep in mind</h2>", _list(judged["cautions"])]
-    steps = "".join(
-        f"<li><code>{escape(typed(s['command']))}</code><br>{escape(s['why'])}</li>" for s in judged["next"]
-    )
-    parts += ["<h2>Next</h2>", f"<ol>{steps}</ol>"]
-    for figure, caption in FIGURES.items():
-        if figure in figures:
-            source = f"data:image/png;base64,{b64encode(figures[figure]).decode()}"
-            picture = f'<img src="{source}" alt="{escape(caption)}">'
-            parts.append(f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>")
-    links = ", ".join(f'<a href="{escape(file)}">{escape(file)}</a>' for file in files)
-    parts += ["<h2>Behind it</h2>", f"<p>The notebooks, and the numbers of each stage: {links}.</p>"] if files else []
-    made = ", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key))
-    parts.append(f"<small>{escape(made)}</small>")
-    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(name)}</title>'
-    return f'<!doctype html><html lang="en"><head>{head}<style>{STYLE}</style></head><body>\n' + "\n".join(
-        [*parts, "</body></html>\n"]
+    header, *rows = zip(*columns(judged), strict=True)  # a column for each mode: a phone shows all without scrolling
+    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
+    pages.filters["words"] = _to_html
+    return pages.get_template(PAGE).render(
+        name=name,
+        judged=judged,
+        header=header,
+        rows=rows,
+        kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
+        worth=_worth(judged),
+        figures=[(FIGURES[figure], b64encode(figures[figure]).decode()) for figure in FIGURES if figure in figures],
+        files=files,
+        made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
+        against=against,
+        typed=typed,
     )
 
 
-def _html_table(judged: Mapping[str, Any]) -> str:
-    """A column for each mode, so that a phone shows all numbers without scrolling."""
-    kinds = ["", *(' class="deploy"' if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])]
-    lines = []
-    for number_of, cells in enumerate(zip(*columns(judged), strict=True)):
-        tag = "td" if number_of else "th"
-        row = zip(cells, kinds, strict=True)
-        lines.append("<tr>" + "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for cell, kind in row) + "</tr>")
-    return '<div class="wide"><table>' + "\n".join(lines) + "</table></div>"
-
-
-def _list(lines: list[str]) -> str:
-    return "<ul>" + "".join(f"<li>{_to_html(line)}</li>" for line in lines) + "</ul>"
-
-
-def _paragraphs(lines: list[str]) -> str:
-    return "".join(f"<p>{_to_html(line)}</p>" for line in lines)
-
-
-def _to_html(line: str) -> str:
+def _to_html(line: str) -> Markup:
     """A sentence as HTML, what is between backticks as code."""
-    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(line))
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(line))))

@@ -37,14 +37,10 @@ def run_dir(cache, tmp_path_factory):
 def test_leaves_what_counting_needs(run_dir):
     artifacts = {p.stem: load_policy(p) for p in run_dir.glob("policy_*") if p.is_file()}
     assert {name: p.image_size for name, p in artifacts.items()} == {
-        "policy_fp32": (72, 128),
-        "policy_fp32.onnx": (72, 128),
-        "policy_static": (72, 128),
-        "policy_static.onnx": (72, 128),
-        "policy_fp32_54x96": (54, 96),
-        "policy_static_54x96": (54, 96),
+        "policy_fp32": (72, 128), "policy_fp32.onnx": (72, 128), "policy_static": (72, 128),
+        "policy_static.onnx": (72, 128), "policy_fp32_54x96": (54, 96), "policy_static_54x96": (54, 96),
         "policy_static_36x64": (36, 64),
-    }
+    }  # fmt: skip
     assert len({p.manifest["checkpoint"]["sha256"] for p in artifacts.values()}) == 1
     again = open_run(run_dir)
     assert len(pick_evenly(again.parts.held_out, 50)) == 50

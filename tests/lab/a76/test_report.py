@@ -75,19 +75,10 @@ def test_what_is_not_divided_over_the_threads_is_executed_by_one():
 
 def artifact(**changed):
     numbers = {
-        "gmac": 15.02,
-        "instructions_g": 1.4,
-        "simd_g": 1.05,
-        "tenth_g": 1.401,
-        "peak_memory_mb": 450,
-        "peak_memory_loading_mb": 550,
-        "reference": "policy_fp32",
-        "frames_on_the_core": 50,
-        "steering_mae_pct": 0.1,
-        "throttle_mae_pct": 0.2,
-        "workstation_steering_mae_pct": 0.1,
-        "workstation_throttle_mae_pct": 0.2,
-    }
+        "gmac": 15.02, "instructions_g": 1.4, "simd_g": 1.05, "tenth_g": 1.401, "peak_memory_mb": 450,
+        "peak_memory_loading_mb": 550, "reference": "policy_fp32", "frames_on_the_core": 50, "steering_mae_pct": 0.1,
+        "throttle_mae_pct": 0.2, "workstation_steering_mae_pct": 0.1, "workstation_throttle_mae_pct": 0.2,
+    }  # fmt: skip
     return numbers | changed
 
 
@@ -105,16 +96,13 @@ def test_gates_of_the_cars_policy_hold():
 @pytest.mark.parametrize(
     ("changed", "failing"),
     [
-        ({"instructions_g": 1.47, "tenth_g": 1.47}, "instructions_g"),
-        ({"simd_g": 1.11}, "simd_g"),
+        ({"instructions_g": 1.47, "tenth_g": 1.47}, "instructions_g"), ({"simd_g": 1.11}, "simd_g"),
         ({"throttle_mae_pct": 0.211}, "error, x workstation's"),
         ({"workstation_steering_mae_pct": 0.0}, "error, x workstation's"),
-        ({"frames_on_the_core": 49}, "frames judged on the core"),
-        ({"tenth_g": 1.38}, "tenth off the third, %"),
-        ({"peak_memory_mb": 501}, "peak_memory_mb"),
-        ({"peak_memory_loading_mb": 601}, "peak_memory_loading_mb"),
+        ({"frames_on_the_core": 49}, "frames judged on the core"), ({"tenth_g": 1.38}, "tenth off the third, %"),
+        ({"peak_memory_mb": 501}, "peak_memory_mb"), ({"peak_memory_loading_mb": 601}, "peak_memory_loading_mb"),
     ],
-)
+)  # fmt: skip
 def test_each_gate_can_fail(changed, failing):
     passed_by_gate = gates(policy_static=artifact(**changed))
     assert [name for name, passed in passed_by_gate.items() if not passed] == [f"policy_static {failing}"]

@@ -32,7 +32,7 @@ def test_every_fault_has_its_own_name_and_there_are_enough():
         "lies",
         "at once",
     ):
-        assert any(part in name for name in names), part
+        assert any(part in name for name in names), part  # fmt: skip
     assert container_run.ONE_FAULT in names
 
 

@@ -158,34 +158,19 @@ def test_format_of_a_real_recording_to_the_byte(tmp_path):
 def test_folder_and_files(tmp_path):
     folder = write(tmp_path / "new" / NAME)
     assert sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*")) == [
-        "control_data.csv",
-        "episode_data.json",
-        "frame_data.csv",
-        "frames",
-        "frames/frame_000001.jpg",
+        "control_data.csv", "episode_data.json", "frame_data.csv", "frames", "frames/frame_000001.jpg",
         "frames/frame_000002.jpg",
-    ]
+    ]  # fmt: skip
     assert [p.name for p in folder.parent.iterdir()] == [NAME]
     episode = json.loads((folder / "episode_data.json").read_text())
     assert list(episode) == [
-        "episode_id",
-        "action_label",
-        "start_time",
-        "end_time",
-        "duration",
-        "metadata",
-        "control_samples",
+        "episode_id", "action_label", "start_time", "end_time", "duration", "metadata", "control_samples",
         "frame_samples",
-    ]
+    ]  # fmt: skip
     assert list(episode["metadata"]) == [
-        "camera_fps",
-        "camera_resolution",
-        "arduino_port",
-        "total_control_samples",
-        "total_frames",
-        "avg_control_rate",
-        "avg_frame_rate",
-    ]
+        "camera_fps", "camera_resolution", "arduino_port", "total_control_samples", "total_frames",
+        "avg_control_rate", "avg_frame_rate",
+    ]  # fmt: skip
     assert episode["episode_id"] == NAME
     assert episode["duration"] == pytest.approx(2 / 30)
     assert episode["metadata"]["avg_control_rate"] == pytest.approx(45)
