@@ -174,7 +174,12 @@ def tell_time(
         "counts": counts,
     }
     metrics["gates"] = [
-        gate(f"{n} thread{'s' * (n != '1')}, {key}", found[n][key], ">=" if key in ("n", "held_pct") else "<=", limit)
+        gate(
+            f"{n} thread{'s' * (n != '1')}, {key.replace('_pct', ' %')}",
+            found[n][key],
+            ">=" if key in ("n", "held_pct") else "<=",
+            limit,
+        )
         for n, own in limits["gates"].items()
         for key, limit in own.items()
     ]

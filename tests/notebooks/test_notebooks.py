@@ -398,8 +398,9 @@ def test_what_was_opened_must_not_have_changed(tiny, tiny_file, tmp_path, monkey
     report = {"sha256": "another", "macs_by_block": {"head": 1}}
     given = {"checkpoint": str(tiny_file), "episodes": "episodes"}
     write_stage(tmp_path / "load.json", "load", params=given, metrics={"checkpoint": report, "split": {}}, inputs={})
-    parts = SimpleNamespace(episodes={})
-    monkeypatch.setattr(session, "load", lambda *paths: session.Opened(tiny, SimpleNamespace(root="episodes"), parts))
+    layout = SimpleNamespace(words=lambda: {})
+    recordings, parts = SimpleNamespace(root="episodes", layout=layout), SimpleNamespace(episodes={})
+    monkeypatch.setattr(session, "load", lambda *paths: session.Opened(tiny, recordings, parts))
     with pytest.raises(runs.RoverError, match="is not what notebook 01 loaded"):
         session.open_run(tmp_path)
     report["sha256"] = tiny.sha256

@@ -122,14 +122,14 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
         artifact.prove()
         manifest = artifact.manifest
         code = b"".join(artifact.record(n) for n in artifact.names if n.endswith(".py") or n == ONNX)
-        of_mode = OF_MODE[artifact.kind]
+        if (wanted := OF_MODE[artifact.kind].get(manifest["mode"])) and wanted not in code:
+            what = f"{path}: its manifest says {manifest['mode']}, its code is not"
+            raise ArtifactError(what, remedy="quantize again")
+        for kind, why in expected.refusals(manifest).items():
+            if kind not in allow:
+                remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
+                raise ReleaseError(f"{path}: {why}", remedy=remedy)
         _ = artifact.parity  # has the shapes that the manifest says
-    if (wanted := of_mode.get(manifest["mode"])) and wanted not in code:
-        raise ArtifactError(f"{path}: its manifest says {manifest['mode']}, its code is not", remedy="quantize again")
-    for kind, why in expected.refusals(manifest).items():
-        if kind not in allow:
-            remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
-            raise ReleaseError(f"{path}: {why}", remedy=remedy)
     return artifact
 
 

@@ -101,8 +101,8 @@ def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
     again = load(given["checkpoint"], Source.loaded(given), progress)
     loaded, now, root = stage["metrics"]["checkpoint"], again.checkpoint, again.recordings.root
     layout = stage["metrics"].get("recordings", {}).get("layout")
-    words, found = again.recordings.layout.words(), None
-    what = ""
+    words = again.recordings.layout.words()
+    what, found = "", None
     if now.sha256 != loaded["sha256"] or now.identity != loaded.get("identity", now.identity):  # older runs lack it
         what = f"{now.path}: is not what notebook 01 loaded any more"
         found = "the same weights, and another config or other statistics" if now.sha256 == loaded["sha256"] else None
