@@ -9,6 +9,7 @@ with make_run(folder, config) as new:
 
 import math
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -165,15 +166,15 @@ class Work:
         return write_both(folder, config, weights, loss, origin | {self.VERB: self.described()}, **settings)
 
 
-class Room:
+class Room(ABC):
     """Where a policy learns from lessons, batch by batch. ranges: each action's, (A,); errors are divided by them."""
 
     def __init__(self, work: Work, ranges: np.ndarray):
         self.work, self.units = work, torch.from_numpy(1 / ranges).to(work.device)
 
+    @abstractmethod
     def batch(self, rng: np.random.Generator) -> Batch:
         """Draw the next samples, each with one of its views."""
-        raise NotImplementedError
 
     def train(
         self, saved: Resumable, phase: str, module: nn.Module, rate: float, loss: Callable[[Batch], Tensor]
