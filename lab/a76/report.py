@@ -106,19 +106,36 @@ def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any
         here = {k.removeprefix("workstation_"): v for k, v in artifact.items() if k.startswith("workstation_")}
         off_pct = 100 * abs(artifact["tenth_g"] / artifact["instructions_g"] - 1)
         rows += [
-            gate(f"{stem} error, x workstation's", _times(artifact, here), "<=", limits["x_workstation_error"]),
-            gate(f"{stem} frames judged on the core", artifact["frames_on_the_core"], ">=", limits["frames"]),
-            gate(f"{stem} tenth off the third, %", off_pct, "<=", limits["tenth_pct"]),
+            gate(
+                f"{stem} error on the emulated core, times the workstation's",
+                _times(artifact, here),
+                "<=",
+                limits["x_workstation_error"],
+            ),
+            gate(f"{stem} frames judged on the emulated core", artifact["frames_on_the_core"], ">=", limits["frames"]),
+            gate(f"{stem} cost of the tenth plan against the third, %", off_pct, "<=", limits["tenth_pct"]),
         ]
         for key in ("peak_memory_mb", "peak_memory_loading_mb"):
             if key not in own:
                 rows.append(gate(f"{stem} {key}", artifact[key], "<=", limits[key]))
         if stem == STATIC_ONNX and (torchs := metrics["artifacts"].get(STATIC)):
             errors = {key: torchs[key] for key in here}
-            rows.append(gate(f"{stem} error, x torch's", _times(artifact, errors), "<=", limits["x_torch_error"]))
+            rows.append(
+                gate(
+                    f"{stem} error on the emulated core, times torch's there",
+                    _times(artifact, errors),
+                    "<=",
+                    limits["x_torch_error"],
+                )
+            )
     if bits := metrics.get("backbone_bits"):
         rows.append(
-            gate(f"{STATIC} backbone values that differ", bits["differing"], "<=", limits["backbone_differing"])
+            gate(
+                f"{STATIC} backbone values that differ from the workstation's",
+                bits["differing"],
+                "<=",
+                limits["backbone_differing"],
+            )
         )
     return rows
 

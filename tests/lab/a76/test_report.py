@@ -97,9 +97,10 @@ def test_gates_of_the_cars_policy_hold():
     ("changed", "failing"),
     [
         ({"instructions_g": 1.47, "tenth_g": 1.47}, "instructions_g"), ({"simd_g": 1.11}, "simd_g"),
-        ({"throttle_mae_pct": 0.211}, "error, x workstation's"),
-        ({"workstation_steering_mae_pct": 0.0}, "error, x workstation's"),
-        ({"frames_on_the_core": 49}, "frames judged on the core"), ({"tenth_g": 1.38}, "tenth off the third, %"),
+        ({"throttle_mae_pct": 0.211}, "error on the emulated core, times the workstation's"),
+        ({"workstation_steering_mae_pct": 0.0}, "error on the emulated core, times the workstation's"),
+        ({"frames_on_the_core": 49}, "frames judged on the emulated core"),
+        ({"tenth_g": 1.38}, "cost of the tenth plan against the third, %"),
         ({"peak_memory_mb": 501}, "peak_memory_mb"), ({"peak_memory_loading_mb": 601}, "peak_memory_loading_mb"),
     ],
 )  # fmt: skip
@@ -116,13 +117,16 @@ def test_gates_of_the_cars_policy_without_torch():
     name = "policy_static.onnx"
     assert all(gates(policy_static=torchs, **{name: held}).values())
     failed = {gate for gate, passed in gates(policy_static=torchs, **{name: dear}).items() if not passed}
-    assert failed == {f"{name} {what}" for what in ("instructions_g", "peak_memory_mb", "error, x torch's")}
-    assert f"{name} error, x torch's" not in gates(**{name: held})
+    assert failed == {
+        f"{name} {what}"
+        for what in ("instructions_g", "peak_memory_mb", "error on the emulated core, times torch's there")
+    }
+    assert f"{name} error on the emulated core, times torch's there" not in gates(**{name: held})
 
 
 def test_a_flipped_bit_fails():
     assert [n for n, passed in gates(bits=1, policy_static=artifact()).items() if not passed] == [
-        "policy_static backbone values that differ"
+        "policy_static backbone values that differ from the workstation's"
     ]
 
 
@@ -143,9 +147,11 @@ def test_an_action_that_never_changes_is_not_judged():
     assert errors["throttle_mae_pct"] is None
     assert errors["steering_mae_pct"] == pytest.approx(100 * np.abs(chunks[1] - chunks[0])[..., 0].mean(), rel=1e-4)
     still = artifact(throttle_mae_pct=None, workstation_throttle_mae_pct=None)
-    assert gates(policy_static=still)["policy_static error, x workstation's"] is True
+    assert gates(policy_static=still)["policy_static error on the emulated core, times the workstation's"] is True
     neither = still | {"steering_mae_pct": None, "workstation_steering_mae_pct": None}
-    assert gates(policy_static=neither)["policy_static error, x workstation's"] is None, "not measured, no failure"
+    assert gates(policy_static=neither)["policy_static error on the emulated core, times the workstation's"] is None, (
+        "not measured, no failure"
+    )
 
 
 def test_an_image_size_is_judged_by_fp32_of_its_own():
