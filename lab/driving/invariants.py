@@ -329,8 +329,8 @@ def _in_time(run: Run) -> str | None:
     pauses = [p for p, later in pairwise([*pauses, (10**9, 0)]) if later[0] > p[1] + 15]
     for i, (start, end) in enumerate(pauses):
         begun = max((armed for armed in run.armed if armed <= end), default=end) + 40
-        lates = [b - a - 34 for a, b in pauses[: i + 1] if b > end - 480 and b - a >= 70 and a >= begun]
-        if sum(lates) > 160 and (what := _off_after(run, end, VALID_MS + 20, "pauses until then")):
+        lateness = [b - a - 34 for a, b in pauses[: i + 1] if b > end - 480 and b - a >= 70 and a >= begun]
+        if sum(lateness) > 160 and (what := _off_after(run, end, VALID_MS + 20, "pauses until then")):
             return what
         first = [b for a, b in pauses[:i] if 103 <= b - a <= 148 and b + 20 < start and end < b + 480]
         judged = first and end - start >= 48 and not run.sick[first[0] - 200 : end].any() and end < run.seen.end_ms

@@ -480,6 +480,6 @@ def test_the_batch_of_the_docs_runs(demo_run, tmp_path, monkeypatch, capsys):
 
 def test_an_unknown_parameter_is_refused_before_anything_runs(tmp_path):
     began = time.monotonic()
-    with pytest.raises(runs.NotebookError, match=r"03_quantize.ipynb has no parameter schem; known are .*'scheme'"):
-        runs.execute("03_quantize", tmp_path, schem="affine")
+    with pytest.raises(runs.NotebookError, match=r"03_quantize.ipynb has no parameter shape; known are .*'scheme'"):
+        runs.execute("03_quantize", tmp_path, shape="affine")
     assert time.monotonic() - began < 2
