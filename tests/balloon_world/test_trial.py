@@ -30,7 +30,7 @@ class SeesRed:
         blue, green, red = frame_bgr[::2, ::2].astype(int).transpose(2, 0, 1)
         columns = np.nonzero((red > 70) & (red > 2.2 * np.maximum(blue, green)))[1]
         column = columns.mean() if len(columns) else 160
-        return np.tile(np.float32([np.clip((160 - column) / 200, -0.65, 0.65), 0.05]), (self.chunk, 1))
+        return np.tile(np.float32([np.clip((column - 160) / 200, -0.65, 0.65), 0.05]), (self.chunk, 1))
 
 
 # Newcombe 1998, Statistics in Medicine 17, table I, method 3 (Wilson's score); 40 of 40 and 0 of 40 by its formula.
