@@ -82,13 +82,13 @@ class Fleet:
         self.lines[name] = f"{name} rover_models={self.folder}/{name}/models ansible_connection=lost"
 
     def releases(self, name: str) -> Releases:
-        return Releases(self.folder / name / "models", check=lambda name: None)
+        return Releases(self.folder / name / "models", check=lambda name: None, signers=self.folder / "signers")
 
     def given(self, artifact: Path, *names: str) -> None:
         """These rovers use that artifact, as after a deployment."""
         for name in names:
             releases = self.releases(name)
-            releases.switch(releases.stage(artifact, unsigned=True).name)
+            releases.switch(releases.stage(artifact, unsigned=True).name, unsigned=True)
 
     def play(self, book: str, *options: str, **variables: object) -> subprocess.CompletedProcess:
         inventory = [

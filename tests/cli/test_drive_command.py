@@ -237,12 +237,14 @@ def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
         (["policy.pt", "--hz", "5"], 2, "--hz"),
         (["policy.pt", "--throttle-limit", "1.5"], 2, "--throttle-limit"),
         (["policy.pt", "--port", "/dev/nothing"], 1, "/dev/nothing: cannot be opened"),
+        (["nope.pt", "--port", "/dev/nothing"], 1, "nope.pt: not found"),
         (["policy.pt", "--dry-run", "--camera", "/dev/video77"], 1, "/dev/video77: no such camera"),
         (["--replay", "nothing"], 1, "nothing"),
         (["policy.pt", "--camera", "."], 1, ".: recorded pictures know nothing of where the car is; give the camera's"),
     ],
 )
-def test_what_cannot_begin(options, code, message, tmp_path):
+def test_what_cannot_begin(options, code, message, artifact, tmp_path):
+    options = [str(artifact) if option == "policy.pt" else option for option in options]
     result = CliRunner().invoke(main, ["drive", *options, "--log", str(tmp_path / "flight.log")])
     assert result.exit_code == code
     assert message in result.output

@@ -47,6 +47,8 @@ class FileSample:
 
     state: np.ndarray
     frame_path: Path
+    row: int = 0
+    episode: str = "memory"
 
     def frame_bgr(self) -> np.ndarray:
         return cv2.imread(str(self.frame_path))
