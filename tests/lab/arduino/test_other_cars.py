@@ -193,15 +193,15 @@ def test_after_a_reset_the_pins_have_its_neutral_and_nobody_arms_it(armed, how):
 
 
 def test_told_of_another_car_no_pulse_is_cut():
-    """There and back while a human drives: each pulse on the way is one of his, or a neutral of either car."""
+    """There and back while a human steers, the throttle at rest: each pulse on the way is one neutral or the other."""
     rng = random.Random(4)
     board = Uno()
     board.transmitter(1700, 124)
     board.run_ms(150)
     cars = (CRAWLER, Car(), INVERTED, CRAWLER, INVERTED)
     for before, car in zip((Car(), *cars), cars, strict=False):
-        board.transmitter(1700, rng.choice([400, 700, 900]) if before is not CRAWLER else 1800)
-        board.run_ms(rng.uniform(60, 80))
+        board.transmitter(1700, before.numbers[6])
+        board.run_ms(rng.uniform(260, 280))
         start = len(board.events)
         told(board, car)
         board.run_ms(100)
