@@ -16,19 +16,24 @@ BESIDE = (REPO, *REPO.parents[:2])  # where shared/ may be
 
 def real_episode() -> Path:
     """Return the folder of a real recording in shared/, in or beside the checkout. Skips the test if there is none."""
-    for base in BESIDE:
-        found = sorted((base / "shared" / "sample_episode").glob("episode_*/episode_data.json"))
-        if found:
-            return found[0].parent
-    pytest.skip("no real recording here: put one at shared/sample_episode/episode_*/ to run this test on it")
+    return _shared("sample_episode/episode_*/episode_data.json", "a real recording").parent
 
 
 def real_recordings() -> Path:
     """Return the folder of several whole real recordings in shared/. Skips the test if there is none."""
+    return _shared("recordings/episode_*/frames", "several real recordings").parents[1]
+
+
+def odd_policy() -> Path:
+    """Return a folder with a policy that answers some frames far more strongly than others, and its recordings."""
+    return _shared("outliers/best_model.pth", "a policy with odd frames").parent
+
+
+def _shared(pattern: str, what: str) -> Path:
     for base in BESIDE:
-        if any((base / "shared" / "recordings").glob("episode_*/frames")):
-            return base / "shared" / "recordings"
-    pytest.skip("no real recordings here: put some at shared/recordings/episode_*/ to run this test on them")
+        if found := sorted((base / "shared").glob(pattern)):
+            return found[0]
+    pytest.skip(f"no {what.split(maxsplit=1)[1]} here: put {what} at shared/{pattern} to run this test")
 
 
 def record_drives(root: Path, drives: int = 4, frames: int = 24) -> Path:

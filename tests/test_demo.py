@@ -1,14 +1,27 @@
 """The demo's run, made by `make demo`, must pass the gates of params.yml; before a release, `make demo-more` too."""
 
+from dataclasses import dataclass, replace
+
 import nbformat
+import numpy as np
 import pytest
 from executed import shown, text_of
+from policies import dazzled_by_white
 
 from balloon_world import frontier, latency
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
+from rover_lib.workshop.int8.choose import Chooser
+from rover_lib.workshop.int8.frames import describe_odd
+from rover_lib.workshop.int8.observe import calibrate
+from rover_lib.workshop.int8.quantize import quantize
+from rover_lib.workshop.int8.scheme import Scheme
+from rover_lib.workshop.judge.recorded_range import worst
+from rover_lib.workshop.recordings.samples import Sample, pick_evenly
+from rover_lib.workshop.run.pipeline import Recipe, prepare_chooser
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
+from rover_lib.workshop.run.session import load
 
 STAGES = ("load", "calibrate", "quantize", "compare")
 
@@ -94,3 +107,36 @@ def test_outputs_that_never_change_are_those_committed(demo_run, name):
     for cell in committed.cells:
         if "NBVAL_CHECK_OUTPUT" in cell.source:
             assert found[cell.id] == text_of(cell), cell.id
+
+
+@dataclass(frozen=True, eq=False)
+class _Flash(Sample):
+    """A frame of a drive whose light has jumped: the camera sees nothing but white."""
+
+    def frame_bgr(self):
+        return np.full_like(super().frame_bgr(), 255)
+
+
+def test_int8_survives_light_that_jumps(demo_run):
+    """Each drive begins white, and a policy whose statistics are from elsewhere answers that far more strongly."""
+
+    def jump(samples):
+        return tuple(_Flash(**vars(s)) if s.row < 3 else s for s in samples)
+
+    loaded, gates = load(demo_run / "best_model.pth", demo_run / "episodes"), params()["gates"]
+    dazzled = dazzled_by_white(loaded.checkpoint)
+    parts = loaded.parts
+    parts = replace(parts, calibration=jump(parts.calibration), choosing=jump(parts.choosing))
+    loaded = replace(loaded, checkpoint=dazzled, parts=parts)
+    calibration = calibrate(dazzled, Recipe.of(params(), 100).choose(parts.calibration)[0])
+    named = describe_odd(calibration.frames, calibration.seen)
+    assert named["times"] > 20 and max(named["rows"]) < 3
+    scheme, table = prepare_chooser(dazzled, loaded, calibration).observer(Scheme(), ("minmax", "frames"))
+    judge = Chooser(dazzled, calibration, pick_evenly(parts.held_out, 60), loaded.recordings.action_range())
+    found = {
+        s.observer: judge.error(quantize(dazzled, s, calibration).module) for s in (Scheme(observer="minmax"), scheme)
+    }
+    print(named, table, found)
+    for action in ("steering", "throttle"):
+        assert found["frames"][f"{action}_mae_pct"] <= gates[f"{action}_mae_pct"]
+    assert worst(found["minmax"]) > 2 * worst(found["frames"])

@@ -410,6 +410,7 @@ def test_both_units_have_the_same_sandbox(units):
     def settings(name: str) -> set[str]:
         return {line for line in (units / name).read_text().splitlines() if re.match(r"[A-Z]\w+=", line)}
 
+    assert {"DeviceAllow=/dev/vcio rw", "DeviceAllow=/dev/vcio_gencmd rw"} <= settings("rover-drive.service")
     differ = settings("rover-drive.service") ^ settings("rover-check@.service")
     kinds = {line.partition("=")[0] for line in differ}
     assert kinds <= {

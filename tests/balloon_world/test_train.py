@@ -151,7 +151,7 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(recorded, carried
             bars[-1]["ticks"] += 1
             yield item
 
-    monkeypatch.setattr(train_module, "descend", descend_until_killed)
+    monkeypatch.setattr(training_module, "descend", descend_until_killed)
     out = tmp_path / "killed.pth"
     for _ in kill_at:
         with pytest.raises(Killed):

@@ -1,5 +1,6 @@
 """The command line: help that helps, one sentence for bad input, nothing half-written."""
 
+import errno
 import json
 import os
 import shutil
@@ -11,8 +12,9 @@ from click.testing import CliRunner
 
 from rover_lib.cli import main
 from rover_lib.onboard import cli as onboard
+from rover_lib.onboard.cli import show
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.stage import read_stage, write_stage
+from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
 
 
 def rover(*args):
@@ -131,6 +133,36 @@ def test_a_drive_that_does_not_end_costs_nothing_of_the_last_one(tmp_path, monke
     assert rover("world", "latency", tmp_path).exit_code == 1
     assert read_stage(file, "drive")["metrics"] == {"of": "before"}
     assert list(tmp_path.iterdir()) == [file]
+
+
+def full():
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("fails", "says"),
+    [
+        (full, "{}/o.pt: no space left on device; make room on that disk"),
+        (Path("/proc/x").mkdir, "/proc/x: no such file or directory; is its name right?"),
+        (Path("nothing\x08").read_text, "nothing\\x08: no such file or directory"),
+    ],
+)
+def test_a_systems_error_is_a_sentence_with_its_file(tmp_path, monkeypatch, fails, says):
+    monkeypatch.setattr("rover_lib.workshop.run.session.load", lambda *a, **k: write_through(tmp_path / "o.pt", fails))
+    monkeypatch.setattr("rover_lib.onboard.kinds.kinds_of", lambda path: ())
+    result = CliRunner().invoke(main, ["quantize", "a", "b", "-o", str(tmp_path / "o.pt")])
+    assert result.exit_code == 1 and result.output.startswith("rover: " + says.format(tmp_path)), result.output
+
+
+def write_through(path, fails):
+    with atomic_path(path) as temporary:
+        temporary.write_text("half")
+        fails()
+
+
+def test_what_a_file_says_cannot_control_the_terminal(capsys):
+    show({"labels": ["drive \x1b[31mred"], "layout": "a\nb"}, False)
+    assert "drive \\x1b[31mred" in (out := capsys.readouterr().out) and "a\\nb" in out and "\x1b" not in out
 
 
 def test_a_size_is_width_and_height(tmp_path):

@@ -1,7 +1,6 @@
 """A student is taught from recordings alone, and an interrupted training goes on where it stopped."""
 
 import json
-import math
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
@@ -114,13 +113,16 @@ def test_what_was_begun_with_other_settings_is_not_gone_on_with(teacher, episode
 
     monkeypatch.setattr(distill_module, "Resumable", Elsewhere)
     monkeypatch.setattr(distill_module, "_train_backbone", lambda *_: {})
-    monkeypatch.setattr(distill_module, "_refuse_strangers", lambda room: None)
+    monkeypatch.setattr(distill_module.Lessons, "refuse_stranger", lambda *_: None)
     monkeypatch.setattr(distill_module.Lessons, "ask", lambda *_: None)
     (tmp_path / "other.yml").write_text("quantization: {smooth: 0.3}")
     config = student_config(opened.checkpoint, SHAPE)
     cpu = torch.device("cpu")
     for qat in (True, False):
-        work = distill_module._Work(opened, config, None, recipe, qat, cpu, silent)
+        work = distill_module._Work(
+            origin=opened.checkpoint, opened=opened, config=config, share=None, recipe=recipe, qat=qat, device=cpu,
+            progress=silent,
+        )  # fmt: skip
         for settings in ("", str(tmp_path / "other.yml")):
             monkeypatch.setenv("ROVER_PARAMS", settings)
             with pytest.raises(KeyboardInterrupt):
@@ -138,10 +140,10 @@ def test_killed_twice_in_the_middle_it_goes_on_and_gives_the_same(
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     for at in (2, 8):  # in the backbone's phase with one step done, and in the transformer's with eight
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            interrupt(patch, distill_module, "descend", at)
+            interrupt(patch, training, "descend", at)
             distill(teacher, episodes, "fast", SHAPE, **arguments)
         assert not (tmp_path / "fast").exists()
-    steps = interrupt(monkeypatch, distill_module, "descend", at=0)
+    steps = interrupt(monkeypatch, training, "descend", at=0)
     folder = distill(teacher, episodes, "fast", SHAPE, **arguments)
     assert len(steps) == 3 + 8 + 3 - 8
     expected = weights_of(taught)
@@ -156,7 +158,7 @@ def test_a_student_of_half_the_channels_keeps_its_zeros(teacher, episodes, recip
     shape, arguments = StudentShape(backbone_channels=0.5), {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
         save_each_step(patch, distill_module)
-        steps = interrupt(patch, distill_module, "descend", at=2)
+        steps = interrupt(patch, training, "descend", at=2)
         with pytest.raises(KeyboardInterrupt):
             distill(teacher, episodes, "thin", shape, qat=True, **arguments)
         (own,) = (tmp_path / "cache").glob("student-*")
@@ -191,7 +193,7 @@ def test_the_teacher_itself_learns_to_be_int8(teacher, episodes, recipe, tmp_pat
     arguments = {"qat": True, "runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     with monkeypatch.context() as patch:
         save_each_step(patch, distill_module)
-        steps = interrupt(patch, distill_module, "descend", at=2)
+        steps = interrupt(patch, training, "descend", at=2)
         with pytest.raises(KeyboardInterrupt):
             distill(teacher, episodes, "int8", StudentShape(), **arguments)
         folder = distill(teacher, episodes, "int8", StudentShape(), **arguments)
@@ -212,7 +214,12 @@ def test_what_loses_much_by_int8_is_told_of_qat(taught):
     (row,) = content["metrics"]["gates"]
     assert row["limit"] == 5 and "--qat" in row["gate"] and row["passed"] == (row["found"] <= 5)
     row |= {"found": 7.25, "passed": False}
-    assert "INT8 loses 7.2 % of the recorded range, more than 5 %: train with --qat" in summary(content)
+    said = "INT8 loses 7.2 % of the recorded range, more than 5 %: "
+    assert f"{said}train with --qat" in summary(content)
+    content["metrics"]["before_qat"] = content["metrics"]["students"][1]  # it was trained so already
+    assert f"{said}--qat was not enough, and `rover run` says where" in summary(content)
+    content["metrics"]["odd"] = {"share_pct": 4.0}
+    assert f"{said}4 % of the frames are odd, and `rover run` names them" in summary(content)
 
 
 @pytest.mark.slow
@@ -221,12 +228,9 @@ def test_the_next_student_of_the_same_picture_asks_nothing_again(
 ):
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
     shutil.copytree(taught.parent / "cache", tmp_path / "cache")
-    kinds = []
-    monkeypatch.setattr(
-        distill_module, "descend", lambda loss, module, *rest: kinds.append(1) or training.descend(loss, module, *rest)
-    )
+    steps = interrupt(monkeypatch, training, "descend", at=0)
     distill(teacher, episodes, "second", replace(SHAPE, decoder_layers=2), **arguments)
-    assert len(kinds) == 8 + 3  # no backbone phase
+    assert len(steps) == 8 + 3  # no backbone phase
     assert [p.name.split("-")[0] for p in (tmp_path / "cache").iterdir()] == ["lessons"]
 
 
@@ -235,7 +239,7 @@ def test_a_teacher_with_other_statistics_is_asked_again(teacher, episodes, recip
     """The weights did not change, but the cache holds what the teacher planned with the wrong statistics."""
     was = load_checkpoint(teacher)
     plans, rows = [], np.arange(2 * recipe.samples)
-    monkeypatch.setattr(distill_module, "_refuse_strangers", lambda room: plans.append(room.lessons.plans[rows]))
+    monkeypatch.setattr(distill_module.Lessons, "refuse_stranger", lambda self, *_: plans.append(self.plans[rows]))
     for shift in (0.0, 0.02, 0.02):
         config = replace(was.config, action_unnorm=Affine((1.0, 1.0), (0.0, shift)))
         write_lerobot(tmp_path / "teacher", config, was.weights, {})
@@ -383,49 +387,6 @@ def test_what_cannot_be_taught_is_refused(teacher, episodes, tmp_path, options, 
 
 
 @pytest.mark.parametrize(
-    ("values", "says"),
-    [
-        ({"seed": -1}, "steps and seed at least 0"),
-        ({"batch": 0}, "at least 1"),
-        ({"judged_frames": 0}, "at least 1"),
-        ({"qat_steps": -1}, "steps and seed at least 0"),
-        ({"rate": 0.0}, "above 0"),
-        ({"rate": math.nan}, "finite"),
-        ({"to_teacher": 0.0, "to_recorded": 0.0}, "not both 0"),
-        ({"rate": "2e-4"}, "rate must be a number, found '2e-4'"),  # YAML reads 2e-4 as text
-        ({"samples": 10.5}, "samples must be a whole number"),
-        ({"lessons": 3}, "there is no 'lessons'"),
-    ],
-)
-def test_a_recipe_that_cannot_be_is_refused(values, says):
-    with pytest.raises(DistillError, match=says):
-        DistillRecipe.of({"distill": {**params()["distill"], **values}})
-
-
-def test_of_no_steps_there_is_no_recipe():
-    with pytest.raises(DistillError, match="at least 1 step"):
-        DistillRecipe.of(params(), steps=0)
-
-
-def test_a_phase_may_be_left_out(recipe):
-    """With zero steps its optimiser is still made, and must not fail."""
-    work = SimpleNamespace(recipe=replace(recipe, transformer_steps=0, together_steps=0), rng=np.random.default_rng)
-    room, policy = SimpleNamespace(work=work, lessons=None), torch.nn.Linear(1, 1)
-    policy.model = torch.nn.Linear(1, 1)
-    saved = SimpleNamespace(steps=lambda phase, steps, *_, **__: range(steps))
-    work.rng = lambda phase: np.random.default_rng(0)
-    distill_module._train_transformer(room, policy, saved)
-    distill_module._train_together(room, policy, saved)
-
-
-@pytest.mark.parametrize("steps", [1, 10, 1000])
-def test_a_recipe_of_few_steps_keeps_all_phases(recipe, steps):
-    short = recipe.of_steps(steps)
-    phases = short.backbone_steps, short.transformer_steps, short.together_steps, short.qat_steps
-    assert min(phases) >= 1 and abs(sum(phases) - steps) <= 4
-
-
-@pytest.mark.parametrize(
     ("shape", "qat", "phases"),
     [
         (SHAPE, False, {"backbone", "transformer", "together"}),
@@ -436,7 +397,7 @@ def test_a_recipe_of_few_steps_keeps_all_phases(recipe, steps):
 )
 def test_steps_are_shared_by_the_phases_that_it_learns_in(shape, qat, phases):
     short = DistillRecipe.of(params(), steps=1000, phases=distill_module.phases_of(shape, qat))
-    counts = {phase: getattr(short, f"{phase}_steps") for phase in distill_module.PHASES}
+    counts = {phase: getattr(short, f"{phase}_steps") for phase in DistillRecipe.PHASES}
     assert {phase for phase, steps in counts.items() if steps} == phases
     assert abs(sum(counts.values()) - 1000) <= len(phases)
 

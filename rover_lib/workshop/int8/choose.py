@@ -144,7 +144,7 @@ class Chooser:
     def _widen(self, scheme: Scheme, progress: Progress) -> tuple[Scheme, Errors]:
         """Let the tensors whose odd frames reach furthest reach further, one step at a time, while all frames gain."""
         frames, kept = self.calibration.frames, usual(self.calibration.frames, scheme.usual_pct)
-        further = {place: seen.abs().max() / seen[kept].abs().max() for place, seen in frames.items()}
+        further = {place: seen.abs().max() / seen[kept].abs().max().clamp(min=1e-6) for place, seen in frames.items()}
         places = sorted(further, key=lambda place: -further[place])[:WIDENED]
         graph = restore_observed(self.checkpoint, scheme, self.calibration)
 

@@ -52,7 +52,7 @@ def test_leaves_what_counting_needs(run_dir):
 @pytest.mark.parametrize("suffix", ["", "_54x96"])
 def test_quantize_json_says_how_to_make_it_again(run_dir, suffix):
     made = read_stage(run_dir / "quantize.json", "quantize")["metrics"]["modes"][f"static{suffix}"]
-    scheme = Scheme(**made["scheme"] | {"float_blocks": tuple(made["scheme"]["float_blocks"])})
+    scheme = Scheme.of(made["scheme"])
     checkpoint = open_run(run_dir).checkpoint
     checkpoint = checkpoint.at_size(54, 96) if suffix else checkpoint
     again = quantize(checkpoint, scheme, Calibration.load(run_dir / f"calibration{suffix}.pt"))

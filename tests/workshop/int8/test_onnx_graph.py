@@ -80,6 +80,7 @@ def test_float_policy_is_the_same(name, for_int8, tmp_path):
     [
         pytest.param(Scheme(), id="static"),
         pytest.param(Scheme(kind="affine"), id="affine"),
+        pytest.param(Scheme(observer="frames", usual_pct=75, wider=(("image_project", 0.4),)), id="frames"),
         pytest.param(Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward")), id="mixed"),
     ],
 )

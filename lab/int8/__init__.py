@@ -1,0 +1,1 @@
+"""Does static INT8 hold for policies that nobody tuned it for?"""
