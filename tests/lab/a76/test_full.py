@@ -63,6 +63,7 @@ def test_quantize_json_says_how_to_make_it_again(run_dir, suffix):
 def checkpoint_alone(monkeypatch):
     """A run quantizes nothing, which takes longer than to train it."""
     monkeypatch.setattr(full, "_quantize", lambda *_, **__: {})
+    monkeypatch.setattr(full, "write_quantize", lambda *_: None)
     monkeypatch.setattr(full, "export_onnx", lambda *_: None)
 
 
