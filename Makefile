@@ -15,7 +15,7 @@ export ROVER_AS_ROOT := 1
 # Some container images forbid Python to store its bytecode; then every process compiles torch again, which takes 2 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo demo-more watch run test test-fast check-release coverage lint notebooks-open lab count arm faults faults-cars random pi-fast pi firmware flash notebooks tables docs clean
+.PHONY: help demo demo-more watch run test test-fast check-release coverage lint notebooks-open lab count arm faults faults-cars random mutants kills pi-fast pi firmware flash notebooks tables docs clean
 
 help:
 	@echo "make demo                                   in the balloon world: record, train, quantize, drive, and judge"
@@ -23,7 +23,7 @@ help:
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make notebooks-open NAME=mine [AS=try1]     JupyterLab on a copy of a run's notebooks, with its outputs; the run stays"
 	@echo "make demo-more                              late plans, and a smaller policy that the demo's teaches: half an hour"
-	@echo "make firmware; make flash PORT=/dev/ttyUSB0 build the Arduino's firmware, and put it on the board"
+	@echo "make firmware; make flash                   build the Arduino's firmware, and put it on the board"
 	@echo "make docs                                   these pages and the notebooks as a site: runs/site/index.html"
 	@echo
 	@echo "For who changes something; CONTRIBUTING.md says what each proves and how long it takes:"
@@ -36,6 +36,8 @@ help:
 	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino"
 	@echo "make faults-cars                            the same on two other cars, of lab/cars"
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
+	@echo "make mutants                                break lines of the safety path: tests and random drives must notice"
+	@echo "make kills                                  kill what writes files at random moments, and fill its disk: root"
 	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the notebooks,"
 	@echo "                                            and the JSON behind them into results/, and the pages' tables from it"
@@ -90,8 +92,9 @@ lint: $(READY)
 $(DEMO): $(READY) $(shell find rover_lib rover_learn balloon_world notebooks -name '*.py' -o -name '*.ipynb' -o -name '*.html') $(wildcard params.yml car.yml)
 	$(MAKE) demo
 
+# Some tests call make, for which it does not matter how this one was called.
 test: lint $(DEMO)
-	$(PYTEST)
+	MAKEFLAGS= $(PYTEST)
 
 # No notebook is among these tests, so they do without nbval, whose import takes three seconds in each process.
 test-fast: $(READY)
@@ -102,7 +105,7 @@ check-release: lint $(DEMO)
 	$(MAKE) demo-more
 	$(VENV)/bin/pytest -m release tests
 	$(VENV)/bin/pytest notebooks
-	$(MAKE) faults faults-cars random pi-fast pi
+	$(MAKE) faults faults-cars random mutants kills pi-fast pi
 
 coverage: $(DEMO)
 	$(VENV)/bin/pytest --cov=rover_lib --cov=rover_learn --cov=balloon_world --cov=lab --cov=lerobot_robot_rover --cov-report=term
@@ -121,6 +124,12 @@ faults-cars: $(READY)
 
 random: $(READY)
 	$(LAB) random runs/random.json
+
+mutants: $(READY)
+	$(LAB) mutants runs/mutants.json --drives
+
+kills: $(READY)
+	$(LAB) kills runs/kills.json
 
 # This deploys the demo's artifacts.
 pi-fast: $(READY)

@@ -7,18 +7,15 @@ planner's thread are replaced. Nothing waits, and no result depends on how fast 
 """
 
 import copy
-import os
-import queue
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from balloon_world.side_by_side import everywhere, load_for_cores
 from balloon_world.trial import Trajectory, wilson_interval
 from balloon_world.world import RATE_HZ, CarState, World
 from rover_lib.onboard.artifact.manifest import content_hash
@@ -26,10 +23,9 @@ from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.drive.loop import Until, drive
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
-from rover_lib.onboard.errors import DriveFault, RoverError, WorldError
+from rover_lib.onboard.errors import DriveFault, WorldError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy.load import load_policy
-from rover_lib.onboard.stage import plain, read_stage, write_stage
+from rover_lib.onboard.stage import find_stage, write_stage
 from rover_lib.workshop.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -267,29 +263,12 @@ def run_latencies(
     """
     if worlds < 1 or seed < 0 or not policies:
         raise WorldError("drives need a policy, at least 1 world and a seed from 0", found=f"{worlds} and {seed}")
-    free: queue.SimpleQueue[Plans] = queue.SimpleQueue()
-    for policy in policies:
-        free.put(policy)
-
-    def one(condition: Condition, world_seed: int) -> LateDrive:
-        policy = free.get()
-        try:
-            return drive_late(policy, world_seed, condition)
-        finally:
-            free.put(policy)
-
-    with ThreadPoolExecutor(len(policies)) as pool:
-        running = [[pool.submit(one, c, s) for s in range(seed, seed + worlds)] for c in conditions]
-        every = [future for futures in running for future in futures]
-        try:
-            done = as_completed(every)
-            for future in progress(done, desc="driving", total=len(every)):
-                future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
-        drives = [[future.result() for future in futures] for futures in running]
+    asked = [(i, s) for i in range(len(conditions)) for s in range(seed, seed + worlds)]
+    driven = everywhere(policies, asked, lambda policy, at: drive_late(policy, at[1], conditions[at[0]]))
+    drives = dict(progress(driven, desc="driving", total=len(asked)))
     reports = []
-    for condition, per_world in zip(conditions, drives, strict=True):
+    for i, condition in enumerate(conditions):
+        per_world = [drives[i, s] for s in range(seed, seed + worlds)]
         hits = sum(d.outcome == "hit" for d in per_world)
         reports.append(LatencyReport(condition, hits, worlds, wilson_interval(hits, worlds), per_world))
     return reports
@@ -368,10 +347,8 @@ def measure_latencies(
         "hits_lost_at_150_ms": limit,
     }
     inputs = {artifact.name: content_hash(artifact)}  # unchanged if the same policy is exported again
-    with suppress(RoverError):
-        there = read_stage(path, "drive")
-        if (there["params"], there["inputs"]) == (plain(given), inputs):
-            return there
+    if there := find_stage(path, "drive", params=given, inputs=inputs):
+        return there
     settings = Settings.of(p["drive"])
     conditions = []
     for ms, count in [(ms, 0) for ms in latencies_ms] + [(ms, pushes) for ms in pushed_latencies_ms]:
@@ -379,7 +356,7 @@ def measure_latencies(
         if ms:  # a plan that takes no time leaves nothing to compensate
             conditions.append(Condition(ms / 1e3, replace(settings, compensate=False), count))
     conditions.append(Condition(latencies_ms[0] / 1e3, replace(settings, ensemble=ENSEMBLE)))
-    policies = [load_policy(artifact, threads=1) for _ in range(os.cpu_count() or 1)]
+    policies = load_for_cores(artifact, worlds * len(conditions))
     reports = run_latencies(policies, conditions, worlds, progress=progress)
     first: dict[int, LatencyReport] = {}  # for each number of pushes, the report of its first latency, compensated
     rows = []

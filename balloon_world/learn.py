@@ -13,29 +13,28 @@ Every policy drives as its static INT8 artifact, which is what would drive the c
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from balloon_world.frontier import sign_test
 from balloon_world.latency import SEED, Condition, Plans, drive_in, drive_late
 from balloon_world.record import WorldEpisode, episode_name
-from balloon_world.students import everywhere
+from balloon_world.side_by_side import append_row, everywhere, load_for_cores, read_rows
 from balloon_world.trial import wilson_interval
 from balloon_world.world import RATE_HZ, World, expert
 from rover_learn.finetune import FinetuneRecipe, finetune
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.pilot import Order
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.errors import RoverError, WorldError
+from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
-from rover_lib.onboard.stage import atomic_path, plain, read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import atomic_path, find_stage, plain, read_stage, sha256_of, write_stage
 from rover_lib.workshop.cache import car_in_key
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.notebook_table import Table
@@ -43,9 +42,6 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.pipeline import make_artifact
 from rover_lib.workshop.run.session import load
-
-K = TypeVar("K")
-V = TypeVar("V")
 
 CORRECTED, DEMONSTRATED = ARMS = ("corrected", "demonstrated")
 BEFORE = "before"  # the policy that both arms begin with
@@ -171,9 +167,8 @@ class Experiment:
 
     def recipe(self) -> FinetuneRecipe:
         """Return the recipe for both arms. It learns from all recordings of the rounds, as worlds judge here."""
-        alike = {"correction_weight": 1.0, "held_out_share": 0.0, "judged_frames": JUDGED_FRAMES}
-        recipe = FinetuneRecipe.of(params(), samples=self.samples, **alike)
-        return recipe.of_steps(self.steps) if self.steps else recipe
+        alike: dict[str, Any] = {"correction_weight": 1.0, "held_out_share": 0.0, "judged_frames": JUDGED_FRAMES}
+        return FinetuneRecipe.of(params(), steps=self.steps, samples=self.samples, **alike)
 
 
 def run_experiment(
@@ -196,10 +191,8 @@ def run_experiment(
     inputs = {CHECKPOINT: sha256_of(run_dir / CHECKPOINT), ARTIFACT: content_hash(run_dir / ARTIFACT)}
     how = {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED, **car_in_key()}
     given = plain(asdict(experiment) | how)
-    with suppress(RoverError):
-        there = read_stage(path, "learn")
-        if (there["params"], there["inputs"]) == (given, inputs):
-            return there
+    if there := find_stage(path, "learn", params=given, inputs=inputs):
+        return there
     learned = {name: value for name, value in given.items() if name not in JUDGING}  # more worlds may judge later
     _begin(out_dir, {"params": learned, "inputs": inputs})
     lab = _Lab(experiment, run_dir, out_dir, progress)
@@ -298,9 +291,9 @@ class _Lab:
                 driven = drive_corrected(driver, folder, at, seed, self.experiment.learned_in(i), self.experiment.human)
                 return {"drive": i} | asdict(driven)
 
-            every = everywhere(artifact, missing, one)
+            every = everywhere(load_for_cores(artifact, len(missing)), missing, one)
             for _, row in self.progress(every, desc=f"driving, round {number}", total=len(missing)):
-                _append(folder / DRIVES_FILE, row)
+                append_row(folder / DRIVES_FILE, row)
         rows = _drives_of(folder)
         return [rows[i] for i in range(self.experiment.drives)]
 
@@ -314,7 +307,7 @@ class _Lab:
             if i not in rows:
                 seed = FIRST_DEMONSTRATED + 1000 * number + i
                 driven_s = demonstrate(folder, 1000 * number + i, seed, self.experiment.learned_in(i), left_s)
-                _append(folder / DRIVES_FILE, {"drive": i, "seed": seed, "human_s": driven_s})
+                append_row(folder / DRIVES_FILE, {"drive": i, "seed": seed, "human_s": driven_s})
                 rows = _drives_of(folder)
             left_s -= rows[i]["human_s"]
             i += 1
@@ -323,18 +316,18 @@ class _Lab:
         """Drive every policy through those of the judging worlds that it has not driven yet."""
         conditions = self.experiment.judged_in()
 
-        def outcome_of(driver: Policy, asked: tuple[str, int]) -> str:
-            how, seed = asked
-            return drive_late(driver, seed, conditions[how]).outcome
-
         for name, artifact in self.policies().items():
             done = self.outcomes(name)
             missing = [(how, seed) for how in conditions for seed in self.seeds(how) if seed not in done[how]]
             if not missing:
                 continue
-            every = everywhere(artifact, missing, outcome_of)
+            every = everywhere(
+                load_for_cores(artifact, len(missing)),
+                missing,
+                lambda driver, asked: drive_late(driver, asked[1], conditions[asked[0]]).outcome,
+            )
             for (how, seed), outcome in self.progress(every, desc=f"judging {name}", total=len(missing)):
-                _append(self.folder / f"{name}.jsonl", {"how": how, "seed": seed, "outcome": outcome})
+                append_row(self.folder / f"{name}.jsonl", {"how": how, "seed": seed, "outcome": outcome})
 
     def seeds(self, how: str) -> range:
         """Return the seeds of the worlds that judge under a condition."""
@@ -343,7 +336,7 @@ class _Lab:
     def outcomes(self, name: str) -> dict[str, dict[int, str]]:
         """Return a policy's outcomes by condition and seed, only for the worlds that judge: its file may have more."""
         found: dict[str, dict[int, str]] = {how: {} for how in self.experiment.judged_in()}
-        for row in _rows(self.folder / f"{name}.jsonl"):
+        for row in read_rows(self.folder / f"{name}.jsonl"):
             if row["seed"] in self.seeds(row["how"]):
                 found[row["how"]][row["seed"]] = row["outcome"]
         return found
@@ -353,24 +346,9 @@ def _name(arm: str, number: int) -> str:
     return f"{arm}-{number}"
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a file. A line that is torn, because a process was killed, is left out."""
-    rows = []
-    for line in path.read_text().splitlines() if path.is_file() else ():
-        with suppress(ValueError):
-            rows.append(json.loads(line))
-    return rows
-
-
-def _append(path: Path, row: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        file.write("\n" + json.dumps(plain(row)) + "\n")  # starts with a line break, in case the last line was torn
-
-
 def _drives_of(folder: Path, wanted: str = "drive") -> dict[int, dict[str, Any]]:
     """Return a folder's drives by number: all, or only those whose value of the key `wanted` is not 0."""
-    return {r["drive"]: r for r in _rows(folder / DRIVES_FILE) if wanted == "drive" or r[wanted]}
+    return {r["drive"]: r for r in read_rows(folder / DRIVES_FILE) if wanted == "drive" or r[wanted]}
 
 
 def _sweep_unfinished(folder: Path) -> dict[int, dict[str, Any]]:

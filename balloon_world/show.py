@@ -17,7 +17,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from balloon_world.car import jpeg_of
+import cv2
+
 from balloon_world.latency import NoLog, TimedCar, WorldPilot
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
@@ -155,7 +156,7 @@ class Simulation:
             "path": [[round(s.x_m, 2), round(s.y_m, 2)] for s in (*world.trajectory[::3], world.state)],
             "balloon": [world.balloon.x_m, world.balloon.y_m],
         }
-        return head, jpeg_of(frame)
+        return head, cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
 
 
 class _LastTick(NoLog):

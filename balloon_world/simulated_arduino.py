@@ -46,7 +46,7 @@ class PinEvent(NamedTuple):
 
 _NUMBER = r"(0|[1-9][0-9]{0,9})"
 _COMMAND = re.compile(rf">([ACDLN]) {_NUMBER} {_NUMBER}((?: {_NUMBER})*)", re.ASCII)
-_NUMBERS = {"A": 2, "C": 9, "D": 3, "N": 0, "L": 1}  # how many numbers follow boot and sequence
+_NUMBERS = {"A": 3, "C": 9, "D": 3, "N": 0, "L": 1}  # how many numbers follow boot and sequence
 _STATUS_S = 0.02
 _TIMEOUT_S = 0.150
 LATE_MS = 150

@@ -7,15 +7,11 @@ cache, keyed by the artifact's content. So a process that was ended goes on wher
 only its own drives and plans.
 """
 
-import json
-import os
-import queue
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,16 +19,17 @@ import torch
 from balloon_world import latency, trial, world
 from balloon_world.frontier import DRIVES, NOBODY_DROVE, recommendation
 from balloon_world.latency import SEED, Condition, drive_late
+from balloon_world.side_by_side import append_row, everywhere, load_for_cores, read_rows
 from balloon_world.trial import run_trials, wilson_interval
 from rover_learn.distill import errors_of
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
-from rover_lib.onboard.care.lower_bound import PI5_SEEN_GMAC_PER_S
+from rover_lib.onboard.care.pi5 import Work, estimate_ms, predict_ms
 from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
-from rover_lib.onboard.policy.load import Policy, load_policy
+from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.cache import cache_root, car_in_key, key_of
 from rover_lib.workshop.judge.compare import GATED
@@ -41,19 +38,13 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Recordings, Sample, Source, pick_evenly
 
-K = TypeVar("K")
-V = TypeVar("V")
 WORLDS, PUSHES = 200, 4
 HELD_OUT_FRAMES = 300
 TEACHER = "teacher"
 ARTIFACT = f"policy_{GATED}.pt"
-COUNTED = (
-    "Pushed at the high end of the time computed from counted instructions: what such kernels were seen to reach; "
-    "the low end is what no program can beat."
-)
+COUNTED = "Pushed at the high end of the time that was computed for a Raspberry Pi 5 from counted work."
 ESTIMATED = (
-    f"Pushed at an estimate, as the teacher's instructions are not counted: multiply-accumulates at "
-    f"{PI5_SEEN_GMAC_PER_S:g} G a second, the rate that such kernels were seen to reach."
+    "Pushed at an estimate for a Raspberry Pi 5 by multiply-accumulates, as the teacher's instructions are not counted."
 )
 
 
@@ -73,11 +64,14 @@ class _Run:
     @property
     def computed_ms(self) -> list[float] | None:
         """The low and the high end of the computed latency on a Pi 5; None if instructions were not counted."""
-        return [self.counts["computed_pi5_ms"][end] for end in ("low", "high")] if self.counts else None
+        if not self.counts:
+            return None
+        span = predict_ms(Work.of(self.counts))
+        return [span.low, span.high]
 
     @property
     def estimated_ms(self) -> float:
-        return 1e3 * self.manifest["gmac"] / PI5_SEEN_GMAC_PER_S
+        return estimate_ms(self.manifest["gmac"])
 
 
 def judge_students(
@@ -180,12 +174,13 @@ def _artifact_of(run_dir: Path) -> Path:
 
 
 def _counts(run_dir: Path) -> dict[str, Any] | None:
-    """Return what arm.json says about policy_static.pt; None if nothing was counted, or it was another file then."""
+    """Return what arm.json says about policy_static.pt; None if nothing, or of another file, or without cache lines."""
     if not (path := run_dir / "arm.json").is_file():
         return None
     arm = read_stage(path, "arm")
     same = arm["inputs"].get(ARTIFACT) == sha256_of(run_dir / ARTIFACT)
-    return arm["metrics"]["artifacts"][Path(ARTIFACT).stem] if same else None
+    row = arm["metrics"]["artifacts"].get(Path(ARTIFACT).stem, {})
+    return row if same and "far_lines_g" in row else None
 
 
 def _source_of(run_dir: Path, episodes: Path | str | None) -> Source:
@@ -213,33 +208,6 @@ def _row(run: _Run) -> dict[str, Any]:
     }
 
 
-def everywhere(artifact: Path, asked: Sequence[K], do: Callable[[Policy, K], V]) -> Iterator[tuple[K, V]]:
-    """Call do(policy, question) for each question, on every core a policy of one thread; yield (question, answer).
-
-    The answers come in the order in which they are ready. One policy on all cores would be slower: once torch has a
-    second thread, it spins between inferences, which costs several times what it gains for a small policy.
-    """
-    free: queue.SimpleQueue[Policy] = queue.SimpleQueue()
-    cores = min(os.cpu_count() or 1, len(asked))
-    for _ in range(cores):
-        free.put(load_policy(artifact, threads=1))
-
-    def one(question: K) -> tuple[K, V]:
-        policy = free.get()
-        try:
-            return question, do(policy, question)
-        finally:
-            free.put(policy)
-
-    with ThreadPoolExecutor(max(cores, 1)) as pool:
-        running = [pool.submit(one, question) for question in asked]
-        try:
-            for future in as_completed(running):
-                yield future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
 # --- on recordings ----------------------------------------------------------------------------------------------------
 
 
@@ -263,7 +231,8 @@ def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progr
     key = key_of(planned_by | {"frames": frames}, preprocess)
     path = cache_root() / f"plans-{key}.npy"
     if not path.exists():
-        every = everywhere(artifact, range(len(samples)), lambda policy, i: _plan(policy, samples[i]))
+        policies = load_for_cores(artifact, len(samples))
+        every = everywhere(policies, range(len(samples)), lambda policy, i: _plan(policy, samples[i]))
         planned = dict(progress(every, desc=f"judging {name}", total=len(samples)))
         with atomic_path(path) as temporary:
             np.save(temporary, np.stack([planned[i] for i in range(len(samples))]))
@@ -326,28 +295,11 @@ def _drive(
 
     Drives that are in the files are not repeated, and each new one is written to its file as soon as it has ended.
     """
-    kept = {name: _read(path) for name, path in files.items()}
+    kept = {name: {row["seed"]: row["outcome"] for row in read_rows(path)} for name, path in files.items()}
     missing = [(name, seed) for name in asked for seed in seeds if seed not in kept[name]]
-    driven = everywhere(run.artifact, missing, lambda policy, drive: asked[drive[0]](policy, drive[1]))
+    policies = load_for_cores(run.artifact, len(missing))
+    driven = everywhere(policies, missing, lambda policy, drive: asked[drive[0]](policy, drive[1]))
     for (name, seed), outcome in progress(driven, desc=f"driving {run.name}", total=len(missing)) if missing else ():
         kept[name][seed] = outcome
-        _append(files[name], {"seed": seed, "outcome": outcome})
+        append_row(files[name], {"seed": seed, "outcome": outcome})
     return {name: {seed: kept[name][seed] for seed in seeds} for name in asked}
-
-
-def _read(path: Path) -> dict[int, str]:
-    """Read outcomes by seed. A line that is torn, because a process was killed, is left out."""
-    drives = {}
-    for line in path.read_text().splitlines() if path.exists() else ():
-        try:
-            drive = json.loads(line)
-        except ValueError:
-            continue
-        drives[int(drive["seed"])] = str(drive["outcome"])
-    return drives
-
-
-def _append(path: Path, drive: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        file.write("\n" + json.dumps(drive) + "\n")  # starts with a line break, in case the last line was torn

@@ -201,7 +201,8 @@ class World:
     def render(self) -> np.ndarray:
         """Draw what the front camera sees now: (360, 640, 3) uint8 BGR."""
         frame = np.empty((FRAME_HEIGHT, FRAME_WIDTH, 3), np.uint8)
-        self._draw_wall(frame)
+        first = round(-self.state.heading_rad * FOCAL_PX) % (self._wall.shape[1] - FRAME_WIDTH)
+        frame[:HORIZON_ROW] = self._wall[:, first : first + FRAME_WIDTH]
         self._draw_floor(frame)
         seen = []
         for thing in (*self.distractors, self.balloon):
@@ -213,11 +214,6 @@ class World:
         depth, rate, phase = self._flicker
         gain = self._gain * (1 + depth * math.sin(rate * self.state.time_s + phase))
         return cv2.multiply(frame, self._light, scale=gain / 128)
-
-    def _draw_wall(self, frame: np.ndarray) -> None:
-        width = self._wall.shape[1] - FRAME_WIDTH
-        first = round(-self.state.heading_rad * FOCAL_PX) % width
-        frame[:HORIZON_ROW] = self._wall[:, first : first + FRAME_WIDTH]
 
     def _draw_floor(self, frame: np.ndarray) -> None:
         s = self.state

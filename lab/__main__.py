@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,13 @@ def main(debug: bool) -> None:
     """Prove what the rover project claims, with an emulated Arduino, faults, counted instructions and emulated Pis."""
     # Some of it needs root, and loads only artifacts that were made here.
     os.environ.setdefault(AS_ROOT, "1")
+
+
+def _end(ctx: click.Context, wrong: Sequence[object]) -> None:
+    """Say what is not as expected, and end the command with exit code 1 if that is anything."""
+    for sentence in wrong:
+        click.echo(f"rover: {sentence}", err=True)
+    ctx.exit(1 if wrong else 0)
 
 
 @main.command()
@@ -89,6 +97,25 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as
 
 
 @main.command()
+@click.argument("output", type=FILE, required=False)
+@click.option("--ncnn", "graphs", type=FILE, help="benchmark/models of a copy of ncnn, for what is not counted yet.")
+@click.pass_context
+def clock(ctx: click.Context, output: Path | None, graphs: Path | None) -> None:
+    """Predict what networks and our policies take on a Raspberry Pi 5, and hold it against published times.
+
+    OUTPUT [default: results/clock/clock.json] keeps the counts, so that only what it lacks is counted, in the emulated
+    Cortex-A76: everything takes half an hour on two quiet cores. The exit code is 1 if a gate of lab/params.yml does
+    not hold.
+    """
+    from lab.a76.clock import OUTPUT, table, tell_time
+    from lab.params import lab_params
+
+    content = tell_time(output or OUTPUT, graphs=graphs, limits=lab_params()["clock"], progress=terminal_bar())
+    click.echo(table(content))
+    ctx.exit(0 if all(row["passed"] for row in content["metrics"]["gates"]) else 1)
+
+
+@main.command()
 @click.argument("run_dir", type=FILE)
 @click.option("--samples", type=click.IntRange(min=1), default=64, show_default=True, help="Calibration samples.")
 @click.option("--steps", type=click.IntRange(min=1), default=24, show_default=True, help="Training steps.")
@@ -153,9 +180,7 @@ def faults(
     if output:
         outcome.write(output)
     show(outcome.summary, False)
-    for sentence in outcome.wrong:
-        click.echo(f"rover: {sentence}", err=True)
-    ctx.exit(1 if outcome.wrong else 0)
+    _end(ctx, outcome.wrong)
 
 
 @main.command()
@@ -174,9 +199,57 @@ def view(ctx: click.Context, output: Path, artifact: Path, pairs: int, stops: in
 
     metrics, wrong = measure(output, artifact, pairs, stops, click.echo)
     show(metrics, False)
-    for sentence in wrong:
-        click.echo(f"rover: {sentence}", err=True)
-    ctx.exit(1 if wrong else 0)
+    _end(ctx, wrong)
+
+
+@main.command("mutants")
+@click.argument("output", type=FILE, required=False)
+@click.option("--only", multiple=True, metavar="NAME", help="Only this mutant; several times for more.")
+@click.option("--drives", is_flag=True, help="Random drives, too, must notice those that an invariant is about.")
+@click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True)
+@click.pass_context
+def plant_mutants(ctx: click.Context, output: Path | None, only: tuple[str, ...], drives: bool, jobs: int) -> None:
+    """Break single lines of the safety path, each in a copy, and see that a named test fails.
+
+    The exit code is 1 if one survives.
+    """
+    from lab.repository.mutants import read_mutants, try_mutants
+    from rover_lib.onboard.stage import write_stage
+
+    outcomes = try_mutants([m for m in read_mutants() if not only or m.name in only], jobs, drives)
+    for outcome in outcomes:
+        click.echo(str(outcome))
+    survived = [outcome.mutant.name for outcome in outcomes if outcome.survived]
+    noticed = sum(outcome.noticed is True for outcome in outcomes)
+    metrics = {"mutants": len(outcomes), "survived": survived, "noticed_by_random_drives": noticed}
+    if output:
+        write_stage(output, "mutants", params={"drives": drives}, metrics=metrics)
+    show(metrics, False)
+    ctx.exit(1 if survived else 0)
+
+
+@main.command("kills")
+@click.argument("output", type=FILE, required=False)
+@click.option("--each", type=click.IntRange(min=1), default=50, show_default=True, help="Kills of each.")
+@click.pass_context
+def kill_commands(ctx: click.Context, output: Path | None, each: int) -> None:
+    """Kill what writes files at random moments, and fill its disk (as root). Exit code 1 if anything is lost."""
+    import tempfile
+
+    from lab.repository import kills
+    from rover_lib.onboard.stage import write_stage
+
+    metrics: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = kills.make_inputs(Path(folder))
+        for work in kills.WORKS:
+            metrics[f"{work.name}_killed"] = kills.kill_randomly(work, inputs, each)
+            if os.geteuid() == 0:
+                metrics[f"{work.name}_disk_full"] = kills.fill_randomly(work, inputs, max(1, each // 5))
+    if output:
+        write_stage(output, "kills", params={"each": each}, metrics=metrics)
+    show(metrics, False)
+    ctx.exit(1 if any(found["wrong"] for found in metrics.values()) else 0)
 
 
 @main.command("random")
@@ -198,9 +271,7 @@ def random_drives(ctx: click.Context, output: Path | None, drives: int, first: i
     if output:
         lab_random.write_random_drives(output, first, tally, failures)
     show(tally.summary, False)
-    for failure in failures:
-        click.echo(f"rover: {failure}", err=True)
-    ctx.exit(1 if failures else 0)
+    _end(ctx, failures)
 
 
 @main.group()
@@ -209,10 +280,8 @@ def pi() -> None:
 
 
 def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
-    for sentence in wrong:
-        click.echo(f"rover: {sentence}", err=True)
     click.echo(f"{'not as expected' if wrong else 'as expected'}: {output}")
-    ctx.exit(1 if wrong else 0)
+    _end(ctx, wrong)
 
 
 @pi.command("fast")

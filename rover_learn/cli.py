@@ -64,7 +64,9 @@ def distill(
     height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
     shape = StudentShape(height, width, **parts)
-    recipe = DistillRecipe.of(params(), steps, samples, seed, phases_of(shape, options["qat"]))
+    recipe = DistillRecipe.of(
+        params(), steps=steps, phases=phases_of(shape, options["qat"]), samples=samples, seed=seed
+    )
     folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal_bar(), **options)
     content = read_stage(folder / "distill.json", "distill")
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
@@ -108,8 +110,7 @@ def finetune(
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import read_stage
 
-    recipe = FinetuneRecipe.of(params(), correction_weight=weight, samples=samples, seed=seed)
-    recipe = recipe.of_steps(steps) if steps else recipe
+    recipe = FinetuneRecipe.of(params(), steps=steps, correction_weight=weight, samples=samples, seed=seed)
     folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal_bar(), **options)
     content = read_stage(folder / "finetune.json", "finetune")
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")

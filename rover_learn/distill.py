@@ -11,13 +11,10 @@ The run's folder gets best_model.pth, pretrained_model/, policy_static.pt and di
 Letters: n samples, B batch, C chunk, A actions.
 """
 
-import math
 import shutil
 import sys
-import zlib
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +22,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rover_learn import channels, refit, training
+from rover_learn import channels, phases, refit, training
 from rover_learn import lessons as lessons_module
 from rover_learn import student as student_module
 from rover_learn.channels import without_channels
 from rover_learn.fake_quant import RoundedPolicy
-from rover_learn.lessons import BatchedPolicy, Lessons, as_driven, in_another_light, judged_ranges, plans_of
+from rover_learn.lessons import Batch, BatchedPolicy, Lessons, Part, as_driven, judged_ranges, plans_of
+from rover_learn.phases import Count, FromZero, Positive, Recipe, Room, Taught, Weight, Work, make_run
 from rover_learn.student import StudentShape, gmac, initial_weights, student_config
-from rover_learn.training import Resumable, descend, optimiser, threads
+from rover_learn.training import Resumable
 from rover_lib.onboard.errors import CheckpointError, DistillError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
@@ -41,7 +39,7 @@ from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint.files import find_written, write_both
+from rover_lib.workshop.checkpoint.files import find_written
 from rover_lib.workshop.checkpoint.lerobot import read_origin
 from rover_lib.workshop.int8.export import export
 from rover_lib.workshop.int8.frames import describe_odd
@@ -56,75 +54,37 @@ from rover_lib.workshop.recordings.samples import Source, pick_evenly
 from rover_lib.workshop.run import pipeline as quantization
 from rover_lib.workshop.run.run import files_of_a_run
 from rover_lib.workshop.run.run_folder import run_folder
-from rover_lib.workshop.run.session import SMALL_GMAC, Opened, load, training_device
-from rover_lib.workshop.swap_folder import build_beside
-from rover_lib.workshop.untrusted import numbers
+from rover_lib.workshop.run.session import Opened, load, training_device
 
-PHASES = ("backbone", "transformer", "together", "qat")
 Notes = dict[str, list[dict[str, Any]]]  # of what a student does without, by part
 NOBODY_DROVE = "Judged on recordings alone: nobody drove."
 
 
-@dataclass(frozen=True)
-class DistillRecipe:
+@dataclass(frozen=True, kw_only=True)
+class DistillRecipe(Recipe):
     """How a student is taught: params.yml's section `distill`.
 
-    samples: asked about at most. rate: of the first two phases; the third has a tenth. to_teacher, to_recorded: weights
-    of the two losses, mean absolute errors in units of the recorded range. unit_frames: choose a feed-forward's units.
-    judged_frames: of the held-out episodes, at most. seed: of all that is drawn.
+    rate: of the first two phases; the third has a tenth. to_teacher, to_recorded: weights of the two losses, mean
+    absolute errors in units of the recorded range. unit_frames: choose a feed-forward's units.
     """
 
-    samples: int
-    batch: int
-    backbone_steps: int
-    transformer_steps: int
-    together_steps: int
-    qat_steps: int
-    rate: float
-    qat_rate: float
-    to_teacher: float
-    to_recorded: float
-    unit_frames: int
-    judged_frames: int
-    seed: int
+    SECTION, ERROR, PHASES = "distill", DistillError, ("backbone", "transformer", "together", "qat")
+
+    backbone_steps: FromZero
+    transformer_steps: FromZero
+    together_steps: FromZero
+    qat_steps: FromZero
+    qat_rate: Positive
+    to_teacher: Weight
+    to_recorded: Weight
+    unit_frames: Count
 
     def __post_init__(self):
-        counts = self.samples, self.batch, self.unit_frames, self.judged_frames
-        steps = self.backbone_steps, self.transformer_steps, self.together_steps, self.qat_steps
-        if min(counts) < 1 or min(*steps, self.seed) < 0:
-            raise DistillError("samples, batch and frames must be at least 1, steps and seed at least 0", found=self)
-        rates, weights = (self.rate, self.qat_rate), (self.to_teacher, self.to_recorded)
-        if not (all(map(math.isfinite, (*rates, *weights))) and min(rates) > 0 and min(weights) >= 0 < max(weights)):
+        super().__post_init__()
+        if not self.to_teacher + self.to_recorded > 0:
             raise DistillError(
-                "rates must be finite and above 0, to_teacher and to_recorded at least 0, and not both 0", found=self
+                "to_teacher and to_recorded must not both be 0", remedy="a student learns from one of them"
             )
-
-    @classmethod
-    def of(
-        cls,
-        params: dict[str, Any],
-        steps: int | None = None,
-        samples: int | None = None,
-        seed: int | None = None,
-        phases: Collection[str] = PHASES,
-    ) -> "DistillRecipe":
-        """That of params.yml, with what is not None in its place. steps: in all, of these phases alone. Raises
-        DistillError.
-        """
-        recipe = numbers(cls, params["distill"], "params.yml: distill", DistillError)
-        if steps is not None:
-            recipe = recipe.of_steps(steps, phases)
-        given = {"samples": samples, "seed": seed}
-        return replace(recipe, **{name: value for name, value in given.items() if value is not None})
-
-    def of_steps(self, steps: int, phases: Collection[str] = PHASES) -> "DistillRecipe":
-        """The same with that many steps in all, at least one in each of these phases and none in the others."""
-        if steps < 1:
-            raise DistillError("a student needs at least 1 step", found=steps)
-        planned = {phase: getattr(self, f"{phase}_steps") for phase in PHASES if phase in phases}
-        share = steps / max(sum(planned.values()), 1)
-        counts = {phase: max(1, round(share * count)) for phase, count in planned.items()}
-        return replace(self, **{f"{phase}_steps": counts.get(phase, 0) for phase in PHASES})
 
 
 def phases_of(shape: StudentShape, qat: bool) -> list[str]:
@@ -162,14 +122,20 @@ def distill(
     teacher = opened.checkpoint
     config = student_config(teacher, shape)
     share = None if shape.backbone_channels == 1 else shape.backbone_channels
-    work = _Work(opened, config, share, recipe, qat, where, progress)
+    work = _Work(
+        origin=teacher,
+        opened=opened,
+        config=config,
+        share=share,
+        recipe=recipe,
+        qat=qat,
+        device=where,
+        progress=progress,
+    )
     if work.is_teacher and not qat:
         remedy = "give it a smaller picture, fewer layers or channels, or train it for INT8 with --qat"
         raise DistillError("this student would be its teacher", remedy=remedy)
-    with (
-        build_beside(folder, _of_an_earlier_student) as new,
-        threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()),
-    ):
+    with make_run(folder, config, _of_an_earlier_student) as new:
         _refuse_another_policy(folder, teacher)
         taught = _teach(work)
         _leave(new, name, work, taught)
@@ -204,30 +170,21 @@ def _is_student(path: Path) -> bool:
         return False
 
 
-@dataclass(frozen=True, eq=False)
-class _Work:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Work(Work):
     """What is to be done. config: the student's. share: of its backbone's inner channels that stay, None for all."""
+
+    ROLE, VERB = "teacher", "distilled_by"
 
     opened: Opened
     config: ActConfig
     share: float | None
-    recipe: DistillRecipe
     qat: bool
-    device: torch.device
-    progress: Progress
-
-    @property
-    def teacher(self) -> Checkpoint:
-        return self.opened.checkpoint
 
     @property
     def is_teacher(self) -> bool:
         """Whether the student has its teacher's shape: then there is only rounding to learn."""
-        return self.share is None and self.config == replace(self.teacher.config, vae_layers=0)
-
-    def rng(self, phase: str) -> np.random.Generator:
-        """Random numbers of a phase, the same in every process."""
-        return np.random.default_rng([self.recipe.seed, zlib.crc32(phase.encode())])
+        return self.share is None and self.config == replace(self.origin.config, vae_layers=0)
 
     def ranges(self) -> np.ndarray:
         """(A,) float32: each action's recorded range, in which errors are counted."""
@@ -237,38 +194,29 @@ class _Work:
 # --- teaching ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Taught:
-    """A student: weights by LeRobot's names without the leading `model.`, losses by phase. notes: what was left out of
-    its "backbone", see `without_channels`, and of each "feed_forward", see `initial_weights`. folder: where its phases
-    are saved.
-    """
-
-    weights: dict[str, Tensor]
-    losses: dict[str, list[float]]
-    notes: Notes
-    unrounded: dict[str, Tensor] | None  # the weights before quantization-aware training
-    folder: Path
-
-
-def _teach(work: _Work) -> _Taught:
+def _teach(work: _Work) -> Taught:
     """All phases. What depends on teacher, picture and samples alone stays in the cache, for its next student."""
     progress = work.progress
     samples = pick_evenly(work.opened.parts.calibration, work.recipe.samples)
-    sees = _sees(work, samples)
-    sources = [sys.modules[__name__], lessons_module, student_module, channels, refit, training, preprocess, act]
+    recipe = work.recipe
+    sees = work.sees(samples) | {
+        "size": work.config.image_sizes,
+        "recipe": [recipe.batch, recipe.backbone_steps, recipe.rate],
+    }
+    sources = [sys.modules[__name__], phases, lessons_module, student_module, channels, refit]
+    sources += [training, preprocess, act]
     folder = cache_root() / f"lessons-{key_of(sees, *sources)}"
-    own = cache_root() / f"student-{key_of(sees | _learns(work, samples), *sources)}"
-    depth = work.teacher.weights["encoder_img_feat_input_proj.weight"].shape[1]
+    own = cache_root() / f"student-{key_of(sees | _learns(work), *sources)}"
     with Resumable(folder, progress) as saved:
-        lessons = Lessons.open(folder, samples, work.config, depth, work.rng("states"))
+        lessons = Lessons.open(folder, samples, work.config, work.origin, work.rng("states"))
         room = _Room(work, lessons)
-        lessons.ask(saved, work.teacher, work.rng("teacher"), work.device)
-        _refuse_strangers(room)
-        backbone = _train_backbone(room, saved)
+        lessons.ask(saved, work.origin, work.rng("teacher"), work.device)
+        remedy = "give recordings of the car and the camera that it was trained for"
+        lessons.refuse_stranger(work.origin, work.ranges(), DistillError, "these", remedy)
+        backbone = _train_backbone(work, room, saved)
         losses = dict(saved.losses)
     with Resumable(own, progress) as saved:
-        weights, notes = _start(room, backbone, own)
+        weights, notes = _start(work, lessons, backbone, own)
         policy = BatchedPolicy(work.config, weights).to(work.device)
         if work.share is not None:
             room = _Room(work, lessons.apart(own))
@@ -276,32 +224,24 @@ def _teach(work: _Work) -> _Taught:
         policy.thaw()
         unrounded = None
         if not work.is_teacher:
-            _train_transformer(room, policy, saved)
-            _train_together(room, policy, saved)
+            model = policy.model
+            room.train(
+                saved,
+                "transformer",
+                model,
+                recipe.rate,
+                lambda b: room.loss(policy.plan(b.seen("tokens"), b.states()), b),
+            )
+            slow = recipe.rate / 10
+            room.train(saved, "together", policy, slow, lambda b: room.loss(policy(b.pictures(), b.states()), b))
         if work.qat:
             unrounded = policy.weights()
-            _train_rounded(room, policy, saved, own)
+            _train_rounded(work, room, policy, saved, own)
         losses |= saved.losses
-    return _Taught(policy.weights(), losses, notes, unrounded, own)
+    return Taught(policy.weights(), losses, own, notes, unrounded)
 
 
-def _sees(work: _Work, samples: Sequence[Sample]) -> dict[str, Any]:
-    """What lessons and a backbone depend on."""
-    recipe = work.recipe
-    return {
-        "teacher": work.teacher.identity,
-        "size": work.config.image_sizes,
-        "pictures": [(s.episode, s.frame_path.name, s.frame_path.stat().st_size) for s in samples],
-        "rows": [s.row for s in samples],  # a dataset's pictures are many in one file
-        "states": zlib.crc32(np.stack([s.state for s in samples]).tobytes()),
-        "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
-        "recipe": [recipe.batch, recipe.backbone_steps, recipe.rate],
-        "at": [work.device.type, recipe.seed],
-        "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
-    }
-
-
-def _learns(work: _Work, samples: Sequence[Sample]) -> dict[str, Any]:
+def _learns(work: _Work) -> dict[str, Any]:
     """What a student depends on besides: its losses' units too, and what its ranges are read off if it is rounded."""
     p, choosing = params(), work.opened.parts.choosing
     rounded = [p["calibration"], p["quantization"], [(s.episode, s.row) for s in choosing]]
@@ -309,87 +249,60 @@ def _learns(work: _Work, samples: Sequence[Sample]) -> dict[str, Any]:
         "student": asdict(work.config),
         "share": work.share,
         "whole": asdict(work.recipe),
-        "pads": zlib.crc32(np.stack([s.is_pad for s in samples]).tobytes()),
         "units": work.ranges().tolist(),
         "rounded": rounded if work.qat else None,
     }
 
 
-class _Room:
+class _Room(Room):
     """Where a student is taught: batches of lessons, and the loss."""
 
     def __init__(self, work: _Work, lessons: Lessons):
-        self.work, self.lessons = work, lessons
-        self.units = torch.from_numpy(1 / work.ranges()).to(work.device)
+        super().__init__(work, work.ranges())
+        self.lessons = lessons
 
-    def draw(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """The next samples, (B,), and their views."""
+    def batch(self, rng: np.random.Generator) -> Batch:
         count = len(self.lessons)
         rows = rng.choice(count, min(self.work.recipe.batch, count), replace=False)
-        return rows, rng.integers(2, size=len(rows))
+        return Batch([Part(self.lessons, rows, rng.integers(2, size=len(rows)))], rng, self.work.device)
 
-    def pictures(self, rows: np.ndarray, views: np.ndarray, rng: np.random.Generator) -> Tensor:
-        """(B, height, width, 3) uint8 RGB, in another light."""
-        return torch.from_numpy(in_another_light(self.lessons.pictures(rows, views), rng)).to(self.work.device)
-
-    def states(self, rows: np.ndarray, views: np.ndarray) -> Tensor:
-        return torch.from_numpy(self.lessons.asked[2 * rows + views]).to(self.work.device)
-
-    def loss(self, plans: Tensor, rows: np.ndarray, views: np.ndarray) -> Tensor:
+    def loss(self, plans: Tensor, batch: Batch) -> Tensor:
         """plans: (B, C, A), the student's. Mean absolute errors to the teacher's and to what was recorded, weighted."""
-        recipe, device = self.work.recipe, self.work.device
-        taught = torch.from_numpy(self.lessons.plans[2 * rows + views]).to(device)
-        recorded = torch.from_numpy(self.lessons.recorded(rows, views)).to(device)
-        driven = torch.from_numpy(~self.lessons.data.is_pad[rows]).to(device)[..., None]
-        to_teacher = ((plans - taught).abs() * self.units).mean()
-        to_recorded = ((plans - recorded).abs() * self.units * driven).sum() / (driven.sum() * len(self.units))
+        recipe, driven = self.work.recipe, batch.driven()
+        to_teacher = ((plans - batch.planned()).abs() * self.units).mean()
+        to_recorded = ((plans - batch.recorded()).abs() * self.units * driven).sum() / (driven.sum() * len(self.units))
         return recipe.to_teacher * to_teacher + recipe.to_recorded * to_recorded
 
 
-def _refuse_strangers(room: _Room) -> None:
-    """Raise DistillError if the teacher knows nothing of what was driven: then it is another car's, or camera's."""
-    config, ranges = room.work.config, room.work.ranges()
-    if found := room.lessons.stranger(ranges, config.action_names):
-        raise DistillError(
-            f"{room.work.teacher.path}: on these recordings its plans are worse than one action for all frames",
-            found=found,
-            remedy="give recordings of the car and the camera that it was trained for",
-        )
-
-
-def _train_backbone(room: _Room, saved: Resumable) -> dict[str, Tensor]:
+def _train_backbone(work: _Work, room: _Room, saved: Resumable) -> dict[str, Tensor]:
     """Phase one: the backbone, at the student's picture size, to the teacher's feature map. Then its tokens, unless it
     is to lose channels.
 
     Returns its weights by LeRobot's names. At the teacher's own size it is the teacher's, as it is.
     """
-    work, lessons = room.work, room.lessons
-    teacher = work.teacher.at_size(*work.config.image_sizes[0])
+    teacher = work.origin.at_size(*work.config.image_sizes[0])
     policy = BatchedPolicy(teacher.config, teacher.weights).to(work.device)
     policy.thaw()
-    backbone = policy.backbone
-    steps = work.recipe.backbone_steps if work.config.image_sizes != work.teacher.config.image_sizes else 0
-    optimizer, scheduler = optimiser(backbone.parameters(), work.recipe.rate, max(steps, 1))
-    rng = work.rng("backbone")
-    for _ in saved.steps("backbone", steps, rng, backbone=backbone, optimizer=optimizer, scheduler=scheduler):
-        rows, views = room.draw(rng)
-        shown = torch.from_numpy(lessons.maps[2 * rows + views]).to(work.device).float()
-        error = (policy.features(room.pictures(rows, views, rng)) - shown).square().mean() / shown.square().mean()
-        saved.losses["backbone"].append(descend(error, backbone, optimizer, scheduler))
+
+    def off(batch: Batch) -> Tensor:
+        shown = batch.seen()
+        return (policy.features(batch.pictures()) - shown).square().mean() / shown.square().mean()
+
+    if work.config.image_sizes != work.origin.config.image_sizes:
+        room.train(saved, "backbone", policy.backbone, work.recipe.rate, off)
     if not work.is_teacher and work.share is None:
-        lessons.see(saved, policy, work.rng("tokens"))
+        room.lessons.see(saved, policy, work.rng("tokens"))
     return {name: value for name, value in policy.weights().items() if name.startswith("backbone.")}
 
 
-def _start(room: _Room, backbone: dict[str, Tensor], folder: Path) -> tuple[dict[str, Tensor], Notes]:
+def _start(work: _Work, lessons: Lessons, backbone: dict[str, Tensor], folder: Path) -> tuple[dict[str, Tensor], Notes]:
     """The student before its transformer learns, and what was noted of what it does without. Kept in the folder."""
     path = folder / "start.pt"
     if not path.exists():
-        lessons, work = room.lessons, room.work
         rows = pick_evenly(range(len(lessons)), work.recipe.unit_frames)
         states = torch.from_numpy(lessons.data.states)
         inputs = ((states[i][None], torch.from_numpy(lessons.frames[np.array([i])][0])) for i in rows)
-        seeing = replace(work.teacher, weights=work.teacher.weights | backbone)
+        seeing = replace(work.origin, weights=work.origin.weights | backbone)
         weights, narrowed = initial_weights(seeing, work.config, inputs)
         thinner: list[dict[str, Any]] = []
         if work.share is not None:
@@ -410,37 +323,11 @@ def _read_phase(path: Path) -> Any:
         raise TrainingError(f"{path}: cannot go on from it", found=type(error).__name__, remedy=remedy) from error
 
 
-def _train_transformer(room: _Room, policy: BatchedPolicy, saved: Resumable) -> None:
-    """Phase two: all but the backbone, on the tokens that it gave."""
-    recipe, lessons = room.work.recipe, room.lessons
-    optimizer, scheduler = optimiser(policy.model.parameters(), recipe.rate, max(recipe.transformer_steps, 1))
-    rng = room.work.rng("transformer")
-    steps, model = recipe.transformer_steps, policy.model
-    for _ in saved.steps("transformer", steps, rng, model=model, optimizer=optimizer, scheduler=scheduler):
-        rows, views = room.draw(rng)
-        tokens = torch.from_numpy(lessons.tokens[2 * rows + views]).to(room.work.device).float()
-        loss = room.loss(policy.plan(tokens, room.states(rows, views)), rows, views)
-        saved.losses["transformer"].append(descend(loss, policy.model, optimizer, scheduler))
-
-
-def _train_together(room: _Room, policy: BatchedPolicy, saved: Resumable) -> None:
-    """Phase three: all parameters at a tenth of the rate, on pictures in any light."""
-    recipe = room.work.recipe
-    optimizer, scheduler = optimiser(policy.parameters(), recipe.rate / 10, max(recipe.together_steps, 1))
-    rng = room.work.rng("together")
-    steps = recipe.together_steps
-    for _ in saved.steps("together", steps, rng, policy=policy, optimizer=optimizer, scheduler=scheduler):
-        rows, views = room.draw(rng)
-        plans = policy(room.pictures(rows, views, rng), room.states(rows, views))
-        saved.losses["together"].append(descend(room.loss(plans, rows, views), policy, optimizer, scheduler))
-
-
-def _train_rounded(room: _Room, policy: BatchedPolicy, saved: Resumable, folder: Path) -> None:
+def _train_rounded(work: _Work, room: _Room, policy: BatchedPolicy, saved: Resumable, folder: Path) -> None:
     """Phase four: as INT8 the student learns to plan what it planned before, in float, on the very same pictures.
 
     Nothing else, so that all that it changes is what rounding costs. Rounded by the ranges that it has before.
     """
-    work, recipe = room.work, room.work.recipe
     path, student = folder / "ranges.pt", _checkpoint(work, policy.weights())  # as it was before this phase
     if not path.exists():
         calibration, scheme = _calibrate(work, student)
@@ -449,15 +336,14 @@ def _train_rounded(room: _Room, policy: BatchedPolicy, saved: Resumable, folder:
     kept = _read_phase(path)
     rounded = RoundedPolicy(student, Scheme.of(kept["scheme"]), Calibration(**kept["calibration"])).to(work.device)
     exact = BatchedPolicy(work.config, student.weights).to(work.device)
-    optimizer, scheduler = optimiser(policy.parameters(), recipe.qat_rate, max(recipe.qat_steps, 1))
-    rng, steps = work.rng("qat"), recipe.qat_steps
-    for _ in saved.steps("qat", steps, rng, policy=policy, optimizer=optimizer, scheduler=scheduler):
-        rows, views = room.draw(rng)
-        pictures, states = room.pictures(rows, views, rng), room.states(rows, views)
+
+    def off(batch: Batch) -> Tensor:
+        pictures, states = batch.pictures(), batch.states()
         with torch.no_grad():
             wanted = exact(pictures, states)
-        off = ((rounded(policy.named_weights(), pictures, states) - wanted).abs() * room.units).mean()
-        saved.losses["qat"].append(descend(off, policy, optimizer, scheduler))
+        return ((rounded(policy.named_weights(), pictures, states) - wanted).abs() * room.units).mean()
+
+    room.train(saved, "qat", policy, work.recipe.qat_rate, off)
 
 
 def _checkpoint(work: _Work, weights: dict[str, Tensor]) -> Checkpoint:
@@ -574,9 +460,9 @@ def summary(content: dict[str, Any]) -> str:
 # --- what is left in the run's folder ---------------------------------------------------------------------------------
 
 
-def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
+def _leave(new: Path, name: str, work: _Work, taught: Taught) -> None:
     """Judge the student, and write its files and distill.json into a folder that will be the run's of that name."""
-    teacher, parts, action_range = work.teacher, work.opened.parts, work.opened.recordings.action_range()
+    teacher, parts, action_range = work.origin, work.opened.parts, work.opened.recordings.action_range()
     held_out = pick_evenly(parts.held_out, work.recipe.judged_frames)
     choosing = pick_evenly(parts.choosing, work.recipe.judged_frames)
     planned = _plans(work, teacher.config, teacher.weights, held_out)
@@ -596,24 +482,14 @@ def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
     chosen = _plans(work, work.config, taught.weights, choosing)
     driven = ~np.stack([s.is_pad for s in choosing])
     loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
-    recipe = asdict(work.recipe) | {"device": work.device.type}
-    origin = {"teacher_sha256": teacher.sha256, "teacher_format": teacher.format, "distilled_by": recipe}
-    settings = {
-        "learning_rate": work.recipe.rate,
-        "batch_size": work.recipe.batch,
-        "data_dir": work.opened.recordings.root.name,
-        "output_dir": name,
-        "device": work.device.type,
-        "seed": work.recipe.seed,
-    }
-    hashes = write_both(new, work.config, taught.weights, loss, origin, **settings)
+    hashes = work.write_policy(new, name, work.config, taught.weights, loss, work.opened.recordings.root.name)
     student = load_checkpoint(find_written(new))
     samples, parity = pick_evenly(parts.choosing, quantization.CHOOSING_FRAMES), quantization.Recipe.of(params()).parity
     export(rounded, student, new / "policy_static.pt", samples, calibration, parity)
     write_stage(
         new / "distill.json",
         "distill",
-        params=recipe,
+        params=work.described(),
         metrics={
             "students": students,
             "losses": taught.losses,

@@ -18,31 +18,21 @@ Letters: n samples, B batch, C chunk, A actions.
 import math
 import shutil
 import sys
-import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from rover_learn import lessons as lessons_module
-from rover_learn import training
+from rover_learn import phases, training
 from rover_learn.acceptance import Judged, verdict
-from rover_learn.lessons import (
-    MIRROR,
-    MIRRORED,
-    BatchedPolicy,
-    Lessons,
-    in_another_light,
-    judged_ranges,
-    plans_of,
-)
-from rover_learn.student import gmac, not_a_cars
-from rover_learn.training import Resumable, descend, optimiser, threads
+from rover_learn.lessons import Batch, BatchedPolicy, Lessons, Part, judged_ranges, plans_of
+from rover_learn.phases import FromZero, Positive, Recipe, Room, Share, Taught, Weight, Within, Work, make_run
+from rover_learn.student import not_a_cars
+from rover_learn.training import Resumable
 from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
@@ -52,7 +42,6 @@ from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import act
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint.files import write_both
 from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
@@ -66,64 +55,34 @@ from rover_lib.workshop.recordings.samples import (
     pick_evenly,
 )
 from rover_lib.workshop.run.run_folder import run_folder
-from rover_lib.workshop.run.session import SMALL_GMAC, check_sizes, training_device
-from rover_lib.workshop.swap_folder import build_beside
-from rover_lib.workshop.untrusted import numbers
+from rover_lib.workshop.run.session import check_sizes, training_device
 
 OLD, NEW = "old", "new"
 TOGETHER_SLOWER = 50  # the second phase's rate is this much smaller, so that the backbone does not unlearn to see
-FADED = (0.1, 1.0)  # the state of a new recording keeps a share of its steering, drawn from this range
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonstrations", "corrections")
 
 
-@dataclass(frozen=True)
-class FinetuneRecipe:
+@dataclass(frozen=True, kw_only=True)
+class FinetuneRecipe(Recipe):
     """How a policy goes on learning: the section `finetune` of params.yml.
 
-    samples: at most this many frames of each folder's demonstrations, and as many of its corrections. rate: learning
-    rate of the first phase; the second has a fiftieth of it. correction_weight: a frame of a correction is drawn this
-    many times as often as one of a demonstration. focus: new frames on which the policy planned something else than the
-    human did are drawn more often, in proportion to this power of how far off it was; with 0 all are drawn alike.
+    samples: at most this many frames of each folder's demonstrations, and as many of its corrections. rate: the second
+    phase has a fiftieth of it. correction_weight: a frame of a correction is drawn this many times as often as one of a
+    demonstration. focus: new frames on which the policy planned something else than the human did are drawn more often,
+    in proportion to this power of how far off it was; with 0 all are drawn alike.
     to_parent: the share of an old demonstration's loss that is the distance to what the policy planned there before;
     the rest, and all of the loss elsewhere, is the distance to what was recorded. held_out_share: the share of new
-    episodes that judge; the old ones are split as for everything else. judged_frames: at most this many of each
-    held-out episode. seed: of everything that is drawn at random.
+    episodes that judge; the old ones are split as for everything else. judged_frames: of each held-out episode.
     """
 
-    samples: int
-    batch: int
-    transformer_steps: int
-    together_steps: int
-    rate: float
-    correction_weight: float
-    focus: float
-    to_parent: float
-    held_out_share: float
-    judged_frames: int
-    seed: int
+    SECTION, ERROR, PHASES = "finetune", FinetuneError, ("transformer", "together")
 
-    def __post_init__(self):
-        counts = self.samples, self.batch, self.judged_frames
-        if min(counts) < 1 or min(self.transformer_steps, self.together_steps, self.seed) < 0:
-            raise FinetuneError("samples, batch and frames must be at least 1, steps and seed at least 0", found=self)
-        if not all(map(math.isfinite, (self.rate, self.correction_weight, self.focus))):
-            raise FinetuneError("rate, correction_weight and focus must be finite", found=self)
-        if not (self.rate > 0 and self.correction_weight > 0 and self.focus >= 0):
-            raise FinetuneError("rate and correction_weight must be above 0, focus at least 0", found=self)
-        if not (0 <= self.held_out_share < 1 and 0 <= self.to_parent <= 1):
-            raise FinetuneError("to_parent must be from 0 to 1, held_out_share from 0 to below 1", found=self)
-
-    @classmethod
-    def of(cls, params: dict[str, Any], **given: Any) -> "FinetuneRecipe":
-        """Take the recipe of params.yml, with each given value that is not None instead. Raises FinetuneError."""
-        values = params["finetune"] | {name: value for name, value in given.items() if value is not None}
-        return numbers(cls, values, "params.yml: finetune", FinetuneError)
-
-    def of_steps(self, steps: int) -> "FinetuneRecipe":
-        """Return the same recipe with this many steps in all, shared between the phases, at least one in each."""
-        planned = self.transformer_steps + self.together_steps
-        transformer = max(1, round(steps * self.transformer_steps / max(planned, 1)))
-        return replace(self, transformer_steps=transformer, together_steps=max(1, steps - transformer))
+    transformer_steps: FromZero
+    together_steps: FromZero
+    correction_weight: Positive
+    focus: Weight
+    to_parent: Share
+    held_out_share: Annotated[float, Within("from 0 to below 1", 0, math.nextafter(1, 0))]
 
 
 def finetune(
@@ -151,11 +110,8 @@ def finetune(
         raise _is_there(folder)
     recipe = recipe or FinetuneRecipe.of(params())
     parent, material = _open_work(checkpoint, episodes, recipe, progress)
-    work = _Work(parent, material, recipe, where, progress)
-    with (
-        build_beside(folder) as new,
-        threads(1 if gmac(parent.config) < SMALL_GMAC else torch.get_num_threads()),
-    ):
+    work = _Work(origin=parent, material=material, recipe=recipe, device=where, progress=progress)
+    with make_run(folder, parent.config) as new:
         if folder.exists():  # another process has just made it
             raise _is_there(folder)
         taught = _train_phases(work)
@@ -355,97 +311,55 @@ def _refuse_another_rate(read: Sequence[Recordings], plans_hz: float) -> None:
 # --- learning ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Work:
-    """Everything that a training needs."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Work(Work):
+    ROLE, VERB = "parent", "finetuned_by"
 
-    parent: Checkpoint
     material: _Material
-    recipe: FinetuneRecipe
-    device: torch.device
-    progress: Progress
-
-    def rng(self, phase: str) -> np.random.Generator:
-        """Return a phase's source of random numbers, the same in every process."""
-        return np.random.default_rng([self.recipe.seed, zlib.crc32(phase.encode())])
 
 
-@dataclass(frozen=True, eq=False)
-class _Taught:
-    """A policy that has learned.
-
-    weights: by LeRobot's names without the leading `model.`; the VAE's are unchanged. losses: by phase. folder: where
-    the phases are saved.
-    """
-
-    weights: dict[str, Tensor]
-    losses: dict[str, list[float]]
-    folder: Path
-
-
-def _train_phases(work: _Work) -> _Taught:
+def _train_phases(work: _Work) -> Taught:
     """Train both phases. What the policy sees in each of the recordings stays in the cache, for its next training."""
-    sources = [lessons_module, training, preprocess, act]
-    recipe, material = work.recipe, work.material
+    sources = [lessons_module, phases, training, preprocess, act]
+    recipe, parent, ranges = work.recipe, work.origin, judged_ranges(work.material.action_range())
     every = []
-    for kind, samples in material.taught:
-        folder = cache_root() / f"lessons-{key_of(_sees(work, kind, samples), *sources)}"
-        every.append((kind, _make_lessons(work, kind, samples, folder)))
+    for kind, samples in work.material.taught:
+        folder = cache_root() / f"lessons-{key_of(work.sees(samples) | {'kind': kind}, *sources)}"
+        lessons = _make_lessons(work, kind, samples, folder)
+        every.append((kind, lessons))
         if kind == DEMONSTRATIONS:
-            _refuse_strangers(work, every[-1][1])
+            remedy = "give first the recordings that it was trained on"
+            lessons.refuse_stranger(parent, ranges, FinetuneError, "the old", remedy)
     whole = {"lessons": [[kind, each.frames.path.parent.name] for kind, each in every], "recipe": asdict(recipe)}
     own = cache_root() / f"finetune-{key_of(whole, sys.modules[__name__], *sources)}"
-    room = _Room(work, every)
+    room = _Room(work, ranges, every)
     with Resumable(own, work.progress) as saved:
-        policy = BatchedPolicy(work.parent.config, work.parent.weights).to(work.device)
+        policy = BatchedPolicy(parent.config, parent.weights).to(work.device)
         policy.thaw()
-        _train(room, policy, saved, "transformer")
-        _train(room, policy, saved, "together")
-        losses = dict(saved.losses)
-    weights = {name: weight.float() for name, weight in work.parent.weights.items()} | policy.weights()
-    return _Taught(weights, losses, own)
-
-
-def _refuse_strangers(work: _Work, lessons: Lessons) -> None:
-    """Raise FinetuneError if the policy knows nothing of the old recordings, so that it is of another car or camera."""
-    if found := lessons.stranger(judged_ranges(work.material.action_range()), work.parent.config.action_names):
-        raise FinetuneError(
-            f"{work.parent.path}: on the old recordings its plans are worse than one action for all frames",
-            found=found,
-            remedy="give first the recordings that it was trained on",
+        room.train(
+            saved, "transformer", policy.model, recipe.rate, lambda b: room.loss(policy.plan(b.seen(), b.states()), b)
         )
-
-
-def _sees(work: _Work, kind: str, samples: Sequence[Sample]) -> dict[str, Any]:
-    """Return everything that the lessons depend on, as the key of their cache."""
-    return {
-        "parent": work.parent.identity,
-        "pictures": [(s.episode, s.frame_name, s.row, s.frame_path.stat().st_size) for s in samples],
-        "states": zlib.crc32(np.stack([s.state for s in samples]).tobytes()),
-        "actions": zlib.crc32(np.stack([s.chunk for s in samples]).tobytes()),
-        "pads": zlib.crc32(np.stack([s.is_pad for s in samples]).tobytes()),
-        "kind": kind,
-        "at": [work.device.type, work.recipe.seed],
-        "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
-    }
+        slow = recipe.rate / TOGETHER_SLOWER
+        room.train(saved, "together", policy, slow, lambda b: room.loss(policy(b.pictures(), b.states()), b))
+        losses = dict(saved.losses)
+    weights = {name: weight.float() for name, weight in parent.weights.items()} | policy.weights()
+    return Taught(weights, losses, own)
 
 
 def _make_lessons(work: _Work, kind: str, samples: tuple[Sample, ...], folder: Path) -> Lessons:
     """Make or complete the lessons: what the policy sees and plans on these samples before it learns."""
-    config = work.parent.config
-    channels = work.parent.weights["encoder_img_feat_input_proj.weight"].shape[1]
     with Resumable(folder, work.progress) as saved:
-        lessons = Lessons.open(folder, samples, config, channels, work.rng(f"states, {kind}"))
-        lessons.ask(saved, work.parent, work.rng(kind), work.device)
+        lessons = Lessons.open(folder, samples, work.origin.config, work.origin, work.rng(f"states, {kind}"))
+        lessons.ask(saved, work.origin, work.rng(kind), work.device)
     return lessons
 
 
-class _Room:
+class _Room(Room):
     """Draws batches from all lessons, and computes the loss."""
 
-    def __init__(self, work: _Work, lessons: Sequence[tuple[str, Lessons]]):
-        self.work, self.lessons = work, lessons
-        self.units = torch.from_numpy(1 / judged_ranges(work.material.action_range())).to(work.device)
+    def __init__(self, work: _Work, ranges: np.ndarray, lessons: Sequence[tuple[str, Lessons]]):
+        super().__init__(work, ranges)
+        self.lessons = lessons
         counts = [len(each) for _, each in lessons]
         weights = np.concatenate([self._weights(kind, each) for kind, each in lessons])
         self.shares = weights / weights.sum()
@@ -462,8 +376,7 @@ class _Room:
         off = ((off * driven).sum(1) / driven.sum(1)) ** recipe.focus
         return (recipe.correction_weight if kind == CORRECTIONS else 1.0) * off / max(off.mean(), 1e-9) + 1e-6
 
-    def batch(self, rng: np.random.Generator) -> "_Batch":
-        """Draw the next samples, each with one of its views."""
+    def batch(self, rng: np.random.Generator) -> Batch:
         count = len(self.rows)
         chosen = rng.choice(count, min(self.work.recipe.batch, count), replace=False, p=self.shares)
         views = rng.integers(2, size=len(chosen))
@@ -471,94 +384,16 @@ class _Room:
         for place, (kind, lessons) in enumerate(self.lessons):
             own = self.places[chosen] == place
             if own.any():
-                parts.append((kind, lessons, self.rows[chosen][own], views[own]))
-        return _Batch(parts, rng, self.work.device)
+                parts.append(Part(lessons, self.rows[chosen][own], views[own], kind != DEMONSTRATIONS))
+        return Batch(parts, rng, self.work.device)
 
-    def loss(self, plans: Tensor, batch: "_Batch") -> Tensor:
+    def loss(self, plans: Tensor, batch: Batch) -> Tensor:
         """Return the mean absolute error, in units of the recorded range. plans: (B, C, A)."""
-        share, driven = batch.to_parent(self.work.recipe.to_parent), batch.driven()
+        share, driven = batch.share_of_old(self.work.recipe.to_parent), batch.driven()
         to_parent = ((plans - batch.planned()).abs() * self.units * share).sum()
         to_recorded = ((plans - batch.recorded()).abs() * self.units * driven * (1 - share)).sum()
         counted = (share + driven * (1 - share)).expand(*plans.shape[:2], 1).sum()
         return (to_parent + to_recorded) / (counted * len(self.units))
-
-
-@dataclass(frozen=True, eq=False)
-class _Batch:
-    """The samples of one step. parts: (kind, lessons, rows (b,), views (b,)) for each Lessons with any of them."""
-
-    parts: list[tuple[str, Lessons, np.ndarray, np.ndarray]]
-    rng: np.random.Generator
-    device: torch.device
-
-    def _together(self, each: list[np.ndarray]) -> Tensor:
-        return torch.from_numpy(np.concatenate(each)).to(self.device)
-
-    def features(self) -> Tensor:
-        """The feature maps that the backbone gave before it learned, (B, D, h, w)."""
-        return self._together([lessons.maps[2 * rows + views] for _, lessons, rows, views in self.parts]).float()
-
-    def pictures(self) -> Tensor:
-        """The pictures in another light, (B, height, width, 3) uint8 RGB."""
-        frames = np.concatenate([lessons.pictures(rows, views) for _, lessons, rows, views in self.parts])
-        return torch.from_numpy(in_another_light(frames, self.rng)).to(self.device)
-
-    def states(self) -> Tensor:
-        """The states, (B, 2).
-
-        Half of the old demonstrations have another frame's state, as in training, so that it does not give the action
-        away. New recordings keep the side of their steering and a random share of its size: if nothing to steer to is
-        in sight, only the state says on which side it was, and the human in the recording steers more than the policy
-        will when it comes there.
-        """
-        each = []
-        for kind, lessons, rows, views in self.parts:
-            if kind == DEMONSTRATIONS:
-                each.append(lessons.asked[2 * rows + views])
-                continue
-            states = lessons.data.states[rows] * np.where((views == MIRRORED)[:, None], MIRROR, 1)
-            states[:, 0] *= self.rng.uniform(*FADED, len(rows))
-            each.append(states.astype(np.float32))
-        return self._together(each)
-
-    def to_parent(self, share: float) -> Tensor:
-        """The given share for old demonstrations, 0 for new recordings, (B, 1, 1)."""
-        each = [np.full(len(rows), share if kind == DEMONSTRATIONS else 0.0) for kind, _, rows, _ in self.parts]
-        return self._together(each).float()[:, None, None]
-
-    def planned(self) -> Tensor:
-        """What the policy planned before it learned, (B, C, A)."""
-        return self._together([lessons.plans[2 * rows + views] for _, lessons, rows, views in self.parts])
-
-    def recorded(self) -> Tensor:
-        """What the human did, (B, C, A)."""
-        return self._together([lessons.recorded(rows, views) for _, lessons, rows, views in self.parts])
-
-    def driven(self) -> Tensor:
-        """Whether the human drove, (B, C, 1)."""
-        return self._together([~lessons.data.is_pad[rows] for _, lessons, rows, _ in self.parts])[..., None]
-
-
-def _train(room: _Room, policy: BatchedPolicy, saved: Resumable, phase: str) -> None:
-    """Train one phase.
-
-    'transformer' trains all but the backbone, on the backbone's stored feature maps. 'together' trains everything,
-    slowly, with pictures in another light.
-    """
-    recipe = room.work.recipe
-    whole = phase == "together"
-    module = policy if whole else policy.model
-    steps = recipe.together_steps if whole else recipe.transformer_steps
-    optimizer, scheduler = optimiser(
-        module.parameters(), recipe.rate / TOGETHER_SLOWER if whole else recipe.rate, max(steps, 1)
-    )
-    rng = room.work.rng(phase)
-    for _ in saved.steps(phase, steps, rng, module=module, optimizer=optimizer, scheduler=scheduler):
-        batch = room.batch(rng)
-        states = batch.states()
-        features = policy.features(batch.pictures()) if whole else batch.features()
-        loss = room.loss(policy.plan(features, states), batch)
-        saved.losses[phase].append(descend(loss, module, optimizer, scheduler))
 
 
 # --- judging and leaving ----------------------------------------------------------------------------------------------
@@ -567,7 +402,7 @@ def _train(room: _Room, policy: BatchedPolicy, saved: Resumable, phase: str) -> 
 def _judge(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
     """Judge each held-out episode with the policy as it was before and after."""
     action_range = work.material.action_range()
-    policies = [BatchedPolicy(work.parent.config, each).to(work.device) for each in (work.parent.weights, weights)]
+    policies = [BatchedPolicy(work.origin.config, each).to(work.device) for each in (work.origin.weights, weights)]
     judged = []
     for episode in work.progress(work.material.held_out, desc="judging", total=len(work.material.held_out)):
         samples = pick_evenly(episode.samples, work.recipe.judged_frames)
@@ -583,27 +418,17 @@ def _judge(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
     return judged
 
 
-def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
+def _leave(new: Path, name: str, work: _Work, taught: Taught) -> None:
     """Judge the policy, and write its files and finetune.json into `new`, which becomes the run's folder."""
-    parent, material, recipe = work.parent, work.material, work.recipe
+    parent, material = work.origin, work.material
     judged = _judge(work, taught.weights)
     errors = [e for each in judged if each.kind == OLD for e in each.after.values() if e is not None]
-    described = asdict(recipe) | {"device": work.device.type}
-    origin = {"parent_sha256": parent.sha256, "parent_format": parent.format, "finetuned_by": described}
-    settings = {
-        "learning_rate": recipe.rate,
-        "batch_size": recipe.batch,
-        "data_dir": material.recordings[-1].root.name,
-        "output_dir": name,
-        "device": work.device.type,
-        "seed": recipe.seed,
-    }
     loss = float(np.mean(errors)) / 100 if errors else float("nan")
-    hashes = write_both(new, parent.config, taught.weights, loss, origin, **settings)
+    hashes = work.write_policy(new, name, parent.config, taught.weights, loss, material.recordings[-1].root.name)
     write_stage(
         new / "finetune.json",
         "finetune",
-        params=described,
+        params=work.described(),
         metrics={
             "learned_from": {kind: material.count(kind) for kind in KINDS} | {"not_imitated": material.left_out},
             "held_out": [each.row() for each in judged],

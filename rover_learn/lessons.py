@@ -1,6 +1,6 @@
 """Keep on disk what a student learns from: recorded frames, and what its teacher sees and plans on them.
 
-    lessons = Lessons.open(folder, samples, config, channels, rng)
+    lessons = Lessons.open(folder, samples, config, teacher, rng)
     lessons.ask(saved, teacher, rng, device)          # or go on where that was interrupted
     frames = lessons.pictures(rows, views)
 
@@ -14,6 +14,7 @@ Letters: B batch, C chunk, A actions, D channels of the feature map, h and w of 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rover_learn.training import Frames, Given, Resumable, RowFile, frames_of, swap_states
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine, lerobot_act
@@ -33,6 +35,7 @@ VIEWS = PLAIN, MIRRORED = 0, 1
 MIRROR = np.array([-1, 1], np.float32)  # a mirrored view multiplies steering and throttle by this
 LIGHT, COLOUR = (0.8, 1.25), (0.9, 1.1)  # a picture is multiplied by the first as a whole, by the second per colour
 SMALLEST_RANGE = 0.02  # at least, for an action that hardly changes: errors are divided by the range
+FADED = (0.1, 1.0)  # the state of a new recording keeps a share of its steering, drawn from this range
 STRANGER = 2.0  # a policy with more than this many times the error of one constant action is not of this car
 
 
@@ -146,16 +149,16 @@ class Lessons:
 
     @classmethod
     def open(
-        cls, folder: Path, samples: tuple[Sample, ...], config: ActConfig, channels: int, rng: np.random.Generator
+        cls, folder: Path, samples: tuple[Sample, ...], config: ActConfig, teacher: Checkpoint, rng: np.random.Generator
     ) -> "Lessons":
         """Open the lessons in a folder, which must be used with these arguments only.
 
-        config: the student's. channels: D. rng: draws the states.
+        config: the student's. rng: draws the states.
         """
         folder.mkdir(parents=True, exist_ok=True)
         (size,) = config.image_sizes
         data = frames_of(samples, *size)
-        grid = config.grid(*size)
+        seen = teacher.weights["encoder_img_feat_input_proj.weight"].shape[1], *config.grid(*size)
         rows = np.arange(len(data))
         asked = np.stack([swap_states(data, rows, rng) for _ in VIEWS], 1)
         asked[:, MIRRORED] *= MIRROR
@@ -164,9 +167,9 @@ class Lessons:
             data,
             asked.reshape(-1, 2),
             RowFile(folder / "frames", (*size, 3), np.uint8),
-            RowFile(folder / "maps", (channels, *grid), np.float16),
+            RowFile(folder / "maps", seen, np.float16),
             RowFile(folder / "plans", data.chunks.shape[1:]),
-            RowFile(folder / "tokens", (channels, *grid), np.float16),
+            RowFile(folder / "tokens", seen, np.float16),
         )
 
     def __len__(self) -> int:
@@ -180,7 +183,7 @@ class Lessons:
     @property
     def blocks(self) -> int:
         """The number of blocks of BLOCK samples."""
-        return _blocks(len(self))
+        return -(-len(self) // BLOCK)
 
     def each_once(self) -> Iterator[np.ndarray]:
         """Yield every sample's picture once, each second one mirrored, in blocks of (B, height, width, 3) uint8."""
@@ -216,20 +219,25 @@ class Lessons:
             self.maps.append(F.adaptive_avg_pool2d(seen, grid).half().cpu())
             self.plans.append(policy.plan(seen, states).cpu())
 
-    def stranger(self, ranges: np.ndarray, action_names: Sequence[str]) -> str | None:
-        """Say how far off the teacher's plans are if it knows nothing of these drives; None if it does.
+    def refuse_stranger(
+        self, teacher: Checkpoint, ranges: np.ndarray, error: type[RoverError], which: str, remedy: str
+    ) -> None:
+        """Raise `error` if the teacher knows nothing of these drives, as it is for another car or camera.
 
-        Such a teacher was trained for another car or camera. ranges: (A,), from `judged_ranges`.
+        ranges: (A,), from `judged_ranges`. which: the recordings, in words.
         """
         actions, driven = self.data.chunks, ~self.data.is_pad
         constant = (np.abs(actions - np.median(actions[driven], axis=0)) / ranges)[driven].mean(0)
         as_recorded = (self.asked[::2] == self.data.states).all(1)  # planned with the sample's own state
         plans = self.plans[2 * np.arange(len(self))]
         planned = (np.abs(plans - actions) / ranges)[driven & as_recorded[:, None]].mean(0)
-        if not (planned > STRANGER * constant).all():
-            return None
-        pairs = zip(action_names, planned, constant, strict=True)
-        return " and ".join(f"{a} {100 * p:.0f} % off instead of {100 * c:.0f} %" for a, p, c in pairs)
+        if (planned > STRANGER * constant).all():
+            pairs = zip(teacher.config.action_names, planned, constant, strict=True)
+            raise error(
+                f"{teacher.path}: on {which} recordings its plans are worse than one action for all frames",
+                found=" and ".join(f"{a} {100 * p:.0f} % off instead of {100 * c:.0f} %" for a, p, c in pairs),
+                remedy=remedy,
+            )
 
     @torch.inference_mode()
     def see(self, saved: Resumable, student: BatchedPolicy, rng: np.random.Generator) -> None:
@@ -240,9 +248,68 @@ class Lessons:
             self.tokens.append(student.features(torch.stack([frames, frames.flip(2)], 1).flatten(0, 1)).half().cpu())
 
 
-def _blocks(count: int) -> int:
-    return -(-count // BLOCK)
-
-
 def _rows(block: int, count: int) -> np.ndarray:
     return np.arange(block * BLOCK, min((block + 1) * BLOCK, count))
+
+
+class Part(NamedTuple):
+    """Samples of a batch from the same lessons. rows, views: (b,). new: recorded after the teacher was trained."""
+
+    lessons: Lessons
+    rows: np.ndarray
+    views: np.ndarray
+    new: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """The samples of one step, of one or several lessons."""
+
+    parts: Sequence[Part]
+    rng: np.random.Generator
+    device: torch.device
+
+    def _join(self, each: Sequence[np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.concatenate(each)).to(self.device)
+
+    def seen(self, what: str = "maps") -> Tensor:
+        """The teacher's feature maps, or the student's own tokens, (B, D, h, w) float32."""
+        return self._join([getattr(p.lessons, what)[2 * p.rows + p.views] for p in self.parts]).float()
+
+    def pictures(self) -> Tensor:
+        """The pictures in another light, (B, height, width, 3) uint8 RGB."""
+        frames = np.concatenate([p.lessons.pictures(p.rows, p.views) for p in self.parts])
+        return torch.from_numpy(in_another_light(frames, self.rng)).to(self.device)
+
+    def states(self) -> Tensor:
+        """The states, (B, 2), with which the teacher planned.
+
+        New recordings keep the side of their steering and a random share of its size: if nothing to steer to is in
+        sight, only the state says on which side it was, and the human in the recording steers more than the policy will
+        when it comes there.
+        """
+        each = []
+        for p in self.parts:
+            if not p.new:
+                each.append(p.lessons.asked[2 * p.rows + p.views])
+                continue
+            states = p.lessons.data.states[p.rows] * np.where((p.views == MIRRORED)[:, None], MIRROR, 1)
+            states[:, 0] *= self.rng.uniform(*FADED, len(p.rows))
+            each.append(states.astype(np.float32))
+        return self._join(each)
+
+    def share_of_old(self, share: float) -> Tensor:
+        """The given share for old recordings, 0 for new ones, (B, 1, 1)."""
+        return self._join([np.full(len(p.rows), 0.0 if p.new else share) for p in self.parts]).float()[:, None, None]
+
+    def planned(self) -> Tensor:
+        """What the teacher planned, (B, C, A)."""
+        return self._join([p.lessons.plans[2 * p.rows + p.views] for p in self.parts])
+
+    def recorded(self) -> Tensor:
+        """What was driven, (B, C, A)."""
+        return self._join([p.lessons.recorded(p.rows, p.views) for p in self.parts])
+
+    def driven(self) -> Tensor:
+        """Whether that was driven and is no padding, (B, C, 1)."""
+        return self._join([~p.lessons.data.is_pad[p.rows] for p in self.parts])[..., None]

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import yaml
 
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import FOR_THIS_RUN, params, read_params
@@ -156,9 +157,9 @@ def _check_student(student: Mapping[str, Any]) -> None:
         elif key == "qat":
             right, what = isinstance(value, bool), "true or false"
         elif key == "backbone_channels":
-            right, what = type(value) in (int, float), "a number"
+            right, what = is_number(value), "a number"
         else:
-            right, what = type(value) is int, "a whole number"
+            right, what = is_whole(value), "a whole number"
         if not right:
             raise SweepError(f"a student's {key} is {what}", found=value)
 

@@ -39,7 +39,6 @@ from rover_learn.training import (
     Resumable,
     RowFile,
     batch_of,
-    descend,
     driving_error,
     error_of,
     frames_of,
@@ -75,6 +74,7 @@ from rover_lib.workshop.recordings.samples import (
     pick_evenly,
 )
 from rover_lib.workshop.recordings.turning import measure_sides
+from rover_lib.workshop.run.session import training_device
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
@@ -190,13 +190,9 @@ def train(
     and EpisodeError for recordings that cannot be used.
     """
     out_path, source = Path(out_path), Source.of(episodes)
-    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    device = training_device(device, TrainingError).type
     if size not in SIZES:
         raise TrainingError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))
-    if device not in ("cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
-        raise TrainingError(
-            "device must be cpu, or cuda where torch finds one", found=repr(device), remedy="leave it out"
-        )
     if (steps is not None and steps < 1) or seed < 0:
         raise TrainingError("training needs at least 1 step and a seed from 0", found=f"{steps} and {seed}")
     recipe = RECIPES[size, device]
@@ -337,8 +333,11 @@ class _Training:
         errors = [driving_error(policy, judges, rows, units, maps is not None) for rows in every]
         return float(np.average(errors, weights=[len(rows) for rows in every]))
 
-    def descend(self, phase: str, loss: Tensor, module: nn.Module, optimizer: Any, scheduler: Any) -> None:
-        self.saved.losses[phase].append(descend(loss, module, optimizer, scheduler))
+    def train(
+        self, phase: str, rate: float, module: nn.Module, loss: Callable[[], Tensor]
+    ) -> tuple[torch.optim.Optimizer, Any]:
+        count, cost = self.plan[phase]
+        return self.saved.train(phase, count, rate, module, self.rng, loss, cost)
 
 
 def _train(
@@ -463,13 +462,12 @@ def _train_backbone(training: _Training) -> None:
     resnet = torchvision.models.resnet18(weights=None)
     live = torchvision.models._utils.IntermediateLayerGetter(resnet, {"layer4": "feature_map"})
     model = _ChunkFromFeatures(live, training.size).to(training.device).train()
-    optimizer, scheduler = optimiser(model.parameters(), recipe.backbone_rate, recipe.backbone_steps)
-    parts = {"model": model, "optimizer": optimizer, "scheduler": scheduler}
-    for _ in training.steps("backbone", **parts):
-        batch = training.batch(recipe.batch)
-        loss = error_of(model(batch[IMAGE]), batch, training.loss_weights)
-        training.descend("backbone", loss, model, optimizer, scheduler)
 
+    def loss() -> Tensor:
+        batch = training.batch(recipe.batch)
+        return error_of(model(batch[IMAGE]), batch, training.loss_weights)
+
+    training.train("backbone", recipe.backbone_rate, model, loss)
     norms = [m for m in live.modules() if isinstance(m, nn.BatchNorm2d)]
     for norm in norms:
         norm.reset_running_stats()
@@ -533,7 +531,7 @@ def _transformer_steps(training: _Training, chosen: np.ndarray, views: dict[str,
             IS_PAD: torch.from_numpy(data.is_pad[rows]).to(training.device),
         }
         loss = policy_loss(policy, batch, training.loss_weights)
-        training.descend("transformer", loss, policy, optimizer, scheduler)
+        training.saved.losses["transformer"].append(training_module.descend(loss, policy, optimizer, scheduler))
         if (step + 1) % JUDGE_EVERY == 0:
             best.see(training.judge(policy, judged), policy)
     if best.weights:
@@ -544,8 +542,9 @@ def _train_together(training: _Training, phase: str) -> tuple[torch.optim.Optimi
     """Phase three: train all parameters at a tenth of the rate. Returns the optimiser and scheduler, to be saved."""
     policy, recipe = training.policy, training.recipe
     policy.train()
-    optimizer, scheduler = optimiser(policy.parameters(), recipe.transformer_rate / 10, training.plan[phase][0])
-    for _ in training.steps(phase, policy=policy, optimizer=optimizer, scheduler=scheduler):
-        loss = policy_loss(policy, training.batch(recipe.together_batch), training.loss_weights)
-        training.descend(phase, loss, policy, optimizer, scheduler)
-    return optimizer, scheduler
+    return training.train(
+        phase,
+        recipe.transformer_rate / 10,
+        policy,
+        lambda: policy_loss(policy, training.batch(recipe.together_batch), training.loss_weights),
+    )

@@ -1,8 +1,7 @@
 """What every training on recordings needs: frames, batches, the loss, and a way to go on after it was killed.
 
     with Resumable(folder) as saved:
-        for _ in saved.steps("backbone", 200, rng, model=model, optimizer=optimizer, scheduler=scheduler):
-            saved.losses["backbone"].append(descend(loss_of(model), model, optimizer, scheduler))
+        saved.train("backbone", 200, 1e-3, model, rng, lambda: loss_of(model))
 
 A training that is ended at any moment and started again gives the same weights, to the last bit, as one that was never
 ended.
@@ -211,6 +210,25 @@ class Resumable:
                 self._save(file, phase, step + 1, rng, parts)
                 saved_s = self.clock()
                 took_s = saved_s - now_s
+
+    def train(
+        self,
+        phase: str,
+        count: int,
+        rate: float,
+        module: nn.Module,
+        rng: np.random.Generator,
+        loss: Callable[[], Tensor],
+        cost: int = 1,
+    ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
+        """Train a module for the steps of a phase that are still to be done, at this rate, and note each one's loss.
+
+        loss: computes the next batch's. Returns the optimiser and its scheduler.
+        """
+        optimizer, scheduler = optimiser(module.parameters(), rate, max(count, 1))
+        for _ in self.steps(phase, count, rng, cost, module=module, optimizer=optimizer, scheduler=scheduler):
+            self.losses[phase].append(descend(loss(), module, optimizer, scheduler))
+        return optimizer, scheduler
 
     def _advance(self, phase: str, cost: int, total: int) -> None:
         desc = f"training, {phase}"

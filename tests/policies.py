@@ -18,14 +18,9 @@ if TYPE_CHECKING:
     from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 
 TINY = {
-    "dim_model": 64,
-    "n_heads": 4,
-    "dim_feedforward": 128,
-    "n_encoder_layers": 1,
-    "n_decoder_layers": 2,
-    "n_vae_encoder_layers": 1,
-    "chunk_size": 32,
-}
+    "dim_model": 64, "n_heads": 4, "dim_feedforward": 128, "n_encoder_layers": 1, "n_decoder_layers": 2,
+    "n_vae_encoder_layers": 1, "chunk_size": 32,
+}  # fmt: skip
 FULL = {"cameras": {"observation.images.cam_front": (360, 640)}, "n_decoder_layers": 7, "chunk_size": 32}
 
 
@@ -143,25 +138,12 @@ def trainer_config(policy: "ACTPolicy") -> dict:
     c = policy.config
     _, height, width = next(iter(c.image_features.values())).shape
     return {
-        "image_width": width,
-        "image_height": height,
-        "n_obs_steps": 1,
-        "chunk_size": c.chunk_size,
-        "n_action_steps": c.chunk_size,
-        "hidden_size": c.dim_model,
-        "n_encoder_layers": c.n_encoder_layers,
-        "n_decoder_layers": c.n_decoder_layers,
-        "n_heads": c.n_heads,
-        "feedforward_dim": c.dim_feedforward,
-        "dropout": 0.1,
-        "kl_weight": 10.0,
-        "vision_encoder": c.vision_backbone,
-        "pretrained_backbone": True,
-        "learning_rate": 1e-4,
-        "betas": [0.9, 0.999],
-        "device": "cuda",
-        "seed": 42,
-    }
+        "image_width": width, "image_height": height, "n_obs_steps": 1, "chunk_size": c.chunk_size,
+        "n_action_steps": c.chunk_size, "hidden_size": c.dim_model, "n_encoder_layers": c.n_encoder_layers,
+        "n_decoder_layers": c.n_decoder_layers, "n_heads": c.n_heads, "feedforward_dim": c.dim_feedforward,
+        "dropout": 0.1, "kl_weight": 10.0, "vision_encoder": c.vision_backbone, "pretrained_backbone": True,
+        "learning_rate": 1e-4, "betas": [0.9, 0.999], "device": "cuda", "seed": 42,
+    }  # fmt: skip
 
 
 def trainer_content(policy: "ACTPolicy") -> dict:

@@ -40,12 +40,9 @@ def compiled(name: str, *arguments: object) -> Path:
 
 class _Event(ctypes.Structure):
     _fields_ = (
-        ("at_us", ctypes.c_double),
-        ("pulse_us", ctypes.c_double),
-        ("period_us", ctypes.c_double),
-        ("kind", ctypes.c_int32),
-        ("channel", ctypes.c_int32),
-    )
+        ("at_us", ctypes.c_double), ("pulse_us", ctypes.c_double), ("period_us", ctypes.c_double),
+        ("kind", ctypes.c_int32), ("channel", ctypes.c_int32),
+    )  # fmt: skip
 
 
 @functools.cache

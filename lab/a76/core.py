@@ -107,13 +107,9 @@ def prepare(progress: Progress = silent, cpu: str = A76) -> Core:
     Missing Debian packages are installed if this runs as root. Raises CountError or DebianError if anything cannot be
     had.
     """
-    steps = (_install_missing, build_plugin, partial(_userland, cpu))
+    steps = (partial(install_packages, missing_packages(NEEDS), "counting"), build_plugin, partial(_userland, cpu))
     _, plugin, root = [step() for step in progress(steps, desc=f"emulated {cpu}", total=len(steps))]
     return Core(root, plugin, cpu)
-
-
-def _install_missing() -> None:
-    install_packages(missing_packages(NEEDS), "counting")
 
 
 def build_plugin() -> Path:
@@ -121,7 +117,7 @@ def build_plugin() -> Path:
 
     def make(folder: Path) -> None:
         # The emulator's functions need no library here: they are resolved when it loads the plugin.
-        run("gcc", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "count.so", PLUGIN, error=CountError)
+        run("gcc", "-O3", "-Wall", "-shared", "-fPIC", "-o", folder / "count.so", PLUGIN, error=CountError)
 
     return cache_folder("arm-plugin", key_of({}, PLUGIN), make) / "count.so"
 
@@ -212,6 +208,7 @@ class Emulation:
     """What one program did: its counts by section, and the most memory that it held in each of its steps."""
 
     sections: dict[int, np.ndarray]  # arrays of BLOCK
+    more: dict[int, np.ndarray]  # by section, if it was watched, as guest/count.c leaves it
     peak_mb: dict[str, float]  # by the line that the program had printed last; "" stands for before the first
     emulator_mb: float  # the emulator's own memory at the end
 
@@ -219,6 +216,21 @@ class Emulation:
         """Return how many instructions, or "simd" or "sdot" ones, were executed in a section."""
         blocks = self.sections[section]
         return int((blocks["entered"] * blocks[what]).sum())
+
+    def near_lines(self, section: int) -> int:
+        """Return how many lines of 64 bytes the loads of a section had to fetch into its core's first cache."""
+        return int(self.more[section][0])
+
+    def far_lines(self, section: int) -> int:
+        """Return how many lines of 64 bytes the memory that all cores share had to deliver or take.
+
+        That is what loads found in no cache, and twice, as it goes back, what stores found in no cache of their core.
+        """
+        return int(self.more[section][4] + 2 * self.more[section][3])
+
+    def by_thread(self, section: int) -> list[int]:
+        """Return the instructions of each thread that worked in a section; the first is the thread that marked it."""
+        return [int(count) for count in self.more[section][6:] if count]
 
 
 def emulate_script(
@@ -228,15 +240,18 @@ def emulate_script(
     folder: Path,
     *,
     packages: Path | None = None,
+    threads: int = 1,
     **options: Any,
 ) -> Emulation:
     """`emulate` a Python script of ours with the Pi's wheels, rover_lib and the modules beside guest/predict.py.
 
-    packages: a folder of packages that come before the Pi's own on the path. options: for `emulate`.
+    packages: a folder of packages that come before the Pi's own on the path. threads: of OpenMP, which wait without
+    executing instructions. options: for `emulate`.
     """
     environment = _environment(core.root, folder)
     places = [*([packages] if packages else []), environment["PYTHONPATH"], REPOSITORY, GUEST]
     environment["PYTHONPATH"] = ":".join(map(str, places))
+    environment |= {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0"}
     environment["PYTHONDONTWRITEBYTECODE"] = "1"  # keep the emulated Python's bytecode out of the checkout
     return emulate(core, [_python(core.root), script, *arguments], folder, environment=environment, **options)
 
@@ -249,15 +264,17 @@ def emulate(
     environment: dict[str, str] | None = None,
     on_line: Callable[[str], None] = lambda line: None,
     stop: Event | None = None,
+    watch: str = "",
 ) -> Emulation:
     """Run an aarch64 program to its end on one core, and read the counts that it marked (see guest/count.c).
 
     folder: takes the counts, and what the program leaves. on_line: called with each line on its stdout. stop: ends the
-    program when set.
+    program when set. watch: "memory=SECTION" or "threads=1", see guest/count.c.
     Raises CountError with the end of its stderr if it fails, or if it prints nothing for SILENCE_S of processor time.
     Whatever ends this function also ends the emulator.
     """
-    qemu = [*_qemu(core.root, core.cpu), "-plugin", f"{core.plugin},folder={folder}", *command]
+    plugin = ",".join([str(core.plugin), f"folder={folder}", *([watch] if watch else [])])
+    qemu = [*_qemu(core.root, core.cpu), "-plugin", plugin, *command]
     with (folder / "stderr").open("wb") as stderr:
         try:
             process = subprocess.Popen(
@@ -283,7 +300,8 @@ def emulate(
         end = last_words((folder / "stderr").read_text(errors="replace"))
         raise CountError(f"the emulated program ended with {code} after {watched.step or 'its start'}: {end}")
     sections = {int(f.stem): np.fromfile(f, BLOCK) for f in folder.glob("*.blocks")}
-    return Emulation(sections, dict(watched.peak_mb), watched.emulator_mb)
+    more = {int(f.stem): np.fromfile(f, "<u8") for f in folder.glob("*.more")}
+    return Emulation(sections, more, dict(watched.peak_mb), watched.emulator_mb)
 
 
 @dataclass

@@ -63,6 +63,8 @@ class Counted:
     inferences: tuple[int, ...]  # instructions of each
     simd: int  # SIMD instructions of the steady inference
     sdot: int  # SDOT instructions of the steady inference
+    near_lines: int  # of the steady inference, see Emulation
+    far_lines: int
     kernels: dict[str, tuple[int, int, int]]  # (instructions, SIMD, SDOT) of the steady inference by function
     peak_mb: float
     peak_loading_mb: float
@@ -119,12 +121,15 @@ def count_artifact(
 
         given = [Path(artifact).resolve(), observations, folder, counted, *guest.arguments]
         options: dict[str, Any] = {"packages": guest.packages, "on_line": on_line, "stop": stop}
+        options["watch"] = f"memory={STEADY}"
         done = emulate_script(core, guest.script, given, folder, **options)
         return Counted(
             load=done.total(0),
             inferences=tuple(done.total(i) for i in range(1, counted + 1)),
             simd=done.total(STEADY, "simd"),
             sdot=done.total(STEADY, "sdot"),
+            near_lines=done.near_lines(STEADY),
+            far_lines=done.far_lines(STEADY),
             kernels=by_kernel(done.sections[STEADY], GuestFunctions((folder / "maps").read_text())),
             peak_mb=done.peak_mb["predict"],
             peak_loading_mb=done.peak_mb["load"],

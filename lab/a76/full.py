@@ -93,11 +93,6 @@ def full_run(
     return run_dir
 
 
-def suffix_of(size: tuple[int, int]) -> str:
-    """Return how the files of another image size end: _180x320 for (180, 320), height first."""
-    return f"_{size[0]}x{size[1]}"
-
-
 def _quantize(
     run_dir: Path,
     loaded: Opened,
@@ -108,7 +103,8 @@ def _quantize(
     progress: Progress = silent,
 ) -> dict[str, dict[str, Any]]:
     """Calibrate at one image size (None: training's), write its artifacts, and return their part of quantize.json."""
-    checkpoint, suffix = (loaded.checkpoint.at_size(*size), suffix_of(size)) if size else (loaded.checkpoint, "")
+    suffix = f"_{size[0]}x{size[1]}" if size else ""
+    checkpoint = loaded.checkpoint.at_size(*size) if size else loaded.checkpoint
     chosen, note = recipe.choose(loaded.parts.calibration)
     calibration = calibrate(checkpoint, chosen, smooth=recipe.scheme.smooth, progress=progress)
     policies: dict[str, Any] = {f"static{suffix}": quantize(checkpoint, recipe.scheme, calibration)}

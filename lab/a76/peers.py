@@ -29,7 +29,7 @@ from rover_lib.onboard.artifact.manifest import car_of, read_manifest
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import atomic_path, find_stage, read_stage, sha256_of, write_stage
 from rover_lib.workshop import act
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
@@ -163,10 +163,9 @@ def quantize_with(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Samp
     states = [s.state.tolist() for s in samples]
     goes_in = {"checkpoint": checkpoint.sha256, "frames": frames, "states": states, "packages": engine.packages}
     key = key_of(goes_in, engine.maker, *COMMON, act)
-    if artifact.exists() and report.exists():
-        before = read_stage(report, "peer")
-        if before["params"] == {"key": key} and before["inputs"] == {artifact.name: sha256_of(artifact)}:
-            return Made(artifact, before["metrics"])
+    made_of = {artifact.name: sha256_of(artifact)} if artifact.exists() else {}
+    if made_of and (before := find_stage(report, "peer", params={"key": key}, inputs=made_of)):
+        return Made(artifact, before["metrics"])
     height, width = checkpoint.config.image_sizes[0]
     with tempfile.TemporaryDirectory(prefix="rover-peer-") as scratch, atomic_path(artifact) as temporary:
         calibration = Path(scratch) / "calibration.npz"

@@ -1,11 +1,12 @@
 """Turn counts into arm.json: the numbers of each artifact, gates, groups of kernels, computed times, and a table."""
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from lab.a76.core import A76
 from lab.a76.count import Counted
-from rover_lib.onboard.care.lower_bound import PI5_SEEN_GMAC_PER_S
+from rover_lib.onboard.care.pi5 import DRIVING, Work, predict_ms
 from rover_lib.onboard.columns import align
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.recorded_range import worst
@@ -13,14 +14,6 @@ from rover_lib.workshop.judge.recorded_range import worst
 LABEL = "counted on an emulated Cortex-A76"
 STATIC, STATIC_ONNX = "policy_static", "policy_static.onnx"
 SDOT_MACS = 16  # multiply-accumulates of one SDOT; the floor is the count if nothing but SDOT ran
-
-PI5_CORES, PI5_GHZ, SIMD_PER_CYCLE = 4, 2.4, 2
-LOOP_PER_SDOT = 80 / 64  # instructions of XNNPACK's inner loop per SDOT, counted here
-IPC_SEEN = PI5_SEEN_GMAC_PER_S / SDOT_MACS / (PI5_CORES * PI5_GHZ) * LOOP_PER_SDOT
-PREDICTED = (
-    f"low: SIMD instructions / ({SIMD_PER_CYCLE} per cycle x {PI5_CORES} cores x {PI5_GHZ} GHz); "
-    f"high: all instructions / ({IPC_SEEN:.2f} per cycle x {PI5_CORES} cores x {PI5_GHZ} GHz)"
-)
 
 # The gates of instructions are for one policy: one whose multiply-accumulates differ by less than this share.
 SAME_POLICY = 0.01
@@ -40,6 +33,10 @@ GROUPS = (
     ("element-wise", r"VectorizedLoop|vectorized_loop|max_?pool|v(add|mul|clamp|max)|(add|mul|relu|clamp)\w*_kernel"),
 )
 
+# Kernels that divide their work over the threads, by name or by the library if that has no names. The rest is executed
+# by one thread while the others wait.
+DIVIDED = re.compile(r"xnn|pthreadpool|sgemm|[Ss]leef|flash_attention|qmaxpool|onnxruntime|Mlas")
+
 COLUMNS = {  # the table's columns with their widths
     **dict.fromkeys(("instructions_g", "simd_g", "x_floor", "first_g", "tenth_g", "load_instructions_g"), 7),
     **{"peak_memory_mb": 6, "peak_memory_loading_mb": 7},
@@ -52,10 +49,8 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
     """Return one artifact's part of arm.json; _g are 10**9 instructions. The floor is SDOT alone, for every mode."""
     floor_g = manifest["gmac"] / SDOT_MACS
     inferences_g = [n / 1e9 for n in counted.inferences]
-    low_ms, high_ms = predict_ms(counted.simd / 1e9, counted.steady / 1e9)
-    return {
-        "instructions_g": counted.steady / 1e9,
-        "simd_g": counted.simd / 1e9,
+    work = work_of(counted)
+    return work | {
         "sdot_g": counted.sdot / 1e9,
         "floor_g": floor_g,
         "x_floor": counted.steady / 1e9 / floor_g,
@@ -74,25 +69,22 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
         "emulator_memory_mb": counted.emulator_mb,
         "threads": counted.versions["threads"],
         "versions": counted.versions,
-        "computed_pi5_ms": {"low": low_ms, "high": high_ms, "formula": PREDICTED},
+        "computed_pi5_ms": predict_ms(Work.of(work))._asdict() | {"threads": DRIVING},
     }
 
 
-def predict_ms(simd_g: float, instructions_g: float) -> tuple[float, float]:
-    """Compute a range for the time of one inference on a Raspberry Pi 5, in ms, from counts. Nothing here was timed.
+def work_of(counted: Counted) -> dict[str, float]:
+    """Return what an artifact's steady inference executes, as `pi5.Work.of` reads it."""
+    kernels = {name: row[0] for name, row in counted.kernels.items()}
+    counts = {"instructions": counted.steady, "simd": counted.simd}
+    counts |= {"near_lines": counted.near_lines, "far_lines": counted.far_lines}
+    return {f"{name}_g": count / 1e9 for name, count in counts.items()} | {"alone": alone_of(kernels)}
 
-    low: the SIMD instructions alone at two per cycle, which is what a Cortex-A76 can issue (Arm's optimisation guide),
-    on four cores at 2.4 GHz, all of them always busy. No program with this count can be faster.
-    high: all instructions at the rate that such kernels have been seen to reach on a Pi 5. It was published that
-    ResNet18 at 224x224 with XNNPACK's INT8 kernels takes 8.75 ms, which is 207 GMAC/s, 67 % of the chip's SDOT peak, or
-    1.35 SDOT per cycle and core. Their inner loop executes 80 instructions for 64 SDOT, hence 1.68 instructions per
-    cycle, or more if the instructions outside the loop are counted too.
-    Some things are not known and are in neither number: how evenly the work divides over four threads, how long it
-    waits for memory (the published network has 11 MB of weights, the full policy 66), and whether float kernels, which
-    are most of FP32's, reach that rate. So high is a careful estimate and no bound.
-    """
-    cycles_per_ms = PI5_CORES * PI5_GHZ * 1e6
-    return simd_g * 1e9 / (SIMD_PER_CYCLE * cycles_per_ms), instructions_g * 1e9 / (IPC_SEEN * cycles_per_ms)
+
+def alone_of(instructions_by_kernel: Mapping[str, float]) -> float:
+    """Return the share of the instructions, 0 to 1, that are in no kernel that divides its work over the threads."""
+    divided = sum(count for kernel, count in instructions_by_kernel.items() if DIVIDED.search(kernel))
+    return 1 - divided / sum(instructions_by_kernel.values())
 
 
 def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any]]:
@@ -172,10 +164,13 @@ def table(content: dict[str, Any]) -> str:
         shown = m | {WORST: worst(m.get(key) for key in keys)}
         cells = (_cell(shown.get(key), key, width) for key, width in widths.items())
         lines.append(" ".join([f"{stem:{wide}}", *cells]))
-    lines += ["", f"computed from these counts for a Raspberry Pi 5, ms, never timed ({PREDICTED})"]
+    lines += [
+        "",
+        f"computed from these counts for {DRIVING} cores of a Raspberry Pi 5, ms, never timed (docs/clock.md)",
+    ]
     for stem, m in rows:
-        low, high = predict_ms(m["simd_g"], m["instructions_g"])
-        lines.append(f"{stem:{wide}} {low:7.3g} to {high:.3g}")
+        if times := m.get("computed_pi5_ms"):
+            lines.append(f"{stem:{wide}} {times['ms']:7.3g}, from {times['low']:.3g} to {times['high']:.3g}")
     if note := metrics.get("note"):
         lines += ["", f"note: {note}"]
     if metrics.get("gates"):

@@ -35,8 +35,8 @@ static uint16_t in_length, out_length;
 static double waiting; /* bytes that the chip has not sent yet */
 static uint8_t lost;
 static uint16_t pins[2];
-static struct event events[4096];
-static uint16_t event_count;
+static struct event events[65536];
+static uint32_t event_count;
 
 const struct car *car_kept() { return &DEFAULT_CAR; } /* each start is a power-on's */
 void car_keep(const struct car *car) { (void)car; }
@@ -147,7 +147,7 @@ int board_said(char *text) {
 }
 
 int board_events(struct event *to) {
-    int count = event_count;
+    int count = (int)event_count;
     memcpy(to, events, sizeof *events * event_count);
     event_count = 0;
     return count;

@@ -333,7 +333,9 @@ def run_faults(
             if outcome.fuzz["unsafe_pulses"]:
                 outcome.wrong.append(f"fuzz: {outcome.fuzz['said']}")
         for fault, row in _rows(bench, chosen, gates):
-            _complete(fault, row)
+            if row["log_line"] is None:
+                row["wrong"].append(f"no line tells of it (wanted: {fault.message})")
+            row["found"] = fault.expected if not row["wrong"] else "not as expected"
             echo(row_text(row))
             outcome.rows.append(row)
             outcome.wrong += [f"{row['fault']}: {sentence}" for sentence in row["wrong"]]
@@ -381,12 +383,6 @@ def _drive_again(bench: DrivingBench, waiting: Sequence[tuple[FaultRow, dict[str
             row["recovered"] = again
         if fault.told_later:
             row["log_line"] = _line_of(fault.message, bench.drive)
-
-
-def _complete(fault: FaultRow, row: dict[str, Any]) -> None:
-    if row["log_line"] is None:
-        row["wrong"].append(f"no line tells of it (wanted: {fault.message})")
-    row["found"] = fault.expected if not row["wrong"] else "not as expected"
 
 
 def row_text(row: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ allowed. The only statement of the code under test that it believes is the firmw
 """
 
 import re
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.driving.virtual import HELD, LIVE, Hand, Seen
-from rover_lib.onboard.drive.service import REQUEST_S
+from lab.driving.virtual import HELD, LIVE, Asked, Hand, Seen
 
 # What firmware/README.md and params.yml promise, with numbers that are written here anew.
 RESTING_US = 124  # a throttle pulse up to this moves no car
@@ -28,8 +28,17 @@ SIGNAL_MS = 105  # a lost signal, or a moved stick, is noticed within 100 ms, an
 DEAD_BAND_US = {"steering": 48 + 8, "throttle": 32 + 8}
 STALE_MS = 1000 + VALID_MS  # drive.stop_s of params.yml, and then the last command's time
 BLIND_MS = 250  # how long the car may drive by pictures that show nothing new
-ASKED_MS = 1000 * REQUEST_S + 200  # from the operator's request to autonomous, including the line's way
-GESTURE_MS = 30_000
+SPARE_MS = 250  # a line's way, and turns of the loops
+GESTURE_MS, SIDES_MS, LET_GO_MS = 30_000, 3000, 1000
+SIDE_US, LET_GO_US = 200, 100 + 24
+GLIMPSE_MS = 30  # a stick that is back sooner may not have been seen, if few pulses come
+NEUTRAL_US = {"steering": 1456, "throttle": 120}
+STOP_MS = 250  # from what ends a drive to throttle off; if lines are lost, the firmware's time limit
+PLANNED_MS = 400  # a plan blends in within 100, and its commands hold for 265
+PER_UNIT_US = {"steering": 555.7, "throttle": 591.2}
+LIMIT = 0.2  # params.yml's throttle_limit
+BLACK_FRAMES = 4
+UNANSWERED_MS = 150 + 50  # and a tick
 # From a stop to the end of the drive. To find a silent link takes 0.5 s, and so does each of two unanswered neutrals.
 ENDED_MS = 1700
 
@@ -49,6 +58,13 @@ class Run:
         self.steering = _each_ms(pins, n, lambda e: e.steering_us if e else 0)
         self.throttle = _each_ms(pins, n, lambda e: e.throttle_us if e else 0)
         self.state = _each_ms(pins, n, lambda e: ord(e.state) if e else 0)
+        self.sick = _for_any(_each_ms(seen.sick, n, int) == 1, STOP_MS + 20)
+        paused = np.zeros(n, bool)
+        for start, end in seen.pauses:
+            paused[start:end] = True
+        self.clean = ~self.sick & ~_for_any(paused, STOP_MS + 20)
+        sent = [[(ms, hand.pulses()[channel]) for ms, hand in seen.hands] for channel in (0, 1)]
+        self.receiver = {pin: _each_ms(sent[i], n, int) for i, pin in enumerate(("steering", "throttle"))}
         self.live = _each_ms(seen.hands, n, lambda h: h.receiver == LIVE)
         self.stick = {
             "steering": _each_ms(seen.hands, n, lambda h: h.sticks[0]),
@@ -74,6 +90,11 @@ def _for_ms(holds: np.ndarray, ms: int) -> np.ndarray:
     return np.convolve(holds, np.ones(ms), "full")[: len(holds)] >= ms - 0.5
 
 
+def _for_any(holds: np.ndarray, ms: int) -> np.ndarray:
+    """Return, for each millisecond, whether `holds` is true at any less than `ms` before or after it."""
+    return np.convolve(holds, np.ones(2 * ms + 1), "same") > 0.5
+
+
 def _first(bad: np.ndarray) -> int | None:
     return int(np.argmax(bad)) if bad.any() else None
 
@@ -81,7 +102,10 @@ def _first(bad: np.ndarray) -> int | None:
 def broken(seen: Seen) -> Iterator[str]:
     """Yield a sentence, with the millisecond, for each invariant that is broken."""
     run = Run(seen)
-    for check in (_asked_for, _capped, _slewed, _not_blind, _human_wins, _human_keeps, _armed_by_people, _told):
+    for check in (
+        *(_asked_for, _capped, _slewed, _not_blind, _human_wins, _human_keeps, _armed_by_people, _told),
+        *(_ends_when_told, _stopped_is_neutral, _as_planned, _bad_ends, _answered, _in_time),
+    ):
         if (what := check(run)) is not None:
             yield f"{check.__name__[1:]}: {what}"
 
@@ -168,32 +192,159 @@ def _human_keeps(run: Run) -> str | None:
 
 
 def _armed_by_people(run: Run) -> str | None:
-    """Autonomous begins only by an operator's request since it last ended and a human's gesture since it last began."""
+    """Autonomous begins only by a young request since it last ended and a human's gesture since it last began.
+
+    The gesture: the steering stick at both sides within three seconds, then let go for one, without any throttle.
+    """
     lost = _for_ms(run.signals == 0, 130)[130:] & _for_ms(run.signals == 1, 130)[:-130]  # gone after it was there
+    steering = run.receiver["steering"]
+    off = np.where(steering > 0, steering - NEUTRAL_US["steering"], 0)
+    throttle = run.receiver["throttle"]
+    off_rest = _for_ms((throttle > 0) & (np.abs(throttle - NEUTRAL_US["throttle"]) > 32), GLIMPSE_MS)
     used = 0
     for armed in run.armed:
         stopped = max((ms for ms in run.left if ms < armed), default=-1)
         asked = [ms for ms in run.seen.asked if stopped < ms <= armed]
-        if not asked or armed - asked[-1] > ASKED_MS:
+        if not asked or armed - asked[-1] > run.seen.asked_most_ms + SPARE_MS:
             return f"armed at {armed} ms, asked for at {run.seen.asked}, stopped at {stopped}"
         since = max(
             [
                 used,
+                armed - GESTURE_MS - SIDES_MS - SPARE_MS,
                 *(ms for ms in run.seen.starts if ms <= armed),
                 *np.flatnonzero(lost[: max(0, armed - SIGNAL_MS)]).tolist(),
+                *np.flatnonzero(off_rest[:armed])[-1:].tolist(),
             ]
         )
-        gestures = [ms for ms in run.seen.wiggled if since < ms <= armed and armed - ms <= GESTURE_MS]
-        if not gestures:
+        held = np.abs(off[armed - LET_GO_MS + 60 : armed - 25]) > LET_GO_US
+        sides = [np.flatnonzero(side[since:armed]) + since for side in (off <= -SIDE_US, off >= SIDE_US)]
+        if _for_ms(held, GLIMPSE_MS).any() or not any(ms <= SIDES_MS + 60 for ms in _gaps(*sides)):
             return f"armed at {armed} ms without a gesture since {since} ms (they were at {run.seen.wiggled})"
         used = armed
     return None
 
 
+def _gaps(left: np.ndarray, right: np.ndarray) -> Iterator[int]:
+    """Yield how long after the one side the stick was at the other, each time."""
+    for one, other in ((left, right), (right, left)):
+        at = np.searchsorted(one, other) - 1
+        yield from (other[at >= 0] - one[at[at >= 0]]).tolist()
+
+
+def _off_after(run: Run, since_ms: int, limit_ms: int, what: str) -> str | None:
+    """Say whether a drive that goes on at since_ms still moves the car limit_ms later."""
+    for armed, left in zip(run.armed, [*run.left, run.seen.end_ms], strict=False):
+        if armed <= since_ms < left:
+            moving = np.flatnonzero(run.throttle[since_ms + limit_ms : left] > RESTING_US)
+            if len(moving):
+                return f"{what} at {since_ms} ms, and throttle at {since_ms + limit_ms + int(moving[0])}"
+    return None
+
+
+def _ends_when_told(run: Run) -> str | None:
+    """A signal, the view, a limit or a missing heartbeat ends a drive: throttle off within 250 ms."""
+    for ms, since in run.seen.stops:
+        if ms < run.seen.end_ms and (not since or any(a <= since <= ms < b for a, b in _drives(run))):
+            limit_ms = STOP_MS if run.clean[ms] else VALID_MS + 20
+            if what := _off_after(run, ms, limit_ms, "told to stop"):
+                return what
+    return None
+
+
+def _drives(run: Run) -> list[tuple[int, int]]:
+    return list(zip(run.armed, [*run.left, run.seen.end_ms + 1], strict=False))
+
+
+def _stopped_is_neutral(run: Run) -> str | None:
+    """In STOPPED both pins are at neutral."""
+    for pin, neutral_us in NEUTRAL_US.items():
+        if (ms := _first((run.state == ord("S")) & (getattr(run, pin) != neutral_us))) is not None:
+            return f"{pin} at {getattr(run, pin)[ms]} us at {ms} ms"
+    return None
+
+
+def _as_planned(run: Run) -> str | None:
+    """The host's pins are what the plans of the last 400 ms meant, within limit and fade, and so they stay."""
+    n = len(run.throttle)
+    good = [p for p in run.seen.plans if not p.bad]
+    young = np.zeros(n, bool)
+    for armed, _ in _drives(run):
+        young[armed : armed + PLANNED_MS] = True
+    fresh = np.zeros(n, bool)
+    for p in good:
+        fresh[p.at_ms : p.at_ms + 200] = True
+    well = run.clean & _for_ms(fresh, PLANNED_MS) & ~young & ~_for_any(young, PLANNED_MS)
+    most_us = NEUTRAL_US["throttle"] + LIMIT * PER_UNIT_US["throttle"] + 1  # on the pins, the firmware's cap hides it
+    if over := [c for c in run.seen.commands if c.throttle_us > most_us and not run.sick[c.at_ms]]:
+        return f"the host asks for throttle {over[0].throttle_us} us at {over[0].at_ms} ms"
+    for i, (pin, neutral_us) in enumerate(NEUTRAL_US.items()):
+        meant = [(p.at_ms, neutral_us + PER_UNIT_US[pin] * (min(p[2], LIMIT) if i else p[1])) for p in good]
+        values = _each_ms([(0, neutral_us), *meant], n, round)
+        windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, (PLANNED_MS, 0), "edge"), PLANNED_MS + 1)
+        low, high = windows.min(1), windows.max(1)
+        low = np.where(young, np.minimum(low, neutral_us), low)
+        high = np.where(young, np.maximum(high, neutral_us), high)
+        pins, spoilt = getattr(run, pin), run.sick if i else np.zeros(n, bool)
+        bad = run.autonomous & ~spoilt & ((pins > high + 4) | ((pins < low - 4) & (well if i else True)))
+        if (ms := _first(bad)) is not None:
+            return f"{pin} at {pins[ms]} us at {ms} ms, meant were {low[ms]} to {high[ms]}"
+    return None
+
+
+def _bad_ends(run: Run) -> str | None:
+    """A plan that nobody may drive by, or black pictures, end the drive's motion."""
+    for p in run.seen.plans:
+        if p.bad and (what := _off_after(run, p.at_ms, VALID_MS + 20, "a bad plan")):
+            return what
+    blacks = 0
+    for ms, black in run.seen.frames:
+        blacks = blacks + 1 if black else 0
+        if blacks == BLACK_FRAMES and (what := _off_after(run, ms, VALID_MS + 20, "black pictures")):
+            return what
+    return None
+
+
+def _answered(run: Run) -> str | None:
+    """A drive that has had no answer for 150 ms sends nothing more."""
+    heard, at = run.seen.heard, 0
+    waiting: deque[Asked] = deque()
+    for command in run.seen.commands:
+        while at < len(heard) and heard[at][0] <= command.at_ms:
+            while waiting and (heard[at][1] - waiting[0].sequence) % 2**32 < 2**31:
+                waiting.popleft()
+            at += 1
+        while waiting and not any(a <= waiting[0].at_ms <= command.at_ms <= b + 1 for a, b in _drives(run)):
+            waiting.popleft()  # of an earlier drive, or of an earlier start of the Arduino
+        if waiting and command.at_ms - waiting[0].at_ms > UNANSWERED_MS:
+            span = waiting[0].at_ms - 2, command.at_ms + 2
+            if not any(start < span[1] and span[0] < end + 10 for start, end in run.seen.pauses):
+                return f"a command at {command.at_ms} ms, and that of {waiting[0].at_ms} was not answered"
+        waiting.append(command)
+    return None
+
+
+def _in_time(run: Run) -> str | None:
+    """A host that pauses again and again ends its drive, or the Arduino does after 45 ms of a later pause."""
+    pauses = sorted(run.seen.pauses)
+    pauses = [p for p, later in pairwise([*pauses, (10**9, 0)]) if later[0] > p[1] + 15]
+    for i, (start, end) in enumerate(pauses):
+        begun = max((armed for armed in run.armed if armed <= end), default=end) + 40
+        lates = [b - a - 34 for a, b in pauses[: i + 1] if b > end - 480 and b - a >= 70 and a >= begun]
+        if sum(lates) > 160 and (what := _off_after(run, end, VALID_MS + 20, "pauses until then")):
+            return what
+        first = [b for a, b in pauses[:i] if 103 <= b - a <= 148 and b + 20 < start and end < b + 480]
+        judged = first and end - start >= 48 and not run.sick[first[0] - 200 : end].any() and end < run.seen.end_ms
+        if judged and any(a < first[0] - 150 and end + 2 < b for a, b in _drives(run)):
+            return f"autonomous at {end} ms after a second pause"
+    return None
+
+
 NAMED = re.compile(
-    "took over|before it began|before a human armed|told to stop|transmitter|wiggled|at rest|was reset|no valid command"
-    "|the host asked|the host paused|took no data|writing failed|reading failed|cannot be opened|no hello|no answer"
-    "|said nothing|no status|not answered|no time|frozen|black|contrast|pictures in a row|no frame|ended after|too old"
+    "as requested|no heartbeat|from the view|have passed since"
+    "|took over|before it began|before a human armed|told to stop|transmitter|wiggled|at rest|was reset"
+    "|no valid command|the host asked|the host paused|took no data|writing failed|reading failed"
+    "|cannot be opened|no hello|no answer|said nothing|no status|not answered|no time|frozen|black|contrast"
+    "|pictures in a row|no frame|ended after|too old"
     "|not finite|outside the range|told to fail|fresh plan|plan within|raised in the loop"
 )
 UNFORESEEN = re.compile(r"\w+(Error|Exception): (?!raised in the loop)")  # sentence_of()'s form for unforeseen errors
@@ -211,6 +362,9 @@ def _told(run: Run) -> str | None:
             continue  # the answer to arming was lost, so no drive began, and the firmware stopped without a command
         for begin, end, words in seen.drives:
             late = end - left > ENDED_MS + seen.paused_ms
-            if begin <= left < end and late and words is not None:  # if it is None, the next start tells of it
+            drove = any(begin <= armed <= left for armed in run.armed)  # and did not only wait for a request
+            if (
+                begin <= left < end and drove and late and words is not None
+            ):  # if it is None, the next start tells of it
                 return f"stopped at {left} ms, and the drive ended at {end}"
     return None

@@ -123,6 +123,13 @@ def _drive_seeds(seeds: Sequence[int]) -> tuple[Tally, list[Failure]]:
     return tally, failures
 
 
+def find_broken(seeds: Sequence[int]) -> str:
+    """Drive the story of each seed until one breaks an invariant, and return what it says; "" if none does."""
+    logging.getLogger(servo_link.__name__).setLevel(logging.CRITICAL)
+    found = ((seed, next(broken(drive_story(random_story(seed))), None)) for seed in seeds)
+    return next((f"seed {seed}: {sentence}" for seed, sentence in found if sentence), "")
+
+
 def _breaks(invariant: str, story: Story) -> bool:
     return any(sentence.startswith(invariant) for sentence in broken(drive_story(story)))
 

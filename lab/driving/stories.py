@@ -17,6 +17,7 @@ from lab.driving.virtual_host import Process
 from rover_lib.onboard.car.servo_link import frame
 
 WIGGLE_MS, START_MS, ASK_MS, STOP_MS, END_MS = 100, 1500, 2100, 4800, 5400
+LONGER_MS = 32_000  # of a drive that takes longer than a gesture and a request last
 
 
 @dataclass(frozen=True)
@@ -34,13 +35,19 @@ class Story:
     """What happens in a drive in addition to the usual: the human's gesture, an operator's start, a stop 3.3 s later.
 
     wiggled: whether the gesture comes before the start. service: whether the drive is a service; then the operator also
-    asks it to arm the car. clock_ms: the Arduino's clock when it is switched on.
+    asks it to arm the car. limited, heartbeat: see Process. terminal: whether the drive waits for the gesture.
+    longer_ms: how much later it is stopped, and if `late`, begun. clock_ms: the Arduino's clock when it is switched on.
     """
 
     happenings: tuple[Happening, ...] = ()
     wiggled: bool = True
     service: bool = False
     clock_ms: int = 0
+    terminal: bool = False
+    limited: bool = False
+    heartbeat: bool = False
+    longer_ms: int = 0
+    late: bool = False
 
 
 # ---- what may happen
@@ -229,6 +236,33 @@ def _lose_throttle(stage: Stage, h: Happening) -> None:
     stage.during(h, stage.world.hand, throttle_wire=False)
 
 
+@_may("the receiver's steering wire is off", for_ms=A_WHILE)
+def _lose_steering(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.hand, steering_wire=False)
+
+
+@_may("the human steers to both sides, seconds apart", (3200, 6000))
+def _steer_slowly(stage: Stage, h: Happening) -> None:
+    for ms, amount in ((0, -300), (h.amount, 300)):
+        moved = Happening(h.at_ms, h.what, amount, 120)
+        stage.world.at(stage.world.now_ms + ms, partial(_steer, stage, moved))
+
+
+@_may("the human drives by hand", (130, 400), (1000, 12_000))
+def _by_hand(stage: Stage, h: Happening) -> None:
+    """Around corners, with stops of a second in between."""
+    hand, world = stage.world.hand, stage.world
+
+    def turn(steering_us: int, throttle_us: int) -> None:
+        hand.sticks = [STICKS_US[0] + steering_us, throttle_us]
+        world.handle()
+
+    for ms in range(0, h.for_ms, 1900):
+        side = 300 if ms // 1900 % 2 else -300
+        world.at(world.now_ms + ms, partial(turn, side, h.amount))
+        world.at(world.now_ms + ms + 800, partial(turn, 0, STICKS_US[1]))
+
+
 @_may("the receiver sends presets", (60, 700), A_WHILE)
 def _preset(stage: Stage, h: Happening) -> None:
     world, hand = stage.world, stage.world.hand
@@ -286,9 +320,17 @@ def _suspend(stage: Stage, h: Happening) -> None:
     stage.world.suspend(h.for_ms)
 
 
+@_may("the process stutters for long", (75, 98), (900, 2500))
 @_may("the process stutters", (20, 140), A_WHILE)
 def _stutter(stage: Stage, h: Happening) -> None:
     stage.again_and_again(h, 150, lambda: stage.world.pause(h.amount))
+
+
+@_may("the process pauses twice", (48, 90))
+def _pause_twice(stage: Stage, h: Happening) -> None:
+    world = stage.world
+    world.pause(h.amount + 58)
+    world.at(world.now_ms + h.amount + 58 + 150, lambda: world.pause(h.amount))
 
 
 @_may("an exception in the loop")
@@ -305,7 +347,18 @@ def _kill(stage: Stage, h: Happening) -> None:
 @_may("the operator says stop")
 def _stop(stage: Stage, h: Happening) -> None:
     if stage.process:
-        stage.process.until.stop.set()
+        stage.process.stop("signal")
+
+
+@_may("somebody stops it from the view")
+def _stop_from_view(stage: Stage, h: Happening) -> None:
+    if stage.process:
+        stage.process.stop("view")
+
+
+@_may("the operator's connection is lost")
+def _lose_operator(stage: Stage, h: Happening) -> None:
+    stage.world.operator_gone = True
 
 
 @_may("the operator starts it")
@@ -314,6 +367,12 @@ def _start(stage: Stage, h: Happening) -> None:
         stage.process.ask()
     else:
         stage.start_due = True
+
+
+@_may("the operator starts it, and the machine is suspended", for_ms=(2500, 20_000))
+def _start_and_suspend(stage: Stage, h: Happening) -> None:
+    _start(stage, h)
+    stage.world.at(stage.world.now_ms + 5, lambda: stage.world.suspend(h.for_ms))
 
 
 H = Happening
@@ -356,8 +415,8 @@ KEPT: dict[str, tuple[Story, str]] = {  # stories that once broke an invariant, 
         "has not answered",
     ),
     "asked for, and then the process is stopped": (
-        Story((H(2000, "the process is stopped", for_ms=2300),), service=True),
-        "before a human armed",
+        Story((H(2110, "the process is stopped", for_ms=2300),), service=True),
+        "before a human armed|said nothing",
     ),
     "asked for, and then the machine is suspended": (
         Story((H(2110, "the machine is suspended", for_ms=2300),), service=True),
@@ -370,13 +429,20 @@ def random_story(seed: int) -> Story:
     """Make a story of up to eight happenings. The same seed gives the same story, as long as HAPPENINGS is the same."""
     rng = random.Random(seed)
     happenings = []
+    longer_ms = LONGER_MS if rng.random() < 0.03 else 0
     for _ in range(rng.randint(0, 8)):
         what = rng.choice(list(HAPPENINGS))
         _, amount, (shortest, longest) = HAPPENINGS[what]
         for_ms = round(shortest * (longest / shortest) ** rng.random()) if shortest else 0
-        happenings.append(Happening(rng.randint(0, STOP_MS), what, rng.randint(*amount), for_ms))
+        happenings.append(Happening(rng.randint(0, STOP_MS + longer_ms), what, rng.randint(*amount), for_ms))
     in_order = tuple(sorted(happenings, key=lambda h: h.at_ms))
-    return Story(in_order, rng.random() < 0.8, rng.random() < 0.5, rng.choice([0, 2**32 - 2000]))
+    path = rng.choice(["service", "service", "terminal", "at once"])
+    limits = rng.random() < 0.2, rng.random() < 0.2
+    clock_ms = rng.choice([0, 2**32 - 2000])
+    return Story(
+        *(in_order, rng.random() < 0.8, path == "service", clock_ms, path == "terminal", *limits),
+        *(longer_ms, bool(longer_ms) and rng.random() < 0.5),
+    )
 
 
 def shortest(story: Story, breaks: Callable[[Story], bool]) -> Story:
@@ -391,8 +457,9 @@ def shortest(story: Story, breaks: Callable[[Story], bool]) -> Story:
 def _simpler(story: Story) -> Iterator[Story]:
     if story.clock_ms:
         yield replace(story, clock_ms=0)
-    if story.service:
-        yield replace(story, service=False)
+    for name in ("service", "terminal", "limited", "heartbeat", "late", "longer_ms"):
+        if getattr(story, name):
+            yield replace(story, **{name: type(getattr(story, name))()})
     if not story.wiggled:
         yield replace(story, wiggled=True)
     for i, h in enumerate(story.happenings):
@@ -416,16 +483,18 @@ def drive_story(story: Story) -> Seen:
         world.at(WIGGLE_MS, stage.wiggle)
     for h in story.happenings:
         world.at(h.at_ms, lambda h=h: HAPPENINGS[h.what][0](stage, h))  # type: ignore[misc]
-    start, stop = (Happening(ms, what) for ms, what in ((START_MS, "start"), (STOP_MS, "stop")))
-    world.at(START_MS, lambda: _start(stage, start))
-    world.at(STOP_MS, lambda: _stop(stage, stop))
+    stop_ms = STOP_MS + story.longer_ms
+    later_ms = story.longer_ms * story.late
+    start, stop = (Happening(ms, what) for ms, what in ((START_MS, "start"), (stop_ms, "stop")))
+    world.at(START_MS + later_ms, lambda: _start(stage, start))
+    world.at(stop_ms, lambda: _stop(stage, stop))
     if story.service:
-        world.at(ASK_MS, lambda: _start(stage, start))
-    while world.now_ms < END_MS:
+        world.at(ASK_MS + later_ms, lambda: _start(stage, start))
+    while world.now_ms < END_MS + story.longer_ms:
         world.advance(world.now_ms + 1)
-        if stage.start_due and world.now_ms < STOP_MS:
+        if stage.start_due and world.now_ms < stop_ms:
             stage.start_due = False
-            stage.process = Process(world, story.service)
+            stage.process = Process(world, story.service, story.terminal, story.limited, story.heartbeat)
             stage.process.run()
             stage.process = None
     world.close()

@@ -134,7 +134,7 @@ def _arm(bench: DrivingBench, page: Page) -> None:
     while True:
         with contextlib.suppress(RoverError):
             bench.arduino.wiggle()
-            bench.wait(0.5)
+            bench.wait(1.4)  # the stick must have been let go of for a second
             arm_car(Request(), wait_s=0.0)
             break
         bench.drive.check()

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from lab.arduino.emulator import CC, FIRMWARE, compile_c
+from rover_lib.onboard.car.servo_link import Telemetry, parse
 from rover_lib.workshop.cache import cache_folder, key_of
 
 BOARD = Path(__file__).with_name("board.c")
@@ -63,7 +64,7 @@ class Board:
     def __init__(self, clock_ms: int, boot: int, cause: str):
         self._c = ctypes.CDLL(str(library()))
         self._text = ctypes.create_string_buffer(1024)
-        self._events = (Event * 4096)()
+        self._events = (Event * 65536)()
         self._zero_ms = clock_ms
         self._c.board_start(ctypes.c_uint32(clock_ms), boot, ctypes.c_char(cause.encode()))
 
@@ -120,13 +121,14 @@ class Hand:
     receiver: str = LIVE
     sent: list[int] = field(default_factory=lambda: list(STICKS_US))  # pulses of a receiver that holds or sends presets
     throttle_wire: bool = True
+    steering_wire: bool = True
     one_in: int = 1
     misread_in: int = 0
 
     def pulses(self) -> tuple[int, int]:
         """Return the pulses on the receiver's pins (steering, throttle; us), where 0 stands for none."""
         steering, throttle = {LIVE: self.sticks, LOST: (0, 0)}.get(self.receiver, self.sent)
-        return steering, throttle if self.throttle_wire else 0
+        return steering if self.steering_wire else 0, throttle if self.throttle_wire else 0
 
 
 @dataclass(eq=False)
@@ -163,6 +165,16 @@ class Asked(NamedTuple):
     throttle_us: int
     content_ms: int
     planned: bool
+    sequence: int
+
+
+class Planned(NamedTuple):
+    """A plan as it arrived. All of its actions are the same: steering, throttle. bad: nobody may drive by it."""
+
+    at_ms: int
+    steering: float
+    throttle: float
+    bad: bool
 
 
 @dataclass
@@ -173,7 +185,11 @@ class Seen:
     receiver do from a time on. commands: the drive commands as the host wrote them. asked: when an operator asked to
     arm the car. wiggled: when a gesture was complete. starts: when the sketch started. hung: from when to when its loop
     hung. phases: what the host is doing from a time on. drives: begin, end and closing sentence of each, None if it was
-    killed. log: the events of the flight log. paused_ms: for how long the host's process was stopped in all.
+    killed. log: the events of the flight log. paused_ms: for how long the host's process was stopped in all; pauses:
+    from when to when. asked_most_ms: how old a request may become. plans: as they arrived. frames: when each came, and
+    whether it was black. heard: the Arduino's statuses as the host read them: when, and the command's number. stops:
+    when a drive was to end, by a signal, the view, its limit or a missing heartbeat; and since when it must have
+    driven. sick: from a time on, whether lines or orders are spoilt.
     """
 
     pins: list[tuple[int, Event | None]] = field(default_factory=list)
@@ -187,6 +203,13 @@ class Seen:
     drives: list[tuple[int, int, str | None]] = field(default_factory=list)
     log: list[tuple[int, str]] = field(default_factory=list)
     paused_ms: int = 0
+    pauses: list[tuple[int, int]] = field(default_factory=list)
+    asked_most_ms: int = 2000
+    plans: list[Planned] = field(default_factory=list)
+    frames: list[tuple[int, bool]] = field(default_factory=list)
+    heard: list[tuple[int, int]] = field(default_factory=list)
+    stops: list[tuple[int, int]] = field(default_factory=list)
+    sick: list[tuple[int, bool]] = field(default_factory=list)
     end_ms: int = 0
 
 
@@ -223,6 +246,7 @@ class World:
         self._due: list[tuple[int, int, Callable[[], None]]] = []
         self._count = 0
         self._started_ms = self._hung_ms = 0
+        self.view_stop = self.operator_gone = False
         self.down, self.up = Wire(self, self._arrive_down), Wire(self, self._arrive_up)
         self._power(clock_ms, "p")
 
@@ -279,6 +303,7 @@ class World:
         """Stop the host's process for a while."""
         until_ms = self.now_ms + ms
         self.seen.paused_ms += max(0, until_ms - max(self.paused_until_ms, self.now_ms))
+        self.seen.pauses.append((self.now_ms, until_ms))
         self.paused_until_ms = max(self.paused_until_ms, until_ms)
 
     # ---- the board
@@ -322,6 +347,10 @@ class World:
         """Pass on to the receiver's pins what the hand does now."""
         hand = replace(self.hand, sticks=list(self.hand.sticks), sent=list(self.hand.sent))
         self.seen.hands.append((self.now_ms, hand))
+        wires = (self.down, self.up)
+        sick = any(w.latency_ms > 1 or w.lost_pct or w.garbled_pct for w in wires)
+        sick |= bool(self.lens.late_ms or self.mind.latency_ms > LATENCY_MS)  # then the throttle fades
+        self.seen.sick.append((self.now_ms, bool(sick or self.stuck or self.unplugged or self.mad_us)))
         if self.board:
             steering_us, throttle_us = hand.pulses()
             self.board.transmit(STEERING, steering_us)
@@ -346,7 +375,14 @@ class World:
                 self.at(self.paused_until_ms + 1, self._read_all)
             self._unread.append(line)
         else:
-            self.port.hear(line)
+            self._hear(line)
+
+    def _hear(self, lines: bytes) -> None:
+        for line in lines.splitlines():
+            if self.port and isinstance(status := parse(line, 0.0), Telemetry):
+                self.seen.heard.append((self.now_ms, status.sequence))
+        if self.port:
+            self.port.hear(lines)
 
     def _read_all(self) -> None:
         lines, self._unread = self._unread, []
@@ -354,7 +390,7 @@ class World:
             self._unread = lines
             self.at(self.paused_until_ms + 1, self._read_all)
         elif self.port:
-            self.port.hear(b"".join(lines))
+            self._hear(b"".join(lines))
 
     def write(self, line: bytes) -> None:
         """Write a line from the host. Raises what a port raises: OSError if unplugged, BlockingIOError if stuck."""
@@ -366,6 +402,7 @@ class World:
             raise BlockingIOError
         self.written.append(line)
         if line.startswith(b">D"):
-            throttle_us = int(line.split(b"*")[0].split()[-1])
-            self.seen.commands.append(Asked(self.now_ms, throttle_us, self.content_ms, not self.mad_us))
+            _, _, sequence, *_, throttle_us = line.split(b"*")[0].split()
+            asked = self.now_ms, int(throttle_us), self.content_ms, not self.mad_us, int(sequence)
+            self.seen.commands.append(Asked(*asked))
         self.down.send(line)

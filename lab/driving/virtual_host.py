@@ -12,19 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from lab.driving.virtual import FRAME_MS, Killed, World
+from lab.driving.virtual import FRAME_MS, Killed, Planned, World
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
+from rover_lib.onboard.drive.drive import arm_capped, arm_when_ready, what_is_missing
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
-from rover_lib.onboard.drive.service import NotArmed, check_age
+from rover_lib.onboard.drive.service import Request, Service
 from rover_lib.onboard.errors import DriveFault, PolicyError, RoverError, TakenOver, sentence_of
 from rover_lib.onboard.params import params
 
 RATE_HZ = 30.0
-PLAN = (0.2, 0.15)  # steering, throttle
+PLAN = (0.2, 0.15)  # steering, one way and the other, and throttle
+LIMIT_MS, HEARTBEAT_MS = 1500, 600  # those of a service's drive, if it has them
 GO_MS, BRAKE_MS = 1200, 600  # how long the policy goes and brakes, in turn
 WALL_S = 1.7e9
 
@@ -161,6 +163,7 @@ class Eyes:
         picture = _scenery()[round(content_ms / FRAME_MS) % len(_scenery())]
         if lens.black:
             picture = (picture - picture.min()) // 64 + world.now_ms % 2
+        world.seen.frames.append((world.now_ms, lens.black))
         # The driver of a frozen camera still gives each picture a new time stamp.
         self._give((picture, (seen_ms - world.suspended_ms) / 1e3))
         self.content.setdefault(self.camera.frames, content_ms)
@@ -197,7 +200,8 @@ class VirtualPlanner(Planner):
             self._thinking, self._asked_s = True, self._clock()
             world, mind = self._world, self._world.mind
             throttle = PLAN[1] if world.now_ms % (GO_MS + BRAKE_MS) < GO_MS else 0.0
-            actions = np.tile([PLAN[0], throttle if mind.throttle is None else mind.throttle], (32, 1))
+            steering = PLAN[0] if world.now_ms // 700 % 2 else -PLAN[0]
+            actions = np.tile([steering, throttle if mind.throttle is None else mind.throttle], (32, 1))
             if mind.does in ("nan", "wild"):
                 actions[:] = {"nan": np.nan, "wild": 5.0}[mind.does]
             content_ms = self._eyes.content[frame.number]
@@ -210,6 +214,9 @@ class VirtualPlanner(Planner):
         if world.paused_until_ms > world.now_ms:
             return world.at(world.paused_until_ms, lambda: self._answer(captured_s, content_ms, actions))
         self._thinking, self._asked_s = False, None
+        steering, throttle = actions[0].tolist()
+        bad = bool(world.mind.does == "raise" or not np.isfinite(throttle) or throttle > 1)
+        world.seen.plans.append(Planned(world.now_ms, steering, throttle, bad))
         try:
             if world.mind.does == "raise":
                 raise PolicyError("the policy was told to fail")
@@ -239,6 +246,18 @@ class _Pilot(PolicyPilot):
         return order
 
 
+class _Stop(threading.Event):
+    """An event whose waiting lets the world go on."""
+
+    def __init__(self, world: World):
+        super().__init__()
+        self._world = world
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self._world.sleep(timeout or 0.0)
+        return self.is_set()
+
+
 class _Log:
     def __init__(self, world: World):
         self._world = world
@@ -258,27 +277,58 @@ def _settings() -> Settings:
 class Process:
     """`rover drive` from its start to its end, run in the present process. Its parts are attributes, to be broken.
 
-    service: whether it drives again each time that an operator asks for it with ask(). record: the loop's hook, called
-    with each command. armed: the status with which the car was armed.
+    service: whether it drives again each time that an operator asks for it with ask(); terminal: whether it waits for
+    the human's gesture. limited, heartbeat: whether a service's drive ends after LIMIT_MS, or without the operator's
+    heartbeats. record: the loop's hook, called with each command. armed: the status with which the car was armed.
     """
 
     record: Callable[..., None] | None = None
     armed: Telemetry | None = None
 
-    def __init__(self, world: World, service: bool):
+    def __init__(self, world: World, service: bool, terminal: bool = False, limited=False, heartbeat=False):
         self.world = world
-        self.until = Until()
+        self.until = Until(stop=_Stop(world), over=self._over)
+        self._terminal = terminal
+        self._operators = Service(Report(), self.until.stop, clock=world.boottime)
+        turn: Any = _Waiting(world)
+        self._operators._turn = turn
+        self._limits = Request(LIMIT_MS / 1e3 if limited else None, HEARTBEAT_MS / 1e3 if heartbeat else None)
+        world.seen.asked_most_ms = 31_000 if terminal else 2000
         self.commanded = Commanded()
         world.alive = True
         self.eyes = Eyes(world)
         self.planner = VirtualPlanner(world, self.eyes, self.commanded)
-        self._service, self._asked, self._asked_ms = service, False, 0
+        self._service = service
         self._log = _Log(world)
 
     def ask(self) -> None:
-        """Let the operator ask to arm the car."""
-        self._asked, self._asked_ms = True, self.world.now_ms
+        """Let the operator ask to arm the car, as Service._answer_to() does."""
+        operators = self._operators
         self.world.seen.asked.append(self.world.now_ms)
+        if operators._ticket:
+            operators._ticket, operators._request, operators._asked = "", self._limits, True
+            operators._asked_s = self.world.boottime()
+
+    def stop(self, how: str) -> None:
+        """End the drive by a signal, or by the view."""
+        self.world.seen.stops.append((self.world.now_ms, 0))
+        if how == "signal":
+            self.until.stop.set()
+        else:
+            self.world.view_stop = True
+
+    def _over(self) -> str | None:
+        if self.world.view_stop:
+            return "stopped from the view (127.0.0.1)"
+        return self._operators.over() if self._service else None
+
+    def _beat(self, armed_ms: int) -> None:
+        """Let the operator's heartbeats come until they are gone."""
+        world = self.world
+        if world.operator_gone:
+            return world.seen.stops.append((round(self._operators._heard_s * 1e3) + HEARTBEAT_MS, armed_ms))
+        self._operators._heard_s = world.boottime()
+        world.at(world.now_ms + HEARTBEAT_MS // 3, lambda: self._beat(armed_ms))
 
     def run(self) -> None:
         """Run until it ends. Raises nothing."""
@@ -323,33 +373,37 @@ class Process:
         drive(pilot, link, self._log, rate_hz=RATE_HZ, until=self.until, hooks=hooks, report=report,
               clock=world.clock, sleep=world.sleep)  # fmt: skip
 
-    def _arm(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry:
-        """Arm the car as drive.py and service.py do: one attempt for each request."""
-        world = self.world
-        if not self._service:
-            self.ask()
-        while True:
+    def _arm(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry | None:
+        """Arm the car as drive.py does: for whoever asks the service, for a human in a terminal, or at once."""
+        world, wait = self.world, self._operators.wait_for_human
+        world.phase("disarmed")
+        checks = (self.eyes.camera.latest, self.planner.newest, link.latest)
+        attempt = functools.partial(self._attempt, pilot, link)
+        if self._service:
+            return wait(attempt, checks, functools.partial(what_is_missing, link))
+        world.seen.asked.append(world.now_ms)
+        if self._terminal:
+            stop, notify = self.until.stop, self._log.event
+            return arm_when_ready(attempt, link, stop, notify, checks, clock=world.boottime)
+        return attempt()
+
+    def _attempt(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry:
+        world, limit = self.world, _settings().throttle_limit
+        world.phase("arming")
+        try:
+            link.request(keep=True)
+            self.planner.renew(_settings().fade_s)
+            pilot.check_sight()
+            wanted = self._operators.check_request if self._service else lambda: None
+            self.armed = arm_capped(link, limit, limit, self._log.event, wanted)
+        except RoverError as error:
             world.phase("disarmed")
-            while not self._asked:
-                self.eyes.camera.latest()
-                self.planner.newest()
-                link.latest()
-                if self.until.stop.is_set():
-                    raise NotArmed("told to stop before a human armed the car")
-                world.sleep(0.1)
-            self._asked = False
-            world.phase("arming")
-            try:
-                self.planner.renew(_settings().fade_s)
-                pilot.check_sight()
-                if self._service:
-                    check_age(world.boottime() - self._asked_ms / 1e3)
-                telemetry = link.arm()
-            except RoverError as error:
-                if not self._service:
-                    raise
-                self._log.event(f"not armed: {error}")
-                continue
-            world.phase("driving")
-            self.armed = telemetry
-            return telemetry
+            self._log.event(f"not armed: {error}")
+            raise
+        world.phase("driving")
+        world.view_stop = False
+        if self._service and self._limits.max_seconds:
+            world.seen.stops.append((world.now_ms + LIMIT_MS, world.now_ms))
+        if self._service and self._limits.heartbeat_s:
+            world.at(world.now_ms + 1, functools.partial(self._beat, world.now_ms))
+        return self.armed

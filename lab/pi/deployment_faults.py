@@ -94,14 +94,14 @@ def _anytime(disk: Disk) -> bool:
     return True
 
 
-def _no_room_to_arrive(bench: DeploymentBench) -> None:
-    bench.small_disk(ROOM)
-    bench.deploy()
+def _little_room(policies: int) -> Callable[[DeploymentBench], None]:
+    """Return an inject for a disk with little more room than that many times the policy's bytes."""
 
+    def inject(bench: DeploymentBench) -> None:
+        bench.small_disk(policies * bench.about["bytes"] + ROOM)
+        bench.deploy()
 
-def _no_room_to_stage(bench: DeploymentBench) -> None:
-    bench.small_disk(2 * bench.about["bytes"] + ROOM)
-    bench.deploy()
+    return inject
 
 
 def _fill_while_staging(bench: DeploymentBench) -> None:
@@ -175,10 +175,6 @@ def _sign_by_another(bench: DeploymentBench) -> None:
     bench.deploy(rover_signing_key=str(key))
 
 
-def _fail_parity(bench: DeploymentBench) -> None:
-    bench.deploy(write_changed_artifact(bench.artifacts[bench.target], bench.folder / "parity.pt", answers=0.5))
-
-
 def _two_at_once(bench: DeploymentBench) -> None:
     with ThreadPoolExecutor(1) as pool:
         second: list[Any] = []
@@ -197,10 +193,6 @@ def _wrong_clock(years: int) -> Callable[[DeploymentBench], dict[str, str]]:
         return {"date": bench.pi.inside("date", "+%Y").stdout.strip()}
 
     return inject
-
-
-def _tamper_before(bench: DeploymentBench) -> None:
-    bench.deploy_until(lambda disk: bench.proves(), lambda: flip(bench.released))
 
 
 def _tamper_in_use(bench: DeploymentBench) -> dict[str, Any]:
@@ -272,10 +264,10 @@ FAULTS = [
         "once it was proven again; a power cut ends a service too, which then loads what current points to",
         fresh=False,
     ),
-    DeploymentFault("disk full in the transfer", _no_room_to_arrive, FULL, f"{ROOM >> 20} MB are free", fresh=True),
+    DeploymentFault("disk full in the transfer", _little_room(0), FULL, f"{ROOM >> 20} MB are free", fresh=True),
     DeploymentFault(
         "too little room for a release",
-        _no_room_to_stage,
+        _little_room(2),
         r"\d+ MB free, \d+ are needed; prune releases",
         "it can arrive, but the release does not fit beside it",
         fresh=True,
@@ -350,7 +342,9 @@ FAULTS = [
     ),
     DeploymentFault(
         "parity vectors that fail",
-        _fail_parity,
+        lambda bench: bench.deploy(
+            write_changed_artifact(bench.artifacts[bench.target], bench.folder / "parity.pt", answers=0.5)
+        ),
         "computes something else here",
         "they want other answers",
     ),
@@ -362,7 +356,7 @@ FAULTS = [
     ),
     DeploymentFault(
         "release tampered with before it was proven",
-        _tamper_before,
+        lambda bench: bench.deploy_until(lambda disk: bench.proves(), lambda: flip(bench.released)),
         r"is not what policy\.pt\.sha256 says",
         "a byte of it, as its health check begins",
     ),

@@ -25,6 +25,7 @@ from rover_lib.workshop.wheelhouse import REQUIREMENTS, VIEW
 
 VENV, STATE = "/opt/rover/venv", "/var/lib/rover-drive"
 READY_S = 600  # how long the service may take until it can drive, with emulated torch on a busy machine
+DRIVES_S = 30.0  # from a request until the car drives
 
 
 def environment(root: Path, engine: str = "torch") -> dict[str, Any]:
@@ -210,6 +211,15 @@ def _probe(pi: Container, name: str, unit: str) -> dict[str, Any]:
         (pi.root / "etc/systemd/system" / name).unlink()
 
 
+def arm(pi: Container, pins: Pins) -> float:
+    """Arm the car and wait until it moves; return when it was asked to (monotonic seconds)."""
+    asked_s = time.monotonic()
+    pi.inside(f"{VENV}/bin/rover", "arm-car", "--yes")
+    if not wait_for(lambda: moving(pins.since(asked_s)), DRIVES_S):
+        raise EmulationError(f"the car does not drive, its service says: {show(pi, 'StatusText')['StatusText']}")
+    return asked_s
+
+
 def hang(pi: Container, pins: Pins) -> dict[str, Any]:
     """Hang the loop's process by SIGSTOP while it drives. All times are in seconds from then.
 
@@ -220,10 +230,7 @@ def hang(pi: Container, pins: Pins) -> dict[str, Any]:
     """
     pi.inside("systemctl", "reset-failed", UNIT, check=False)
     pi.inside("systemctl", "start", UNIT)
-    asked_s = time.monotonic()
-    pi.inside(f"{VENV}/bin/rover", "arm-car", "--yes")
-    if not wait_for(lambda: moving(pins.since(asked_s)), 30):
-        raise EmulationError(f"the car does not drive, its service says: {show(pi, 'StatusText')['StatusText']}")
+    asked_s = arm(pi, pins)
     pid = int(show(pi, "MainPID")["MainPID"])
     here = pi.pid_of(pid)
     at_s = time.monotonic()

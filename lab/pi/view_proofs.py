@@ -22,8 +22,8 @@ from lab.driving.page import Page
 from lab.driving.pins import STOPPED_THROTTLE_US
 from lab.pi.container import Container
 from lab.pi.emulation import EmulationError, wait_for
-from lab.pi.pulses import READ_S, Pins, moving, stopped
-from lab.pi.service_proofs import READY_S, STATE, VENV, show
+from lab.pi.pulses import READ_S, Pins, stopped
+from lab.pi.service_proofs import READY_S, STATE, VENV, arm, show
 from rover_lib.onboard.drive.feed import DRIVING, WAITING
 from rover_lib.onboard.drive.service import UNIT
 
@@ -32,7 +32,6 @@ TOKEN = "/etc/rover/view.token"
 FILES = (f"/etc/systemd/system/{VIEW_UNIT}", TOKEN, "/opt/rover/requirements_pi_view.txt", "/run/rover-view")
 START_S = 180.0  # how long its program may take to start, emulated on a busy machine
 SEEN_S = 30.0  # how long it may take until a page shows what has happened
-DRIVES_S = 30.0  # from a request until the car drives
 WITHOUT_S = 3.0  # how long a drive must go on after its view was killed; longer than the Arduino's 150 ms
 STOPPED_S = 2.0  # how long after a stop nothing may move the car any more
 ATTEMPTS = 3  # how often a drive is tried if this machine was too busy; if it was each time, the drive fails
@@ -187,7 +186,7 @@ def _beside(pi: Container, pins: Pins, port: int, token: str, stop_s: float) -> 
     with Page(url) as page:
         seen = _shows(page, lambda newest: newest["phase"] == WAITING and newest["stopped"])
         yield Row("what a page shows of a disarmed car", "waiting, at rest", _brief(page), seen)
-        armed_s = _arm(pi, pins)
+        armed_s = arm(pi, pins)
         drive = show(pi, "MainPID", "NRestarts")
         seen = _shows(page, _drives)
         yield Row("what it shows of an armed drive", "driving, with picture and pins", _brief(page), seen)
@@ -196,15 +195,6 @@ def _beside(pi: Container, pins: Pins, port: int, token: str, stop_s: float) -> 
         seen = _shows(page, _drives)
         yield Row("a page of the view's next start", "driving", _brief(page), seen)
         yield from _stop(pi, pins, page, stop_s, armed_s, drive)
-
-
-def _arm(pi: Container, pins: Pins) -> float:
-    """Arm the car and wait until it moves; return when it was asked to (monotonic seconds)."""
-    asked_s = time.monotonic()
-    pi.inside(f"{VENV}/bin/rover", "arm-car", "--yes")
-    if not wait_for(lambda: moving(pins.since(asked_s)), DRIVES_S):
-        raise EmulationError(f"the car does not drive, its service says: {show(pi, 'StatusText')['StatusText']}")
-    return asked_s
 
 
 def _killed(pi: Container, pins: Pins, port: int, token: str, armed_s: float, drive: dict[str, str]) -> Iterator[Row]:

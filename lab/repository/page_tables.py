@@ -4,6 +4,7 @@
 
 A table stands in README.md or in a page of docs/ between `<!-- table NAME, by make tables -->` and `<!-- end -->`, each
 once. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is left out.
+A computed time in a sentence stands between `<!-- ms POLICY -->` and `<!-- end -->`; it is from the clock's JSON too.
 """
 
 import re
@@ -12,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.care.pi5 import CORES, DRIVING
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path, read_stage
 from rover_lib.workshop.run.run import parameters_in
@@ -24,7 +26,9 @@ EXPLAINED = {  # the modes, in words that need no other page
     "mixed": "*mixed*: static, the most sensitive parts in FP32",
 }
 BEST = "static"
+GHZ, LINE = 2.4, 64  # of a Raspberry Pi 5; bytes of a cache line
 PLACE = re.compile(r"(<!-- table (\w+), by make tables -->\n)(.*?)(<!-- end -->)", re.S)
+TIME = re.compile(r"(<!-- ms ([^>]+?) -->)(.*?)(<!-- end -->)")
 
 Row = tuple[str, ...]
 
@@ -62,7 +66,101 @@ def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
         lines = [header, ("---",) * len(header), *rows]
         return match[1] + "".join(map(_line, lines)) + match[4]
 
-    return {path: PLACE.sub(place, text) for path, text in texts.items()}
+    placed = {path: PLACE.sub(place, text) for path, text in texts.items()}
+    times = _clock(root)
+
+    def tell(match: re.Match[str]) -> str:
+        if match[2] not in times:
+            raise TableError(
+                f"no time of {match[2]!r} is computed",
+                found=sorted(times),
+                remedy="add it to lab/a76/network_counts.py",
+            )
+        return match[1] + times[match[2]] + match[4]
+
+    return {path: TIME.sub(tell, text) for path, text in placed.items()}
+
+
+def _clock(root: Path) -> dict[str, str]:
+    """What each policy takes on the cores that drive, as "low to high"; on others as "POLICY, 4 threads"."""
+    times = {}
+    for row in _metrics(root / "results" / "clock", "clock")["policies"]:
+        span = span_of(row)
+        times[f"{row['name']}, {row['threads']} threads"] = span
+        if row["threads"] == DRIVING:
+            times[row["name"]] = span
+            times[shape_of(row)] = span
+    return times
+
+
+def _policies(root: Path) -> list[Row]:
+    """What our policies take by threads."""
+    rows = _metrics(root / "results" / "clock", "clock")["policies"]
+    times = _clock(root)
+    table: list[Row] = [
+        ("a plan, ms, *computed*: policy", "10^9 instructions", *(f"{n} thread{'s' * (n > 1)}" for n in range(1, 5)))
+    ]
+    for row in rows[::CORES]:
+        what = f"{row['name']}: {row['width']}x{row['height']}, {row['decoder_layers']} x {row['feedforward']}"
+        spans = (times[f"{row['name']}, {n} threads"] for n in range(1, CORES + 1))
+        table.append((what, f"{row['instructions_g']:.3g}", *spans))
+    return table
+
+
+def _fit(root: Path) -> list[Row]:
+    """What the fit found that one of each takes."""
+    instruction, near, far = _metrics(root / "results" / "clock", "clock")["fit"]["ns"]
+    return [
+        ("what", "ns", "that is"),
+        ("an instruction", f"{instruction:.3f}", f"{1 / (GHZ * instruction):.1f} a cycle at {GHZ} GHz"),
+        ("a near line", f"{near:.2f}", f"{GHZ * near:.1f} cycles, most of its way hidden"),
+        ("a far line", f"{far:.2f}", f"{LINE / far:.1f} GB/s"),
+    ]
+
+
+def _judged(root: Path) -> list[Row]:
+    """How far off the computed times were."""
+    metrics = _metrics(root / "results" / "clock", "clock")
+    rows: list[Row] = [("", "times", "median error, %", "worst error, %", "in the interval, %")]
+    for n, found in metrics["judged"].items():
+        shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct", "held_pct"))
+        rows.append((f"{n} thread{'s' * (n != '1')}, architecture left out", *shown))
+    for runtime, found in metrics["other_runtime"].items():
+        shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct"))
+        rows.append((f"4 threads, all of {runtime} left out", *shown, ""))
+    return rows
+
+
+def _networks(root: Path) -> list[Row]:
+    """Published against computed, a row a network."""
+    rows: dict[tuple[str, ...], dict[int, Mapping[str, Any]]] = {}
+    for row in _metrics(root / "results" / "clock", "clock")["networks"]:
+        rows.setdefault((row["runtime"], row["name"], row["precision"]), {})[row["threads"]] = row
+    table: list[Row] = [
+        ("network", "10^9 instructions", *(f"{n}: published, computed" for n in ("1 thread", "4 threads")))
+    ]
+    for (runtime, name, precision), by_threads in rows.items():
+        cells = (_against(by_threads[n]) if n in by_threads else "" for n in (1, CORES))
+        any_row = next(iter(by_threads.values()))
+        table.append((f"{runtime} {name}, {precision}", f"{any_row['instructions_g']:.3g}", *cells))
+    return table
+
+
+def span_of(row: Mapping[str, Any]) -> str:
+    """Return the ends of a computed time with two digits each."""
+    return " to ".join(f"{float(f'{row[key]:.2g}'):g}" for key in ("predicted_low_ms", "predicted_high_ms"))
+
+
+def _against(row: Mapping[str, Any]) -> str:
+    computed, low, high = (row[f"predicted{end}_ms"] for end in ("", "_low", "_high"))
+    return f"{row['published_ms']:.3g}, {computed:.3g} ({low:.3g} to {high:.3g})"
+
+
+def shape_of(row: Mapping[str, Any]) -> str:
+    """Return what tells a policy from others: its picture, its decoder, and how much of its backbone it computes."""
+    return "x".join(
+        str(row.get(key)) for key in ("width", "height", "decoder_layers", "feedforward", "backbone_channels")
+    )
 
 
 def _line(fields: Row) -> str:
@@ -79,25 +177,22 @@ def _demo(root: Path) -> list[Row]:
         found = modes[mode]
         errors = [_of(found, f"{action}_mae_pct", ".2f") for action in ("steering", "throttle")]
         hits = f"{found['hits']} of {found['trials']}"
-        fields = (
-            _of(found, "size_mb", ".1f"),
-            hits,
-            " / ".join(filter(None, errors)),
-            _of(timed[mode], "speedup", ".1f"),
-        )
-        return EXPLAINED[mode], *(_strong(field or "", mode == BEST) for field in fields)
+        faster = f"{timed['fp32']['latency_p50_ms'] / timed[mode]['latency_p50_ms']:.1f}"
+        fields = (_of(found, "size_mb", ".1f"), hits, " / ".join(filter(None, errors)), faster)
+        return EXPLAINED[mode], *(f"**{field}**" if field and mode == BEST else field or "" for field in fields)
 
-    return [("", "MB", "balloons hit", "error, %: steering / throttle", "times faster"), *map(row, EXPLAINED)]
+    return [("", "MB", "balloons hit", "error, %", "times faster"), *map(row, EXPLAINED)]
 
 
 def _faults(root: Path) -> list[Row]:
     """What was done to a driving car, and what became of it."""
-    report = _metrics(root / "results" / "lab", "faults")
+    report, random = (_metrics(root / "results" / "lab", name) for name in ("faults", "random"))
     of = {e: [f for f in report["faults"] if f["expected"] == e] for e in ("stopped", "continues", "refused", "human")}
 
     def right(expected: str) -> str:
         return f"{sum(not f['wrong'] for f in of[expected])} of {len(of[expected])}"
 
+    broken = f"{len(random['broken'])} of {random['drives']:,}"
     worst, takeover = (report["summary"][key] for key in ("worst_stopped_after_ms", "takeover_ms"))
     return [
         ("what", "figure"),
@@ -112,7 +207,7 @@ def _faults(root: Path) -> list[Row]:
             "pulses that were recorded, replayed and measured again: difference",
             f"within {report['bytes']['worst_us']:.0f} us",
         ),
-        ("drives with random faults in virtual time that broke a safety rule", _random(root)),
+        ("drives with random faults in virtual time that broke a safety rule", broken),
         *_view(root),
     ]
 
@@ -132,11 +227,6 @@ def _view(root: Path) -> list[Row]:
         ("pictures in the view", picture),
         ("processor time of the view, share of one core", f"{report['cpu_pct']:.1f} %"),
     ]
-
-
-def _random(root: Path) -> str:
-    report = _metrics(root / "results" / "lab", "random")
-    return f"{len(report['broken'])} of {report['drives']:,}"
 
 
 def _drives(root: Path) -> list[Row]:
@@ -160,25 +250,25 @@ def _students(run: str, root: Path) -> list[Row]:
     """The policy of that run, and what was distilled from it."""
     rows = _metrics(root / "results" / run, "students")["students"]
     actions = [key.removeprefix("recorded_").removesuffix("_pct") for key in rows[0] if key.startswith("recorded_")]
+    times = _clock(root)
 
     def row(student: Mapping[str, Any]) -> Row:
         count = student["decoder_layers"]
         layers = f"{count} decoder layer{'s' if count > 1 else ''} of {student['feedforward']}"
-        low, high = student["computed_ms"]
         if share := student.get("backbone_channels"):
             layers += f", {share:.0%} of the backbone's channels"
         return (
             f"{student['name']}: {student['width']}x{student['height']}, {layers}",
             format(student["size_mb"], ".1f"),
             f"{student['instructions_g']:.3g} ({student['simd_g']:.3g})",
-            f"{low:.2g} to {high:.2g}",
+            times.get(shape_of(student), ""),
             f"{student['hits']} of {student['trials']}",
             f"{student['pushed_hits']} of {student['pushed_trials']} at {student['pushed_latency_ms']:.2g} ms",
             " / ".join(f"{student[f'recorded_{action}_pct']:.2f}" for action in actions),
         )
 
     counted = "10^9 instructions (SIMD), *counted*", "ms on a Pi 5, *computed*"
-    driven = "balloons hit, left alone", "balloons hit, pushed, with its computed latency"
+    driven = "balloons hit, left alone", "balloons hit, pushed, with plans as late as"
     return [("", "MB", *counted, *driven, f"{' / '.join(actions)} error against the recordings, %"), *map(row, rows)]
 
 
@@ -217,14 +307,16 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "faster": partial(_students, "faster"),
     "learning": _learning,
     "parameters": _parameters,
+    "policies": _policies,
+    "fit": _fit,
+    "judged": _judged,
+    "networks": _networks,
 }
 
 
-def _metrics(folder: Path, stage: str, otherwise: dict[str, Any] | None = None) -> dict[str, Any]:
-    """A stage's metrics. Raises TableError if it is not there and there is nothing otherwise."""
+def _metrics(folder: Path, stage: str) -> dict[str, Any]:
+    """A stage's metrics. Raises TableError if it is not there."""
     paths = sorted(folder.glob(f"{stage}.json"))
-    if not paths and otherwise is not None:
-        return otherwise
     if len(paths) != 1:
         found = [path.name for path in paths] or "none"
         raise TableError(f"{folder.name}/{stage}.json must be there once", found=found, remedy="make notebooks")
@@ -234,10 +326,6 @@ def _metrics(folder: Path, stage: str, otherwise: dict[str, Any] | None = None) 
 def _of(values: Mapping[str, Any], key: str, form: str) -> str | None:
     value = values.get(key)
     return None if value is None else format(value, form)
-
-
-def _strong(text: str, strong: bool) -> str:
-    return f"**{text}**" if strong and text else text
 
 
 if __name__ == "__main__":

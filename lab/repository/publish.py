@@ -114,7 +114,8 @@ def _result(path: Path) -> str:
     """A stage's JSON as it is committed. Raises NotebookError if it still holds a path, or is large."""
     content = json.loads(path.read_text())
     if len(inputs := content.get("inputs", {})) > MANY_INPUTS:
-        content["inputs"] = _sum_up(inputs)
+        lines = "".join(f"{sha256}  {name}\n" for name, sha256 in sorted(inputs.items()))
+        content["inputs"] = {f"{len(inputs)} files": hashlib.sha256(lines.encode()).hexdigest()}
     text = json.dumps(_names_only(content), indent=1) + "\n"
     if (shown := ABSOLUTE.search(text)) is not None:
         around = text[max(shown.start() - 40, 0) : shown.end() + 40]
@@ -125,12 +126,6 @@ def _result(path: Path) -> str:
             f"{path.name}: {size}, of at most {RESULT_LIMIT / 1e3:.0f}", remedy="leave out what is bulk"
         )
     return text
-
-
-def _sum_up(inputs: dict[str, str]) -> dict[str, str]:
-    """{file: sha256} of many files as one entry: their count, and a hash of all."""
-    lines = "".join(f"{sha256}  {name}\n" for name, sha256 in sorted(inputs.items()))
-    return {f"{len(inputs)} files": hashlib.sha256(lines.encode()).hexdigest()}
 
 
 def _names_only(value: Any) -> Any:

@@ -4,6 +4,7 @@ It is thin: it parses arguments, calls the library and prints.
 """
 
 import contextlib
+import functools
 import json
 import os
 import platform
@@ -30,7 +31,7 @@ CAMERA = click.option(
     "--camera", default="0", show_default=True, help="A number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
 )
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-PORT = click.option("--port", default="/dev/ttyUSB0", show_default=True, help="The Arduino's serial port.")
+PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")
 LOG_DRIVE = click.option(
     "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
 )
@@ -167,11 +168,9 @@ def main(debug: bool) -> None:
     """Drive a car with a learned policy. These commands work on the rover; on a workstation, `rover` has more."""
 
 
-def drive_options(command: Callable) -> Callable:
-    """Add the options of driving, on the rover and in the balloon world."""
-    for option in reversed(DRIVE_OPTIONS):
-        command = option(command)
-    return command
+def with_options(*options: Callable) -> Callable[[Callable], Callable]:
+    """Make one decorator of several options that more than one command has."""
+    return lambda command: functools.reduce(lambda inner, option: option(inner), reversed(options), command)
 
 
 def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
@@ -181,7 +180,7 @@ def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
     return file
 
 
-DRIVE_OPTIONS = (
+drive_options = with_options(  # on the rover and in the balloon world
     click.argument("artifact", type=ARTIFACT, required=False),
     CAMERA,
     PORT,
@@ -288,15 +287,28 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
     show_default=True,
     help="Episodes to record, one after another.",
 )
+@click.option("--finish", is_flag=True, help="Only make episodes of what killed recordings have left in OUT_DIR.")
 @click.pass_context
-def record_human(ctx: click.Context, out_dir: Path, hz: float, **options: Any) -> None:
+def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **options: Any) -> None:
     """Record a human who drives with the transmitter: episode folders in OUT_DIR, to train and calibrate with.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGQUIT end an episode, and it is kept. Exit code 1 if a fault ended it; what was
     recorded until then is kept too.
     """
+    from rover_lib.onboard.recording.episode import find_killed, finish_killed
     from rover_lib.onboard.recording.recorder import record_episodes
 
+    if finish:
+        failed = False
+        for part in (parts := find_killed(out_dir)):
+            try:
+                click.echo(f"finished: {finish_killed(part) or 'nothing, it was killed before its first row'}")
+            except RoverError as error:  # the others are finished all the same
+                failed = True
+                click.echo(f"rover: {error}", err=True)
+        if not parts:
+            click.echo(f"{out_dir}: nothing to finish")
+        ctx.exit(1 if failed else 0)
     fault = None
     for report in record_episodes(
         folder=out_dir, rate_hz=hz, status=sys.stderr, notify=lambda text: click.echo(text, err=True), **options
@@ -381,7 +393,7 @@ def calibrate(
     """
     from rover_lib.onboard.car.calibrate import measure, refuse_existing, write_car
     from rover_lib.onboard.car.car import Car, default_place, read_car, yaml_of
-    from rover_lib.onboard.car.servo_link import ServoLink
+    from rover_lib.onboard.car.servo_link import LinkError, ServoLink
     from rover_lib.onboard.errors import CarError
 
     path = output or default_place()
@@ -401,7 +413,10 @@ def calibrate(
             notify=lambda text: click.echo(text, err=True),
             **more,
         )
-        link.tell(car)  # the Arduino still has the last one that was tried
+        # The Arduino still has the last one that was tried. It may refuse this one while the throttle's stick is off
+        # that one's rest; the next command that opens the port tells it again.
+        with contextlib.suppress(LinkError):
+            link.tell(car)
     click.echo(yaml_of(car), nl=False)  # before writing: if that fails, it can be copied from here
     write_car(car, path)
     click.echo(f"rover: written to {path}", err=True)
@@ -666,14 +681,7 @@ def status(releases: Any, as_json: bool) -> None:
         raise RoverError(report["trouble"])
 
 
-def view_options(command: Callable) -> Callable:
-    """Add the options of a view, on the rover and on a workstation."""
-    for option in reversed(VIEW_OPTIONS):
-        command = option(command)
-    return command
-
-
-VIEW_OPTIONS = (
+view_options = with_options(  # on the rover and on a workstation
     click.option(
         "--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="Port of the page; 0: any."
     ),

@@ -215,7 +215,7 @@ def _of_archive(file: Path) -> tuple[str, ...]:
         with file.open("rb") as f:  # an artifact's directory, which names its records, is not opened as a zip for that
             f.seek(max(0, file.stat().st_size - DIRECTORY_BYTES))
             directory = f.read()
-        if any(name.encode() in directory for name in (ONNX, HEF, "/code/__torch__")):
+        if any(name.encode() in directory for name in (ONNX, HEF, "/code/")):
             return ("artifact",)
         with zipfile.ZipFile(file) as z:
             names = z.namelist()

@@ -4,6 +4,7 @@
 Metric keys end in their unit (_ms _mb _us _pct _hz _c _g). Papermill, pytest, Ansible and the plots read these.
 """
 
+import contextlib
 import hashlib
 import json
 import math
@@ -14,7 +15,7 @@ import socket
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from io import BufferedReader
@@ -169,3 +170,12 @@ def read_stage(path: Path | str, stage: str | None) -> dict[str, Any]:
     if lacking := [part for part in PARTS if not isinstance(content.get(part), dict)]:
         raise RoverError(f"{path}: has no {', '.join(lacking)}", remedy="run the stage again")
     return content
+
+
+def find_stage(path: Path | str, stage: str, *, params: Mapping[str, Any], inputs: Mapping[str, str]) -> Any:
+    """Read a stage's result if it is there and was made with these parameters, of these inputs; None otherwise."""
+    with contextlib.suppress(RoverError):
+        there = read_stage(path, stage)
+        if (there["params"], there["inputs"]) == (plain(params), plain(inputs)):
+            return there
+    return None

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from balloon_world import latency
+from balloon_world import latency, side_by_side
 from balloon_world.latency import Condition, beside_path, drive_late, from_above, gates, run_latencies, table
 from balloon_world.world import World, expert
 from rover_lib.cli import main
@@ -218,7 +218,7 @@ def write_policy(folder, acts, serial="1"):
 def run_dir(tmp_path, monkeypatch):
     write_policy(tmp_path, "a policy")
     loaded = []
-    monkeypatch.setattr(latency, "load_policy", lambda path, threads: loaded.append(path) or Foresees())
+    monkeypatch.setattr(side_by_side, "load_policy", lambda path, threads: loaded.append(path) or Foresees())
     return SimpleNamespace(path=tmp_path, loaded=loaded)
 
 

@@ -41,7 +41,7 @@ class Raw:
     def command(self, kind, *values):
         self.sequence += 1
         dated = (self.heard_ms,) if kind in "AD" else ()
-        dated += (Car().id,) if kind == "A" else ()
+        dated += (self.heard_ms, Car().id) if kind == "A" else ()
         return line(f">{kind} {' '.join(map(str, (self.boot, self.sequence, *dated, *values)))}")
 
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from balloon_world import students
+from balloon_world import side_by_side, students
 from balloon_world.latency import SEED
 from balloon_world.students import judge_students
 from rover_learn import plots
 from rover_lib.cli import main
 from rover_lib.onboard.car.car import FILE_VARIABLE, Car, yaml_of
+from rover_lib.onboard.care.pi5 import Work, estimate_ms, predict_ms
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.run import run as runs
@@ -50,12 +51,10 @@ def distilled(folder, teacher="teacher's", own="student's"):
     write_stage(folder / "distill.json", "distill", params={}, metrics=found, inputs={"best_model.pth": teacher})
 
 
-def counted(folder, low_ms, high_ms):
-    counts = {
-        "instructions_g": high_ms / 60,
-        "simd_g": low_ms / 60,
-        "computed_pi5_ms": {"low": low_ms, "high": high_ms},
-    }
+def counted(folder, high_ms, **changed):
+    """Write counts of work that takes a Pi 5 at most that time."""
+    counts = {"instructions_g": high_ms / predict_ms(Work(1, 0, 0)).high, "simd_g": high_ms / 90} | changed
+    counts |= {"near_lines_g": 0, "far_lines_g": 0, "alone": 0}
     inputs = {"policy_static.pt": sha256_of(folder / "policy_static.pt")}
     metrics = {"artifacts": {"policy_static": counts}}
     write_stage(folder / "arm.json", "arm", params={}, metrics=metrics, inputs=inputs)
@@ -65,7 +64,7 @@ def counted(folder, low_ms, high_ms):
 def made(tmp_path, recorded, monkeypatch):
     """A teacher's run and a student's, and the drives that were driven: (off, kind, seed, latency)."""
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(students, "load_policy", Policy)
+    monkeypatch.setattr(side_by_side, "load_policy", Policy)
     monkeypatch.setattr(students, "content_hash", sha256_of)
     monkeypatch.setattr(students, "read_manifest", lambda path: json.loads(path.read_text()))
     driven = []
@@ -86,43 +85,29 @@ def made(tmp_path, recorded, monkeypatch):
 
 
 KEYS = [
-    "name",
-    "height",
-    "width",
-    "decoder_layers",
-    "feedforward",
-    "qat",
-    "instructions_g",
-    "simd_g",
-    "size_mb",
-    "computed_ms",
-    "teacher_steering_pct",
-    "teacher_throttle_pct",
-    "recorded_steering_pct",
-    "recorded_throttle_pct",
-    "hits",
-    "trials",
-    "pushed_hits",
-    "pushed_trials",
-    "pushed_latency_ms",
-]
+    "name", "height", "width", "decoder_layers", "feedforward", "qat", "instructions_g", "simd_g", "size_mb",
+    "computed_ms", "teacher_steering_pct", "teacher_throttle_pct", "recorded_steering_pct", "recorded_throttle_pct",
+    "hits", "trials", "pushed_hits", "pushed_trials", "pushed_latency_ms",
+]  # fmt: skip
 
 
 def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
-    counted(made.teacher, 56, 90)
-    counted(made.student, 13, 20)
+    counted(made.teacher, 90)
+    counted(made.student, 20)
     content = judge_students(made.teacher, [made.student], worlds=3)
     assert content == read_stage(made.teacher / "students.json", "students")
     teacher, student = content["metrics"]["students"]
     assert set(KEYS) <= set(teacher) and set(teacher) == set(student)
-    assert (teacher["name"], teacher["decoder_layers"], teacher["computed_ms"]) == ("teacher", 7, [56, 90])
+    assert (teacher["name"], teacher["decoder_layers"]) == ("teacher", 7)
+    assert teacher["computed_ms"] == pytest.approx(predict_ms(Work(teacher["instructions_g"], 0, 0))[::2])
+    assert teacher["computed_ms"][1] == pytest.approx(90)
     assert (student["name"], student["height"], student["decoder_layers"]) == ("fast", 180, 2)
     assert (student["hits"], student["trials"], student["missed"]) == (2, 3, [SEED])
-    assert (student["pushed_hits"], student["pushed_latency_ms"]) == (2, 20)
+    assert (student["pushed_hits"], student["pushed_latency_ms"]) == (2, pytest.approx(20))
     assert teacher["hits"] == teacher["pushed_hits"] == 3 and teacher["hits_wilson_high"] == 1
     assert 0 < teacher["teacher_throttle_pct"] < student["teacher_throttle_pct"]  # to FP32, which is 0 off
     assert student["teacher_throttle_pct"] == pytest.approx(2 * teacher["teacher_throttle_pct"], rel=1e-3)
-    assert {late for *_, late in made.driven} == {None, 0.09, 0.02}
+    assert {late and round(late, 6) for *_, late in made.driven} == {None, 0.09, 0.02}
     assert content["metrics"]["latency"] == "counted" and content["metrics"]["recommendation"]["name"] == "teacher"
     assert {p.name for p in made.teacher.iterdir()} == {
         "arm.json", "load.json", "policy_fp32.pt", "policy_static.pt", "students.json",
@@ -130,10 +115,10 @@ def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
 
 
 def test_without_counts_all_are_estimated_alike_and_it_is_said(made):
-    counted(made.student, 13, 20)
+    counted(made.student, 20)
     found = judge_students(made.teacher, [made.student], worlds=1)["metrics"]
     late = [row["pushed_latency_ms"] for row in found["students"]]
-    assert late == pytest.approx([15e3 / 207, 3e3 / 207])
+    assert late == pytest.approx([estimate_ms(15), estimate_ms(3)])
     assert found["latency"] == "estimated" and found["students"][0]["instructions_g"] is None
     assert (
         "at an estimate" in found["notes"][0] and "Not counted, or another artifact was: teacher." in found["notes"][1]
@@ -141,8 +126,8 @@ def test_without_counts_all_are_estimated_alike_and_it_is_said(made):
 
 
 def test_a_student_that_is_not_counted_is_not_pushed(made):
-    counted(made.teacher, 56, 90)
-    counted(made.student, 13, 20)
+    counted(made.teacher, 90)
+    counted(made.student, 20)
     artifact(made.student / "policy_static.pt", "student's", off=0.003)  # another one than was counted
     row = judge_students(made.teacher, [made.student], worlds=1)["metrics"]["students"][1]
     assert row["pushed_trials"] is row["pushed_latency_ms"] is row["instructions_g"] is None and row["hits"] == 1
@@ -173,7 +158,7 @@ def test_what_another_car_drove_is_not_taken_for_this_ones(made, monkeypatch, tm
 
 
 def test_a_kill_costs_the_drives_that_had_not_ended(made, monkeypatch):
-    whole, append = [], students._append
+    whole, append = [], students.append_row
 
     def dies(path, drive):
         if len(whole) == 3:
@@ -183,11 +168,11 @@ def test_a_kill_costs_the_drives_that_had_not_ended(made, monkeypatch):
         whole.append(drive)
         append(path, drive)
 
-    monkeypatch.setattr(students, "_append", dies)
+    monkeypatch.setattr(students, "append_row", dies)
     with pytest.raises(KeyboardInterrupt):
         judge_students(made.teacher, [made.student], worlds=3)
     assert not (made.teacher / "students.json").exists()
-    monkeypatch.setattr(students, "_append", append)
+    monkeypatch.setattr(students, "append_row", append)
     made.driven.clear()
     rows = judge_students(made.teacher, [made.student], worlds=3)["metrics"]["students"]
     assert len(made.driven) == 12 - 3 and [row["hits"] for row in rows] == [3, 2]
@@ -202,12 +187,12 @@ def test_where_there_is_no_world_nobody_drives(made):
 
 @pytest.mark.slow
 def test_rows_are_drawn(made):
-    counted(made.teacher, 56, 90)
-    counted(made.student, 13, 20)
+    counted(made.teacher, 90)
+    counted(made.student, 20)
     rows = judge_students(made.teacher, [made.student], worlds=3)["metrics"]["students"]
     work, hits, errors = plots.frontier(rows, "fast").axes
     assert [label.get_text().split("\n")[0] for label in work.get_yticklabels()] == ["teacher", "fast"]
-    assert {"13 to 20", "56 to 90"} <= {text.get_text() for text in work.texts}
+    assert {"12 to 20", "53.8 to 90"} <= {text.get_text() for text in work.texts}
     assert "2, 20 ms late" in {text.get_text() for text in hits.texts} and len(errors.patches) == 8
     rows = [row | {"computed_ms": None, "recorded_throttle_pct": None} for row in rows]
     work, _, errors = plots.frontier(rows, "fast").axes

@@ -19,43 +19,14 @@ pytestmark = pytest.mark.slow
 
 # the keys of the user's best_model.pth
 CHECKPOINT_KEYS = [
-    "epoch",
-    "model_state_dict",
-    "optimizer_state_dict",
-    "scheduler_state_dict",
-    "best_val_loss",
-    "config",
-]
+    "epoch", "model_state_dict", "optimizer_state_dict", "scheduler_state_dict", "best_val_loss", "config",
+]  # fmt: skip
 CONFIG_KEYS = {
-    "image_width",
-    "image_height",
-    "n_obs_steps",
-    "chunk_size",
-    "n_action_steps",
-    "hidden_size",
-    "n_encoder_layers",
-    "n_decoder_layers",
-    "n_heads",
-    "feedforward_dim",
-    "dropout",
-    "kl_weight",
-    "vision_encoder",
-    "pretrained_backbone",
-    "learning_rate",
-    "weight_decay",
-    "betas",
-    "grad_clip",
-    "num_epochs",
-    "batch_size",
-    "train_split",
-    "data_dir",
-    "output_dir",
-    "device",
-    "seed",
-    "log_freq",
-    "save_freq",
-    "num_workers",
-}
+    "image_width", "image_height", "n_obs_steps", "chunk_size", "n_action_steps", "hidden_size", "n_encoder_layers",
+    "n_decoder_layers", "n_heads", "feedforward_dim", "dropout", "kl_weight", "vision_encoder", "pretrained_backbone",
+    "learning_rate", "weight_decay", "betas", "grad_clip", "num_epochs", "batch_size", "train_split", "data_dir",
+    "output_dir", "device", "seed", "log_freq", "save_freq", "num_workers",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -180,7 +151,7 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(recorded, carried
             bars[-1]["ticks"] += 1
             yield item
 
-    monkeypatch.setattr(train_module, "descend", descend_until_killed)
+    monkeypatch.setattr(training_module, "descend", descend_until_killed)
     out = tmp_path / "killed.pth"
     for _ in kill_at:
         with pytest.raises(Killed):

@@ -37,14 +37,10 @@ class SeesRed:
 @pytest.mark.parametrize(
     ("hits", "trials", "low", "high"),
     [
-        (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
-        (0, 20, 0.0000, 0.1611),
-        (1, 29, 0.0061, 0.1718),
-        (40, 40, 0.9124, 1.0000),
-        (0, 40, 0.0000, 0.0876),
+        (81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0000, 0.1611), (1, 29, 0.0061, 0.1718),
+        (40, 40, 0.9124, 1.0000), (0, 40, 0.0000, 0.0876),
     ],
-)
+)  # fmt: skip
 def test_wilson_interval_equals_published_values(hits, trials, low, high):
     assert wilson_interval(hits, trials) == pytest.approx((low, high), abs=6e-5)
 

@@ -144,6 +144,14 @@ def test_a_stick_that_is_still_moving_is_not_let_go(board):
     assert board.status.state is State.AUTONOMOUS
 
 
+def test_a_stopped_car_is_at_neutral_whatever_the_resting_sticks_say(armed):
+    armed.drive(1600, 200, 200)
+    armed.run(300)
+    armed.sticks = [1490, 140]  # not moved far enough for a takeover
+    assert set(armed.run(300)) == {NEUTRAL}
+    assert armed.status.state is State.STOPPED
+
+
 def drive_by_hand(board, steering_us, throttle_us, ms):
     board.sticks = [steering_us, throttle_us]
     board.run(ms)
@@ -206,6 +214,25 @@ def test_a_human_who_drives_keeps_the_car_when_another_is_told(board, throttle_u
     assert board.command("C", 20000, 1000, 1500, 2000, 20000, 1000, 1500, 2000, 100) == result
     if result == "t":
         assert set(board.run(300)) == {(1600, 300)}
+
+
+@pytest.mark.parametrize(("channel", "off", "missing"), [(0, 1.2, "w"), (0, 1.3, "s"), (1, 1.2, "w"), (1, 1.3, "s")])
+def test_the_period_of_a_signal_may_be_off_by_a_quarter(channel, off, missing):
+    board = NativeArduino()
+    periods = list(board.periods_us)
+    periods[channel] = round(off * periods[channel])
+    board.periods_us = tuple(periods)
+    board.run(400)
+    assert board.status.missing == missing
+
+
+def test_a_throttle_at_rest_frees_nothing_while_the_steering_is_lost(board):
+    board.sticks = [0, 0]
+    board.run(200)
+    board.sticks = [0, 120]
+    board.run(300)
+    board.sticks = [1500, 300]
+    assert set(throttles(board.run(400))) == {120}
 
 
 def test_a_wiggle_is_good_for_one_arming_within_30_seconds(board):

@@ -214,10 +214,28 @@ def test_a_run_that_does_not_end_costs_nothing_of_the_last_one(one_notebook, old
         whole(source, folder, given, bars)
         raise error
 
-    before = contents(old_run.parent)
+    before = contents(old_run)
     with pytest.raises(type(error)):
         run_with(monkeypatch, one_notebook, old_run, ends_early)
-    assert contents(old_run.parent) == before
+    assert contents(old_run) == before
+    kept = contents(old_run.parent / ".mine.unfinished")
+    assert kept["policy_static.pt"] == "new" and sorted(p.name for p in old_run.parent.iterdir())[1:] == ["mine"]
+    # the same command goes on there, and with another checkpoint it begins anew
+    assert run_with(monkeypatch, one_notebook, old_run, lambda *args: pytest.fail("it began again")) == old_run
+    assert contents(old_run)["policy_static.pt"] == "new" and [p.name for p in old_run.parent.iterdir()] == ["mine"]
+    with pytest.raises(type(error)):
+        run_with(monkeypatch, one_notebook, old_run, ends_early)
+    monkeypatch.setattr(runs, "_execute", lambda *args: (_ for _ in ()).throw(error))
+    with pytest.raises(type(error)):
+        runs.run("other", "episodes", "mine", runs_dir=old_run.parent, notebooks=one_notebook)
+    assert [p.name for p in old_run.parent.iterdir()] == ["mine"]
+
+
+def test_root_learns_at_once_that_it_may_load_no_artifact(one_notebook, old_run, monkeypatch):
+    monkeypatch.delenv("ROVER_AS_ROOT")
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    with pytest.raises(runs.RoverError, match="root does not load artifacts"):
+        run_with(monkeypatch, one_notebook, old_run, lambda *args: pytest.fail("it began"))
 
 
 def test_a_second_run_of_the_same_name_waits_for_the_first(one_notebook, old_run, monkeypatch):
@@ -380,8 +398,9 @@ def test_what_was_opened_must_not_have_changed(tiny, tiny_file, tmp_path, monkey
     report = {"sha256": "another", "macs_by_block": {"head": 1}}
     given = {"checkpoint": str(tiny_file), "episodes": "episodes"}
     write_stage(tmp_path / "load.json", "load", params=given, metrics={"checkpoint": report, "split": {}}, inputs={})
-    parts = SimpleNamespace(episodes={})
-    monkeypatch.setattr(session, "load", lambda *paths: session.Opened(tiny, SimpleNamespace(root="episodes"), parts))
+    layout = SimpleNamespace(words=lambda: {})
+    recordings, parts = SimpleNamespace(root="episodes", layout=layout), SimpleNamespace(episodes={})
+    monkeypatch.setattr(session, "load", lambda *paths: session.Opened(tiny, recordings, parts))
     with pytest.raises(runs.RoverError, match="is not what notebook 01 loaded"):
         session.open_run(tmp_path)
     report["sha256"] = tiny.sha256
@@ -405,17 +424,13 @@ TURNED = {
     "03_quantize": (
         "quantize",
         {
-            "scheme": "affine",
-            "observer": "percentile",
-            "percentile": 99.5,
-            "float_blocks": ["backbone.stem"],
-            "modes": ["mixed"],
-            "choosing_frames": 2,
+            "scheme": "affine", "observer": "percentile", "percentile": 99.5, "float_blocks": ["backbone.stem"],
+            "modes": ["mixed"], "choosing_frames": 2,
         },
     ),
     "04_compare": ("compare", {"held_out_frames": 4, "worlds": 1}),
     "05_benchmark": (f"benchmark-{runs.socket.gethostname()}", {"iterations": 3, "threads": 1}),
-}
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

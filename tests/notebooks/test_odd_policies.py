@@ -38,22 +38,17 @@ class Robot:
     imagenet: bool = True
 
 
-JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
-ROBOTS = {
-    "an arm": Robot(
-        {"front": (36, 64), "wrist": (48, 40)}, JOINTS, 6, rate_hz=20, units=90.0, policy={"chunk_size": 100}
-    ),
+ROBOTS = {  # what else a dataset may say of a car, tests/workshop/recordings/test_lerobot_dataset.py has
     "two arms": Robot(
-        {"top": (36, 48)},
+        {"front": (36, 64), "wrist": (48, 40)},
         tuple(f"joint_{i}" for i in range(14)),
         14,
         50,
         1.5,
-        {"vision_backbone": "resnet34"},
+        {"vision_backbone": "resnet34", "chunk_size": 100},
         imagenet=False,
     ),
     "a car without names": Robot({"cam_front": (36, 64)}, None, rate_hz=20, said="throttle,steering"),
-    "a car with its names swapped": Robot({"cam_front": (36, 64)}, ("throttle", "steering"), rate_hz=20),
 }
 
 

@@ -8,7 +8,7 @@ from lerobot.teleoperators.utils import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig, line
-from lerobot_robot_rover.line import FEATURES, line_to, named, wait_for_humans
+from lerobot_robot_rover.line import FEATURES, line_to, named, unnamed, wait_for_humans
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry
 from rover_lib.onboard.errors import ParamsError
@@ -70,7 +70,7 @@ def test_the_sticks_by_car_yml(transmitter):
     transmitter.connect()
     action = transmitter.get_action()
     assert action == pytest.approx(named(0.5, 0.1), abs=2e-3)
-    assert CALIBRATION.pulses(**action) == DRIVEN
+    assert CALIBRATION.pulses(**unnamed(action)) == DRIVEN
 
 
 def test_the_sticks_ends_are_the_ends(transmitter):

@@ -26,13 +26,10 @@ def test_while_one_is_in_it_another_is_refused(tmp_path):
 
 def test_what_a_killed_process_left_goes_first(tmp_path):
     lines = (
-        "import os, sys, pathlib",
-        "from rover_lib.workshop.swap_folder import lock_folder",
-        "with lock_folder(pathlib.Path(sys.argv[1])) as folder:",
-        "    (folder / 'sub').mkdir()",
-        "    (folder / 'link').symlink_to('/nowhere')",
-        "    os.kill(os.getpid(), 9)",
-    )
+        "import os, sys, pathlib", "from rover_lib.workshop.swap_folder import lock_folder",
+        "with lock_folder(pathlib.Path(sys.argv[1])) as folder:", "    (folder / 'sub').mkdir()",
+        "    (folder / 'link').symlink_to('/nowhere')", "    os.kill(os.getpid(), 9)",
+    )  # fmt: skip
     assert subprocess.run([sys.executable, "-c", "\n".join(lines), tmp_path / ".mine.new"]).returncode == -9
     assert {p.name for p in (tmp_path / ".mine.new").iterdir()} == {"sub", "link"}
     with lock_folder(tmp_path / ".mine.new") as folder:

@@ -25,7 +25,10 @@ def test_the_own_wheel_has_what_drives_and_nothing_else(own):
     files = {n for n in names if not n.startswith("rover_policy-")}
     assert {"rover_lib/__init__.py", "rover_lib/onboard/cli.py", "rover_lib/onboard/params.yml"} <= files
     assert all(
-        re.fullmatch(r"rover_lib/(__init__\.py|LICENSE|onboard/(\w+/)?\w+\.(py|yml|toml|html))", n) for n in files
+        re.fullmatch(
+            r"rover_lib/(__init__\.py|LICENSE|(onboard/)?py\.typed|onboard/(\w+/)?\w+\.(py|yml|json|toml|html))", n
+        )
+        for n in files
     ), files
     scripts = next(n for n in names if n.endswith("entry_points.txt"))
     assert "rover = rover_lib.onboard.cli:main" in zipfile.ZipFile(own.wheel).read(scripts).decode()

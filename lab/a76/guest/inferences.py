@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 GETPPID, MARK = 173, 0xC0FFEE  # as in count.c; without the plugin this system call has no effect
@@ -71,6 +70,8 @@ def leave(folder: str, threads: int, **versions: str) -> None:
 
     threads: how many did the work.
     """
+    import cv2  # not above: networks that are no policies do without it, and it takes seconds to emulate
+
     versions |= {"python": platform.python_version(), "numpy": np.__version__, "cv2": cv2.__version__}
     versions |= {"machine": platform.machine(), "libc": " ".join(platform.libc_ver())}
     (Path(folder) / "versions.json").write_text(json.dumps(versions | {"threads": threads}))

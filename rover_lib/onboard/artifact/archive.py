@@ -49,6 +49,11 @@ RECORD_BYTES = {  # largest size by name after "archive/"; None: limited only by
 KNOWN_RECORDS = tuple((re.compile(pattern, re.ASCII), limit) for pattern, limit in RECORD_BYTES.items())
 
 
+def refused(path: Path | str, what: str, found: object = None) -> ArtifactError:
+    """The error of a file that no exporter of ours wrote, for the caller to raise."""
+    return ArtifactError(f"{path}: {what}", found=found, remedy="quantize again")
+
+
 def open_archive(path: Path | str) -> zipfile.ZipFile:
     """Open an artifact, after checking in its headers that the number, names and sizes of its records are allowed.
 
@@ -126,7 +131,7 @@ def _check_directory(file: BinaryIO, path: Path | str) -> None:
     if start + length + after != size:
         raise zipfile.BadZipFile("its directory is not where it says")
     if records > RECORDS or length > DIRECTORY_BYTES:
-        raise ArtifactError(f"{path}: {records} records are more than an artifact has", remedy="quantize again")
+        raise refused(path, f"{records} records are more than an artifact has")
     file.seek(0)
 
 
@@ -138,28 +143,23 @@ def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
             name = "version"
         known = [limit for pattern, limit in KNOWN_RECORDS if pattern.fullmatch(name)]
         if not known or not record.filename.startswith("archive/"):
-            raise ArtifactError(
-                f"{path}: a record that no artifact has", found=repr(record.filename)[:80], remedy="quantize again"
-            )
+            raise refused(path, "a record that no artifact has", repr(record.filename)[:80])
         if name.lower() in names:  # torch ignores case in names
-            raise ArtifactError(f"{path}: '{name}' is in it twice", remedy="quantize again")
+            raise refused(path, f"'{name}' is in it twice")
         if known[0] is not None and record.file_size > known[0]:
-            raise ArtifactError(
-                f"{path}: '{name}' unpacks to {record.file_size} bytes, at most {known[0]} are taken",
-                remedy="quantize again",
-            )
+            raise refused(path, f"'{name}' unpacks to {record.file_size} bytes, at most {known[0]} are taken")
         packed = record.compress_type == zipfile.ZIP_DEFLATED and name.startswith("code/")
         if not packed and (record.compress_type != zipfile.ZIP_STORED or record.compress_size != record.file_size):
-            raise ArtifactError(f"{path}: '{name}' is compressed, only code may be", remedy="quantize again")
+            raise refused(path, f"'{name}' is compressed, only code may be")
         names.add(name.lower())
         total += record.file_size
     if total > ARCHIVE_BYTES:
-        raise ArtifactError(f"{path}: {total} bytes are more than an artifact has", remedy="quantize again")
+        raise refused(path, f"{total} bytes are more than an artifact has")
     kind = kind_of(records)
     required = REQUIRED[kind]
     optional = {"model.onnx"} if kind == "hailo" else set()
     if kind != "torch" and names - required - optional:
-        raise ArtifactError(f"{path}: it is a policy for two engines", remedy="quantize again")
+        raise refused(path, "it is a policy for two engines")
     for name in sorted(required - names):
         raise ArtifactError(
             f"{path}: no {name.removeprefix('extra/')} in it",

@@ -17,11 +17,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rover_lib.onboard.artifact.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record
+from rover_lib.onboard.artifact.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record, refused
 from rover_lib.onboard.artifact.engines import HAILO, ONNXRUNTIME
 from rover_lib.onboard.artifact.onnx_file import check_model
 from rover_lib.onboard.artifact.torchscript import check_program
 from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import ArtifactError, CarError
 from rover_lib.onboard.stage import atomic_path
 
@@ -213,10 +214,12 @@ def read_manifest(path: Path | str) -> dict[str, Any]:
 
 def check_manifest(manifest: Any, where: str) -> None:
     """Raise ArtifactError, naming the key, if the manifest has another schema or an impossible value."""
+
+    def wrong(what: str, found: object = None, length: int = 60) -> ArtifactError:
+        return refused(where, what, None if found is None else repr(found)[:length])
+
     if not isinstance(manifest, dict):
-        raise ArtifactError(
-            f"{where}: its manifest is no JSON object", found=type(manifest).__name__, remedy="quantize again"
-        )
+        raise wrong(f"its manifest is no JSON object but a {type(manifest).__name__}")
     _check_values(manifest, where, MOST_DEPTH)
     if manifest.get("schema") != SCHEMA:
         raise ArtifactError(
@@ -226,56 +229,36 @@ def check_manifest(manifest: Any, where: str) -> None:
     for key, kind in MANIFEST_KEYS.items():
         if not isinstance(manifest.get(key), kind):
             value = repr(manifest[key])[:60] if key in manifest else "nothing"
-            raise ArtifactError(
-                f"{where}: manifest key '{key}' is {value}, not what it should be", remedy="quantize again"
-            )
+            raise wrong(f"manifest key '{key}' is {value}, not what it should be")
     for key, known in (("mode", MODES), ("scheme", SCHEMES)):
         if manifest[key] not in known:
-            raise ArtifactError(
-                f"{where}: manifest {key} must be one of {', '.join(known)}",
-                found=repr(manifest[key])[:60],
-                remedy="quantize again",
-            )
+            raise wrong(f"manifest {key} must be one of {', '.join(known)}", manifest[key])
     car_of(manifest)
     if not manifest["cameras"]:
-        raise ArtifactError(f"{where}: manifest has no cameras", remedy="quantize again")
+        raise wrong("manifest has no cameras")
     for camera in manifest["cameras"]:
         recorded = camera.get("recorded", [1, 1]) if isinstance(camera, dict) else None
         pair = isinstance(recorded, list) and len(recorded) == 2
         if not isinstance(camera, dict) or not pair or not {"name", "height", "width"} <= camera.keys():
-            raise ArtifactError(
-                f"{where}: manifest camera {str(camera)[:80]!r} lacks name, height or width", remedy="quantize again"
-            )
+            raise wrong(f"manifest camera {str(camera)[:80]!r} lacks name, height or width")
         sides = [camera["height"], camera["width"], *camera.get("recorded", ())]
-        if not is_name(camera["name"]) or not all(isinstance(s, int) and _is_within(s, SIDE_PX) for s in sides):
-            raise ArtifactError(
-                f"{where}: manifest camera {str(camera)[:80]!r} is not a name and a size", remedy="quantize again"
-            )
-    if not isinstance(manifest["chunk"], int) or not _is_within(manifest["chunk"], CHUNK):
-        raise _out_of_range(where, manifest, "chunk", CHUNK)
-    for key, limits in (("rate_hz", RATE_HZ), ("weights_mb", WEIGHTS_MB), ("gmac", GMAC)):
-        if not _is_within(manifest[key], limits):
-            raise _out_of_range(where, manifest, key, limits)
+        if not is_name(camera["name"]) or not all(is_whole(s, *SIDE_PX) for s in sides):
+            raise wrong(f"manifest camera {str(camera)[:80]!r} is not a name and a size")
+    numbers = {"chunk": CHUNK, "rate_hz": RATE_HZ, "weights_mb": WEIGHTS_MB, "gmac": GMAC}
+    for key, limits in numbers.items():
+        if not (is_whole if key == "chunk" else is_number)(manifest[key], *limits):
+            raise wrong(f"manifest {key} must be from {limits[0]:g} to {limits[1]:g}", manifest[key])
     for key in ("state_names", "action_names", "cameras"):
         names = [c["name"] for c in manifest[key]] if key == "cameras" else manifest[key]
         if not 1 <= len(names) <= MOST_NAMES or not all(map(is_name, names)) or len(set(names)) != len(names):
-            raise ArtifactError(
-                f"{where}: manifest {key} must be names, each once", found=repr(names)[:80], remedy="quantize again"
-            )
+            raise wrong(f"manifest {key} must be names, each once", names, 80)
     tolerance = manifest["parity"].get("tolerance")
     if not isinstance(tolerance, dict) or set(tolerance) != set(manifest["action_names"]):
-        raise ArtifactError(
-            f"{where}: manifest parity tolerance {str(tolerance)[:80]!r} does not cover its actions",
-            remedy="quantize again",
-        )
+        raise wrong(f"manifest parity tolerance {str(tolerance)[:80]!r} does not cover its actions")
     for name, value in tolerance.items():
         most = largest_tolerance(manifest["mode"], name)
-        if not _is_within(value, (0.0, most)):
-            raise ArtifactError(
-                f"{where}: manifest parity tolerance of {name} must be from 0 to {most:g}",
-                found=repr(value)[:60],
-                remedy="quantize again",
-            )
+        if not is_number(value, 0, most):
+            raise wrong(f"manifest parity tolerance of {name} must be from 0 to {most:g}", value)
 
 
 def seen_size(manifest: Mapping[str, Any]) -> tuple[int, int]:
@@ -300,32 +283,17 @@ def _check_values(value: Any, where: str, depth: int) -> None:
     Such characters could control the terminal: a manifest's values appear in sentences, and some stay in a release.
     """
     if isinstance(value, str) and not value.isprintable():
-        raise ArtifactError(
-            f"{where}: its manifest holds text that cannot be printed", found=ascii(value)[:60], remedy="quantize again"
-        )
+        raise refused(where, "its manifest holds text that cannot be printed", ascii(value)[:60])
     inner = [*value, *value.values()] if isinstance(value, dict) else value if isinstance(value, list) else []
     if inner and not depth:
-        raise ArtifactError(f"{where}: its manifest is nested more than {MOST_DEPTH} deep", remedy="quantize again")
+        raise refused(where, f"its manifest is nested more than {MOST_DEPTH} deep")
     for each in inner:
         _check_values(each, where, depth - 1)
-
-
-def _is_within(value: Any, limits: tuple[float, float]) -> bool:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return number and limits[0] <= value <= limits[1] and value != math.inf
 
 
 def is_name(value: Any) -> bool:
     """Whether a manifest may give this name to a camera, a state or an action."""
     return isinstance(value, str) and 0 < len(value) <= NAME_LENGTH and "/" not in value
-
-
-def _out_of_range(where: str, manifest: dict[str, Any], key: str, limits: tuple[float, float]) -> ArtifactError:
-    return ArtifactError(
-        f"{where}: manifest {key} must be from {limits[0]:g} to {limits[1]:g}",
-        found=repr(manifest[key])[:60],
-        remedy="quantize again",
-    )
 
 
 def distinct_names(paths: Sequence[Path], drop: str = "") -> dict[str, Path]:
@@ -362,11 +330,7 @@ def _manifest_in(z: zipfile.ZipFile, path: Path | str) -> dict[str, Any]:
     check_manifest(manifest, str(path))
     kind = manifest["engine"] if manifest["engine"] in (ONNXRUNTIME, HAILO) else "torch"
     if kind != kind_of(z.infolist()):
-        raise ArtifactError(
-            f"{path}: its manifest names another engine than its policy is for",
-            found=manifest["engine"][:60],
-            remedy="quantize again",
-        )
+        raise refused(path, "its manifest names another engine than its policy is for", manifest["engine"][:60])
     return manifest
 
 
@@ -383,21 +347,18 @@ def _parity_in(z: zipfile.ZipFile, path: Path, manifest: dict[str, Any]) -> "dic
             for name, (dtype, shape) in wanted.items():
                 size = packed.getinfo(f"{name}.npy").file_size
                 if size > MOST_VECTORS * math.prod(shape) * np.dtype(dtype).itemsize + 200:
-                    raise ArtifactError(f"{path}: its parity vectors are too large", remedy="quantize again")
+                    raise refused(path, "its parity vectors are too large")
                 raw = io.BytesIO(read_record(packed, f"{name}.npy"))
                 if np.lib.format.read_magic(raw) != (1, 0):
                     raise ValueError("another version of numpy's format")
                 found, _, kind = np.lib.format.read_array_header_1_0(raw)
                 if found[1:] != shape or not 1 <= found[0] <= MOST_VECTORS or kind != dtype:
-                    raise ArtifactError(
-                        f"{path}: its parity vectors have another shape than its manifest says",
-                        found=f"{name} of {kind} {found}",
-                        remedy="quantize again",
-                    )
+                    what = "its parity vectors have another shape than its manifest says"
+                    raise refused(path, what, f"{name} of {kind} {found}")
                 raw.seek(0)
                 vectors[name] = np.load(raw, allow_pickle=False)
     except (KeyError, ValueError, OSError, zipfile.BadZipFile, zlib.error, RuntimeError) as e:
-        raise ArtifactError(f"{path}: its parity vectors are not readable ({e})", remedy="quantize again") from None
+        raise refused(path, f"its parity vectors are not readable ({e})") from None
     if len({len(v) for v in vectors.values()}) != 1 or not all(np.isfinite(v).all() for v in vectors.values()):
-        raise ArtifactError(f"{path}: its parity vectors do not belong together", remedy="quantize again")
+        raise refused(path, "its parity vectors do not belong together")
     return vectors

@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.car.pwm import Channel, PwmCalibration, is_finite
+from rover_lib.onboard.car.pwm import Channel, PwmCalibration
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CarError, ParamsError, PwmError
 
 FILE_VARIABLE = "ROVER_CAR"  # environment variable that names another file; inherited by started programs
@@ -262,13 +263,13 @@ def _section(value: object, where: str, needed: set[str], optional: set[str]) ->
 
 
 def _number(value: Any, what: str) -> float:
-    if not is_finite(value):
+    if not is_number(value):
         raise CarError(f"{what} must be a number", found=repr(value)[:80])
     return value
 
 
 def _whole(value: object, what: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 65535:
+    if not is_whole(value, 0, 65535):
         raise CarError(f"{what} must be whole microseconds", found=repr(value)[:80])
     return value
 

@@ -15,14 +15,6 @@ ARDUINO_STEP_US = 4  # resolution of micros() on a 16 MHz Arduino: no pulse is k
 NEUTRAL = (0.0, 0.0)  # (steering, throttle): straight and stopped
 
 
-def is_finite(value: object) -> bool:
-    """Return whether `value` is a number that a float can hold: not a boolean, NaN or an infinity."""
-    try:
-        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # a whole number of 309 digits
-        return False
-
-
 def _finite(value: object, what: str) -> float:
     """Return `value` as a float. Raises PwmError for None, strings, booleans, NaN and infinities."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):

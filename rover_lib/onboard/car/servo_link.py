@@ -24,6 +24,7 @@ from typing import Any
 import serial
 
 from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.car.ports import find_port
 from rover_lib.onboard.car.pwm import Channel, Pulses
 from rover_lib.onboard.errors import RoverError
 
@@ -225,8 +226,10 @@ class ServoLink:
         boot_s: float = BOOT_S,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """car: None means this machine's. Raises CarError if its car.yml cannot be read."""
-        self.port = port
+        """port: "" means the only Arduino's. car: None means this machine's. Raises CarError if its car.yml cannot be
+        read, and PortError if it is not clear which port is meant.
+        """
+        self.port = port or find_port()
         self.car = car or this_car()
         self.calibration = self.car.pwm
         self._told_boot: int | None = None  # the start in which the Arduino learned of the car

@@ -1,6 +1,6 @@
 """Check everything that driving needs, and say in one line each what was found and what to do about it.
 
-    for check in examine("policy_static.pt", camera="0", port="/dev/ttyUSB0"):
+    for check in examine("policy_static.pt", camera="0"):
         print(check)
 
 "fail" means that the car would not drive, "warning" that it would drive worse or stop more often than it could. The
@@ -27,6 +27,7 @@ from rover_lib.onboard.artifact.manifest import car_of, read_manifest, seen_size
 from rover_lib.onboard.car.camera import Camera, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import car_file, this_car
 from rover_lib.onboard.car.host import Host, throttled_means
+from rover_lib.onboard.car.ports import find_port, list_ports
 from rover_lib.onboard.car.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, ServoLink, Telemetry
 from rover_lib.onboard.drive.flight_log import log_limits
 from rover_lib.onboard.drive.inference import PolicyProcess
@@ -83,7 +84,7 @@ def examine(
     artifact: Path | str | None = None,
     *,
     camera: str = "0",
-    port: str = "/dev/ttyUSB0",
+    port: str = "",
     rate_hz: float = 30.0,
     log_folder: Path | None = None,
     host: Host | None = None,
@@ -103,8 +104,8 @@ def examine(
         checks["cameras"] = lambda: cameras(dev)
     checks |= {
         "camera": lambda: camera_rate(device, seen_by(artifact), rate_hz=rate_hz, proc_root=host.proc_root),
-        "group dialout": lambda: access("group dialout", Path(port), "dialout"),
-        "Arduino": lambda: arduino(port, dev=dev, proc_root=host.proc_root, boot_s=boot_s),
+        "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports(dev)), dev)), "dialout"),
+        "Arduino": lambda: arduino(port or find_port(dev), dev=dev, proc_root=host.proc_root, boot_s=boot_s),
         "ModemManager": lambda: modem_manager(host.proc_root),
         "car": lambda: car(artifact),
         "engines": lambda: engines_here(),

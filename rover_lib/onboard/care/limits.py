@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import ParamsError
 
 HIGHER_IS_BETTER = ("throughput_fps", "control_rate_hz")
@@ -33,8 +34,7 @@ def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[di
             continue
         is_range = isinstance(limit, (list, tuple)) and len(limit) == 2
         ends = list(limit) if is_range else [limit]
-        numbers = [e for e in ends if isinstance(e, (int, float)) and not isinstance(e, bool) and math.isfinite(e)]
-        if len(numbers) != len(ends) or ends != sorted(ends):
+        if not all(map(is_number, ends)) or ends != sorted(ends):
             raise ParamsError(
                 f"gate {gate} must be a number, [low, high] or a text", found=repr(limit), remedy="see params.yml"
             )

@@ -1,15 +1,13 @@
 """The least time that a Raspberry Pi 5 needs for an inference, by arithmetic alone."""
 
-import math
 from collections.abc import Mapping
 
+from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import ParamsError
 
 # Measured peaks of a Raspberry Pi 5, four cores at 2.4 GHz (public cpufp results), in 10**9 multiply-accumulates
 # per second: INT8 SDOT 614 GOPS, FP16 307 GFLOPS, FP32 153.5 GFLOPS, two operations to a multiply-accumulate.
 PI5_GMAC_PER_S = {"int8": 307.0, "fp16": 153.5, "fp32": 76.75}
-# Seen there: ResNet18 at 224x224 in INT8, ExecuTorch with XNNPACK, 8.75 ms p50 (published); two thirds of the peak.
-PI5_SEEN_GMAC_PER_S = 207.0
 PRECISION = {"dynamic": "int8", "static": "int8", "mixed": "int8"}  # of an artifact's mode, at its best
 
 
@@ -30,7 +28,7 @@ def floor_ms(gmac: float | Mapping[str, float] | None, mode: str) -> float | Non
         if precision not in PI5_GMAC_PER_S:
             known = sorted({*PI5_GMAC_PER_S, *PRECISION})
             raise ParamsError(f"no Pi 5 peak is known for {precision!r}", remedy=f"choose one of {', '.join(known)}")
-        if isinstance(amount, bool) or not isinstance(amount, (int, float)) or not 0 <= amount < math.inf:
+        if not is_number(amount, 0):
             raise ParamsError("gmac must be a number from 0", found=repr(amount), remedy="count the model again")
         total_s += amount / PI5_GMAC_PER_S[precision]
     return total_s * 1000

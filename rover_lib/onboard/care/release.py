@@ -122,14 +122,14 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
         artifact.prove()
         manifest = artifact.manifest
         code = b"".join(artifact.record(n) for n in artifact.names if n.endswith(".py") or n == ONNX)
-        of_mode = OF_MODE[artifact.kind]
+        if (wanted := OF_MODE[artifact.kind].get(manifest["mode"])) and wanted not in code:
+            what = f"{path}: its manifest says {manifest['mode']}, its code is not"
+            raise ArtifactError(what, remedy="quantize again")
+        for kind, why in expected.refusals(manifest).items():
+            if kind not in allow:
+                remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
+                raise ReleaseError(f"{path}: {why}", remedy=remedy)
         _ = artifact.parity  # has the shapes that the manifest says
-    if (wanted := of_mode.get(manifest["mode"])) and wanted not in code:
-        raise ArtifactError(f"{path}: its manifest says {manifest['mode']}, its code is not", remedy="quantize again")
-    for kind, why in expected.refusals(manifest).items():
-        if kind not in allow:
-            remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
-            raise ReleaseError(f"{path}: {why}", remedy=remedy)
     return artifact
 
 
@@ -255,7 +255,10 @@ class Staged:
 
 @dataclass(frozen=True)
 class Release:
-    """One release on the disk. signed: by a laptop that the rover knows now. wrong: with its bytes, "" if nothing."""
+    """One release on the disk.
+
+    signed: whether a laptop that the rover knows now has signed it. wrong: what is wrong with its bytes, "" if nothing.
+    """
 
     name: str
     current: bool
@@ -403,10 +406,9 @@ class Releases:
         """Make a release of an artifact, or of a folder that pack() wrote. The release in use stays in use.
 
         The signature is policy.pt.sig in that folder, or lies beside the artifact with .sig added to its name. sha256:
-        what the artifact's must be, if it is known. unsigned: accept it without a signature. A release that exists
-        and is intact only gets the signature that it may lack. A damaged one is replaced; if it is in use, a second
-        copy is made beside it.
-        Raises ReleaseError, ArtifactError.
+        what the artifact's must be, if it is known. unsigned: accept it without a signature. A release that exists and
+        is intact only gets the signature that it may lack. A damaged one is replaced; if it is in use, a second copy
+        is made beside it. Raises ReleaseError, ArtifactError.
         """
         source = Path(source)
         with _disk_errors_explained(), _memory_limited(source), self._exclusively():
@@ -453,7 +455,7 @@ class Releases:
             return Staged(name, True)
 
     def _accept(self, name: str, signature: Path, unsigned: bool) -> Staged:
-        """Take an intact release as staged again. One that came in unsigned needs a signature, unless `unsigned`."""
+        """Stage an intact release again. One that came in unsigned needs a signature now, unless `unsigned`."""
         if unsigned or self.is_signed(name):
             return Staged(name, False)
         policy = self.path_of(name)

@@ -77,7 +77,7 @@ class DriveOptions:
 
     artifact: Path | None = None
     camera: str = "0"
-    port: str = "/dev/ttyUSB0"
+    port: str = ""
     hz: float = 30.0
     dry_run: bool = False
     record: Path | None = None

@@ -39,8 +39,8 @@ import numpy as np
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.host import THROTTLED_VALUE, Host, throttled_means
-from rover_lib.onboard.car.pwm import is_finite
 from rover_lib.onboard.car.servo_link import State
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import ParamsError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.signal_event import SignalEvent
@@ -137,7 +137,7 @@ def log_limits() -> tuple[int, int]:
     """Return FlightLog's max_bytes and keep from params.yml. Raises ParamsError if they are not a size and a count."""
     section = params()["flight_log"]
     max_mb, keep = section["max_mb"], section["keep"]
-    if not is_finite(max_mb) or type(keep) is not int:
+    if not is_number(max_mb) or not is_whole(keep):
         raise ParamsError(
             "flight_log: max_mb must be a number, and keep a whole one",
             found=f"{max_mb!r} and {keep!r}",
@@ -642,7 +642,7 @@ def _number_of(text: str) -> float:
 
 def _time_of(row: dict[str, Any]) -> float:
     t_s = row["t_s"]
-    if not isinstance(t_s, (int, float)) or not math.isfinite(t_s):
+    if not is_number(t_s):
         raise ValueError("no time")
     return float(t_s)
 

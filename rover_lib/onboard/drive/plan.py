@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.car.pwm import is_finite
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import ParamsError, PolicyError
 
 STEERING, THROTTLE = 0, 1
@@ -59,10 +59,10 @@ class Settings:
 
         for name in ("fade_s", "stop_s", "throttle_limit", "black_level", "flat_level"):
             value = getattr(self, name)
-            must(is_finite(value), f"{name} must be a finite number, found {value!r}")
+            must(is_number(value), f"{name} must be a finite number, found {value!r}")
         for name in ("blend_ticks", "frozen_frames", "black_frames"):
             value = getattr(self, name)
-            must(type(value) is int and value >= 0, f"{name} must be a whole number from 0, found {value!r}")
+            must(is_whole(value, 0), f"{name} must be a whole number from 0, found {value!r}")
         must(0 < self.fade_s <= self.stop_s, f"0 < fade_s <= stop_s must hold, found {self.fade_s} and {self.stop_s}")
         must(
             self.blind_s * RECORDED_MPS <= BLIND_M,
@@ -74,7 +74,7 @@ class Settings:
         must(type(self.compensate) is bool, f"compensate must be true or false, found {self.compensate!r}")
         if self.ensemble is not None:
             # Beyond it, the weights of a few dozen plans overflow, and their average is not a number.
-            holds = is_finite(self.ensemble) and abs(self.ensemble) <= ENSEMBLE_MOST
+            holds = is_number(self.ensemble, -ENSEMBLE_MOST, ENSEMBLE_MOST)
             must(holds, f"ensemble must be a number within {ENSEMBLE_MOST:g} of 0, found {self.ensemble!r}")
 
     @property

@@ -14,6 +14,7 @@ DRIVERS. Whether a drive succeeded, one of OUTCOMES, is metadata.outcome, noted 
 import contextlib
 import csv
 import errno
+import fcntl
 import json
 import math
 import os
@@ -32,7 +33,7 @@ import numpy as np
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.stage import plain
+from rover_lib.onboard.stage import atomic_path, plain
 
 CHANNELS = ("steering", "throttle")
 CONTROL_FIELDS = (
@@ -51,6 +52,7 @@ FRAME_FIELDS = ("frame_id", "timestamp", "image_path")
 POLICY, HUMAN, NOBODY = DRIVERS = ("policy", "human", "nobody")
 HIT, MISSED = OUTCOMES = ("hit", "missed")  # whether a drive succeeded: metadata.outcome
 
+ABOUT = "about.json"  # in the hidden folder: what finish_killed() needs
 DATA_BYTES = 200_000_000  # largest data file that is read: three hours of driving
 LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
 ARDUINO_WRAP_MS = 1 << 32  # its clock starts at 0 again after 49.7 days
@@ -142,14 +144,17 @@ class EpisodeWriter:
             except FileExistsError:
                 raise EpisodeExists(
                     f"{self.folder}: is being recorded, or was when its program was killed",
-                    remedy=f"name another folder, or delete {temporary.name}",
+                    remedy=f"name another folder; `rover record {self.folder.parent} --finish` keeps what was recorded",
                 ) from None
         self._temporary = temporary
         try:
             with self._disk():
                 (temporary / "frames").mkdir()
+                told = {"about": vars(replace(self.about, car=None)), "metadata": self.metadata, "flags": self.flags}
+                (temporary / ABOUT).write_text(json.dumps(told))
                 for name in ("control", "frame"):
                     self._rows[name] = (temporary / f"{name}.rows").open("ab", buffering=0)
+                fcntl.flock(self._rows["control"], fcntl.LOCK_EX | fcntl.LOCK_NB)  # says that it is being recorded
         except BaseException:
             self.discard()  # no __exit__ follows a failed open()
             raise
@@ -247,6 +252,17 @@ class EpisodeWriter:
         if self._temporary:
             shutil.rmtree(self._temporary, ignore_errors=True)
         self._temporary = None
+
+    def _take(self, part: Path, controls: list[dict[str, Any]], frames: list[dict[str, Any]]) -> None:
+        """Go on with what a killed recording has left: its rows, of which there is one of each kind at least."""
+        known = {*CONTROL_FIELDS, *FLAG_FIELDS}
+        self._extra = dict.fromkeys(name for row in controls for name in row if name not in known)
+        times = [row["system_timestamp"] for row in controls] + [row["timestamp"] for row in frames]
+        self.controls, self.frames, self._first_s, self._last_s = len(controls), len(frames), min(times), max(times)
+        first = cv2.imread(str(part / frames[0]["image_path"]))
+        if first is not None:
+            self.resolution = first.shape[1], first.shape[0]
+        self.metadata["fault"] = "the program that recorded it was killed"
 
     def _append(self, kind: str, row: dict[str, Any], t_s: float) -> None:
         try:
@@ -350,8 +366,74 @@ class EpisodeWriter:
                 table.writeheader()
                 table.writerows(_read_rows(temporary, kind, columns[kind]))
                 _to_disk(f)
-        for kind in columns:
-            (temporary / f"{kind}.rows").unlink()
+        for name in (*(f"{kind}.rows" for kind in columns), ABOUT):
+            (temporary / name).unlink(missing_ok=True)
+
+
+def find_killed(folder: Path) -> list[Path]:
+    """Return the hidden folders of recordings whose program was killed, in a folder of episodes."""
+    return [path for path in sorted(folder.glob(".*.part")) if path.is_dir() and not _is_recording(path)]
+
+
+def _is_recording(part: Path) -> bool:
+    try:
+        with (part / "control.rows").open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def finish_killed(part: Path) -> Path | None:
+    """Make an episode of what a killed recording has left, and return its folder.
+
+    A row or a picture that was cut is left out. A recording that was killed before its first row is removed, and None
+    returned. Raises EpisodeError, and changes nothing, if there are no controls or no pictures.
+    """
+    folder = part.with_name(part.name.removeprefix(".").removesuffix(".part"))
+    if _is_recording(part):
+        raise EpisodeExists(f"{folder}: is being recorded", remedy="wait until it is")
+    rows = {kind: part / f"{kind}.rows" for kind in ("control", "frame")}
+    try:
+        told = json.loads(_data_of(part / ABOUT))
+        writer = EpisodeWriter(folder, About(**told["about"]), resolution=None, flags=told["flags"])
+        writer.metadata = dict(told["metadata"])
+    except (ValueError, TypeError, KeyError):
+        writer = EpisodeWriter(folder, About(), resolution=None, flags=True)
+    writer._refuse_existing()
+    if all(path.is_file() for path in rows.values()):  # else all was written already, and only the rename is missing
+        kept = {kind: list(_whole_rows(path)) for kind, path in rows.items()}
+        kept["frame"] = [row for row in kept["frame"] if _is_whole_picture(part / str(row.get("image_path")))]
+        if not kept["control"] and not kept["frame"]:
+            shutil.rmtree(part)
+            return None
+        if not kept["control"] or not kept["frame"]:
+            raise EpisodeError(f"{part}: nothing usable was recorded", remedy="remove it")
+        for kind, path in rows.items():
+            with atomic_path(path) as whole:
+                whole.write_text("".join(json.dumps(row) + "\n" for row in kept[kind]))
+        writer._take(part, kept["control"], kept["frame"])
+        writer._write(part)
+    elif not (part / "episode_data.json").is_file():
+        shutil.rmtree(part)
+        return None
+    part.rename(folder)
+    return folder
+
+
+def _whole_rows(path: Path) -> Iterator[dict[str, Any]]:
+    for line in _data_of(path).splitlines(keepends=True):
+        with contextlib.suppress(ValueError):
+            row = json.loads(line)
+            if line.endswith(b"\n") and isinstance(row, dict):
+                yield row
+
+
+def _is_whole_picture(path: Path) -> bool:
+    data = _data_of(path)
+    return data.startswith(b"\xff\xd8") and data.endswith(b"\xff\xd9")
 
 
 def _read_rows(folder: Path, kind: str, columns: tuple[str, ...]) -> Iterator[dict[str, Any]]:

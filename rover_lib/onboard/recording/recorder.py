@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
-from rover_lib.onboard.recording.episode import About, EpisodeExists, EpisodeWriter
+from rover_lib.onboard.recording.episode import About, EpisodeExists, EpisodeWriter, find_killed
 from rover_lib.onboard.signal_event import SignalEvent, signals
 from rover_lib.onboard.status_line import StatusLine
 
@@ -191,7 +191,9 @@ class Recorder:
         while True:
             frame = self._camera.wait(seen, 0.1)
             closing = self._closing.is_set()  # read before the queue is emptied, so that nothing is lost
-            self._write_controls()
+            for _ in range(len(self._queue)):
+                host_s, *control, extra = self._queue.popleft()
+                self._writer.control(host_s + self._to_system_s, *control, **extra)
             if closing:
                 return
             now = self._clock()
@@ -207,11 +209,6 @@ class Recorder:
             captured_s = frame.captured_s
             self._check_room()
             self._writer.frame(captured_s + self._to_system_s, frame.image)
-
-    def _write_controls(self) -> None:
-        for _ in range(len(self._queue)):
-            host_s, *control, extra = self._queue.popleft()
-            self._writer.control(host_s + self._to_system_s, *control, **extra)
 
 
 def room_for(folder: Path | str, most_mb: float) -> int:
@@ -229,6 +226,9 @@ def room_for(folder: Path | str, most_mb: float) -> int:
 
 def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
     """Open an episode in `folder`, named by its start; if that name is taken, by the next free second."""
+    if killed := find_killed(folder):
+        text = f"{len(killed)} recordings here were killed; `rover record {folder} --finish` keeps what they have"
+        _log.warning(text)
     while True:
         name = time.strftime("episode_%Y%m%d_%H%M%S", time.localtime(start_s))
         writer = EpisodeWriter(folder / name, about, resolution=None, flags=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from rover_lib.onboard.car.car import WIDTH_PX, Car, this_car
-from rover_lib.onboard.car.pwm import is_finite
+from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.params import params
 
@@ -38,7 +38,7 @@ class CarShape:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if name != "left" and (not is_finite(value) or value <= 0):
+            if name != "left" and (not is_number(value) or value <= 0):
                 raise ParamsError(f"view: {name} must be a number above 0", found=repr(value), remedy="see params.yml")
 
     @classmethod

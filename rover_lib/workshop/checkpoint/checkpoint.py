@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from rover_lib.onboard.car.picture import is_squeezed
+from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.kinds import refuse_part
 from rover_lib.workshop import hub
@@ -65,7 +66,7 @@ class Checkpoint:
             raise CheckpointError(
                 f"{self.path}: has {len(self.config.cameras)} cameras", remedy="another size is only known for one"
             )
-        if not all(isinstance(n, int) and not isinstance(n, bool) for n in (height, width)):
+        if not all(map(is_whole, (height, width))):
             raise CheckpointError(
                 "an image size must be two whole numbers",
                 found=f"{quote(height)} and {quote(width)}",

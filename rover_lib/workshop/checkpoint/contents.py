@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig
 from rover_lib.workshop.untrusted import quote, quote_all
@@ -89,12 +90,12 @@ def _unusable(weight: Tensor) -> str | None:
 
 
 def is_size(value: Any, most: int = LARGEST_SIZE) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most
+    return is_whole(value, 1, most)
 
 
 def positive(path: Path, raw: dict[str, Any], key: str, most: int = LARGEST_SIZE) -> int:
     value = raw.get(key)
-    if not isinstance(value, int) or not is_size(value, most):
+    if not is_whole(value, 1, most):
         raise CheckpointError(
             f"{path}: config '{key}' must be a whole number of at least 1 and at most {most}",
             found=quote(value),

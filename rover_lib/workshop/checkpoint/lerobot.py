@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import Affine
@@ -46,6 +47,11 @@ STEPS = {
     POSTPROCESSOR: ("unnormalize_outputs.buffer_", "unnormalizer_processor"),
 }
 BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+
+
+def _broken(what: str, found: object = None) -> CheckpointError:
+    """The error of a folder that no LeRobot wrote so, for the caller to raise."""
+    return CheckpointError(what, found=found, remedy=COPY_AGAIN)
 
 
 def lerobot_folder(path: Path) -> tuple[Path, list[str]] | None:
@@ -169,9 +175,8 @@ def read_lerobot(folder: Path) -> Contents:
         ("action", actions, len(config.action_names)),
     ):
         if shape != ([size] if size else []):
-            raise CheckpointError(
-                f"{folder}: config and weights do not agree ('{name}' has shape {shape}, the weights are for {size})",
-                remedy=COPY_AGAIN,
+            raise _broken(
+                f"{folder}: config and weights do not agree ('{name}' has shape {shape}, the weights are for {size})"
             )
     extra = {
         "optimizer_mb": 0.0,
@@ -204,10 +209,8 @@ def read_origin(folder: Path) -> dict[str, Any]:
 def _own_rate_hz(folder: Path) -> float:
     """Return the steps of a plan in a second: what we noted in a folder that we wrote, else RATE_HZ."""
     rate_hz = read_origin(folder).get("rate_hz", RATE_HZ)
-    if isinstance(rate_hz, bool) or not isinstance(rate_hz, (int, float)) or not 0 < rate_hz <= 1000:
-        raise CheckpointError(
-            f"{folder / ORIGIN}: 'rate_hz' must be above 0 and at most 1000", found=quote(rate_hz), remedy=COPY_AGAIN
-        )
+    if not is_number(rate_hz, 0, 1000) or not rate_hz:
+        raise _broken(f"{folder / ORIGIN}: 'rate_hz' must be above 0 and at most 1000", quote(rate_hz))
     return float(rate_hz)
 
 
@@ -215,17 +218,14 @@ def _features(folder: Path, raw: Mapping[str, Any], key: str) -> dict[str, tuple
     """Return the type and shape of each of the config's features, by name."""
     features = raw.get(key) or {}
     if not isinstance(features, dict):
-        raise CheckpointError(
-            f"{folder}/config.json: '{key}' is not an object", found=quote(features), remedy=COPY_AGAIN
-        )
+        raise _broken(f"{folder}/config.json: '{key}' is not an object", quote(features))
     checked = {}
     for name, feature in features.items():
         kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
         if not isinstance(kind, str) or not isinstance(shape, list) or not shape or not all(map(is_size, shape)):
-            raise CheckpointError(
+            raise _broken(
                 f"{folder}/config.json: feature {quote(name)} has no type and shape",
-                found=f"{quote(kind)} and {quote(shape)}",
-                remedy=COPY_AGAIN,
+                f"{quote(kind)} and {quote(shape)}",
             )
         checked[name] = kind, shape
     return checked
@@ -275,10 +275,9 @@ class Normaliser:
             self.source = "the weights' file, as LeRobot did before 0.4" if self.stats else "config.json: IDENTITY"
         texts = isinstance(self.modes, dict) and all(isinstance(v, str) for v in self.modes.values())
         if not texts or not isinstance(self.eps, (int, float)) or not 0 <= self.eps <= 1:
-            raise CheckpointError(
+            raise _broken(
                 f"{self.where}: norm_map must map names to texts, and eps must be from 0 to 1",
-                found=f"{quote(self.modes)} and {quote(self.eps)}",
-                remedy=COPY_AGAIN,
+                f"{quote(self.modes)} and {quote(self.eps)}",
             )
 
     def _read_steps(self, folder: Path, step_name: str) -> None:
@@ -289,10 +288,9 @@ class Normaliser:
             if renames := config.get("rename_map"):
                 texts = isinstance(renames, dict) and all(isinstance(v, str) for v in renames.values())
                 if not texts or self.renames or count:
-                    raise CheckpointError(
+                    raise _broken(
                         f"{self.where}: its rename_map is no map of names, or not the first that it does",
-                        found=quote(renames),
-                        remedy=COPY_AGAIN,
+                        quote(renames),
                     )
                 self.renames = renames
             if step["registry_name"] not in known:
@@ -323,17 +321,12 @@ class Normaliser:
             for s in steps
         )
         if not named:
-            raise CheckpointError(
-                f"{self.where}: its steps are not a list of objects with a registry_name and a config",
-                remedy=COPY_AGAIN,
-            )
+            raise _broken(f"{self.where}: its steps are not a list of objects with a registry_name and a config")
         return [{**s, "config": s.get("config") or {}} for s in steps]
 
     def _read_statistics(self, folder: Path, name: Any) -> dict[str, Tensor]:
         if not isinstance(name, str) or Path(name).name != name or not name.isprintable():
-            raise CheckpointError(
-                f"{self.where}: its state file {quote(name)} is not a file in the folder", remedy=COPY_AGAIN
-            )
+            raise _broken(f"{self.where}: its state file {quote(name)} is not a file in the folder")
         return _read_safetensors(folder / name, STATISTICS_BYTES)
 
     def affine(self, key: str, kind: str, size: int, inverse: bool = False) -> Affine | None:
@@ -373,9 +366,8 @@ class Normaliser:
             )
         a, b = (stats[p].double().flatten() for p in pairs[mode])
         if len(a) != size or len(b) != size:
-            raise CheckpointError(
-                f"{self.where}: statistics of '{key}' have {len(a)} and {len(b)} values, the feature has {size}",
-                remedy=COPY_AGAIN,
+            raise _broken(
+                f"{self.where}: statistics of '{key}' have {len(a)} and {len(b)} values, the feature has {size}"
             )
         if mode == "MEAN_STD":
             scale, shift = (b, a) if inverse else (1 / (b + self.eps), -a / (b + self.eps))
@@ -426,9 +418,7 @@ def _of_folder(path: Path, most_bytes: int | None = None) -> Path:
     if not stat.S_ISREG(status.st_mode):
         raise CheckpointError(f"{path}: not a file", remedy="a LeRobot folder has config.json and model.safetensors")
     if most_bytes is not None and status.st_size > most_bytes:
-        raise CheckpointError(
-            f"{path}: has {status.st_size / 1e6:.1f} MB, at most {most_bytes / 1e6:g} are read", remedy=COPY_AGAIN
-        )
+        raise _broken(f"{path}: has {status.st_size / 1e6:.1f} MB, at most {most_bytes / 1e6:g} are read")
     return path
 
 
@@ -436,9 +426,9 @@ def _read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(_of_folder(path, JSON_BYTES).read_bytes())
     except (ValueError, OSError, RecursionError) as e:  # RecursionError comes from brackets nested too deep
-        raise CheckpointError(f"{path}: not readable as JSON ({e})", remedy=COPY_AGAIN) from None
+        raise _broken(f"{path}: not readable as JSON ({e})") from None
     if not isinstance(content, dict):
-        raise CheckpointError(f"{path}: expected a JSON object", found=type(content).__name__, remedy=COPY_AGAIN)
+        raise _broken(f"{path}: expected a JSON object", type(content).__name__)
     return content
 
 
@@ -447,13 +437,12 @@ def _read_safetensors(path: Path, most_bytes: int | None = None) -> dict[str, Te
         with _of_folder(path, most_bytes).open("rb") as f:
             header_bytes = int.from_bytes(f.read(8), "little")
         if header_bytes > HEADER_BYTES:
-            raise CheckpointError(
+            raise _broken(
                 f"{path}: not readable as safetensors (its header claims {header_bytes / 1e6:.1f} MB, "
-                f"at most {HEADER_BYTES / 1e6:g} are read)",
-                remedy=COPY_AGAIN,
+                f"at most {HEADER_BYTES / 1e6:g} are read)"
             )
         return load_file(path)
     except CheckpointError:
         raise
     except Exception as e:  # whatever safetensors or torch raise for a wrong header
-        raise CheckpointError(f"{path}: not readable as safetensors ({quote(str(e))})", remedy=COPY_AGAIN) from None
+        raise _broken(f"{path}: not readable as safetensors ({quote(str(e))})") from None

@@ -114,8 +114,13 @@ class Network:
 
 
 def networks(policy: ACT) -> tuple[Network, Network, onnx.ModelProto]:
-    """Make an FP32 policy's networks: `backbone`, `whole`, and what runs after `backbone` on the processor."""
+    """Make an FP32 policy's networks: `backbone`, `whole`, and what runs after `backbone` on the processor.
+
+    Raises QuantizeError for a policy that sees no state: its networks have no place for one.
+    """
     config = policy.config
+    if not config.sees_state:
+        raise QuantizeError("a policy without a state has no kit for Hailo yet", remedy="use the Pi's processor")
     pictures = {f"frame_{n}": torch.zeros(1, 3, *s) for n, s in zip(config.cameras, config.image_sizes, strict=True)}
     grids = [config.grid(*size) for size in config.image_sizes]
     features = {f"features_{n}": torch.zeros(*g, config.dim) for n, g in zip(config.cameras, grids, strict=True)}

@@ -4,9 +4,9 @@
     for warning in judged.warnings(): ...
 
 The guesses are a constant action (the better of mean and median), the last action again and again, and the mean plan,
-step by step, of the recordings that the policy could learn from. An error is the mean over the judged actions, each in
-percent of its recorded range. Whether a guess is beaten is asked of many draws of the held-out episodes (a bootstrap),
-as few episodes say little.
+step by step, of the recordings that the policy could learn from. A guess is beaten if the policy is nearer to the
+driver in every judged action, and surely so in their mean, each in percent of its recorded range: as few episodes say
+little, that is asked of many draws of the held-out ones (a bootstrap).
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ SURE_PCT = 95
 class Guess:
     """One guess: its error by action, and by how much the policy is better: the mean, and the ends of the interval.
 
-    All in percent of the recorded range. The interval has SURE_PCT % of the draws.
+    All in percent of the recorded range. The interval has SURE_PCT % of the draws. beaten: by the policy.
     """
 
     name: str
@@ -37,10 +37,7 @@ class Guess:
     better: float
     low: float
     high: float
-
-    @property
-    def beaten(self) -> bool:
-        return self.low > 0
+    beaten: bool
 
 
 @dataclass(frozen=True)
@@ -113,7 +110,7 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
     drawn, pieces = _pieces(report)
     draws = np.random.default_rng(seed).integers(0, len(pieces), (DRAWS, len(pieces)))
     counts = np.array([len(p) for p in pieces])
-    guesses = []
+    guesses, own_pct = [], dict(zip(units, own.mean(0).tolist(), strict=True))
     for name, errors in found.items():
         gain = (errors - own).mean(1)
         sums = np.array([gain[p].sum() for p in pieces])
@@ -121,8 +118,9 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
             sums[draws].sum(1) / counts[draws].sum(1), [(100 - SURE_PCT) / 2, (100 + SURE_PCT) / 2]
         )
         means = dict(zip(units, errors.mean(0).tolist(), strict=True))
-        guesses.append(Guess(name, means, float(gain.mean()), float(low), float(high)))
-    return Judged(dict(zip(units, own.mean(0).tolist(), strict=True)), tuple(guesses), drawn)
+        beaten = bool(low > 0 and all(own_pct[action] < mean for action, mean in means.items()))
+        guesses.append(Guess(name, means, float(gain.mean()), float(low), float(high), beaten))
+    return Judged(own_pct, tuple(guesses), drawn)
 
 
 def _pieces(report: Fidelity) -> tuple[str, list[np.ndarray]]:

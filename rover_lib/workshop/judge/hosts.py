@@ -6,17 +6,20 @@ plots.latency(benchmarks.by_host)
 """
 
 import socket
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.notebook_table import Table
 
 THIS = "this machine"  # instead of the host's name, which a committed figure need not show
 NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
+CLOCK = Path(__file__).parents[3] / "results" / "clock" / "clock.json"  # written by `python -m lab clock`
+SAME_WORK = 0.01
 NO_SOAK = "none of the rovers was soaked; -e rover_soak_minutes=30 shows temperature, clock and throttling over time"
 
 
@@ -34,6 +37,21 @@ class Benchmarks:
     def soaks(self) -> dict[str, dict[str, Any]]:
         """The benchmarks with a time series, by host."""
         return {host: b for host, b in self.by_host.items() if b["metrics"].get("series")}
+
+    def beside_clock(self, policies: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Rovers' own static artifacts, as rows of the clock's policies with `host` and `measured_ms`, the p50.
+
+        policies: those of clock.json. One is the rover's if it has as many multiply-accumulates, to 1 %, and threads.
+        """
+        rows = []
+        for host, b in self.by_host.items():
+            own = b["metrics"]["artifacts"].get("static")
+            if host == THIS or own is None or not own.get("gmac"):
+                continue
+            for row in policies:
+                if row["threads"] == b["metrics"].get("threads") and abs(row["gmac"] / own["gmac"] - 1) < SAME_WORK:
+                    rows.append({**row, "host": host, "measured_ms": own["latency_p50_ms"]})
+        return rows
 
     def table(self) -> Table:
         """A row for each host and artifact, with notes below. A dash means that the host has no such sensor."""
@@ -55,6 +73,11 @@ class Benchmarks:
             count = len(self.unusable)
             notes += [f"{count} {'files are' if count > 1 else 'file is'} left out:", *self.unusable]
         return Table(header, rows, notes=notes)
+
+
+def read_clock() -> dict[str, Any] | None:
+    """The metrics of the clock's JSON; None outside a checkout, which alone has it."""
+    return read_stage(CLOCK, "clock")["metrics"] if CLOCK.is_file() else None
 
 
 def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
@@ -113,7 +136,7 @@ def _check(path: Path, content: Mapping[str, Any]) -> None:
         for p in (metrics, *series):
             int(p.get("throttled") or "0x0", 16)
         numbers = needed + [n for n in readings if n is not None]
-        usable = metrics["main"] in metrics["artifacts"] and all(type(n) in (int, float) for n in numbers)
+        usable = metrics["main"] in metrics["artifacts"] and all(map(is_number, numbers))
         usable &= all(isinstance(v, str) for v in (env["host"], env["machine"], *content["inputs"].values()))
     except (KeyError, TypeError, ValueError, AttributeError):
         usable = False

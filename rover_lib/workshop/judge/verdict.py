@@ -82,6 +82,7 @@ def verdict(
         "why": (unfit or _why(best, rows["fp32"])) + _for_another_robot(refused),
         "refused": dict(refused),
         "timing": _timing(rows),
+        "compared": "least ms" if time_key(stages["benchmark"], params["verdict"]) == "latency_min_ms" else "p50 ms",
         "modes": list(rows.values()),
         "failed": failed,
         "cautions": _cautions(stages, params, rows, best),
@@ -97,7 +98,7 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
     compared, timed = stages["compare"], stages["benchmark"]["artifacts"]
     counted = stages.get("arm", {}).get("artifacts", {})
     fp32 = compared["fp32"]
-    key = _time_key(stages["benchmark"], params["verdict"])
+    key = time_key(stages["benchmark"], params["verdict"])
     rows = {}
     for mode in ("fp32", *(m for m in MODES if m in compared["modes"])):
         found, time = fp32 if mode == "fp32" else compared["modes"][mode], timed.get(mode, {})
@@ -178,7 +179,7 @@ def _timing(rows: Mapping[str, Mapping[str, Any]]) -> str:
     return {"instructions_g": COUNTED, "time_ms": "measured here", None: "not measured"}[key]
 
 
-def _time_key(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
+def time_key(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
     """Return which time of a mode is compared: the median, or the smallest if the machine was busy with other things.
 
     INT8's engine waits for all its threads at each layer, so another process that takes part of a core can make its
@@ -507,7 +508,7 @@ def _cautions(
             "The times are this machine's; on a Pi another mode may be fastest: `ansible/benchmark.yml` measures it."
         )
     if how := _busy(stages["benchmark"], params["verdict"]):
-        least = _time_key(stages["benchmark"], params["verdict"]) == "latency_min_ms"
+        least = time_key(stages["benchmark"], params["verdict"]) == "latency_min_ms"
         judged = "the least time of each mode is compared, and " if least else ""
         lines.append(
             f"This machine was busy when it took the times ({how}): {judged}a quiet machine gives better figures."
@@ -569,7 +570,7 @@ def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[
     play = "ansible-playbook -i inventory.ini ansible/"
     commands = []
     if drove:
-        commands.append((_shell("rover", "drive", artifact, "--world", "--max-seconds", "60"), "watch it drive"))
+        commands.append((_shell("rover", "view", artifact), "watch it drive, in your browser"))
     if not any(row["gate"].startswith(GATED) and not row["gate"].endswith("floor_ms") for row in judged["failed"]):
         commands.append((deploying, "put it on the rover"))
         commands.append((f"{play}benchmark.yml", "measure its time there"))

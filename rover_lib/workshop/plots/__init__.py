@@ -29,4 +29,4 @@ from rover_lib.workshop.plots.recordings import (
     work_per_block,
 )
 from rover_lib.workshop.plots.style import save
-from rover_lib.workshop.plots.tables import computed_times, gates
+from rover_lib.workshop.plots.tables import gates

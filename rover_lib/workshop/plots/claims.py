@@ -6,9 +6,10 @@ A function returns an empty text if what it would compare is not there.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rover_lib.onboard.params import params
 from rover_lib.workshop.judge.compare import GATED, Fidelity, WorstFrame
 from rover_lib.workshop.judge.recorded_range import worst
-from rover_lib.workshop.judge.verdict import CALLED
+from rover_lib.workshop.judge.verdict import CALLED, time_key
 
 
 def _upper(text: str) -> str:
@@ -82,11 +83,16 @@ def apart(most_m: float, worlds: int) -> str:
 
 
 def speed(benchmarks: Mapping[str, Mapping[str, Any]]) -> str:
-    """Compare the medians of the first host. benchmarks: contents of benchmark-<host>.json by host."""
+    """Compare the first host's times as the verdict does: medians, or the least where the machine was busy.
+
+    benchmarks: contents of benchmark-<host>.json by host.
+    """
     host, content = next(iter(benchmarks.items()))
-    p50 = {name: v["latency_p50_ms"] for name, v in content["metrics"]["artifacts"].items()}
-    how = times(p50.get("fp32"), p50.get(GATED), "fast", "slow")
-    return f"{_upper(_called(GATED))} is {how} as FP32 on {host}" if how else ""
+    key = time_key(content["metrics"], params()["verdict"])
+    compared = {name: v[key] for name, v in content["metrics"]["artifacts"].items()}
+    how = times(compared.get("fp32"), compared.get(GATED), "fast", "slow")
+    by = "" if key == "latency_p50_ms" else ", by the least time of each"
+    return f"{_upper(_called(GATED))} is {how} as FP32 on {host}{by}" if how else ""
 
 
 def instructions(rows: Mapping[str, Mapping[str, Any]]) -> str:

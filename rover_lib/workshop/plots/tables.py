@@ -1,12 +1,10 @@
-"""Gates and computed times, as tables for notebooks."""
+"""Gates as tables for notebooks."""
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rover_lib.workshop.judge.verdict import gate_in_words
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.plots.style import NAMES
 
 KEPT = {True: "kept", False: "MISSED", None: "not measured"}
 SHADES = {True: "#009E7333", False: "#D55E0044", None: "#88888833"}  # translucent: readable on a dark page too
@@ -26,16 +24,6 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
     cells = [(gate_in_words(row["gate"]), _limit(row), _shown(row["found"]), KEPT[row["passed"]]) for row in rows]
     shades = tuple(SHADES[row["passed"]] for row in rows)
     return Table(("gate", "promised", "found", "verdict"), tuple(cells), caption, shades=shades)
-
-
-def computed_times(metrics: Mapping[str, Any]) -> Table:
-    """Make a table of the times that are computed for a Raspberry Pi 5. metrics: those of arm.json."""
-    rows = []
-    for stem, m in sorted(metrics["artifacts"].items(), key=lambda item: -item[1]["instructions_g"]):
-        mode, time_ms = re.sub(r"^policy_|_\d+x\d+$", "", stem), m["computed_pi5_ms"]
-        size = f"{m['image_width']}x{m['image_height']}"
-        rows.append((NAMES.get(mode, mode), size, f"{time_ms['low']:.3g} to {time_ms['high']:.3g}"))
-    return Table(("artifact", "picture", "ms on a Pi 5"), tuple(rows), "computed from the counts, never measured")
 
 
 def _shown(value: Any) -> str:

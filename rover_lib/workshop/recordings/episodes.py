@@ -53,6 +53,7 @@ from rover_lib.onboard.recording.episode import (
     arduino_step_s,
     driver_of,
     find_backlog,
+    find_killed,
     no_pulse,
     number_of,
     read_car_of,
@@ -161,11 +162,16 @@ def load_recordings(
             remedy="give the folder with episode_* in it, a LeRobotDataset's (with meta/info.json), or "
             "user/name@revision of the Hub",
         ) from None
+    finish = f"`rover record {root} --finish` makes an episode of it"
+    killed = find_killed(root)
     if not folders:
+        remedy = finish if killed else "give the folder that holds episode_YYYYMMDD_HHMMSS"
         raise EpisodeError(
-            f"{root}: no episode folders in it", remedy="give the folder that holds episode_YYYYMMDD_HHMMSS"
+            f"{root}: no episode folders in it", found=f"{len(killed)} killed ones" if killed else None, remedy=remedy
         )
     faults = Faults(root)
+    for part in killed:
+        faults.add(part, "killed_recording", finish)
     read = (
         _load_episode(folder, chunk, sync_s, faults)
         for folder in progress(folders, desc="reading episodes", total=len(folders))

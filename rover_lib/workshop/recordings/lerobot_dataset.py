@@ -6,7 +6,9 @@ The meaning of its numbers is read from the names of its features, or given by t
 never guessed: if throttle and steering were swapped, training, calibration and comparison would not notice.
 """
 
+import io
 import json
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager
@@ -17,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
@@ -51,8 +54,19 @@ DRIVEN_BY, OUTCOMES = (
     "outcomes",
 )  # who drove where nobody intervened; what the drive came to, or null
 CAR = "car"  # and of them all, the content of their car.yml
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+TEMPLATES = {"data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video_key}}/{FILE}.mp4"}  # of LeRobot
+# What a small file may claim to hold: frames for which there are bytes, and numbers and pixels that fit in memory.
+FRAMES_FREE, FRAME_BYTES = 20_000, 20
+MOST_VALUES, MOST_PIXELS = 20_000_000, 20_000_000
+UNPACKED_FREE, PICTURES_FREE, UNPACKED_TIMES = 100_000_000, 1_000_000, 4
 COPY_AGAIN = "copy the whole dataset again"
 UNEVEN = 0.1  # the time between two frames may differ by this share
+
+
+def _broken(what: str, found: object = None) -> EpisodeError:
+    """The error of a dataset that no LeRobot wrote so, for the caller to raise."""
+    return EpisodeError(what, found=found, remedy=COPY_AGAIN)
 
 
 def is_dataset(root: Path) -> bool:
@@ -80,20 +94,36 @@ class _Pictures:
         """Read one frame's pictures by the cameras' names, (h, w, 3) uint8 BGR each."""
         with _said_of(path, f"its frame {row} cannot be decoded"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torchvision warns of the decoder that LeRobot has chosen
+            for camera in self.cameras:
+                self._check_size(camera, self._size(camera, row), row, path)  # a bomb is not decoded
             item = self.dataset[row]
             # Each is (3, h, w) float32 in [0, 1]. Dividing a uint8 by 255 and multiplying by 255 again is exact.
             pixels = [(item[camera.key] * 255).round().byte().permute(1, 2, 0).numpy() for camera in self.cameras]
         frames = {}
         for camera, frame in zip(self.cameras, pixels, strict=True):
-            if frame.shape != (*camera.size, 3):
-                raise EpisodeError(
-                    f"{path}: its frame {row} of '{camera.key}' has another shape than meta/info.json says, "
-                    f"{(*camera.size, 3)}",
-                    found=frame.shape,
-                    remedy="record pictures of one size in one dataset",
-                )
+            self._check_size(camera, frame.shape, row, path)
             frames[camera.name] = np.ascontiguousarray(frame[..., ::-1])
         return frames
+
+    def _size(self, camera: _Camera, row: int) -> tuple[int, ...]:
+        """Return the shape that a picture's header gives; for a video, what it should be."""
+        from PIL import Image
+
+        if camera.key in self.dataset.meta.video_keys:
+            return *camera.size, 3
+        packed = self.dataset.hf_dataset.data.column(camera.key)[row]["bytes"].as_py()
+        with Image.open(io.BytesIO(packed)) as image:
+            return *image.size[::-1], 3
+
+    @staticmethod
+    def _check_size(camera: _Camera, shape: tuple[int, ...], row: int, path: Path) -> None:
+        if shape != (*camera.size, 3):
+            raise EpisodeError(
+                f"{path}: its frame {row} of '{camera.key}' has another shape than meta/info.json says, "
+                f"{(*camera.size, 3)}",
+                found=shape,
+                remedy="record pictures of one size in one dataset",
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +157,10 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     root = source.path
     info = _read_info(root)
     layout, cameras = _layout(root, info, source)
+    _check_files(root, info)
     _check_tables(root, info["features"], {*NUMBERS, INTERVENTION, SUCCESS, *(camera.key for camera in cameras)})
     dataset = _open_local(root)
+    _check_pictures(root, dataset, cameras)
     columns = _columns(root, dataset, layout)
     pictures = _Pictures(dataset, cameras)
     _check_rate(root, columns, float(info["fps"]))
@@ -205,15 +237,13 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
     path = root / INFO
     try:
         if path.stat().st_size > INFO_BYTES:
-            raise EpisodeError(f"{path}: is larger than any that LeRobot writes", remedy=COPY_AGAIN)
+            raise _broken(f"{path}: is larger than any that LeRobot writes")
         info = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as e:
-        raise EpisodeError(f"{path}: not readable as JSON ({quote(str(e))})", remedy=COPY_AGAIN) from None
+        raise _broken(f"{path}: not readable as JSON ({quote(str(e))})") from None
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if not isinstance(version, str) or not version.startswith("v"):
-        raise EpisodeError(
-            f"{path}: does not name a version of LeRobot's format", found=quote(version), remedy=COPY_AGAIN
-        )
+        raise _broken(f"{path}: does not name a version of LeRobot's format", quote(version))
     if version.startswith("v2.1"):
         where = " and give the folder below ~/.cache/huggingface/lerobot that it names" if hub_id else ""
         raise EpisodeError(
@@ -230,18 +260,18 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
             f"{root}: a LeRobotDataset {quote(version)}, only v3 is known here", remedy="use a newer version of this"
         )
     if not isinstance(info.get("data_path"), str):
-        raise EpisodeError(f"{path}: has no 'data_path'", found=quote_all(info), remedy=COPY_AGAIN)
+        raise _broken(f"{path}: has no 'data_path'", quote_all(info))
     features, fps = info.get("features"), info.get("fps")
-    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
-        raise EpisodeError(f"{path}: does not give a number of frames per second", found=quote(fps), remedy=COPY_AGAIN)
+    if not is_number(fps, 0, 1000) or not fps:
+        raise _broken(f"{path}: does not give a number of frames per second", quote(fps))
     if not isinstance(features, dict) or not all(_is_feature(f) for f in features.values()):
-        raise EpisodeError(f"{path}: its features are not objects with a dtype and a shape", remedy=COPY_AGAIN)
+        raise _broken(f"{path}: its features are not objects with a dtype and a shape")
     return info
 
 
 def _is_feature(feature: Any) -> bool:
     shape = feature.get("shape") if isinstance(feature, dict) else None
-    return isinstance(shape, list) and all(isinstance(n, int) and 0 < n <= 10_000 for n in shape)
+    return isinstance(shape, list) and all(is_whole(n, 1, 10_000) for n in shape)
 
 
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, tuple[_Camera, ...]]:
@@ -325,9 +355,57 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:
     shape = list(feature["shape"])
-    if len(shape) == 3 and 3 in (shape[0], shape[2]):
+    if len(shape) == 3 and 3 in (shape[0], shape[2]) and math.prod(shape) <= 3 * MOST_PIXELS:
         return (shape[0], shape[1]) if shape[2] == 3 else (shape[1], shape[2])
     raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy="choose another: --camera NAME")
+
+
+def _check_files(root: Path, info: Mapping[str, Any]) -> None:
+    """Raise EpisodeError for files that are none, and for tables that claim to hold more than their bytes can.
+
+    This comes before LeRobot opens anything: it would wait for a pipe, and unpack whatever a table claims.
+    """
+    from pyarrow import parquet
+
+    for key, template in TEMPLATES.items():
+        if info.get(key, template) not in (template, None):
+            raise EpisodeError(
+                f"{root}: its {key} is not LeRobot's", found=quote(info[key]), remedy=f"write {template}"
+            )
+    size = 0
+    for path in (path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*")):
+        if not path.is_dir() and not path.is_file():
+            raise _broken(f"{path}: not a plain file")
+        size += path.stat().st_size
+        if path.suffix == ".json" and path.stat().st_size > INFO_BYTES:
+            raise _broken(f"{path}: is larger than any that LeRobot writes")
+    rows = values = unpacked = 0
+    for path in root.rglob("*.parquet"):
+        with _said_of(path, "LeRobot cannot read it"):
+            footer = parquet.read_metadata(path)
+        groups = [footer.row_group(i) for i in range(footer.num_row_groups)]
+        columns = [group.column(i) for group in groups for i in range(group.num_columns)]
+        rows += footer.num_rows
+        values += sum(column.num_values for column in columns)
+        unpacked += sum(column.total_uncompressed_size for column in columns)
+        pictures = (column for column in columns if column.physical_type == "BYTE_ARRAY")
+        for column in pictures:  # which are compressed already; one that is packed once may be there in every row
+            if column.total_uncompressed_size > PICTURES_FREE + UNPACKED_TIMES * column.total_compressed_size:
+                raise EpisodeError(f"{path}: its {quote(column.path_in_schema)} unpacks to far more than its size")
+    most = FRAMES_FREE + size // FRAME_BYTES, MOST_VALUES, UNPACKED_FREE + UNPACKED_TIMES * size
+    for what, found, limit in zip(("rows", "values", "bytes"), (rows, values, unpacked), most, strict=True):
+        if found > limit:
+            raise EpisodeError(f"{root}: its tables claim {found:,} {what}, more than files of {size:,} bytes can hold")
+
+
+def _check_pictures(root: Path, dataset: "LeRobotDataset", cameras: tuple[_Camera, ...]) -> None:
+    """Raise EpisodeError for pictures that are not in the dataset's own tables: a path may lead anywhere."""
+    for camera in cameras:
+        if camera.key in dataset.meta.video_keys:
+            continue
+        for chunk in dataset.hf_dataset.data.column(camera.key).chunks:
+            if chunk.null_count or chunk.field("bytes").null_count:
+                raise _broken(f"{root}: pictures of '{camera.key}' are not in its tables, but named by a path")
 
 
 def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> None:
@@ -339,15 +417,13 @@ def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> No
 
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
         if not list(root.glob(pattern)):
-            raise EpisodeError(f"{root}: has no {pattern}", remedy=COPY_AGAIN)
+            raise _broken(f"{root}: has no {pattern}")
     wanted = [name for name, feature in features.items() if name in read and feature.get("dtype") != "video"]
     for path in sorted(root.glob("data/*/*.parquet")):
         with _said_of(path, "LeRobot cannot read it"):
             columns = parquet.read_schema(path).names
         if missing := [name for name in wanted if name not in columns]:
-            raise EpisodeError(
-                f"{path}: has no column {quote_all(missing)}", found=quote_all(columns), remedy=COPY_AGAIN
-            )
+            raise _broken(f"{path}: has no column {quote_all(missing)}", quote_all(columns))
 
 
 def _open_local(root: Path) -> "LeRobotDataset":
@@ -363,15 +439,13 @@ def _open_local(root: Path) -> "LeRobotDataset":
     with _said_of(root, "LeRobot cannot read it"):
         meta = LeRobotDatasetMetadata(**given)
         if meta.total_episodes > len(meta.episodes):  # LeRobot would list as many as the file claims
-            raise EpisodeError(
-                f"{root}: {INFO} says {quote(meta.total_episodes)} episodes",
-                found=f"{len(meta.episodes)} in meta/episodes",
-                remedy=COPY_AGAIN,
+            raise _broken(
+                f"{root}: {INFO} says {quote(meta.total_episodes)} episodes", f"{len(meta.episodes)} in meta/episodes"
             )
         for key in meta.video_keys:
             for number in range(meta.total_episodes):
                 if not (video := root / meta.get_video_file_path(number, key)).is_file():
-                    raise EpisodeError(f"{video}: not there", remedy=COPY_AGAIN)
+                    raise _broken(f"{video}: not there")
             _check_video_times(root, meta, key)
         return Local(**given, video_backend=BACKEND)
 
@@ -425,7 +499,7 @@ def _said_of(path: Path, what: str) -> Iterator[None]:
         cause = e.__cause__ or e  # datasets wraps pyarrow's error
         reason = " ".join(str(cause).split())[:160]
         text = f"{type(cause).__name__}: {reason}" if reason else type(cause).__name__
-        raise EpisodeError(f"{path}: {what} ({text})", remedy=COPY_AGAIN) from None
+        raise _broken(f"{path}: {what} ({text})") from None
 
 
 def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
@@ -494,10 +568,9 @@ def _check_episodes(root: Path, dataset: "LeRobotDataset", number: np.ndarray) -
         agree = np.array_equal(index, np.arange(len(index))) and lengths.sum() == len(number)
         agree = agree and np.array_equal(number, np.repeat(index, lengths))
     if not agree:
-        raise EpisodeError(
+        raise _broken(
             f"{root}: meta/episodes and the frames in data do not belong together",
-            found=f"{len(index)} episodes of {lengths.sum()} frames beside {len(np.unique(number))} of {len(number)}",
-            remedy=COPY_AGAIN,
+            f"{len(index)} episodes of {lengths.sum()} frames beside {len(np.unique(number))} of {len(number)}",
         )
 
 
@@ -520,7 +593,7 @@ def _episode(
         files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
         task = meta.tasks.index[meta.tasks["task_index"] == columns["task_index"][first]]
     if not data.is_file():
-        raise EpisodeError(f"{data}: not there, and episode {number} is in it", remedy=COPY_AGAIN)
+        raise _broken(f"{data}: not there, and episode {number} is in it")
     index = np.arange(n)[:, None] + np.arange(chunk)
     actions, pads = columns[ACTION][rows], index >= n
     chunks = actions[np.minimum(index, n - 1)]

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.pwm import NEUTRAL, is_finite
+from rover_lib.onboard.car.pwm import NEUTRAL
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import DATA_BYTES
 from rover_lib.workshop.progress import Progress, silent
@@ -171,9 +172,9 @@ def _read_record(
         number = row["_index"] if index is None else index
         ms = row.get("_timestamp_ms", row.get("milliseconds") if index is None else None)
         values = row[ANGLE], row[THROTTLE]
-        if not all(is_finite(v) and -1 <= v <= 1 for v in values) or not isinstance(row[PICTURE], str):
+        if not all(is_number(v, -1, 1) for v in values) or not isinstance(row[PICTURE], str):
             raise ValueError(f"{quote(values)} with {quote(row[PICTURE])}")
-        if not isinstance(number, int) or not (ms is None or is_finite(ms)):
+        if not is_whole(number) or not (ms is None or is_number(ms)):
             raise ValueError(f"number {quote(number)}, time {quote(ms)}")
     except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:
         faults.add(tub, "broken_record", f"{where}: {quote(str(e))}")

@@ -9,10 +9,12 @@ import re
 import shutil
 import sys
 from base64 import b64encode
-from collections.abc import Mapping
-from html import escape
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from jinja2 import Environment, FileSystemLoader
+from markupsafe import Markup, escape
 
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.care.release import THIS_CAR
@@ -35,17 +37,6 @@ FIGURES = {  # of the run's folder, with what each shows
     "04_hits": "Balloons hit, by mode",
     "05_latency": "How long a plan takes, by mode",
 }
-# Narrow columns may be scrolled to, but the page itself never is: it is read on a phone beside the track.
-STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;margin:0 auto;max-width:64rem;padding:1rem;color:#222;background:#fff}
-h1{font-size:1.4rem;line-height:1.25}h2{font-size:1.1rem;margin-top:2rem}
-.verdict{border-left:.4rem solid #2a7;padding:.2rem .8rem;background:#f2faf6}.none{border-color:#c33;background:#fdf3f3}
-.wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
-td,th{padding:.25rem .6rem;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
-td:first-child,th:first-child{text-align:left}tr.deploy{font-weight:bold;background:#f2faf6}
-img{max-width:100%;height:auto}figure{margin:1rem 0}figcaption,small{color:#666}
-code{font-size:.9rem;overflow-wrap:anywhere}li{margin:.3rem 0}
-"""
 
 
 def write(run_dir: Path | str) -> dict[str, Any]:
@@ -79,8 +70,10 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         folder / "run.json", "run", params={"verdict": p["verdict"], "gates": p["gates"]}, metrics=judged, inputs=inputs
     )
     figures = {name: (folder / "figures" / f"{name}.png") for name in FIGURES}
+    drawn = {name: path.read_bytes() for name, path in figures.items() if path.is_file()}
+    beside = [path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))]
     with atomic_path(folder / PAGE) as temporary:
-        temporary.write_text(page(content, names.name, {n: f.read_bytes() for n, f in figures.items() if f.is_file()}))
+        temporary.write_text(page(content, names.name, drawn, beside))
     return content
 
 
@@ -177,7 +170,7 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
         "times smaller",
         *(f"{action} error, %" for action in actions),
         "hits",
-        "p50 ms",
+        judged["compared"],
         "times faster",
     ]
     lines = [tuple([*header, *(["10^9 instructions"] if counted else [])])]
@@ -185,14 +178,18 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
         errors = [number(row["errors_pct"].get(action), ".2f") for action in actions]
         hits = f"{row['hits']} of {row['trials']}" if row["trials"] else "-"
         cells = [CALLED[row["mode"]], f"{row['size_mb']:.1f}", f"{row['times_smaller']:.1f}", *errors, hits]
-        cells += [number(row["latency_p50_ms"], ".1f"), number(row["times_faster"], ".1f")]
+        cells += [number(row["time_ms"], ".1f"), number(row["times_faster"], ".1f")]
         lines.append(tuple([*cells, *([number(row["instructions_g"], ".3g")] if counted else [])]))
     return lines
 
 
 def table(judged: Mapping[str, Any]) -> list[str]:
     """`columns` in a terminal, and below it what each mode is worth."""
-    return align(columns(judged)) + [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
+    return align(columns(judged)) + _worth(judged)
+
+
+def _worth(judged: Mapping[str, Any]) -> list[str]:
+    return [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
 
 
 # --- as a page --------------------------------------------------------------------------------------------------------
@@ -224,60 +221,29 @@ def write_card(run_dir: Path | str) -> Path:
     return path
 
 
-def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes]) -> str:
-    """run.json as one HTML page that needs no other file. name: the run's. figures: PNGs by their names in FIGURES."""
+def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes], files: Sequence[str] = ()) -> str:
+    """run.json as one HTML page that needs no other file. name: the run's. figures: PNGs by their names in FIGURES.
+    files: names of files beside it, to which it links.
+    """
     judged, env = content["metrics"], content["env"]
-    title = f"{name}: {judged['headline']}"
-    kind = "verdict none" if judged["deploy"] is None else "verdict"
-    parts = [
-        f"<h1>{escape(title)}</h1>",
-        f'<div class="{kind}">{_paragraphs(judged["why"])}</div>',
-        "<h2>The modes compared</h2>",
-        _html_table(judged),
-        _list([f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]),
-        f"<small>Errors are mean differences from FP32, in percent of the recorded range. "
-        f"Speed: {escape(judged['timing'])}, on {escape(judged['host'])}.</small>",
-    ]
-    if judged["failed"]:
-        parts.append("<h2>What failed, and what to do</h2>")
-    for row in judged["failed"]:
-        parts += [f"<p><b>{escape(against(row))}</b></p>", _list(row["remedies"])]
-    if judged["cautions"]:
-        parts += ["<h2>Keep in mind</h2>", _list(judged["cautions"])]
-    steps = "".join(
-        f"<li><code>{escape(typed(s['command']))}</code><br>{escape(s['why'])}</li>" for s in judged["next"]
-    )
-    parts += ["<h2>Next</h2>", f"<ol>{steps}</ol>"]
-    for figure, caption in FIGURES.items():
-        if figure in figures:
-            source = f"data:image/png;base64,{b64encode(figures[figure]).decode()}"
-            picture = f'<img src="{source}" alt="{escape(caption)}">'
-            parts.append(f"<figure>{picture}<figcaption>{escape(caption)}</figcaption></figure>")
-    made = ", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key))
-    parts.append(f"<small>{escape(made)}</small>")
-    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(name)}</title>'
-    return f'<!doctype html><html lang="en"><head>{head}<style>{STYLE}</style></head><body>\n' + "\n".join(
-        [*parts, "</body></html>\n"]
+    header, *rows = zip(*columns(judged), strict=True)  # a column for each mode: a phone shows all without scrolling
+    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
+    pages.filters["words"] = _to_html
+    return pages.get_template(PAGE).render(
+        name=name,
+        judged=judged,
+        header=header,
+        rows=rows,
+        kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
+        worth=_worth(judged),
+        figures=[(FIGURES[figure], b64encode(figures[figure]).decode()) for figure in FIGURES if figure in figures],
+        files=files,
+        made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
+        against=against,
+        typed=typed,
     )
 
 
-def _html_table(judged: Mapping[str, Any]) -> str:
-    header, *rows = columns(judged)
-    lines = ["<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in header) + "</tr>"]
-    for row, mode in zip(rows, judged["modes"], strict=True):
-        kind = ' class="deploy"' if mode["mode"] == judged["deploy"] else ""
-        lines.append(f"<tr{kind}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
-    return '<div class="wide"><table>' + "\n".join(lines) + "</table></div>"
-
-
-def _list(lines: list[str]) -> str:
-    return "<ul>" + "".join(f"<li>{_to_html(line)}</li>" for line in lines) + "</ul>"
-
-
-def _paragraphs(lines: list[str]) -> str:
-    return "".join(f"<p>{_to_html(line)}</p>" for line in lines)
-
-
-def _to_html(line: str) -> str:
+def _to_html(line: str) -> Markup:
     """A sentence as HTML, what is between backticks as code."""
-    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(line))
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(line))))

@@ -99,23 +99,19 @@ def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
         torch.set_num_threads(1)
     given = stage["params"]
     again = load(given["checkpoint"], Source.loaded(given), progress)
-    loaded, now = stage["metrics"]["checkpoint"], again.checkpoint
-    if now.sha256 != loaded["sha256"] or now.identity != loaded.get("identity", now.identity):  # older runs lack it
-        found = "the same weights, and another config or other statistics" if now.sha256 == loaded["sha256"] else None
-        raise RoverError(
-            f"{now.path}: is not what notebook 01 loaded any more", found=found, remedy="run notebook 01 again"
-        )
+    loaded, now, root = stage["metrics"]["checkpoint"], again.checkpoint, again.recordings.root
     layout = stage["metrics"].get("recordings", {}).get("layout")
-    if layout and layout != again.recordings.layout.words():
-        raise RoverError(
-            f"{again.recordings.root}: says something else of its numbers than when notebook 01 loaded it",
-            found=again.recordings.layout.words(),
-            remedy="run notebook 01 again",
-        )
-    if again.parts.episodes != stage["metrics"]["split"]:
-        raise RoverError(
-            f"{again.recordings.root}: has other episodes than notebook 01 loaded", remedy="run notebook 01 again"
-        )
+    words = again.recordings.layout.words()
+    what, found = "", None
+    if now.sha256 != loaded["sha256"] or now.identity != loaded.get("identity", now.identity):  # older runs lack it
+        what = f"{now.path}: is not what notebook 01 loaded any more"
+        found = "the same weights, and another config or other statistics" if now.sha256 == loaded["sha256"] else None
+    elif layout and layout != words:
+        what, found = f"{root}: says something else of its numbers than when notebook 01 loaded it", words
+    elif again.parts.episodes != stage["metrics"]["split"]:
+        what = f"{root}: has other episodes than notebook 01 loaded"
+    if what:
+        raise RoverError(what, found=found, remedy="run notebook 01 again")
     return again
 
 

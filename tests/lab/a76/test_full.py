@@ -4,8 +4,9 @@ import json
 
 import pytest
 
-from balloon_world import train as train_module
+from lab.a76 import full
 from lab.a76.full import LEARNED_NOTE, NOTE, SIZES, STEPS, full_run
+from rover_learn import train as train_module
 from rover_lib.onboard.errors import WorldError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
@@ -36,14 +37,10 @@ def run_dir(cache, tmp_path_factory):
 def test_leaves_what_counting_needs(run_dir):
     artifacts = {p.stem: load_policy(p) for p in run_dir.glob("policy_*") if p.is_file()}
     assert {name: p.image_size for name, p in artifacts.items()} == {
-        "policy_fp32": (72, 128),
-        "policy_fp32.onnx": (72, 128),
-        "policy_static": (72, 128),
-        "policy_static.onnx": (72, 128),
-        "policy_fp32_54x96": (54, 96),
-        "policy_static_54x96": (54, 96),
+        "policy_fp32": (72, 128), "policy_fp32.onnx": (72, 128), "policy_static": (72, 128),
+        "policy_static.onnx": (72, 128), "policy_fp32_54x96": (54, 96), "policy_static_54x96": (54, 96),
         "policy_static_36x64": (36, 64),
-    }
+    }  # fmt: skip
     assert len({p.manifest["checkpoint"]["sha256"] for p in artifacts.values()}) == 1
     again = open_run(run_dir)
     assert len(pick_evenly(again.parts.held_out, 50)) == 50
@@ -62,12 +59,19 @@ def test_quantize_json_says_how_to_make_it_again(run_dir, suffix):
     assert json.loads(json.dumps(again.report["layers"])) == made["layers"]
 
 
-def test_what_was_made_before_is_taken_from_the_cache(run_dir, tmp_path):
+@pytest.fixture
+def checkpoint_alone(monkeypatch):
+    """A run quantizes nothing, which takes longer than to train it."""
+    monkeypatch.setattr(full, "_quantize", lambda *_, **__: {})
+    monkeypatch.setattr(full, "export_onnx", lambda *_: None)
+
+
+def test_what_was_made_before_is_taken_from_the_cache(run_dir, checkpoint_alone, tmp_path):
     again = full_run(tmp_path / "full", steps=5, **SIZE | {"sizes": (), "curve": ()})
     assert sha256_of(again / "best_model.pth") == sha256_of(run_dir / "best_model.pth")
 
 
-def test_the_whole_recipe_is_that_of_the_balloon_world(cache, tmp_path, monkeypatch):
+def test_the_whole_recipe_is_that_of_the_balloon_world(cache, checkpoint_alone, tmp_path, monkeypatch):
     """So that a checkpoint that `rover train` left in the cache is used."""
     short = train_module.RECIPES["small", "cpu"].of_steps(4)
     monkeypatch.setitem(train_module.RECIPES, ("small", "cpu"), short)

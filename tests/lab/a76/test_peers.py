@@ -82,7 +82,9 @@ def tiny_run(tiny, tmp_path_factory) -> SimpleNamespace:
 
 def counted(chunks: np.ndarray, steady: int = 3_000_000) -> Counted:
     versions = {"threads": 1}
-    return Counted(9, (5, 4, steady), 2_000_000, 1_000_000, {"k": (steady, 2, 1)}, 70.0, 80.0, 60.0, chunks, versions)
+    return Counted(
+        9, (5, 4, steady), 2_000_000, 1_000_000, 500, 200, {"k": (steady, 2, 1)}, 70.0, 80.0, 60.0, chunks, versions
+    )
 
 
 def arm_json(folder: Path, **artifacts: dict) -> dict:

@@ -23,7 +23,7 @@ def test_200_random_drives_break_nothing(capsys):
     with capsys.disabled():
         print(f"\nrandom drives: {tally.summary}")
     assert not failures, "\n".join(map(str, failures))
-    assert tally.driven > 100
+    assert tally.driven > 70
     assert len(tally.firmware) > 50
     assert len(tally.loop) > 20
 

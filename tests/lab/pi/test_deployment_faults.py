@@ -1,6 +1,5 @@
 """What the bench of broken deployments sees and judges, without a Pi: `make pi-fast` has those."""
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,7 +7,7 @@ import pytest
 
 from lab.params import lab_params
 from lab.pi import container_run
-from lab.pi.deployment_bench import DeploymentBench, Disk, Line, line_of
+from lab.pi.deployment_bench import DeploymentBench, Line, line_of
 from lab.pi.deployment_faults import FAULTS, wrong_rows
 from lab.pi.emulation import EmulationError
 from lab.pi.fleet import REPORT as REPORT_TASK
@@ -33,37 +32,8 @@ def test_every_fault_has_its_own_name_and_there_are_enough():
         "lies",
         "at once",
     ):
-        assert any(part in name for name in names), part
+        assert any(part in name for name in names), part  # fmt: skip
     assert container_run.ONE_FAULT in names
-
-
-def test_how_far_a_deployment_has_come_is_on_the_disk(tmp_path):
-    models = tmp_path / "models"
-    incoming, releases = models / "incoming" / ABOUT["sha256"], models / "releases"
-    assert Disk.seen(tmp_path, ABOUT) == Disk()
-    incoming.mkdir(parents=True)
-    assert Disk.seen(tmp_path, ABOUT) == Disk(ready=True)
-    for name in ("part-0000", "part-0001", ".ansible_tmp"):
-        (incoming / name).touch()
-    seen = Disk.seen(tmp_path, ABOUT)
-    assert seen.arrived == ("part-0000", "part-0001") and not seen.complete
-    (incoming / "release.json").touch()
-    assert not Disk.seen(tmp_path, ABOUT).complete
-    (incoming / "policy.pt.sig").touch()
-    assert Disk.seen(tmp_path, ABOUT).complete
-    (releases / ".new").mkdir(parents=True)
-    (releases / ".new" / "policy.pt").write_bytes(b"12345")
-    seen = Disk.seen(tmp_path, ABOUT)
-    assert seen.staging == {"policy.pt": 5} and not seen.released
-    (releases / ".new").rename(releases / ABOUT["name"])
-    seen = Disk.seen(tmp_path, ABOUT)
-    assert seen.released and not seen.switched and not seen.staging
-    (tmp_path / "models" / "current").symlink_to(f"releases/{ABOUT['name']}")
-    seen = Disk.seen(tmp_path, ABOUT)
-    assert seen.switched and not seen.remembered
-    (tmp_path / "models" / "history.json").write_text(json.dumps(["c" * 64, ABOUT["name"]]))
-    assert Disk.seen(tmp_path, ABOUT).remembered
-    assert json.loads(json.dumps(vars(seen)))["switched"]
 
 
 STATUS = """

@@ -47,5 +47,5 @@ def test_a_release_opens_it_once_a_step(artifacts, tmp_path, opens):
     assert releases.stage(tmp_path / "packed", unsigned=True, allow=["camera"]).changed
     assert opens == {"policy.pt": 1}
     opens.clear()
-    releases.switch(about["name"])
+    releases.switch(about["name"], unsigned=True)
     assert opens == {"policy.pt": 2}

@@ -41,10 +41,11 @@ class Desk:
             if words in text:
                 throttle_us = self.sticks[where]
         self.board.sticks = [steering_us, throttle_us]
-        self.board.run(100)
+        self.board.run(1500)
 
     def tell(self, car):
-        assert self.board.command("C", *car.numbers) == "k"
+        if (answer := self.board.command("C", *car.numbers)) != "k":
+            raise servo_link.LinkError(f"refused: {answer}")
 
     def latest(self):
         return self.board.status
@@ -134,10 +135,10 @@ def run(monkeypatch, tmp_path):
     path = tmp_path / "etc" / "car.yml"
     monkeypatch.setattr(car_module, "PLACES", (tmp_path / "checkout" / "car.yml", path))
     monkeypatch.delenv(car_module.FILE_VARIABLE, raising=False)
-    # The board's time advances whenever its status is read, so measure() need not sleep.
-    monkeypatch.setattr(module, "measure", partial(measure, sleep=lambda seconds: None))
 
     def run(desk, *options):
+        monkeypatch.setattr(module, "measure", partial(measure, sleep=desk.sleep))
+
         class Link:
             def __init__(self, port, car):
                 self.tell, self.latest = desk.tell, lambda: (desk.sleep(0.02), desk.latest())[1]
@@ -215,3 +216,9 @@ def test_ctrl_c_leaves_everything_as_it_was(run, at):
     result, path = run(desk)
     assert result.exit_code == 1
     assert not path.parent.exists() or not list(path.parent.iterdir())
+
+
+def test_a_throttle_trimmed_far_from_the_middle_is_no_reason_to_refuse_its_car(run):
+    desk = Desk(CRAWLER | {"rest": (1504, 1400)})
+    result, path = run(desk)
+    assert result.exit_code == 0 and read_car(path).numbers[6] == 1400, result.output

@@ -66,13 +66,10 @@ def test_recorded_pulses_come_back_within_a_timer_step(pwm):
     ("pulse_us", "period_us", "normalised"),
     # readings of a real drive: left and right, and both ends that were seen on the wire
     [
-        (1488, 21312, 0.0583),
-        (1500, 21308, 0.0804),
-        (1492, 21308, 0.066),
-        (1488, 21316, 0.0578),
+        (1488, 21312, 0.0583), (1500, 21308, 0.0804), (1492, 21308, 0.066), (1488, 21316, 0.0578),
         (1500, 21300, 0.0814),
     ],
-)
+)  # fmt: skip
 def test_steering_of_real_readings(pwm, pulse_us, period_us, normalised):
     assert pwm.steering.action(pulse_us, period_us) == pytest.approx(normalised, abs=5.1e-5)
     assert abs(pwm.steering.pulse_us(normalised) - pulse_us) <= ARDUINO_STEP_US
@@ -196,13 +193,8 @@ def test_microseconds_per_unit(pwm):
 )
 def test_a_calibration_that_exists_is_valid(bad):
     good = {
-        "name": "steering",
-        "period_us": 21316,
-        "neutral_pct": 6.83,
-        "span_pct": 2.607,
-        "low": -1,
-        "high": 1,
-    }
+        "name": "steering", "period_us": 21316, "neutral_pct": 6.83, "span_pct": 2.607, "low": -1, "high": 1,
+    }  # fmt: skip
     Channel(**good)
     with pytest.raises(PwmError):
         Channel(**{**good, **bad})

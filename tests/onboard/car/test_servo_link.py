@@ -1,5 +1,6 @@
 """The link: by its rules against an Arduino made of a pty and a thread, and for real against the emulated one."""
 
+import fcntl
 import functools
 import os
 import termios
@@ -224,6 +225,28 @@ def test_a_status_from_before_is_no_answer():
     sentence = "no answer to arming"
     with board_of(answer=old) as board, ServoLink(board.port) as link, pytest.raises(LinkError, match=sentence):
         link.arm()
+
+
+def test_a_status_of_another_start_is_no_answer():
+    def other(board, body):
+        board.status("A", "a", boot=9)
+
+    with board_of(answer=other) as board, ServoLink(board.port) as link, pytest.raises(LinkError, match="no answer to"):
+        link.arm()
+
+
+def test_what_waited_in_the_port_is_dropped_and_nobody_else_gets_it():
+    with board_of(hello="") as board:
+        board.hello = f"<H 4 4.0.0 7 0 e {DEFAULT}"
+        board.say(f"<H 4 4.0.0 3 99 e {DEFAULT}")  # of before the port was opened
+        time.sleep(0.05)
+        threading.Timer(0.2, board.greet).start()
+        with ServoLink(board.port) as link:
+            assert link.hello.boot == 7
+            with pytest.raises(serial.SerialException):
+                serial.Serial(board.port, exclusive=True)
+            excluded = fcntl.ioctl(board._slave, 0x80045440, bytes(4))  # TIOCGEXCL, for programs that lock nothing
+            assert int.from_bytes(excluded, "little") == 1
 
 
 def test_a_reset_meanwhile_needs_arming_again():

@@ -19,17 +19,10 @@ from rover_lib.onboard.errors import ParamsError, PolicyError
 FRAMES = [np.full((4, 4, 3), k, np.uint8) for k in range(3)]
 STATE = np.zeros(2, np.float32)
 GATES = {
-    "latency_mean_ms": [20, 40],
-    "latency_p95_ms": [30, 50],
-    "throughput_fps": [25, 50],
-    "control_rate_hz": [22, 35],
-    "model_size_mb": 100,
-    "memory_mb": 500,
-    "cpu_pct": 80,
-    "accuracy_loss_pct": 5,
-    "temperature_c": 80,
+    "latency_mean_ms": [20, 40], "latency_p95_ms": [30, 50], "throughput_fps": [25, 50], "control_rate_hz": [22, 35],
+    "model_size_mb": 100, "memory_mb": 500, "cpu_pct": 80, "accuracy_loss_pct": 5, "temperature_c": 80,
     "throttled": "0x0",
-}
+}  # fmt: skip
 
 
 class Machine:
@@ -294,18 +287,10 @@ def test_threads_are_set_and_restored(bare_host):
 @pytest.mark.parametrize(
     "bad",
     [
-        {"policies": {}},
-        {"frames": []},
-        {"iterations": 0},
-        {"warmup": -1},
-        {"threads": -1},
-        {"duration_s": 0},
-        {"duration_s": math.inf},
-        {"rate_hz": math.nan},
-        {"main": "z"},
-        {"reference": "z"},
+        {"policies": {}}, {"frames": []}, {"iterations": 0}, {"warmup": -1}, {"threads": -1}, {"duration_s": 0},
+        {"duration_s": math.inf}, {"rate_hz": math.nan}, {"main": "z"}, {"reference": "z"},
     ],
-)
+)  # fmt: skip
 def test_parameters_that_make_no_sense(machine, bare_host, bad):
     given = {"policies": {"a": machine.policy("a", [1])}, "frames": FRAMES, **bad}
     policies, frames = given.pop("policies"), given.pop("frames")
@@ -356,17 +341,10 @@ def test_gates_of_the_original():
     rows = check_gates(metrics, GATES)
     assert [r["gate"] for r in rows] == list(GATES)
     assert {r["gate"]: r["passed"] for r in rows} == {
-        "latency_mean_ms": False,
-        "latency_p95_ms": True,
-        "throughput_fps": True,
-        "control_rate_hz": False,
-        "model_size_mb": True,
-        "memory_mb": False,
-        "cpu_pct": None,
-        "accuracy_loss_pct": None,
-        "temperature_c": None,
+        "latency_mean_ms": False, "latency_p95_ms": True, "throughput_fps": True, "control_rate_hz": False,
+        "model_size_mb": True, "memory_mb": False, "cpu_pct": None, "accuracy_loss_pct": None, "temperature_c": None,
         "throttled": False,
-    }
+    }  # fmt: skip
     assert rows[4] == {"gate": "model_size_mb", "limit": 100, "found": 66.4, "passed": True}
 
 

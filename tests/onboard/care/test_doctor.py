@@ -170,11 +170,13 @@ class FakeCamera:
 
     time_stamps = "monotonic"
 
-    def __init__(self, hz=30.0, level=100, stops=False, repeats=0, contrast=40.0):
+    def __init__(self, hz=30.0, level=100, stops=False, repeats=0, contrast=40.0, seen=None):
+        self.seen = seen  # what the policy has seen
         self.hz, self.level, self.stops, self.number = hz, level, stops, 1
         self.repeats, self.contrast = repeats, contrast
 
-    def __call__(self, source, rate_hz):
+    def __call__(self, source, rate_hz, size=(640, 360)):
+        assert size == ((640, 480) if self.seen == (64, 48) else (640, 360))
         return self
 
     def __enter__(self):
@@ -211,12 +213,14 @@ def quick(monkeypatch):
         (FakeCamera(contrast=0.7), "warning", "nothing is on the camera's picture (contrast 0.7 of 255)"),
         (FakeCamera(repeats=9), "fail", "frozen: 10 frames showed nothing new"),
         (FakeCamera(stops=True), "fail", "no new frame within"),
+        (FakeCamera(seen=(128, 72)), "ok", "640x360"),
+        (FakeCamera(seen=(64, 48)), "fail", "gives 640x360, and the policy has seen pictures of the shape of 64x48"),
     ],
 )
 def test_the_real_frame_rate(tmp_path, proc, quick, camera, verdict, found):
     source = tmp_path / "video0"
     source.touch()
-    check = only(doctor.camera_rate(source, proc_root=proc, open_camera=camera))
+    check = only(doctor.camera_rate(source, camera.seen, proc_root=proc, open_camera=camera))
     assert check.verdict == verdict and found in check.found
     assert bool(check.remedy) == (verdict != "ok")
 
@@ -342,10 +346,10 @@ def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_trans
 
 
 def test_an_arduino_of_another_protocol(proc):
-    with board_of(hello="<H 4 4.0.0 something else") as board:
+    with board_of(hello="<H 5 5.0.0 something else") as board:
         check = only(c for c in examine(port=board.port, boot_s=2, host=Host(proc_root=proc)) if c.name == "Arduino")
     assert check.verdict == "fail"
-    assert "firmware 4.0.0 (protocol 4)" in check.found and "make -C firmware flash" in check.remedy
+    assert "firmware 5.0.0 (protocol 5)" in check.found and "make -C firmware flash" in check.remedy
 
 
 def test_nothing_answers(proc):
@@ -444,6 +448,10 @@ def test_a_pi_that_was_short_of_power(pi_host):
         Path(pi_host.vcgencmd).write_text(f"#!/bin/sh\necho throttled={value}\n")
         check = only(doctor.power(pi_host))
         assert (check.verdict, check.remedy) == (verdict, remedy)
+    for words in ("VCHI initialization failed", "Can't open device file: /dev/vcio_gencmd", ""):
+        Path(pi_host.vcgencmd).write_text(f'#!/bin/sh\necho "{words}" >&2; exit 255\n')
+        check = only(doctor.power(pi_host))
+        assert check.verdict == "warning" and "cannot be read" in check.found and words in check.found
 
 
 def test_temperature(pi_host, bare_host):

@@ -17,7 +17,7 @@ from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import Hello, LinkError, State, Telemetry
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.loop import KEEP_S, Hooks, Report, Until, drive
-from rover_lib.onboard.drive.pilot import Order, PolicyPilot, ReplayPilot
+from rover_lib.onboard.drive.pilot import Order, PolicyPilot, ReplayPilot, Sight
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
 from rover_lib.onboard.drive.service import NotArmed
 from rover_lib.onboard.drive.watch import (
@@ -260,6 +260,12 @@ def test_ends_as_asked(link, clock):
     assert (report.ticks, report.ended, link.said[-1]) == (7, "told to stop", "neutral")
 
 
+def test_whoever_may_end_it_is_asked_at_each_tick(link, clock):
+    asked = iter([None] * 4 + ["stopped from the view"])
+    report = go(Always(), link, clock, until=Until(over=lambda: next(asked)))
+    assert (report.ticks, report.ended, link.said[-1]) == (4, "stopped from the view", "neutral")
+
+
 def test_told_to_stop_before_it_began(link, clock):
     stop = threading.Event()
     stop.set()
@@ -484,6 +490,13 @@ def test_a_frozen_camera(pilot):
     drives(pilot, 0.5)
     with pytest.raises(CameraError, match="frozen: 3 frames showed nothing new"):
         drives(pilot, 0.5, start_s=0.5, repeats=lambda i: i)
+
+
+def test_a_frozen_camera_while_the_car_reverses():
+    sight = Sight(Eyes(), Settings())
+    sight.sent(0.0, -0.1)
+    with pytest.raises(CameraError, match="frozen: "):
+        sight.watch(Frame(np.zeros((36, 64, 3), np.uint8), 1.0, 9, 8, 100.0, 50.0), 1.0)
 
 
 def test_a_camera_that_froze_before_the_car_moved(pilot):

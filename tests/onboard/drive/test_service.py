@@ -5,11 +5,13 @@ import inspect
 import json
 import math
 import os
+import shutil
 import signal
 import socket
 import stat
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from dataclasses import replace
@@ -29,10 +31,11 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
 from rover_lib.onboard.drive import service as s
-from rover_lib.onboard.drive.drive import DriveOptions, arm_capped, arm_when_ready, drive_car
+from rover_lib.onboard.drive.drive import DriveOptions, _Arming, arm_capped, arm_when_ready, drive_car
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.plan import Settings
+from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.recording.episode import read_controls
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.MANUAL, "h", "-", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)
@@ -204,6 +207,21 @@ def test_one_request_is_one_attempt(systemd):
     assert len(calls) == 1
     assert [answer["armed"] for answer in answers] == [False, False]
     assert any("ask anew" in answer["text"] or "not ready" in answer["text"] for answer in answers)
+
+
+def test_nobody_can_ask_for_the_car_while_it_drives(systemd):
+    """Such a request would arm it again as soon as that drive ends."""
+    asked = []
+
+    def ask() -> None:
+        ticket = s.ask_service(ask="state")["ticket"]
+        asked.append(s.ask_service(ask="arm", model="ab12", ticket=ticket)["armed"])
+
+    with served() as service:
+        thread = beside(systemd, ask)
+        assert service.wait_for_human(armed) == "telemetry"
+        thread.join()
+        assert asked == [True] and s.ask_service(ask="state")["ticket"] == ""
 
 
 @pytest.mark.parametrize("old", [{"asked_s": -1e9}, {"asked_s": math.nan}, {}])
@@ -446,6 +464,41 @@ def test_without_a_place_for_operators_nobody_could_arm_it(systemd, monkeypatch)
 def test_only_root_talks_to_it(systemd, tmp_path):
     with served():
         assert stat.S_IMODE((tmp_path / "operators").stat().st_mode) == 0o600
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user")
+def test_another_user_arms_nothing_even_if_the_socket_is_open_to_all(systemd, monkeypatch):
+    """Only the socket's mode was tested, and not who asks."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(folder))
+    code = (
+        "import os, socket; os.setuid(65534); c = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)\n"
+        f"c.connect('{folder}/operators'); c.send(b'{{\"ask\": \"state\"}}'); print(c.recv(100))"
+    )
+    with served():
+        (folder / "operators").chmod(0o666)
+        assert s.ask_service(ask="state")["model"] == "ab12"
+        done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True)
+    shutil.rmtree(folder)
+    assert "connect" not in done.stderr and "ab12" not in done.stdout, done  # it got no answer, or was cut off
+
+
+def test_an_old_plan_is_renewed_before_the_car_is_armed():
+    """Or it would set off by a picture of long ago."""
+    asked = []
+
+    def renew(age_s):
+        asked.append(age_s)
+        raise PolicyError("no fresh plan")
+
+    planner = SimpleNamespace(without_rest=contextlib.nullcontext, renew=renew)
+    link = SimpleNamespace(request=lambda keep: None, lower_cap=lambda us: pytest.fail("armed"))
+    log = SimpleNamespace(event=lambda *_: None)
+    opened = SimpleNamespace(options=DriveOptions(), settings=Settings(), link=link, log=log)
+    with pytest.raises(PolicyError), _Arming(opened, planner, None, "static", None) as attempt:
+        attempt.arm()
+    assert asked == [Settings().fade_s]
 
 
 # rover arm-car

@@ -14,10 +14,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from recorded import real_episode
 
+from rover_lib.cli import main
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import (
@@ -26,6 +28,8 @@ from rover_lib.onboard.recording.episode import (
     FRAME_FIELDS,
     About,
     EpisodeWriter,
+    find_killed,
+    finish_killed,
     read_controls,
 )
 from rover_lib.workshop.recordings.episodes import load_recordings
@@ -51,6 +55,66 @@ def test_an_episode_that_cannot_be_begun_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(EpisodeError, match="No space left"):
         EpisodeWriter(tmp_path / NAME, About()).open()
     assert not list(tmp_path.iterdir())
+
+
+def killed(folder, controls=5, frames=3):
+    """What a recorder leaves that is killed while it records, and another while it writes the episode's files."""
+    code = (
+        "import os, sys, numpy as np; from rover_lib.onboard.recording import episode as e\n"
+        "w = e.EpisodeWriter(sys.argv[1], e.About('hit'), resolution=None, flags=True); w.open()\n"
+        "[w.control(100 + i / 30, 33 * i, 1500, 136, 21308, 1016, driver='human') for i in range(int(sys.argv[2]))]\n"
+        "[w.frame(100 + i / 30, np.full((36, 64, 3), 99, np.uint8)) for i in range(int(sys.argv[3]))]\n"
+        "print(len(e.find_killed(w.folder.parent)), flush=True); os.kill(os.getpid(), 9)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, folder, str(controls), str(frames)], capture_output=True, text=True
+    )
+    assert done.stdout == "0\n", done
+    return folder.with_name(f".{folder.name}.part")
+
+
+def test_a_recording_that_was_killed_is_not_lost(tmp_path):
+    """93 frames and 102 rows were, to every command."""
+    part = killed(tmp_path / NAME)
+    with (part / "control.rows").open("ab") as file:
+        file.write(b'{"arduino_timestamp": 9')  # cut by the kill
+    picture = part / "frames/frame_000003.jpg"
+    picture.write_bytes(picture.read_bytes()[:-9])
+    with pytest.raises(EpisodeError, match=r"no episode folders.*1 killed.*--finish` makes an episode"):
+        load_recordings(tmp_path, chunk=4)
+    write(tmp_path / "episode_2")
+    (fault,) = [f for f in load_recordings(tmp_path, chunk=4).faults if f.kind == "killed_recording"]
+    assert fault.file == part.name and "--finish" in fault.note
+    done = CliRunner().invoke(main, ["record", str(tmp_path), "--finish"])
+    assert done.output == f"finished: {tmp_path / NAME}\n", done
+    about = json.loads((tmp_path / NAME / "episode_data.json").read_text())
+    assert (len(about["control_samples"]), len(about["frame_samples"]), about["action_label"]) == (5, 2, "hit")
+    assert about["metadata"]["fault"] == "the program that recorded it was killed"
+    assert about["control_samples"][0]["driver"] == "human" and not find_killed(tmp_path)
+    assert len(load_recordings(tmp_path / NAME, chunk=4).episodes[0].samples) == 2
+    assert "nothing to finish" in CliRunner().invoke(main, ["record", str(tmp_path), "--finish"]).output
+
+
+def test_a_kill_while_an_episode_is_finished_costs_nothing(tmp_path):
+    whole = write(tmp_path / "whole", controls=5, frames=3, flags=True)
+    part = killed(tmp_path / NAME)
+    for name in ("control_data.csv", "frame_data.csv", "episode_data.json"):
+        (part / name).write_bytes((whole / name).read_bytes())
+    for gone in ("frame.rows", "control.rows"):
+        (part / gone).unlink()
+    assert finish_killed(part) == tmp_path / NAME
+    assert (tmp_path / NAME / "episode_data.json").read_bytes() == (whole / "episode_data.json").read_bytes()
+
+
+def test_what_is_being_recorded_is_not_finished(tmp_path):
+    with EpisodeWriter(tmp_path / NAME, About(), resolution=None) as writer:
+        writer.control(100, 33, 1500, 136, 21308, 1016)
+        writer.frame(100, FRAME)
+        assert not find_killed(tmp_path)
+        with pytest.raises(EpisodeError, match="is being recorded"):
+            finish_killed(tmp_path / f".{NAME}.part")
+    with pytest.raises(EpisodeError, match="nothing usable was recorded; remove it"):
+        finish_killed(killed(tmp_path / "episode_2", frames=0))
 
 
 def test_format_of_a_real_recording_to_the_byte(tmp_path):
@@ -94,34 +158,19 @@ def test_format_of_a_real_recording_to_the_byte(tmp_path):
 def test_folder_and_files(tmp_path):
     folder = write(tmp_path / "new" / NAME)
     assert sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*")) == [
-        "control_data.csv",
-        "episode_data.json",
-        "frame_data.csv",
-        "frames",
-        "frames/frame_000001.jpg",
+        "control_data.csv", "episode_data.json", "frame_data.csv", "frames", "frames/frame_000001.jpg",
         "frames/frame_000002.jpg",
-    ]
+    ]  # fmt: skip
     assert [p.name for p in folder.parent.iterdir()] == [NAME]
     episode = json.loads((folder / "episode_data.json").read_text())
     assert list(episode) == [
-        "episode_id",
-        "action_label",
-        "start_time",
-        "end_time",
-        "duration",
-        "metadata",
-        "control_samples",
+        "episode_id", "action_label", "start_time", "end_time", "duration", "metadata", "control_samples",
         "frame_samples",
-    ]
+    ]  # fmt: skip
     assert list(episode["metadata"]) == [
-        "camera_fps",
-        "camera_resolution",
-        "arduino_port",
-        "total_control_samples",
-        "total_frames",
-        "avg_control_rate",
-        "avg_frame_rate",
-    ]
+        "camera_fps", "camera_resolution", "arduino_port", "total_control_samples", "total_frames",
+        "avg_control_rate", "avg_frame_rate",
+    ]  # fmt: skip
     assert episode["episode_id"] == NAME
     assert episode["duration"] == pytest.approx(2 / 30)
     assert episode["metadata"]["avg_control_rate"] == pytest.approx(45)

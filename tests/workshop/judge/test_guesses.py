@@ -58,8 +58,9 @@ def noisy(sample):
         (lambda s: np.tile(s.state, (CHUNK, 1)), ["the last action again"]),
         (lambda s: np.zeros((CHUNK, 2)), GUESSES),
         (lambda s: -s.chunk, GUESSES),
+        (lambda s: s.chunk * [1, 0], ["the last action again"]),  # it steers well, and its throttle is no better
     ],
-    ids=["good", "copies", "always zero", "the other way"],
+    ids=["good", "copies", "always zero", "the other way", "never drives off"],
 )
 @pytest.mark.parametrize("episodes", [1, LEAST_EPISODES])
 def test_only_a_policy_that_sees_beats_the_guesses(plan, unbeaten, episodes):

@@ -12,13 +12,11 @@ from rover_lib.workshop.judge.plausible import fits
 NAMES = ("steering", "throttle")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Driven(MemorySample):
     chunk: np.ndarray
     is_pad: np.ndarray
-    row: int
     time_s: float
-    episode: str = "episode_1"
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +26,10 @@ def driven(tiny):
     plans = predictions(ACT(tiny.config, tiny.weights), [inputs_of(s, tiny.config) for s in samples]).numpy()
     noisy = plans + rng.normal(0, 0.1, plans.shape) * plans.std((0, 1))
     none = np.zeros(plans.shape[1], bool)
-    return [Driven(s.state, s.picture, noisy[i], none, i, i / 30) for i, s in enumerate(samples)]
+    return [
+        Driven(s.state, s.picture, i, "episode_1", chunk=noisy[i], is_pad=none, time_s=i / 30)
+        for i, s in enumerate(samples)
+    ]
 
 
 def ranges(driven):

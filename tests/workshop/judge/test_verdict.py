@@ -55,8 +55,15 @@ def test_the_demo_deploys_static(demo):
     assert row(judged, "mixed")["because"].startswith("is no better than static INT8")
     assert "times as long as static INT8" in row(judged, "fp32")["because"]
     assert len(judged["next"]) == 3
-    assert commands(judged)[0] == "rover drive runs/mine/policy_static.pt --world --max-seconds 60"
+    assert commands(judged)[0] == "rover view runs/mine/policy_static.pt"
     assert "rover_artifact=runs/mine/policy_static.pt" in commands(judged)[1]
+
+
+def test_of_two_that_are_as_good_the_smaller_is_deployed(monkeypatch):
+    for name, value in (("_candidates", list), ("_work_key", lambda rows: None), ("error_pct", lambda row: 1.0)):
+        monkeypatch.setattr(v, name, value)
+    rows = [{"mode": mode, "size_mb": size} for mode, size in zip(v.PREFERRED, (100, 20), strict=False)]
+    assert v._best(rows, {"worth_pct": 10, "better_points": 0.1})["size_mb"] == 20
 
 
 def test_what_a_workstation_measures_of_memory_fails_nothing(demo):
@@ -217,6 +224,16 @@ def test_on_a_busy_machine_the_least_times_are_compared(demo):
     assert "times as long as static INT8" in row(judged, "fp32")["because"]
     benchmark["cpu_per_core_pct"] = [100.0] * 64  # of a machine of which this process may use two: nobody can tell
     assert judge(demo)["deploy"] == "fp32"
+
+
+def test_what_does_more_work_is_not_called_faster(demo):
+    timed = demo["benchmark"]["artifacts"]
+    timed["mixed"]["latency_p50_ms"] = 0.8 * timed["static"]["latency_p50_ms"]  # by chance, on a busy machine
+    demo["quantize"]["modes"]["mixed"]["float_blocks"] = ["encoder.0.attention"]
+    demo.pop("arm", None)
+    judged = judge(demo)
+    assert judged["deploy"] == "static" and "are chance" in row(judged, "mixed")["because"]
+    assert row(judged, "mixed")["times_faster"] == row(judged, "static")["times_faster"]
 
 
 def test_nobody_who_drove_and_an_action_that_is_not_judged_are_said(demo):

@@ -310,7 +310,11 @@ def test_lerobots_training_takes_it(mixed, tmp_path):
     """LeRobot's training derives the policy's features from the dataset and loads batches; both work."""
     import torch
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from lerobot.datasets.utils import dataset_to_policy_features
+
+    try:
+        from lerobot.utils.feature_utils import dataset_to_policy_features  # 0.6
+    except ImportError:
+        from lerobot.datasets.utils import dataset_to_policy_features
 
     from rover_lib.onboard.recording.outcome import label
 

@@ -43,7 +43,8 @@ def info(**changes):
         "observation.state": {"dtype": "float32", "shape": [2], "names": CAR},
         "action": {"dtype": "float32", "shape": [2], "names": CAR},
     }
-    written = {"codebase_version": "v3.0", "fps": FPS, "features": features, "total_episodes": 1, "data_path": "data"}
+    written = {"codebase_version": "v3.0", "fps": FPS, "features": features, "total_episodes": 1}
+    written["data_path"] = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
     return written | changes
 
 

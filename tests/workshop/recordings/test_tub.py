@@ -107,12 +107,9 @@ def test_an_episode_ends_where_records_are_missing(tmp_path):
     recordings = read_tub(tub(tmp_path / "tub", rows, deleted=[20, 21]), LEFT)
     starts = {e.id: (e.samples[0].row, len(e.samples)) for e in recordings.episodes}
     assert starts == {
-        "21-08-21_0 from 0": (0, 5),
-        "21-08-21_0 from 6": (1, 13),
-        "21-08-21_0 from 22": (1, 17),
-        "21-08-21_1 from 40": (0, 30),
-        "21-08-21_1 from 70": (1, 29),
-    }
+        "21-08-21_0 from 0": (0, 5), "21-08-21_0 from 6": (1, 13), "21-08-21_0 from 22": (1, 17),
+        "21-08-21_1 from 40": (0, 30), "21-08-21_1 from 70": (1, 29),
+    }  # fmt: skip
     expected = {"deleted_record": 2, "a_pilot_drove": 1, "records_missing": 2, "hole_in_time": 1}
     assert kinds(recordings) == expected
     assert all(fault.handled == "left out" for fault in recordings.faults)

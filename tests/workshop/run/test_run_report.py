@@ -118,7 +118,7 @@ def test_commands_work_as_they_are_printed(run_dir, monkeypatch):
     monkeypatch.setattr(report.sys, "executable", str(programs / "python"))
     monkeypatch.setenv("PATH", "/usr/bin")
     assert report.typed("rover list") == ".venv/bin/rover list" and report.typed("make watch") == "make watch"
-    assert "\n  .venv/bin/rover drive runs/mine" in report.text(report.write(run_dir)["metrics"])
+    assert "\n  .venv/bin/rover view runs/mine" in report.text(report.write(run_dir)["metrics"])
     monkeypatch.setenv("PATH", str(programs))
     assert report.typed("rover list") == "rover list"
 
@@ -139,7 +139,10 @@ def test_the_page_needs_no_other_file_and_fits_a_phone(run_dir):
     html = (run_dir / report.PAGE).read_text()
     page = Page(html)
     assert ("meta", {"name": "viewport", "content": "width=device-width"}) in page.tags
-    assert not re.search(r"""(?:src|href)=["'](?!data:)""", html) and "<script" not in html
+    assert not re.search(r"""src=["'](?!data:)""", html) and "<script" not in html
+    assert (
+        all((run_dir / link).is_file() for link in re.findall('href="([^"]*)"', html)) and 'href="compare.json"' in html
+    )
     assert html.index('class="wide"') < html.index("<table") and "max-width:100%" in html  # what is wide scrolls itself
     (picture,) = [a["src"] for tag, a in page.tags if tag == "img"]
     assert b64decode(picture.removeprefix("data:image/png;base64,")) == PNG

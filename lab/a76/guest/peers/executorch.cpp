@@ -39,12 +39,13 @@ int policy_output_size(void* loaded, int axis) {
   return output.ok() && axis < static_cast<int>(output->sizes().size()) ? output->sizes()[axis] : -1;
 }
 
-// state: (1, states) float32; frame: (1, 3, height, width) float32; chunk: room for the first output, float32.
+// state: (1, states) float32, not given to a network if states is 0; frame: (1, 3, height, width) float32; chunk: room for the first output, float32.
 // Returns 0, or ExecuTorch's error code.
 int policy_run(void* loaded, float* state, int states, float* frame, int height, int width, float* chunk) {
   TensorPtr state_in = from_blob(state, {1, states}, ScalarType::Float);
   TensorPtr frame_in = from_blob(frame, {1, 3, height, width}, ScalarType::Float);
-  auto outputs = static_cast<Policy*>(loaded)->module->forward({state_in, frame_in});
+  Module& module = *static_cast<Policy*>(loaded)->module;
+  auto outputs = states ? module.forward({state_in, frame_in}) : module.forward(frame_in);
   if (!outputs.ok()) return static_cast<int>(outputs.error());
   const auto& out = outputs->at(0).toTensor();
   std::memcpy(chunk, out.const_data_ptr<float>(), out.nbytes());

@@ -1,0 +1,36 @@
+"""Which serial port is the Arduino's, where nobody says it."""
+
+from pathlib import Path
+
+from rover_lib.onboard.errors import RoverError
+
+PROVISIONED = "rover-arduino"  # the name that provisioning gives it
+KINDS = ("ttyACM*", "ttyUSB*")
+
+
+class PortError(RoverError):
+    """It is not clear which port is the Arduino's."""
+
+
+def list_ports(dev: Path = Path("/dev")) -> dict[Path, str]:
+    """Return each USB serial port, with its name in serial/by-id ("" where it has none)."""
+    names = {link.resolve(): link.name for link in sorted((dev / "serial" / "by-id").glob("*"))}
+    return {port: names.get(port.resolve(), "") for kind in KINDS for port in sorted(dev.glob(kind))}
+
+
+def find_port(dev: Path = Path("/dev")) -> str:
+    """Return the port of the only Arduino: the provisioned name, else the only USB serial port.
+
+    Raises PortError if there is none, or several, which it lists.
+    """
+    if (dev / PROVISIONED).exists():
+        return str(dev / PROVISIONED)
+    ports = list_ports(dev)
+    if len(ports) == 1:
+        return str(next(iter(ports)))
+    found = ", ".join(f"{port} ({name})" if name else str(port) for port, name in ports.items())
+    raise PortError(
+        "which serial port is the Arduino's?" if ports else "no Arduino is plugged in",
+        found=found or "no /dev/ttyACM* and no /dev/ttyUSB*",
+        remedy=f"say it: --port {next(iter(ports))}" if ports else "plug it in; dmesg | tail says what the kernel saw",
+    )

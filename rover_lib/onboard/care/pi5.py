@@ -1,0 +1,90 @@
+"""What a Raspberry Pi 5 takes for counted work, by the fit that `python -m lab clock` made: computed, never measured.
+
+    predict_ms(Work(instructions_g=1.44, near_lines_g=0.03, far_lines_g=0.005), threads=3)
+
+The fit has three terms, and each has a meaning. What a core does itself: the instructions of the busiest thread, and
+the lines of 64 bytes that this thread fetches into its core's first cache. What all cores share: the lines between them
+and the memory. The two overlap, so that the time is the root of the sum of their squares. The low and the high end are
+as far off as nine in ten published times were from a fit that did not know them. docs/clock.md shows those.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rover_lib.onboard.errors import ParamsError
+
+FITTED = Path(__file__).with_name("pi5.json")  # written by `python -m lab clock`
+CORES = 4
+DRIVING = 3  # threads of a policy that drives: all cores but one, which is left for the loop, the camera and the view
+
+
+class Span(NamedTuple):
+    """A computed time of one inference in ms: the expected one, between two ends."""
+
+    low: float
+    ms: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Work:
+    """What one inference executes in one thread, in 10**9.
+
+    near_lines_g, far_lines_g: lines of 64 bytes, as `lab.a76.core.Emulation` counts them.
+    alone: the share of the instructions, 0 to 1, that one thread executes while the others wait.
+    """
+
+    instructions_g: float
+    near_lines_g: float
+    far_lines_g: float
+    alone: float = 0.0
+
+    @classmethod
+    def of(cls, row: Mapping[str, Any]) -> "Work":
+        """Return the work that a row of arm.json or clock.json tells of."""
+        return cls(row["instructions_g"], row["near_lines_g"], row["far_lines_g"], row["alone"])
+
+    def terms(self, threads: int) -> tuple[float, float, float]:
+        """Return the busiest thread's instructions and near lines, and the far lines of all, in 10**9.
+
+        Raises ParamsError for threads that a Pi 5 does not have.
+        """
+        if not 1 <= threads <= CORES:
+            raise ParamsError(f"a Raspberry Pi 5 has {CORES} cores", found=threads, remedy="give 1 to 4 threads")
+        part = self.alone + (1 - self.alone) / threads
+        return self.instructions_g * part, self.near_lines_g * part, self.far_lines_g
+
+
+@cache
+def fitted() -> dict[str, Any]:
+    """Return the fit: `ns` of each term, `off` by threads (see `spread`), and `gmac_per_s` (see `estimate_ms`)."""
+    return json.loads(FITTED.read_text())
+
+
+def time_ms(terms: Sequence[float], ns: Sequence[float]) -> float:
+    """Return the time of one inference from the terms of its work, in 10**9, and what one of each takes."""
+    return 1e3 * math.hypot(terms[0] * ns[0] + terms[1] * ns[1], terms[2] * ns[2])
+
+
+def predict_ms(work: Work, threads: int = DRIVING, fit: Mapping[str, Any] | None = None) -> Span:
+    """Return the computed time of one inference, by `fitted` unless another fit is given.
+
+    Raises ParamsError for threads that a Pi 5 does not have.
+    """
+    fit = fit or fitted()
+    return spread(time_ms(work.terms(threads), fit["ns"]), fit["off"]["1" if threads == 1 else "4"])
+
+
+def spread(ms: float, off: float) -> Span:
+    """Return a time with its ends. off: the largest natural logarithm of a ratio of two times."""
+    return Span(ms * math.exp(-off), ms, ms * math.exp(off))
+
+
+def estimate_ms(gmac: float) -> float:
+    """Return the high end for INT8 that was not counted, by its 10**9 multiply-accumulates: a rough estimate."""
+    return 1e3 * gmac / fitted()["gmac_per_s"]
