@@ -131,12 +131,11 @@ def test_int8_survives_light_that_jumps(demo_run):
     calibration = calibrate(dazzled, Recipe.of(params(), 100).choose(parts.calibration)[0])
     named = describe_odd(calibration.frames, calibration.seen)
     assert named["times"] > 20 and max(named["rows"]) < 3
-    scheme, table = prepare_chooser(dazzled, loaded, calibration).observer(Scheme(), ("minmax", "frames"))
+    scheme, _ = prepare_chooser(dazzled, loaded, calibration).observer(Scheme(), ("minmax", "frames"))
     judge = Chooser(dazzled, calibration, pick_evenly(parts.held_out, 60), loaded.recordings.action_range())
     found = {
         s.observer: judge.error(quantize(dazzled, s, calibration).module) for s in (Scheme(observer="minmax"), scheme)
     }
-    print(named, table, found)
     for action in ("steering", "throttle"):
         assert found["frames"][f"{action}_mae_pct"] <= gates[f"{action}_mae_pct"]
     assert worst(found["minmax"]) > 2 * worst(found["frames"])
