@@ -321,7 +321,7 @@ def test_inspect_layers_sees_clipping(tiny, calibration):
 def test_chooses_by_error(tiny, calibration):
     chooser = Chooser(tiny, calibration, memory_samples(3, seed=8), RANGE)
     scheme, table = chooser.observer(Scheme())
-    assert set(table) == set(OBSERVERS)
+    assert set(table) == set(OBSERVERS) - {"frames"}  # no frame is odd
     least = min(max(row.values()) for row in table.values())
     assert max(table[scheme.observer].values()) == least or scheme.observer == "minmax"
     sensitivity = chooser.sensitivity(scheme)
