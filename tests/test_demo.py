@@ -121,8 +121,8 @@ class _Flash(Sample):
 def test_int8_survives_light_that_jumps(demo_run):
     """Each drive begins white, and a policy whose statistics are from elsewhere answers that far more strongly.
 
-    Not in every `make test`, as it asks more of some trainings of the demo than the choice of ranges can give: where the
-    odd frames' plans lose much by narrow ranges, it keeps min-max.
+    Not in every `make test`: it asks more of some trainings of the demo than the choice of ranges can give. Where the
+    odd frames' plans lose much by narrow ranges, min-max is kept.
     """
 
     def jump(samples):
