@@ -121,7 +121,7 @@ def test_a_policy_from_elsewhere_keeps_its_gates(tmp_path):
     """In 3 to 4 % of these frames layer4 is 50 to 270 times larger; every other observer is 2 and 10 % off."""
     folder = odd_policy()
     loaded = load(folder / "best_model.pth", folder / "episodes")
-    recipe = replace(pipeline.Recipe.of(params()), samples=120)
+    recipe = pipeline.Recipe.of(params())
     calibration = calibrate(loaded.checkpoint, recipe.choose(loaded.parts.calibration)[0])
     named = frames.describe_odd(calibration.frames, calibration.seen)
     assert named["block"] == "backbone.layer4" and max(named["rows"]) < 10 and named["times"] > 50

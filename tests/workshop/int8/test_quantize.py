@@ -387,7 +387,7 @@ def test_choosing_holds_no_policy_that_it_has_judged(tiny, calibration):
 @pytest.mark.slow
 def test_an_action_that_never_changes_takes_no_part_in_choosing(tiny, calibration):
     chooser = Chooser(tiny, calibration, memory_samples(2, seed=8), {"steering": (-0.5, 0.5), "throttle": (0.06, 0.06)})
-    assert chooser.warnings == ["throttle never changes in these recordings: not judged"]
+    assert [w.partition(",")[0] for w in chooser.warnings] == ["throttle never changes in these recordings"]
     scheme, table = chooser.observer(Scheme(), ["minmax", "histogram"])
     assert all(row["throttle_mae_pct"] is None and row["steering_mae_pct"] > 0 for row in table.values())
     blocks = {"backbone.stem": table["minmax"], "image_project": table["histogram"]}
