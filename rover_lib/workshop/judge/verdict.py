@@ -290,8 +290,8 @@ def _remedies(
         return [f"INT8 cannot make it smaller; a smaller policy can: `{_smaller(stages, names)}`."]
     action = key.removesuffix("_mae_pct").removesuffix("_of_spread_pct") if key.endswith("_pct") else None
     remedies = [_of_mixed(params, rows)]
-    # Where frames are odd, training with INT8's rounding began from bad ranges and repaired little; from good ones it is
-    # untried.
+    # Where frames are odd, training with INT8's rounding began from bad ranges and repaired little. From good
+    # ones it is untried.
     if stages["quantize"].get("odd"):
         remedies.append(
             "The frames that the cautions name take the steps of INT8 from all others: leave out drives that should "
