@@ -104,7 +104,7 @@ def clock(ctx: click.Context, output: Path | None, graphs: Path | None) -> None:
     """Predict what networks and our policies take on a Raspberry Pi 5, and hold it against published times.
 
     OUTPUT [default: results/clock/clock.json] keeps the counts, so that only what it lacks is counted, in the emulated
-    Cortex-A76: everything takes half an hour on two quiet cores. The exit code is 1 if a gate of lab/params.yml does
+    Cortex-A76: how long all of it takes has not been measured. The exit code is 1 if a gate of lab/params.yml does
     not hold.
     """
     from lab.a76.clock import OUTPUT, table, tell_time
