@@ -90,6 +90,9 @@ def full_policy():
     """A policy of the user's size: 84 million parameters, which no process keeps longer than it needs them."""
     from policies import FULL, lerobot_policy
 
+    from rover_lib.workshop.int8.quantize import forget_graphs
+
+    forget_graphs()  # of what tests before have left, up to LEFT_MB, for there is no room beside it
     return lerobot_policy(**FULL)
 
 

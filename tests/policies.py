@@ -44,6 +44,7 @@ def lerobot_policy(
     from torchvision.ops.misc import FrozenBatchNorm2d
 
     if first:
+        gc.collect()
         gc.freeze()  # each collection would take 0.3 s to find that all those modules are still used
     cameras = cameras or {"observation.images.cam_front": (72, 128)}
     config.setdefault("n_action_steps", config.get("chunk_size", 100))

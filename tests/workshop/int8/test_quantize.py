@@ -4,7 +4,9 @@ import functools
 import gc
 import itertools
 import math
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -40,8 +42,8 @@ def inputs(checkpoint, count=4, seed=3):
 
 @pytest.fixture(scope="module")
 def made(tiny, calibration):
-    """The tiny policy quantized by a scheme; each is made once, which takes seconds, and left as it is."""
-    return functools.cache(lambda scheme: quantize(tiny, scheme, calibration))
+    """The tiny policy quantized by a scheme, and left as it is; of 70 MB each, the last two are not made again."""
+    return functools.lru_cache(2)(lambda scheme: quantize(tiny, scheme, calibration))
 
 
 @pytest.mark.slow
@@ -503,9 +505,8 @@ def he_weights(config: ActConfig) -> dict[str, torch.Tensor]:
     return weights
 
 
-@pytest.mark.slow
-def test_the_users_full_size_static_artifact_is_at_most_70_mb(tmp_path):
-    """The floor is 66.4 MB, a byte per weight that acts; the optimizer and the VAE encoder are not in it.
+def full_static_mb(folder: Path) -> float:
+    """Return the size of the user's policy as a static artifact, with random weights.
 
     Calibrated on small frames: their size adds 0.5 MB of positions at 640x360, and no weight.
     """
@@ -514,5 +515,15 @@ def test_the_users_full_size_static_artifact_is_at_most_70_mb(tmp_path):
     samples = memory_samples(2)
     calibration = calibrate(checkpoint, samples)
     quantized = quantize(checkpoint, Scheme("static"), calibration)
-    export(quantized, checkpoint, tmp_path / "static.pt", samples=samples, calibration=calibration)
-    assert 66 < (tmp_path / "static.pt").stat().st_size / 1e6 <= 69
+    export(quantized, checkpoint, folder / "static.pt", samples=samples, calibration=calibration)
+    return (folder / "static.pt").stat().st_size / 1e6
+
+
+@pytest.mark.slow
+def test_the_users_full_size_static_artifact_is_at_most_70_mb(tmp_path):
+    """The floor is 66.4 MB, a byte per weight that acts; the optimizer and the VAE encoder are not in it.
+
+    In a process of its own, as it takes 2 GB.
+    """
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+        assert 66 < process.submit(full_static_mb, tmp_path).result() <= 69
