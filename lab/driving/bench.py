@@ -106,6 +106,7 @@ class Drive(RoverCommand):
     """
 
     arguments: tuple[str, ...] = ()  # further arguments of the command
+    in_terminal = False  # whether it waits for the human's gesture, which takes a second and a half after a reset
 
     def __init__(self, bench: "DrivingBench", start: str):
         self.start = start
@@ -114,6 +115,8 @@ class Drive(RoverCommand):
         self.log = bench.disk / "flight.log" if start == "disk" else bench.folder / "flight.log"
         env: dict[str, str] = {}
         code = "from lab.driving.policy import obey_pictures; obey_pictures(); "
+        if self.in_terminal:
+            code += "import os, pty; kept, terminal = pty.openpty(); os.dup2(terminal, 0); "
         if start in INSIDE:
             code += f"from {__name__} import on_signal; on_signal({start!r}); "
         run = [sys.executable, "-c", f"{code}from rover_lib.cli import main; main()"]
@@ -147,6 +150,12 @@ class Drive(RoverCommand):
     def mark(self) -> None:
         """Note that what it has printed on stderr until now is from before the fault."""
         self._marked = len(self.errors())
+
+
+class PatientDrive(Drive):
+    """A drive in a terminal: it waits for a human's gesture."""
+
+    in_terminal = True
 
 
 # ---- the bench
@@ -233,7 +242,7 @@ class DrivingBench:
 
     def restart(self, start: str = "") -> None:
         """Start a new drive, and wait until it has been driving for a while."""
-        drive = self.start(start)
+        drive = self.start(start, make=PatientDrive)
         deadline = time.monotonic() + START_S
         first_s = None  # the time of its first command
         while first_s is None or time.monotonic() - first_s < AT_SPEED_S or not self.driving:

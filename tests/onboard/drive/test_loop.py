@@ -748,7 +748,7 @@ def test_a_loop_that_is_dead_ends_the_process():
     """In a process, since it ends that; a loop that ticks, or has ended, does not."""
     code = """
 import sys, threading, time
-from rover_lib.onboard import loop, watch
+from rover_lib.onboard.drive import loop, watch
 watch.HUNG_S = 0.3
 class Log:
     def event(self, text, **_): print(text, flush=True)

@@ -623,6 +623,22 @@ class Policy:
         return np.tile(np.float32([0.1, 0.05]), (32, 1))
 
 
+class OneFile:
+    """An artifact that is opened and proven."""
+
+    manifest: ClassVar[dict] = {"mode": "fake", "cameras": [{"height": 160, "width": 320}]}
+    content_hash = "ab12"
+
+    def __init__(self, path):
+        self.path = path
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        pass
+
+
 def write_film(path):
     """As long as the slowest of these tests may take on a busy machine, four minutes: a film that ends is a fault."""
     frames = pictures(0)
@@ -632,7 +648,7 @@ def write_film(path):
 @pytest.mark.slow
 def test_after_a_takeover_the_same_process_waits_for_another_request(systemd, tmp_path, monkeypatch):
     """The port stays open: opened again, it might reset the Arduino, and the human would lose the car."""
-    for name, fake in {"ServoLink": Link, "PolicyProcess": Policy, "content_hash": lambda path: "ab12"}.items():
+    for name, fake in {"ServoLink": Link, "PolicyProcess": Policy, "Artifact": OneFile}.items():
         monkeypatch.setattr(f"rover_lib.onboard.drive.drive.{name}", fake)
     write_film(tmp_path / "film.mjpeg")
     answers = []
@@ -697,7 +713,7 @@ class DrivenLink(Link):
 @pytest.mark.slow
 @pytest.mark.parametrize("ends", ["let go", "SIGTERM"])
 def test_a_takeover_is_recorded_and_then_the_service_waits_disarmed(systemd, tmp_path, monkeypatch, ends):
-    for name, fake in {"ServoLink": DrivenLink, "PolicyProcess": Policy, "content_hash": lambda path: "ab12"}.items():
+    for name, fake in {"ServoLink": DrivenLink, "PolicyProcess": Policy, "Artifact": OneFile}.items():
         monkeypatch.setattr(f"rover_lib.onboard.drive.drive.{name}", fake)
     monkeypatch.setattr("rover_lib.onboard.drive.takeover.LET_GO_S", 0.5)
     monkeypatch.setattr(s, "FINISH_S", 0.0)  # the watchdog hears of what happens, and of nothing else
