@@ -14,7 +14,6 @@ from lab.pi.fleet import REPORT as REPORT_TASK
 from lab.pi.fleet import results_of, wanted_of
 from lab.pi.playbooks import REPOSITORY
 
-ABOUT = {"name": "a" * 64, "sha256": "b" * 64, "bytes": 100, "parts": 2}
 GOOD = {"healthy": True, "status_true": True, "healed_by_rerun": True}
 
 
