@@ -1,6 +1,6 @@
 """The bench for deployments: a rover that is deployed to while something goes wrong, and the network to it.
 
-The faults of a deployment and the fleet use it. It sees on the rover's disk how far a deployment has come, by looking
+It sees on the rover's disk how far a deployment has come, by looking
 at it from this machine every millisecond or so. So the code that is deployed needs no hook for tests.
 """
 
@@ -351,12 +351,6 @@ class DeploymentBench:
         if self.disk_is_small:
             self.pi.inside("mount", "-o", "remount,size=1g", f"/{STATE}")
             (self.state / "ballast").unlink(missing_ok=True)
-
-    def make_read_only(self) -> None:
-        """Make the rover's disk read-only, like that of a dying card, until the row is over."""
-        self.pi.inside("mount", "--bind", f"/{STATE}", f"/{STATE}")
-        self.pi.inside("mount", "-o", "remount,bind,ro", f"/{STATE}")
-        self.undo.callback(self.pi.inside, "umount", "--lazy", f"/{STATE}", check=False)
 
     def clean(self) -> None:
         """Undo what the fault has left. If the rover went off, its mounts are gone anyway, so errors are ignored."""
