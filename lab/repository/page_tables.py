@@ -197,17 +197,17 @@ def _faults(root: Path) -> list[Row]:
     return [
         ("what", "figure"),
         (
-            "faults that must stop a driving car: stopped; time from the fault to throttle off",
-            f"{right('stopped')}, at most {worst:.0f} ms",
+            "faults that must stop a driving car: throttle off",
+            f"{right('stopped')}, after at most {worst:.0f} ms",
         ),
-        ("faults that must not stop it before the plan is too old: handled", right("continues")),
-        ("faults before the start that must keep it from being armed: not armed", right("refused")),
-        ("human moves a stick: time until the pins follow the human", f"at most {takeover:.0f} ms; designed for 46"),
+        ("faults that must not stop it: it drove on while its plan was young enough", right("continues")),
+        ("faults that must keep it from being armed", right("refused")),
+        ("from a moved stick to the human's pulses", f"at most {takeover:.0f} ms"),
         (
-            "pulses that were recorded, replayed and measured again: difference",
+            "pulses, recorded, replayed and measured again",
             f"within {report['bytes']['worst_us']:.0f} us",
         ),
-        ("drives with random faults in virtual time that broke a safety rule", broken),
+        ("random drives in virtual time that broke a safety rule", broken),
         *_view(root),
     ]
 
@@ -216,16 +216,16 @@ def _view(root: Path) -> list[Row]:
     """What a view does to a drive; `python -m lab view`."""
     report = _metrics(root / "results" / "lab", "view")
     stop, late = report["stop"], report["late_ms"]
-    cost = f"{late['with']['p99']:.2f} ms at p99; {late['without']['p99']:.2f} without a view, measured in turns"
+    cost = f"{late['with']['p99']:.2f} ms at p99; {late['without']['p99']:.2f} without"
     picture = f"{report['pictures_hz']:.0f} a second, {report['delay_ms']['p95']:.0f} ms old at p95"
     return [
         (
-            "stop button of the view: drives stopped; time from the click to throttle off",
-            f"{stop['stopped']} of {stop['stops']}, at most {stop['stop_ms']['max']:.0f} ms",
+            "clicks on the view's stop button: throttle off",
+            f"{stop['stopped']} of {stop['stops']}, after at most {stop['stop_ms']['max']:.0f} ms",
         ),
-        (f"lateness of the loop's commands while {report['pages']} pages of the view are open", cost),
+        (f"commands are late, with {report['pages']} pages of the view", cost),
         ("pictures in the view", picture),
-        ("processor time of the view, share of one core", f"{report['cpu_pct']:.1f} %"),
+        ("the view's share of a core", f"{report['cpu_pct']:.1f} %"),
     ]
 
 
@@ -273,18 +273,15 @@ def _students(run: str, root: Path) -> list[Row]:
 def _learning(root: Path) -> list[Row]:
     """The demo's policy before and after learning on, from corrections and from demonstrations."""
     policies = _metrics(root / "results" / "demo", "learn")["policies"]
-    conditions = [key for key, value in policies[0].items() if isinstance(value, dict)]
+    conditions = {key: value["trials"] for key, value in policies[0].items() if isinstance(value, dict)}
     words = {"alone": "left alone", "decoy": "beside a red decoy"}
 
     def row(policy: Mapping[str, Any]) -> Row:
         name = policy["arm"] + (f", round {policy['round']}" if policy["round"] else "")
-        hits = (f"{policy[how]['hits']} of {policy[how]['trials']}" for how in conditions)
-        return (name, f"{policy['human_s']:.0f}", *hits)
+        return (name, f"{policy['human_s']:.0f}", *(str(policy[how]["hits"]) for how in conditions))
 
-    return [
-        ("policy", "seconds of human driving", *(f"hits, {words.get(how, how)}" for how in conditions)),
-        *map(row, policies),
-    ]
+    hits = (f"{words.get(how, how)}: hits of {trials}" for how, trials in conditions.items())
+    return [("policy", "seconds by a human", *hits), *map(row, policies)]
 
 
 def _parameters(root: Path) -> list[Row]:
