@@ -13,6 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import nbformat
+
 from rover_lib.onboard.care.pi5 import CORES, DRIVING
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path, read_stage
@@ -285,14 +287,13 @@ def _learning(root: Path) -> list[Row]:
 
 
 def _parameters(root: Path) -> list[Row]:
-    """What papermill's -p sets, as the cells of parameters say it; run_dir is in all of them."""
+    """The notebooks' titles, and what papermill's -p sets; run_dir is in all of them."""
     rows: list[Row] = []
     for path in sorted((root / "notebooks").glob("*.ipynb")):
-        for name, default, why in parameters_in(path):
-            if name == "run_dir":
-                continue
-            rows.append((f"[{path.stem}](../notebooks/{path.name})", f"`{name}`", f"`{default}`", why))
-    return [("notebook", "parameter", "default", "meaning"), *rows]
+        title = nbformat.read(path, as_version=4).cells[0].source.partition("\n")[0].removeprefix("# ")
+        names = ", ".join(f"`{name}`" for name, *_ in parameters_in(path) if name != "run_dir")
+        rows.append((f"[{path.stem}](../notebooks/{path.name})", title, names))
+    return [("notebook", "question", "parameters to turn"), *rows]
 
 
 TABLES: dict[str, Callable[[Path], list[Row]]] = {
