@@ -2,7 +2,6 @@
 
 import errno
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -47,16 +46,6 @@ def test_help(command):
 def test_commands_are_said_whole_in_80_columns(group):
     lines = CliRunner().invoke(group, ["--help"], terminal_width=80).output.splitlines()[1:]
     assert max(map(len, lines)) <= 80 and not [line for line in lines if line.endswith("...")]
-
-
-def test_a_reader_who_has_seen_enough_is_no_error():
-    """`rover inspect X | head -1`: the pipe is closed while there is more to print."""
-    read, write = os.pipe()
-    os.close(read)
-    with os.fdopen(write, "w") as stream:
-        unread = onboard.Unread(stream)
-        for _ in range(3):
-            print("more", file=unread, flush=True)
 
 
 def test_completion_is_of_commands_and_options():
@@ -182,20 +171,6 @@ def test_a_training_that_is_stopped_says_that_it_goes_on(tmp_path, monkeypatch):
 def test_debug_shows_the_traceback(tmp_path):
     result = rover("--debug", "inspect", tmp_path / "nothing.pt")
     assert result.exit_code == 1 and result.exception is not None
-
-
-@pytest.mark.slow
-def test_benchmark_writes_its_stage(artifacts, tmp_path):
-    out = tmp_path / "benchmark-here.json"
-    result = rover(
-        "benchmark", artifacts["static"], artifacts["fp32"], "--iterations", 3, "--warmup", 1, "--threads", 1,
-        "--output", out, "--json",
-    )  # fmt: skip
-    assert result.exit_code == 0, result.output
-    metrics = json.loads(out.read_text())["metrics"]
-    keys = "latency_p50_ms latency_p95_ms latency_p99_ms latency_mean_ms latency_max_ms throughput_fps "
-    keys += "control_rate_hz peak_memory_mb cpu_pct floor_ms"
-    assert set(keys.split()) <= set(metrics) and set(metrics["artifacts"]) == {"policy_static", "policy_fp32"}
 
 
 def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypatch):

@@ -320,7 +320,7 @@ def take_over(process, board):
 @pytest.mark.slow
 @needs.simavr
 @pytest.mark.parametrize(
-    "happens", [interrupt, kill, *(pytest.param(what, marks=pytest.mark.release) for what in (stop, take_over))]
+    "happens", [interrupt, *(pytest.param(what, marks=pytest.mark.release) for what in (kill, stop, take_over))]
 )
 @needs.real_time
 def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifact, plugin, tmp_path):

@@ -97,7 +97,7 @@ def serve() -> None:
 
 @pytest.fixture(scope="module")
 def judged():
-    """judged(path, proof) judges an artifact, or a folder of parts, in a process forked from a new interpreter.
+    """judged(path, proof) judges an artifact, or a folder that was packed, in a process forked from a new interpreter.
 
     Not from this one, where a fork could use memory that earlier tests have freed, beyond its limit, and wait for ever
     for a lock that another thread held at that moment.
@@ -482,9 +482,9 @@ def describes(**values: object) -> Callable[[Path], None]:
 
 
 PACKED = {
-    "a part that is a FIFO": ("part-0001", replaced_by(a_fifo), "not a file"),
-    "a part without end": ("part-0001", replaced_by(lambda p: p.symlink_to("/dev/zero")), "not a file"),
-    "a part that is larger": ("part-0001", lambda p: p.write_bytes(bytes(50 << 20)), "larger than it can be"),
+    "a policy that is a FIFO": ("policy.pt", replaced_by(a_fifo), "not a file"),
+    "a policy without end": ("policy.pt", replaced_by(lambda p: p.symlink_to("/dev/zero")), "not a file"),
+    "a policy that is larger": ("policy.pt", lambda p: p.write_bytes(bytes(50 << 20)), "larger than it can be"),
     "a description that is a FIFO": ("release.json", replaced_by(a_fifo), "not what 'rover release pack' writes"),
     "a deep description": (
         "release.json",
@@ -492,9 +492,8 @@ PACKED = {
         "not what 'rover release pack' writes",
     ),
     "a long description": ("release.json", lambda p: p.write_text(" " * 9_000_000), "not what 'rover release pack'"),
-    "a billion parts": ("release.json", describes(parts=10**9, bytes=10**9), "its sizes are impossible"),
-    "a terabyte": ("release.json", describes(bytes=10**12), "its sizes are impossible"),
-    "less than nothing": ("release.json", describes(bytes=-1), "its sizes are impossible"),
+    "a terabyte": ("release.json", describes(bytes=10**12), "its size is impossible"),
+    "less than nothing": ("release.json", describes(bytes=-1), "its size is impossible"),
     "fewer bytes than there are": ("release.json", describes(bytes=1000), "larger than it can be"),
     "another name": ("release.json", describes(name="../../harm"), "its name or sha256 is not a hash"),
     "a terminal's commands": (
@@ -506,8 +505,7 @@ PACKED = {
 
 
 @pytest.mark.parametrize("what", PACKED)
-def test_no_parts_of_another_form_are_joined(artifacts, tmp_path, monkeypatch, refused, what):
-    monkeypatch.setattr("rover_lib.onboard.care.release.PART_BYTES", 20 << 20)
+def test_nothing_packed_in_another_form_is_staged(artifacts, tmp_path, refused, what):
     name, change, message = PACKED[what]
     pack(artifacts["fp32"], tmp_path / "packed", EITHER)
     change(tmp_path / "packed" / name)
