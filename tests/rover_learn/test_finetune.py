@@ -199,21 +199,6 @@ def assert_same(folder, other):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("asked", [2, 4])
-def test_killed_while_it_looks_at_the_recordings_it_goes_on(
-    checkpoint, old, new, recipe, taught, tmp_path, monkeypatch, asked
-):
-    """It is interrupted once in the old recordings, and once in the new ones."""
-    save_each_step(monkeypatch, finetune_module)
-    arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
-    with monkeypatch.context() as patch:
-        interrupt(patch, finetune_module.BatchedPolicy, "features", at=asked)
-        with pytest.raises(KeyboardInterrupt):
-            finetune(checkpoint, [old, new], "better", **arguments)
-    assert_same(finetune(checkpoint, [old, new], "better", **arguments), taught)
-
-
-@pytest.mark.slow
 def test_it_learns_what_the_human_did_and_keeps_what_it_could(checkpoint, old, new, recipe, tmp_path):
     longer = replace(recipe, transformer_steps=150, together_steps=0, correction_weight=1000.0, to_parent=1.0)
     folder = finetune(checkpoint, [old, new], "better", runs_dir=tmp_path, recipe=longer, device="cpu")

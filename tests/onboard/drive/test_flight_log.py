@@ -416,24 +416,6 @@ def test_a_disk_that_takes_a_line_without_its_end(path, monkeypatch, end):
     assert (flight.drives, flight.damaged) == (1, 0)
 
 
-def test_a_long_failure_loses_the_oldest_and_marks_the_gap(path, monkeypatch):
-    monkeypatch.setattr(telemetry, "QUEUE_TICKS", 50)
-    monkeypatch.setattr(telemetry, "RETRY_S", 0.02)
-    path.mkdir()
-    with FlightLog(path, header=HEADER, **LIMITS, flush_s=0.02) as log:
-        until(lambda: log.failures >= 1)
-        for k in range(200):
-            log.tick(tick(k))
-        path.rmdir()
-        until(path.is_file)
-    flight = read_log(path)
-    assert flight.ticks["frame"].tolist() == list(range(150, 200))
-    assert log.dropped == 150
-    assert {e.text: e.fields for e in flight.events}[telemetry.MISSING] == {"ticks": 150}
-    found = flight.summary()
-    assert (found["ticks_not_logged"], found["missed"]) == (150, 0)
-
-
 def test_ticks_that_were_not_logged_are_not_missed(path, monkeypatch):
     monkeypatch.setattr(telemetry, "QUEUE_TICKS", 50)
     with FlightLog(path, header=HEADER, **LIMITS) as log:
