@@ -207,7 +207,7 @@ def _write(
         "pictures": f"{shape[1]}x{shape[0]}" + ("" if shape == recorded else f", recorded {recorded[1]}x{recorded[0]}"),
         "episodes": len(origins),
         "frames": sum(lengths),
-        "frames_in_half_of_the_episodes_at_most": int(np.median(lengths)),
+        "frames_in_a_usual_episode": int(np.median(lengths)),
         "frames_a_second": rate_hz,
         "recorded_episodes": len(recordings.episodes),
         "left_out_pictures_not_whole": broken,

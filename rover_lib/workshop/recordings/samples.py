@@ -24,7 +24,7 @@ OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has an
 
 ACTION_NAMES = CHANNELS
 HANDLED = ("repaired", "recomputed from the pulses", "taken as recorded", "left out")  # what is done about a fault
-REPAIRED = ("serial_burst", "unsorted_control_times", "unsorted_frame_times")
+REPAIRED = ("serial_burst", "unsorted_control_times", "unsorted_frame_times", "reverse_on_a_car_without")
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 
