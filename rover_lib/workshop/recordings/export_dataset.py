@@ -47,6 +47,7 @@ from rover_lib.workshop.recordings.lerobot_dataset import (
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     CAMERA,
+    LEAST_RATED,
     Episode,
     Recordings,
     Sample,
@@ -59,7 +60,6 @@ from rover_lib.workshop.swap_folder import lock_folder
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
 REWARD, DONE = "next.reward", "next.done"
 SIDES_PX = 16, 8192  # smallest and largest side of a picture that an artifact takes
-LEAST_RATED = 10  # frames; fewer do not show a rate, unless no episode is longer
 SHORTEST = 2  # rows in the shortest episode: a single row has no spread to normalise by
 
 

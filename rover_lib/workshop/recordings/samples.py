@@ -175,6 +175,9 @@ def car_of(samples: Iterable[Any]) -> Car:
     return cars[0] if cars else Car()
 
 
+LEAST_RATED = 10  # frames; fewer do not show a rate
+
+
 def frame_rate_hz(samples: Sequence[Sample]) -> float | None:
     """Return one episode's frames per second, from the median time between two neighbouring frames.
 

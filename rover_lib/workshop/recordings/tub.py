@@ -29,7 +29,15 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import DATA_BYTES
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, check_picture
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source
+from rover_lib.workshop.recordings.samples import (
+    LEAST_RATED,
+    Episode,
+    Recordings,
+    Sample,
+    Source,
+    frame_rate_hz,
+    is_another_rate,
+)
 from rover_lib.workshop.untrusted import quote
 
 RATE_HZ = 20.0  # of records without a time: donkeycar's own
@@ -82,6 +90,10 @@ def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: s
     episodes = []
     for i, run in enumerate(progress(runs, desc="reading the tub", total=len(runs))):
         if samples := _samples(run, tub, images, car, first[i], faults):
+            found_hz = frame_rate_hz(samples)
+            if len(samples) >= LEAST_RATED and is_another_rate(found_hz, 1 / usual_s):
+                faults.add(tub, "another_rate", f"{found_hz:.1f} Hz from record {run[0].index} on", len(samples))
+                continue
             length_s = samples[-1].time_s - samples[0].time_s
             name = f"{run[0].session or 'session'} from {run[0].index}"
             episodes.append(Episode(name, tub, "drive", length_s, len(run), len(run), samples, ()))

@@ -150,7 +150,11 @@ def test_runs_of_a_few_records_have_no_rate(tmp_path):
     rows[2]["_timestamp_ms"] += 20
     for row in rows[4:]:
         row["_timestamp_ms"] += 300
-    recordings = read_tub(tub(tmp_path / "tub", rows), LEFT)
+    slower = records(60, "21-08-21_1", 40, 1_629_500_100_000)[:20]
+    for i, row in enumerate(slower):
+        row["_timestamp_ms"] += 15 * i
+    recordings = read_tub(tub(tmp_path / "tub", [*rows, *slower]), LEFT)
+    assert kinds(recordings) == {"hole_in_time": 1, "another_rate": 20}
     assert [len(e.samples) for e in recordings.episodes] == [4, 35] and usual_rate_hz(recordings) == 20
 
 
