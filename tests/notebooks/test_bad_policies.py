@@ -19,8 +19,10 @@ from rover_lib.workshop.run.run_report import PAGE, text, write, write_card
 
 pytestmark = pytest.mark.slow
 LEARNED, RIDGE = 200, 1e-2  # frames; of the features' variance
-DRIVES = re.compile(r"ansible-playbook|deploy\.yml|drive\.yml|rover (?:drive|view|release)|lerobot_robot_rover |one to deploy"
-                    r"|[Vv]erdict: deploy|put it on the rover|first metres")  # fmt: skip
+DRIVES = re.compile(
+    r"ansible-playbook|deploy\.yml|drive\.yml|rover (?:drive|view|release)|lerobot_robot_rover |one to deploy"
+    r"|[Vv]erdict: deploy|put it on the rover|first metres"
+)
 
 
 def in_old_units(recordings, folder):

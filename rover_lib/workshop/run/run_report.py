@@ -207,17 +207,18 @@ def write_card(run_dir: Path | str) -> Path:
         raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
     header, *rows = columns(judged)
     recorded = f"{count(recordings['episodes'], 'episode')}, {recordings['samples']} frames"
-    use = "No artifact of this policy should drive a car."
+    use, cautions = "No artifact of this policy should drive a car.", judged["cautions"]
     if judged["artifact"]:
         use = f"To drive, in a checkout of {CARD}: `rover drive {judged['artifact']}`. "
         use += "In LeRobot: `python -m lerobot_robot_rover ARTIFACT FOLDER`."
+        cautions = cautions or ["Nothing speaks against it."]
     text = [
         "---", "library_name: lerobot", "pipeline_tag: robotics", "tags: [lerobot, robotics, act, int8]", "---", "",
         f"# {folder.resolve().name}: {judged['headline']}", "", *judged["why"], "",
         f"| {' | '.join(header)} |", f"|{'---|' * len(header)}", *(f"| {' | '.join(row)} |" for row in rows), "",
         f"Errors are mean differences from FP32, in percent of the recorded range. Speed: {judged['timing']}.", "",
         f"Calibrated and judged on {recorded}: {recordings['layout'].replace('|', '/')}.", "",
-        use, "", "## Keep in mind", "", *(f"- {line}" for line in judged["cautions"] or ["Nothing speaks against it."]), "",
+        use, "", "## Keep in mind", "", *(f"- {line}" for line in cautions), "",
     ]  # fmt: skip
     path.write_text("\n".join(text))
     return path
