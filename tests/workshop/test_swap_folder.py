@@ -26,7 +26,13 @@ def test_while_one_is_in_it_another_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("asked", "then", "kept"),
-    [("", "", set()), ("", "this", set()), ("this", "other", set()), ("this", "", set()), ("this", "this", {"sub", "link"})],
+    [
+        ("", "", set()),
+        ("", "this", set()),
+        ("this", "other", set()),
+        ("this", "", set()),
+        ("this", "this", {"sub", "link"}),
+    ],
 )
 def test_what_a_killed_process_left_goes_first_unless_the_same_is_asked(tmp_path, asked, then, kept):
     lines = (
