@@ -165,7 +165,10 @@ def test_what_readme_says_to_type_works(demo_run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lines = re.findall(r"^    (.*)$", (ROOT / "README.md").read_text().partition("## The map")[0], re.M)
     asked = [shlex.split(line, comments=True) for line in lines if line.startswith("make ")]
-    seen = {"watch": r"http://127\.0\.0\.1:\d+/\?token=", "notebooks-open": r"http://localhost:\d+/lab/tree/01_load.ipynb\?token="}
+    seen = {
+        "watch": r"http://127\.0\.0\.1:\d+/\?token=",
+        "notebooks-open": r"http://localhost:\d+/lab/tree/01_load.ipynb\?token=",
+    }
     assert [words[1] for words in asked] == ["demo", "test", "notebooks-open", "watch", "run"]
     for words in asked[2:]:
         dry = ["make", "-n", f"VENV={sys.prefix}", f"--old-file={sys.prefix}/.ready", *words[1:]]
