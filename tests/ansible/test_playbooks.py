@@ -342,6 +342,26 @@ def test_a_card_that_is_full_because_of_us_is_not_refused(tmp_path):
     assert preflight(tmp_path, mounts=[{"mount": "/", "size_available": 900_000_000}]).returncode == 0
 
 
+# A run that was cut off before its handlers
+
+
+def test_what_an_earlier_run_left_to_do_is_done_by_the_next_and_once(tmp_path):
+    handlers = [row["name"] for row in yaml.safe_load((ROLE / "handlers" / "main.yml").read_text())]
+    begin = next(t for t in yaml.safe_load((ROLE / "tasks" / "system.yml").read_text()) if "notify" in t)
+    end = yaml.safe_load((ANSIBLE / "provision.yml").read_text())[0]["post_tasks"]
+    tasks = json.loads(json.dumps([begin, begin, *end, begin]).replace("/run/", f"{tmp_path}/"))
+    flush = {"name": "Flush", "ansible.builtin.meta": "flush_handlers"}
+    book = {"name": "Test", "hosts": "localhost", "connection": "local", "gather_facts": False}
+    book["tasks"] = [task for given in tasks for task in (given, flush)]
+    book["handlers"] = [{"name": name, "ansible.builtin.debug": {"msg": name}} for name in handlers]
+    (tmp_path / "play.yml").write_text(json.dumps([book]).replace('"root"', f'"{Path.home().owner()}"'))
+    found = run(program("ansible-playbook"), "-i", "localhost,", tmp_path / "play.yml", tmp=tmp_path)
+    ran = re.findall(r"^RUNNING HANDLER \[(.*?)\]", found.stdout, re.MULTILINE)
+    later = {"Name the Arduino", "Restart the view"}  # another handler, or view.yml's last task, does that
+    assert sorted(ran) == sorted(set(handlers) - later), found.stdout + found.stderr
+    assert " changed=1 " in found.stdout and (tmp_path / "rover-provisioning").exists(), found.stdout
+
+
 # The units, as they are on a rover
 
 

@@ -373,14 +373,17 @@ def _check_files(root: Path, info: Mapping[str, Any]) -> None:
                 f"{root}: its {key} is not LeRobot's", found=quote(info[key]), remedy=f"write {template}"
             )
     size = 0
-    for path in (path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*")):
+    files = [path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*")]
+    for path in files:
+        if path.is_dir() and path.is_symlink():  # rglob does not look into it, but LeRobot does
+            raise EpisodeError(f"{path}: a link to a folder", remedy="put the files themselves there")
         if not path.is_dir() and not path.is_file():
             raise _broken(f"{path}: not a plain file")
         size += path.stat().st_size
         if path.suffix == ".json" and path.stat().st_size > INFO_BYTES:
             raise _broken(f"{path}: is larger than any that LeRobot writes")
     rows = values = unpacked = 0
-    for path in root.rglob("*.parquet"):
+    for path in (path for path in files if path.suffix == ".parquet"):
         with _said_of(path, "LeRobot cannot read it"):
             footer = parquet.read_metadata(path)
         groups = [footer.row_group(i) for i in range(footer.num_row_groups)]

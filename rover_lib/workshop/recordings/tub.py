@@ -27,6 +27,7 @@ from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import DATA_BYTES
+from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, check_picture
 from rover_lib.workshop.recordings.samples import (
@@ -149,7 +150,7 @@ def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
     manifest = tub / "manifest.json"
     if manifest.is_file():
         paths, deleted = _read_manifest(manifest)
-        for name in paths:
+        for name in dict.fromkeys(paths):  # each once
             if Path(name).name != name or not (tub / name).is_file():
                 faults.add(tub, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
                 continue
@@ -168,10 +169,7 @@ def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
 
 def _read(path: Path) -> str:
     try:
-        size = path.stat().st_size
-        if not path.is_file() or size > DATA_BYTES:
-            raise EpisodeError(f"{path}: no file of a tub", found=f"{size / 1e6:.0f} MB", remedy="copy it again")
-        return path.read_text(errors="replace")
+        return read_plain(path, DATA_BYTES).decode(errors="replace")
     except OSError as e:
         raise EpisodeError(f"{path}: cannot be read ({e.strerror})", remedy="copy it again") from None
 
