@@ -591,17 +591,17 @@ ALLOW = click.option(
 )
 
 
-@release.command(short_help="Split an artifact into parts for the transfer.")
+@release.command(short_help="Sign and describe an artifact for the transfer.")
 @click.argument("artifact", type=ARTIFACT)
 @click.argument("folder", type=FILE)
 @click.option("--sign-key", type=FILE, help="The ssh key that logs in to the rover, to sign with.")
 @ALLOW
 @click.pass_obj
 def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, allow: tuple[str, ...]) -> None:
-    """Split ARTIFACT into parts for the transfer, in FOLDER. Refuses what the rover would refuse."""
-    from rover_lib.onboard.care.release import pack as pack_parts
+    """Put ARTIFACT into FOLDER for the transfer, signed and described. Refuses what the rover would refuse."""
+    from rover_lib.onboard.care.release import pack as pack_release
 
-    show(pack_parts(artifact, folder, releases.expected, allow, sign_key), True)
+    show(pack_release(artifact, folder, releases.expected, allow, sign_key), True)
 
 
 UNSIGNED = click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")

@@ -350,7 +350,7 @@ def test_from_recordings_to_pins(eyes, plugin, tmp_path, monkeypatch):
 @pytest.mark.slow
 @needs.simavr
 @pytest.mark.parametrize(
-    "happens", [interrupt, kill, *(pytest.param(what, marks=pytest.mark.release) for what in (stop, take_over))]
+    "happens", [interrupt, *(pytest.param(what, marks=pytest.mark.release) for what in (kill, stop, take_over))]
 )
 @needs.real_time
 def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifact, plugin, tmp_path):

@@ -405,7 +405,7 @@ def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GA
     ]
     lost = None if fp32["hits"] is None or judged["hits"] is None else fp32["hits"] - judged["hits"]
     rows += [
-        gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32["trials"])),
+        gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32.get("trials"))),
         gate(f"{mode} hits lost", lost, "<=", limits["hits_lost"]),
         gate(f"{mode} size_mb", judged["size_mb"], "<=", limits["size_full_mb"]),
     ]
